@@ -1,0 +1,66 @@
+"""Sizes, times and counts that both ends agree on. Imports nothing of ours.
+
+Sizes are bytes, times are seconds, unless a name says otherwise.
+"""
+
+KIB = 1024
+MIB = 1024 * KIB
+
+HANDSHAKE_FRAME = 16 * KIB
+"""Largest frame on a robot link that has not proved who it is."""
+
+ROBOT_FRAME = 16 * MIB
+"""Largest frame a proven robot may send (a point cloud or a raw picture)."""
+
+COMMAND_FRAME = 4 * MIB
+"""Largest frame the relay sends to a robot."""
+
+CLIENT_MESSAGE = 1 * MIB
+"""Largest websocket message a client may send."""
+
+CLIENT_FRAME = 1 * MIB
+"""Largest websocket frame a client may send."""
+
+UNPROVEN_BYTES = 64 * KIB
+"""What a connection may send before it is authenticated."""
+
+UNPROVEN_SECONDS = 10.0
+"""How long a connection may take to authenticate, an absolute deadline."""
+
+JSON_DEPTH = 64
+"""Deepest nesting of arrays and objects in a JSON message."""
+
+TYPE_DEFINITION = 256 * KIB
+"""Largest .msg/.srv text, with all types it contains, taken from a robot."""
+
+NAME = 255
+"""Longest name of a topic, service, type or node, in characters (as in DDS)."""
+
+ROBOT_NAME = 63
+"""Longest name of a robot, in characters (a DNS label)."""
+
+ENROLMENT_SECONDS = 15 * 60
+"""An enrolment code is good for this long, once."""
+
+TICKET_SECONDS = 60
+"""A single-use ticket for a websocket is good for this long."""
+
+CHANNEL_TICKET_SECONDS = 30
+"""A robot has this long to join a channel it was asked to open."""
+
+HEARTBEAT_SECONDS = 2.0
+"""Each end of a robot link pings this often; three missed and the link is lost."""
+
+HEARTBEATS_MISSED = 3
+
+COMMAND_DEADLINE_MS = 500
+"""No motion command older than this is executed."""
+
+STOP_WITHIN_MS = 500
+"""A robot stands still within this time of its last valid motion command."""
+
+LINGER_SECONDS = 5.0
+"""A channel stays open this long after its last client."""
+
+CALL_SECONDS = 30.0
+"""A service call that names no timeout is given up after this long."""

@@ -1,0 +1,423 @@
+"""JSON messages of the robot link (SPEC section 2): who says what, before and after a robot has proved itself.
+
+Every message is an object with ``op``. Unknown fields are passed over, an unknown ``op`` is an error.
+A sender leaves out fields at their default.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from typing import Any, Optional, Union
+
+import msgspec
+
+from relay_protocol import frames, jsontext
+from relay_protocol.errors import Invalid
+from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
+
+
+def lower_tag(name: str) -> str:
+    """``OpenChannel`` is written ``open_channel``."""
+    return "".join("_" + letter.lower() if letter.isupper() else letter for letter in name).lstrip("_")
+
+
+class Message(msgspec.Struct, tag_field="op", tag=lower_tag, omit_defaults=True, frozen=True):
+    """Base of everything with an ``op``."""
+
+
+# --- before the robot is known -------------------------------------------------------------------------------------
+
+
+class Hello(Message, kw_only=True):
+    """Robot: this is who I am going to prove to be.
+
+    :param key: fingerprint of the public key that will sign, see :func:`relay_protocol.identity.fingerprint`
+    :param encodings: encodings of samples the robot speaks, best first: ``cdr``, ``json``
+    :param agent: software and version, for people
+    """
+
+    version: int
+    robot: str
+    key: str
+    encodings: list[str]
+    agent: str = ""
+
+
+class Challenge(Message, kw_only=True):
+    """Relay: sign this. ``nonce`` is 32 random bytes in base64, good for this connection only."""
+
+    nonce: str
+    relay: str
+
+
+class Prove(Message, kw_only=True):
+    """Robot: the Ed25519 signature (base64) of :func:`relay_protocol.identity.proof_text`."""
+
+    signature: str
+
+
+class Enroll(Message, kw_only=True):
+    """Robot: register my public key (32 bytes, base64) by this code of one use."""
+
+    version: int
+    robot: str
+    code: str
+    public_key: str
+    agent: str = ""
+
+
+class Enrolled(Message, kw_only=True):
+    """Relay: done; dial again with ``hello``. The robot keeps ``relay`` and refuses another name later."""
+
+    robot: str
+    relay: str
+
+
+class Join(Message, kw_only=True):
+    """Robot, on a new connection: this is the channel you asked me to open."""
+
+    version: int
+    ticket: str
+
+
+class Joined(Message, kw_only=True):
+    """Relay: go on. ``at`` is the relay's monotonic clock in nanoseconds, the first estimate of the offset."""
+
+    channel: str
+    at: int
+
+
+class Refused(Message, kw_only=True):
+    """Relay: no, and the connection ends.
+
+    :param retry_after: seconds after which trying again makes sense; ``None`` when only a person can help
+    """
+
+    reason: str
+    code: str = "refused"
+    retry_after: Optional[float] = None
+
+
+class Welcome(Message, kw_only=True):
+    """Relay: you are registered.
+
+    :param session: name of this registration, for logs on both ends
+    :param heartbeat: seconds between pings, each way
+    :param frame_limit: largest frame the robot may send from now on, bytes
+    """
+
+    session: str
+    heartbeat: float
+    frame_limit: int
+
+
+# --- both ways, on every link --------------------------------------------------------------------------------------
+
+
+class Ping(Message, kw_only=True):
+    """Either end: answer at once. ``t`` is the asker's monotonic clock in nanoseconds."""
+
+    t: int
+
+
+class Pong(Message, kw_only=True):
+    """The answer: ``t`` as it came, ``at`` the answerer's monotonic clock in nanoseconds."""
+
+    t: int
+    at: int
+
+
+class Bye(Message, kw_only=True):
+    """Either end: I am closing this link on purpose."""
+
+    reason: str
+
+
+# --- control link, robot to relay ----------------------------------------------------------------------------------
+
+
+class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What the robot's own safety counts as motion, and its times. The robot is the authority on it.
+
+    :param types: message types whose topics are motion topics
+    :param topics: further topics by name
+    :param deadline_ms: a command older than this is dropped
+    :param stop_within_ms: the robot stands still this long after the last valid command
+    """
+
+    types: list[str] = msgspec.field(default_factory=list)
+    topics: list[str] = msgspec.field(default_factory=list)
+    deadline_ms: int = COMMAND_DEADLINE_MS
+    stop_within_ms: int = STOP_WITHIN_MS
+
+
+class Describe(Message, kw_only=True):
+    """Robot: facts about myself, whole; sent after ``welcome`` and whenever they change.
+
+    :param platform: ``ros2``, ``mqtt``, …
+    :param distro: ROS distribution, e.g. ``jazzy``
+    :param started: Unix time the daemon started, seconds
+    :param extra: anything else worth showing, text by text
+    """
+
+    host: str = ""
+    platform: str = ""
+    distro: str = ""
+    os: str = ""
+    agent: str = ""
+    started: float = 0.0
+    motion: MotionPolicy = msgspec.field(default_factory=MotionPolicy)
+    extra: dict[str, str] = msgspec.field(default_factory=dict)
+
+
+class Topic(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One topic of the graph: its types (usually one) and the full names of the nodes at its ends."""
+
+    types: list[str]
+    publishers: list[str] = msgspec.field(default_factory=list)
+    subscribers: list[str] = msgspec.field(default_factory=list)
+
+
+class Service(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One service (or action) of the graph and the nodes that provide it."""
+
+    types: list[str]
+    providers: list[str] = msgspec.field(default_factory=list)
+
+
+class Graph(Message, kw_only=True):
+    """Robot: the ROS graph, or what has changed in it.
+
+    With ``full`` the maps are all there is. Otherwise each map holds the names that changed, with ``null`` for a
+    name that is gone. Nodes are keys with an empty object. The daemon's own node is left out.
+    """
+
+    full: bool = False
+    topics: dict[str, Optional[Topic]] = msgspec.field(default_factory=dict)
+    services: dict[str, Optional[Service]] = msgspec.field(default_factory=dict)
+    actions: dict[str, Optional[Service]] = msgspec.field(default_factory=dict)
+    nodes: dict[str, Optional[dict[str, Any]]] = msgspec.field(default_factory=dict)
+
+
+class Health(Message, kw_only=True):
+    """Robot: how I am, every few seconds.
+
+    :param battery: charge, 0 to 1; ``None`` when unknown
+    :param cpu: load of the whole machine, 0 to 1
+    :param memory: memory in use, 0 to 1
+    :param rtt_ms: round trip to the relay as the robot measures it, milliseconds
+    :param stale_commands: motion commands dropped because they were too old, since start
+    :param watchdog_stops: times the watchdog sent zero because commands ceased, since start
+    :param dropped_samples: samples dropped because the uplink was full, since start
+    """
+
+    battery: Optional[float] = None
+    cpu: Optional[float] = None
+    memory: Optional[float] = None
+    rtt_ms: Optional[float] = None
+    stale_commands: int = 0
+    watchdog_stops: int = 0
+    dropped_samples: int = 0
+
+
+class Alert(Message, kw_only=True):
+    """Robot: something a person should know. ``level`` is ``info``, ``warning`` or ``error``."""
+
+    level: str
+    text: str
+
+
+# --- control link, relay to robot ----------------------------------------------------------------------------------
+
+
+class OpenChannel(Message, kw_only=True):
+    """Relay: dial and ``join`` with this ticket.
+
+    :param address: ``host:port`` to dial; empty for the address of the control link
+    """
+
+    channel: str
+    ticket: str
+    address: str = ""
+
+
+class CloseChannel(Message, kw_only=True):
+    """Relay: nobody is left on this channel."""
+
+    channel: str
+
+
+# --- channel link, relay to robot ----------------------------------------------------------------------------------
+
+
+class QoS(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """ROS 2 quality of service as a client may ask for it (PROTOCOL: ``qos``); ``None`` leaves it to the robot."""
+
+    history: Optional[str] = None
+    depth: Optional[int] = None
+    reliability: Optional[str] = None
+    durability: Optional[str] = None
+    deadline: Optional[float] = None
+    lifespan: Optional[float] = None
+
+
+class Subscribe(Message, kw_only=True):
+    """Relay: send me this topic, as samples of this number. Again with a known number: change ``throttle_ms``.
+
+    :param type: the type, where the asker knows it; else the robot takes the topic's one type from its graph
+    :param throttle_ms: least time between two samples, milliseconds; 0 for all
+    """
+
+    number: int
+    topic: str
+    type: str = ""
+    throttle_ms: int = 0
+    qos: Optional[QoS] = None
+
+
+class Unsubscribe(Message, kw_only=True):
+    number: int
+
+
+class Advertise(Message, kw_only=True):
+    """Relay: samples of this number are to be published on this topic.
+
+    :param source: who publishes, for the robot's own log
+    """
+
+    number: int
+    topic: str
+    type: str
+    latch: bool = False
+    queue_size: int = 0
+    qos: Optional[QoS] = None
+    source: str = ""
+
+
+class Unadvertise(Message, kw_only=True):
+    number: int
+
+
+class CallService(Message, kw_only=True):
+    """Relay: call a service. Arguments are ``cdr`` (base64) or, for a robot without CDR, ``args``.
+
+    :param timeout: seconds the robot waits for the answer
+    """
+
+    id: str
+    service: str
+    type: str
+    timeout: float
+    cdr: Optional[str] = None
+    args: Optional[msgspec.Raw] = None
+
+
+class GetType(Message, kw_only=True):
+    """Relay: send the definition of a type such as ``sensor_msgs/msg/LaserScan`` or ``std_srvs/srv/Trigger``."""
+
+    type: str
+
+
+# --- channel link, robot to relay ----------------------------------------------------------------------------------
+
+
+class Subscribed(Message, kw_only=True):
+    """Robot: samples will come.
+
+    :param encoding: ``cdr`` (kind-1 frames), or ``json`` (kind-1 frames with a JSON body)
+    :param latched: publishers keep their last messages for late joiners (transient local)
+    :param publishers: how many publish now
+    """
+
+    number: int
+    topic: str
+    type: str
+    encoding: str
+    latched: bool = False
+    publishers: int = 0
+
+
+class Advertised(Message, kw_only=True):
+    """Robot: the publisher stands.
+
+    :param motion: the robot's safety counts this topic as motion
+    """
+
+    number: int
+    topic: str
+    type: str
+    encoding: str
+    motion: bool = False
+
+
+class Failed(Message, kw_only=True):
+    """Robot: a request could not be done. ``what`` is its ``op``, ``ref`` its number, id or type."""
+
+    what: str
+    ref: str
+    reason: str
+
+
+class ServiceResponse(Message, kw_only=True):
+    """Robot: the answer to ``call_service``; ``reason`` when ``result`` is false."""
+
+    id: str
+    result: bool
+    cdr: Optional[str] = None
+    values: Optional[msgspec.Raw] = None
+    reason: str = ""
+
+
+class TypeDefinition(Message, kw_only=True):
+    """Robot: the .msg or .srv text, then every type it contains, each after a line of ``=`` and ``MSG: name``.
+
+    The layout is that of rosbag2's ``ros2msg``. For a service the main part has the request and the response
+    divided by ``---``.
+
+    :param hash: RIHS01 type hash where the distribution has one
+    """
+
+    type: str
+    text: str
+    hash: str = ""
+
+
+Opening = Union[Hello, Prove, Enroll, Join]
+"""What a robot may say before it is known."""
+
+OpeningReply = Union[Challenge, Welcome, Enrolled, Joined, Refused]
+"""What the relay answers to that."""
+
+RobotControl = Union[Describe, Graph, Health, Alert, Ping, Pong, Bye]
+RelayControl = Union[OpenChannel, CloseChannel, Ping, Pong, Bye]
+RobotChannel = Union[Subscribed, Advertised, Failed, ServiceResponse, TypeDefinition, Ping, Pong, Bye]
+RelayChannel = Union[Subscribe, Unsubscribe, Advertise, Unadvertise, CallService, GetType, Ping, Pong, Bye]
+
+opening_decoder: msgspec.json.Decoder[Opening] = msgspec.json.Decoder(Opening)
+opening_reply_decoder: msgspec.json.Decoder[OpeningReply] = msgspec.json.Decoder(OpeningReply)
+robot_control_decoder: msgspec.json.Decoder[RobotControl] = msgspec.json.Decoder(RobotControl)
+relay_control_decoder: msgspec.json.Decoder[RelayControl] = msgspec.json.Decoder(RelayControl)
+robot_channel_decoder: msgspec.json.Decoder[RobotChannel] = msgspec.json.Decoder(RobotChannel)
+relay_channel_decoder: msgspec.json.Decoder[RelayChannel] = msgspec.json.Decoder(RelayChannel)
+
+
+def frame(message: Message) -> bytes:
+    """A message as a kind-0 frame, ready for the wire."""
+    return frames.encode_json(jsontext.encode(message))
+
+
+def to_base64(data: bytes) -> str:
+    """Bytes for a JSON field (RFC 4648 section 4)."""
+    return base64.b64encode(data).decode("ascii")
+
+
+def from_base64(text: str, what: str) -> bytes:
+    """The bytes of a JSON field; ``what`` names it in the error.
+
+    :raises Invalid: not base64
+    """
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        raise Invalid(f"{what} is not base64") from None

@@ -1,0 +1,159 @@
+"""Rights on a robot, compiled once and asked at every message.
+
+A right is a level, with optional patterns that allow or deny more. Deny beats allow, allow beats the level, and
+what nothing allows is denied.
+"""
+
+from __future__ import annotations
+
+import enum
+import fnmatch
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from relay_protocol.errors import Invalid
+
+
+class Level(str, enum.Enum):
+    """How far a right goes; each level includes the ones before it."""
+
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    OWNER = "owner"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+class Operation(str, enum.Enum):
+    """What one may do to a resource of a robot."""
+
+    SUBSCRIBE = "subscribe"
+    PUBLISH = "publish"
+    CALL = "call"
+    PROVIDE = "provide"
+    """Offer a service or an action to the robot's graph."""
+    MANAGE = "manage"
+    """Change who may do what on this robot."""
+
+    def __str__(self) -> str:
+        return self.value
+
+
+_RANK = {Level.VIEWER: 0, Level.OPERATOR: 1, Level.OWNER: 2}
+
+_NEEDED = {
+    Operation.SUBSCRIBE: Level.VIEWER,
+    Operation.PUBLISH: Level.OPERATOR,
+    Operation.CALL: Level.OPERATOR,
+    Operation.PROVIDE: Level.OPERATOR,
+    Operation.MANAGE: Level.OWNER,
+}
+
+_ALL = "*"
+
+
+class Grant(NamedTuple):
+    """One right as it stands in the database.
+
+    :param allow: patterns ``operation:resource``, e.g. ``call:/reset`` or ``*:/arm/*`` (shell wildcards)
+    :param deny: patterns of the same form
+    :param source: whom the right was given to, for the reason: ``user ann`` or ``group lab``
+    """
+
+    level: Level
+    allow: tuple[str, ...] = ()
+    deny: tuple[str, ...] = ()
+    source: str = ""
+
+
+class Verdict(NamedTuple):
+    """Yes or no, and why, in words for the one who asked."""
+
+    allowed: bool
+    reason: str
+
+
+def parse_level(text: str) -> Level:
+    """:raises Invalid: not one of viewer, operator, owner"""
+    try:
+        return Level(text)
+    except ValueError:
+        raise Invalid(f"'{text}' is no level; it is viewer, operator or owner") from None
+
+
+def parse_pattern(text: str) -> str:
+    """Check one allow or deny pattern and return it normalised.
+
+    :raises Invalid: not ``operation:resource`` with a known operation (or ``*``) and an absolute resource name
+    """
+    operation, colon, resource = text.partition(":")
+    if not colon or operation not in {_ALL, *(str(each) for each in Operation)}:
+        known = ", ".join(str(each) for each in Operation)
+        raise Invalid(f"'{text}' is no pattern; write operation:resource with one of {known} or *")
+    if not resource.startswith(("/", "*")):
+        raise Invalid(f"'{text}': the resource must begin with / (as in publish:/cmd_vel) or be a wildcard")
+    return text
+
+
+class Rules:
+    """All rights of one principal on one robot, compiled.
+
+    No grants at all means no channel: :attr:`level` is ``None`` and every question is answered with no.
+    """
+
+    def __init__(self, grants: Iterable[Grant] = ()) -> None:
+        self.grants = tuple(grants)
+        self.level: Level | None = max(
+            (grant.level for grant in self.grants), key=_RANK.__getitem__, default=None
+        )
+        self._allow = [pattern for grant in self.grants for pattern in map(_compile, grant.allow)]
+        self._deny = [pattern for grant in self.grants for pattern in map(_compile, grant.deny)]
+        self._verdicts: dict[tuple[Operation, str], Verdict] = {}
+
+    def __bool__(self) -> bool:
+        return self.level is not None
+
+    def judge(self, operation: Operation, resource: str) -> Verdict:
+        """May the principal do this to that resource of the robot? Answers are kept: names recur."""
+        key = (operation, resource)
+        verdict = self._verdicts.get(key)
+        if verdict is None:
+            verdict = self._decide(operation, resource)
+            if len(self._verdicts) < _VERDICTS_KEPT:
+                self._verdicts[key] = verdict
+        return verdict
+
+    def _decide(self, operation: Operation, resource: str) -> Verdict:
+        if self.level is None:
+            return Verdict(False, "you have no right on this robot")
+        for pattern in self._deny:
+            if pattern.matches(operation, resource):
+                return Verdict(False, f"{operation} on {resource} is denied to you by '{pattern.text}'")
+        for pattern in self._allow:
+            if pattern.matches(operation, resource):
+                return Verdict(True, f"allowed by '{pattern.text}'")
+        needed = _NEEDED[operation]
+        if _RANK[self.level] >= _RANK[needed]:
+            return Verdict(True, f"allowed to {self.level}")
+        return Verdict(
+            False, f"{operation} on {resource} needs the level {needed}; you are {self.level} on this robot"
+        )
+
+
+_VERDICTS_KEPT = 4096
+
+
+class _Pattern(NamedTuple):
+    operation: str
+    resource: re.Pattern[str]
+    text: str
+
+    def matches(self, operation: Operation, resource: str) -> bool:
+        return self.operation in (_ALL, operation.value) and self.resource.match(resource) is not None
+
+
+def _compile(text: str) -> _Pattern:
+    operation, _, resource = text.partition(":")
+    return _Pattern(operation, re.compile(fnmatch.translate(resource)), text)
