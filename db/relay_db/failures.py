@@ -1,0 +1,76 @@
+"""Turns what a database reports into words, without paths, parameters or passwords."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from sqlalchemy import exc
+
+from relay_protocol.errors import Unavailable
+
+_SQLITE = {
+    sqlite3.SQLITE_BUSY: "the database is locked by another process; try again",
+    sqlite3.SQLITE_LOCKED: "the database is locked by another process; try again",
+    sqlite3.SQLITE_FULL: "the disk with the database is full; free some space",
+    sqlite3.SQLITE_READONLY: "the database can't be written; check the owner and mode of its file and folder",
+    sqlite3.SQLITE_CANTOPEN: "the database file can't be opened; is it there, and who may read it?",
+    sqlite3.SQLITE_IOERR: "the disk with the database fails; check it",
+    sqlite3.SQLITE_CORRUPT: "the database file is damaged; restore a backup",
+    sqlite3.SQLITE_NOTADB: "the database file is no SQLite database; give another folder or restore a backup",
+    sqlite3.SQLITE_PERM: "the database file can't be opened; check its owner and mode",
+    sqlite3.SQLITE_NOLFS: "the disk can't hold a database as large as this",
+    sqlite3.SQLITE_PROTOCOL: "the database is locked by another process; try again",
+    sqlite3.SQLITE_NOMEM: "no memory is left for the database",
+}
+"""Primary result codes (https://www.sqlite.org/rescode.html) that are the world's fault, not the query's."""
+
+_POSTGRES = {
+    "08": "the database server can't be reached",
+    "28": "the database server refuses the login; check user and password in the database URL",
+    "3D": "the database named in the URL does not exist; create it",
+    "40": "another change came in between; try again",
+    "53": "the database server is out of disk, memory or connections",
+    "55": "the database is locked by another process; try again",
+    "57": "the database server is shutting down or cancelled the query; try again",
+    "58": "the disk of the database server fails",
+    "25": "the database server is read-only; give the URL of the primary",
+}
+"""Classes of SQLSTATE (PostgreSQL manual, appendix A) that are the world's fault."""
+
+_PRIMARY = 0xFF
+
+
+@contextmanager
+def in_words() -> Iterator[None]:
+    """Let database errors leave as :class:`Unavailable`; a wrong query still fails as what it is.
+
+    :raises Unavailable: locked, full, unreachable, or overtaken by another change
+    """
+    try:
+        yield
+    except exc.IntegrityError as error:
+        raise Unavailable("the change contradicts another one made at the same time; try again") from error
+    except exc.TimeoutError as error:
+        raise Unavailable("all connections to the database are busy; try again") from error
+    except exc.DBAPIError as error:
+        sentence = _sentence(error)
+        if sentence is None:
+            raise
+        raise Unavailable(sentence) from error
+    except OSError as error:
+        raise Unavailable(f"the database file can't be used: {error.strerror}") from error
+
+
+def _sentence(error: exc.DBAPIError) -> str | None:
+    original = error.orig
+    if isinstance(original, sqlite3.Error):
+        code = getattr(original, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
+        return _SQLITE.get(code & _PRIMARY)
+    state = getattr(original, "sqlstate", None)
+    if state is None:
+        # psycopg gives no SQLSTATE when there is no server to give one
+        lost = isinstance(error, (exc.OperationalError, exc.InterfaceError)) or error.connection_invalidated
+        return _POSTGRES["08"] if lost else None
+    return _POSTGRES.get(state[:2])

@@ -1,0 +1,45 @@
+"""What users, groups and realms may be called, and what free text is kept as."""
+
+from __future__ import annotations
+
+import unicodedata
+
+from relay_db.models import LABEL, NAME
+from relay_protocol.errors import Invalid
+
+
+def normal_name(text: str, what: str = "name") -> str:
+    """The one form of a name: NFKC, lower case. ``Ann`` and ``ann`` are the same person.
+
+    :param what: whose name it is, for the error
+    :raises Invalid: empty, over 63 characters, not printable, with blanks, or beginning with ``@`` or ``-``
+    """
+    name = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
+    if not 0 < len(name) <= NAME:
+        raise Invalid(f"the {what} must have 1 to {NAME} characters")
+    if not name.isprintable() or any(character.isspace() for character in name):
+        raise Invalid(f"the {what} must be printable, without spaces, line breaks or control characters")
+    if name[0] in "@-":
+        raise Invalid(f"the {what} must not begin with '{name[0]}'")
+    return name
+
+
+def label(text: str, what: str) -> str:
+    """Free text of one line that a person gave, checked.
+
+    :raises Invalid: over 255 characters, or with control characters
+    """
+    if len(text) > LABEL or not text.isprintable():
+        raise Invalid(f"the {what} must be one printable line of at most {LABEL} characters")
+    return text
+
+
+def recorded(text: str, length: int = LABEL) -> str:
+    """Text from anyone, made fit to be kept: what can't be printed is escaped, what is too long is cut."""
+    printable = "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
+        for character in text[:length]
+    )
+    if len(text) <= length and len(printable) <= length:
+        return printable
+    return printable[: length - 1] + "…"

@@ -1,0 +1,171 @@
+"""Events, and the audit log: a chain in which each entry's hash covers the one before."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Text, delete, insert, select, type_coerce, update
+from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
+
+from relay_db.base import canonical_json
+from relay_db.models import NAME, AuditEntry, Event, Revision
+from relay_db.names import recorded
+from relay_db.queries.records import AuditRecord, EventRecord
+
+_START = hashlib.sha256(b"").hexdigest()
+"""What the first entry follows."""
+
+_PAGE = 1000
+
+
+def record_event(
+    s: Session,
+    *,
+    at: float,
+    kind: str,
+    source: str,
+    robot_id: int | None = None,
+    user_id: int | None = None,
+    data: Mapping[str, Any],
+) -> int:
+    """Remember something that happened.
+
+    :param at: Unix seconds
+    :param source: who tells it, e.g. ``relay``
+    :raises ValueError: the data holds NaN or Infinity
+    """
+    values = {
+        "at": at,
+        "kind": recorded(kind, NAME),
+        "source": recorded(source),
+        "robot_id": robot_id,
+        "user_id": user_id,
+        "data": dict(data),
+    }
+    return s.scalars(insert(Event).values(**values).returning(Event.id)).one()
+
+
+def list_events(
+    s: Session, robot_id: int | None = None, kind: str | None = None, limit: int = 100
+) -> list[EventRecord]:
+    """The latest events, newest first."""
+    query = (
+        select(Event.id, Event.at, Event.kind, Event.source, Event.robot_id, Event.user_id, Event.data)
+        .order_by(Event.id.desc())
+        .limit(limit)
+    )
+    if robot_id is not None:
+        query = query.where(Event.robot_id == robot_id)
+    if kind is not None:
+        query = query.where(Event.kind == recorded(kind, NAME))
+    return [EventRecord(*row) for row in s.execute(query)]
+
+
+def purge_events(s: Session, before: float) -> int:
+    """Forget events older than that moment (Unix seconds); how many."""
+    return len(s.scalars(delete(Event).where(Event.at < before).returning(Event.id)).all())
+
+
+def append_audit(
+    s: Session,
+    *,
+    at: float,
+    actor: str,
+    action: str,
+    target: str,
+    origin: str = "",
+    data: Mapping[str, Any] | None = None,
+) -> AuditRecord:
+    """Add an entry to the chain. Text may come from anyone: it is made printable and cut to length.
+
+    :param at: Unix seconds
+    :param actor: who did it, e.g. ``user:ann`` or ``cli:root``
+    :param action: what, e.g. ``right.grant``
+    :param target: to whom or what
+    :param origin: from which address
+    :raises ValueError: the data holds NaN or Infinity
+    """
+    end = s.execute(select(Revision.audit_id, Revision.audit_hash).with_for_update()).one()
+    entry = AuditRecord(
+        end.audit_id + 1,
+        float(at),
+        recorded(actor),
+        recorded(action, NAME),
+        recorded(target),
+        recorded(origin),
+        dict(data or {}),
+        "",
+    )
+    entry = entry._replace(hash=_link(end.audit_hash, entry))
+    s.execute(insert(AuditEntry).values(**entry._asdict()))
+    s.execute(update(Revision).values(audit_id=entry.id, audit_hash=entry.hash))
+    return entry
+
+
+def verify_audit(s: Session) -> int | None:
+    """The number of the first entry that was changed, removed or put in; None if the chain is whole."""
+    end = s.execute(select(Revision.audit_id, Revision.audit_hash)).one()
+    size = _PAGE
+    previous, expected = _START, 1
+    while (page := _page(s, expected, size)) != []:
+        if page is None and size > 1:
+            size = 1
+            continue
+        for row in page or [None]:
+            if row is None or row.id != expected or _broken(previous, row):
+                return expected
+            previous, expected = str(row.hash), expected + 1
+    if (expected - 1, previous) == (end.audit_id, end.audit_hash):
+        return None
+    return max(1, min(expected, int(end.audit_id)))
+
+
+def list_audit(s: Session, limit: int = 100) -> list[AuditRecord]:
+    """The latest audit entries, newest first."""
+    query = select(*_COLUMNS, AuditEntry.data, AuditEntry.hash).order_by(AuditEntry.id.desc()).limit(limit)
+    return [AuditRecord(*row) for row in s.execute(query)]
+
+
+_COLUMNS = (
+    AuditEntry.id,
+    AuditEntry.at,
+    AuditEntry.actor,
+    AuditEntry.action,
+    AuditEntry.target,
+    AuditEntry.origin,
+)
+
+
+def _page(s: Session, first: int, size: int) -> list[Any] | None:
+    """Entries from a number on, their data as the text that is stored; None where it is no text at all.
+
+    The first page has no lower end: an entry put in before the first must be seen.
+    """
+    raw = type_coerce(AuditEntry.data, Text).label("text")
+    query = select(*_COLUMNS, raw, AuditEntry.hash).order_by(AuditEntry.id).limit(size)
+    try:
+        return list(s.execute(query if first == 1 else query.where(AuditEntry.id >= first)))
+    except OperationalError as error:
+        if isinstance(error.orig, sqlite3.Error) and "decode" in str(error.orig):
+            return None
+        raise
+
+
+def _broken(previous: str, row: Any) -> bool:
+    """Whether an entry is not the one that was appended, to the byte."""
+    try:
+        data = json.loads(row.text)
+        entry = AuditRecord(row.id, row.at, row.actor, row.action, row.target, row.origin, data, "")
+        return canonical_json(data) != str(row.text) or _link(previous, entry) != str(row.hash)
+    except (ValueError, TypeError, RecursionError):
+        return True
+
+
+def _link(previous: str, entry: AuditRecord) -> str:
+    body = {name: value for name, value in entry._asdict().items() if name != "hash"}
+    return hashlib.sha256(f"{previous}\n{canonical_json(body)}".encode()).hexdigest()

@@ -1,0 +1,194 @@
+"""Who may do what on which robot."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any
+
+from sqlalchemy import ColumnElement, delete, insert, or_, select
+from sqlalchemy.orm import Session
+
+from relay_db.models import Group, Membership, Realm, Right, Robot, User
+from relay_db.queries.records import RightRecord, RobotRecord
+from relay_db.queries.state import bump
+from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.rights import Grant, Level, parse_level, parse_pattern
+
+PATTERNS = 64
+"""Most allow or deny patterns of one right: all of them are asked for every new resource."""
+
+_PATTERN_LENGTH = 512
+
+
+def grant_right(
+    s: Session,
+    robot_id: int,
+    level: Level | str,
+    *,
+    user_id: int | None = None,
+    group_id: int | None = None,
+    allow: Iterable[str] = (),
+    deny: Iterable[str] = (),
+) -> None:
+    """Give a right to a user or a group; it replaces the one the same holder has on the robot.
+
+    :param allow: patterns ``operation:resource`` allowed beyond the level
+    :param deny: patterns denied in spite of everything
+    :raises Invalid: not exactly one holder, a pattern that is none, or a holder of another realm
+    :raises NotFound: no such robot, user or group
+    """
+    level = parse_level(str(level))
+    patterns = _patterns(allow), _patterns(deny)
+    _check_realms(s, robot_id, user_id, group_id)
+    bump(s)
+    s.execute(delete(Right).where(_held(robot_id, user_id, group_id)))
+    s.execute(
+        insert(Right).values(
+            robot_id=robot_id,
+            user_id=user_id,
+            group_id=group_id,
+            level=level.value,
+            allow=patterns[0],
+            deny=patterns[1],
+        )
+    )
+
+
+def revoke_right(
+    s: Session, robot_id: int, *, user_id: int | None = None, group_id: int | None = None
+) -> bool:
+    """Take the right of a user or a group on a robot away; false if there was none.
+
+    :raises Invalid: not exactly one holder
+    """
+    _one_holder(user_id, group_id)
+    bump(s)
+    gone = delete(Right).where(_held(robot_id, user_id, group_id)).returning(Right.id)
+    return s.scalar(gone) is not None
+
+
+def list_rights(
+    s: Session, *, robot_id: int | None = None, user_id: int | None = None, group_id: int | None = None
+) -> list[RightRecord]:
+    """Rights as they were given, by robot and holder; with ``user_id`` also those through its groups."""
+    query = (
+        select(
+            Right.id,
+            Right.robot_id,
+            Robot.name.label("robot"),
+            User.name.label("user"),
+            Group.name.label("group"),
+            Right.level,
+            Right.allow,
+            Right.deny,
+        )
+        .join(Robot, Robot.id == Right.robot_id)
+        .outerjoin(User, User.id == Right.user_id)
+        .outerjoin(Group, Group.id == Right.group_id)
+        .order_by(Robot.name, User.name, Group.name)
+    )
+    if robot_id is not None:
+        query = query.where(Right.robot_id == robot_id)
+    if group_id is not None:
+        query = query.where(Right.group_id == group_id)
+    if user_id is not None:
+        query = query.where(_of_user(user_id))
+    return [
+        RightRecord(
+            row.id,
+            row.robot_id,
+            row.robot,
+            row.user,
+            row.group,
+            Level(row.level),
+            tuple(row.allow),
+            tuple(row.deny),
+        )
+        for row in s.execute(query)
+    ]
+
+
+def grants_for(s: Session, user_id: int, robot_id: int) -> list[Grant]:
+    """All a user has on a robot: its own right, those of its groups, and an administrator's.
+
+    A disabled user, or one of another realm, has none.
+    """
+    return _grants(s, user_id, robot_id).get(robot_id, [])
+
+
+def robots_with_grants(s: Session, user_id: int) -> list[tuple[RobotRecord, list[Grant]]]:
+    """The robots on which a user has at least one right, by name."""
+    grants = _grants(s, user_id, None)
+    robots = s.execute(
+        select(Robot.id, Robot.name, Realm.name, Robot.description)
+        .join(Realm, Realm.id == Robot.realm_id)
+        .join(User, User.realm_id == Robot.realm_id)
+        .where(User.id == user_id)
+        .order_by(Robot.name)
+    )
+    return [(RobotRecord(*row), grants[row.id]) for row in robots if row.id in grants]
+
+
+def _grants(s: Session, user_id: int, robot_id: int | None) -> dict[int, list[Grant]]:
+    """Grants of a live user by robot, of one robot or of all."""
+    user = s.execute(
+        select(User.name, User.admin, User.realm_id).where(User.id == user_id, User.disabled.is_(False))
+    ).one_or_none()
+    grants: dict[int, list[Grant]] = defaultdict(list)
+    if user is None:
+        return grants
+    if user.admin:
+        robots = select(Robot.id).where(Robot.realm_id == user.realm_id)
+        for each in s.scalars(robots if robot_id is None else robots.where(Robot.id == robot_id)):
+            grants[each].append(Grant(Level.OWNER, source=f"admin {user.name}"))
+    rights = (
+        select(Right.robot_id, Right.level, Right.allow, Right.deny, Group.name.label("group"))
+        .outerjoin(Group, Group.id == Right.group_id)
+        .where(_of_user(user_id))
+        .order_by(Right.id)
+    )
+    for row in s.execute(rights if robot_id is None else rights.where(Right.robot_id == robot_id)):
+        source = f"user {user.name}" if row.group is None else f"group {row.group}"
+        grants[row.robot_id].append(Grant(Level(row.level), tuple(row.allow), tuple(row.deny), source))
+    return grants
+
+
+def _of_user(user_id: int) -> ColumnElement[bool]:
+    groups = select(Membership.group_id).where(Membership.user_id == user_id)
+    return or_(Right.user_id == user_id, Right.group_id.in_(groups))
+
+
+def _held(robot_id: int, user_id: int | None, group_id: int | None) -> Any:
+    holder = Right.user_id == user_id if user_id is not None else Right.group_id == group_id
+    return (Right.robot_id == robot_id) & holder
+
+
+def _one_holder(user_id: int | None, group_id: int | None) -> None:
+    if (user_id is None) == (group_id is None):
+        raise Invalid("a right belongs to exactly one user or group")
+
+
+def _check_realms(s: Session, robot_id: int, user_id: int | None, group_id: int | None) -> None:
+    _one_holder(user_id, group_id)
+    robot_realm = s.scalar(select(Robot.realm_id).where(Robot.id == robot_id))
+    if robot_realm is None:
+        raise NotFound("there is no such robot")
+    if user_id is not None:
+        holder_realm = s.scalar(select(User.realm_id).where(User.id == user_id))
+    else:
+        holder_realm = s.scalar(select(Group.realm_id).where(Group.id == group_id))
+    if holder_realm is None:
+        raise NotFound("there is no such user or group")
+    if holder_realm != robot_realm:
+        raise Invalid("the robot and the holder of the right are of different realms")
+
+
+def _patterns(texts: Iterable[str]) -> list[str]:
+    patterns = [parse_pattern(text) for text in texts]
+    if len(patterns) > PATTERNS:
+        raise Invalid(f"a right has at most {PATTERNS} allow and {PATTERNS} deny patterns")
+    for each in patterns:
+        if len(each) > _PATTERN_LENGTH or not each.isprintable():
+            raise Invalid(f"a pattern is one printable line of at most {_PATTERN_LENGTH} characters")
+    return patterns

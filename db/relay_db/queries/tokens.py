@@ -1,0 +1,131 @@
+"""Access tokens, browser sessions and one-time login links; of each only the hash."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Literal
+
+from sqlalchemy import ColumnElement, delete, insert, or_, select
+from sqlalchemy.orm import Session
+
+from relay_db.models import AccessToken, EnrolmentCode, Realm, User
+from relay_db.names import label as checked_label
+from relay_db.queries.records import PrincipalRecord, TokenRecord
+from relay_db.queries.state import bump
+from relay_protocol.errors import NotFound
+
+TokenKind = Literal["access", "session", "login"]
+_LOGIN: tuple[TokenKind, ...] = ("login",)
+
+
+def create_token(
+    s: Session,
+    user_id: int,
+    token_hash: str,
+    *,
+    kind: TokenKind,
+    label: str = "",
+    expires: float | None,
+    now: float,
+) -> int:
+    """Keep a new token and return its number, which is never given out again.
+
+    :param token_hash: SHA-256 in hex
+    :param expires: Unix seconds, None for never
+    :raises NotFound: no such user
+    :raises Invalid: the label can't be kept
+    """
+    if s.scalar(select(User.id).where(User.id == user_id)) is None:
+        raise NotFound("there is no such user")
+    values = {
+        "user_id": user_id,
+        "token_hash": token_hash,
+        "kind": kind,
+        "label": checked_label(label, "label of a token"),
+        "created": now,
+        "expires": expires,
+    }
+    return s.scalars(insert(AccessToken).values(**values).returning(AccessToken.id)).one()
+
+
+def principal_by_token(
+    s: Session, token_hash: str, now: float, kinds: Collection[TokenKind] = ("access", "session")
+) -> PrincipalRecord | None:
+    """Whom the token stands for.
+
+    None if it is unknown, revoked, expired or of another kind, or if its user is disabled.
+    """
+    row = s.execute(
+        select(User.id, User.name, Realm.name, User.admin, AccessToken.id, AccessToken.expires)
+        .join(User, User.id == AccessToken.user_id)
+        .join(Realm, Realm.id == User.realm_id)
+        .where(
+            AccessToken.token_hash == token_hash,
+            AccessToken.kind.in_(tuple(kinds)),
+            User.disabled.is_(False),
+            _unexpired(now),
+        )
+    ).one_or_none()
+    return None if row is None else PrincipalRecord(*row)
+
+
+def consume_login(s: Session, token_hash: str, now: float) -> PrincipalRecord | None:
+    """Use a login token up; None if it is unknown, used, expired, or its user disabled."""
+    principal = principal_by_token(s, token_hash, now, kinds=_LOGIN)
+    if principal is None:
+        return None
+    spent = delete(AccessToken).where(AccessToken.id == principal.token_id).returning(AccessToken.id)
+    # Of two that found it, only one deletes it.
+    return principal if s.scalar(spent) is not None else None
+
+
+def revoke_token(s: Session, token_id: int) -> bool:
+    """Make a token worthless at once; false if there is none of that number."""
+    bump(s)
+    gone = delete(AccessToken).where(AccessToken.id == token_id).returning(AccessToken.id)
+    return s.scalar(gone) is not None
+
+
+def list_tokens(s: Session, user_id: int | None = None) -> list[TokenRecord]:
+    """All tokens, of one user or of all, oldest first; expired ones too, until they are purged."""
+    query = (
+        select(
+            AccessToken.id,
+            User.id,
+            User.name,
+            AccessToken.kind,
+            AccessToken.label,
+            AccessToken.created,
+            AccessToken.expires,
+        )
+        .join(User, User.id == AccessToken.user_id)
+        .order_by(AccessToken.id)
+    )
+    if user_id is not None:
+        query = query.where(AccessToken.user_id == user_id)
+    return [TokenRecord(*row) for row in s.execute(query)]
+
+
+def token_is_live(s: Session, token_id: int, now: float) -> bool:
+    """Whether the token is there, not expired, and its user not disabled."""
+    live = (
+        select(AccessToken.id)
+        .join(User, User.id == AccessToken.user_id)
+        .where(AccessToken.id == token_id, User.disabled.is_(False), _unexpired(now))
+    )
+    return s.scalar(live) is not None
+
+
+def purge_expired(s: Session, now: float) -> int:
+    """Drop tokens and enrolment codes that are of no use any more; how many."""
+    tokens = delete(AccessToken).where(AccessToken.expires <= now).returning(AccessToken.id)
+    codes = (
+        delete(EnrolmentCode)
+        .where(or_(EnrolmentCode.expires <= now, EnrolmentCode.used.is_not(None)))
+        .returning(EnrolmentCode.id)
+    )
+    return len(s.scalars(tokens).all()) + len(s.scalars(codes).all())
+
+
+def _unexpired(now: float) -> ColumnElement[bool]:
+    return or_(AccessToken.expires.is_(None), AccessToken.expires > now)

@@ -1,0 +1,232 @@
+"""Realms, users, groups and who is in them."""
+
+from __future__ import annotations
+
+from sqlalchemy import ColumnElement, Row, Select, delete, exists, func, insert, select, update
+from sqlalchemy.orm import Session
+
+from relay_db.models import AccessToken, Group, Membership, Realm, User
+from relay_db.names import normal_name
+from relay_db.queries.records import GroupRecord, RealmRecord, UserRecord
+from relay_db.queries.state import bump
+from relay_protocol.errors import Invalid, NotFound
+
+DEFAULT_REALM = "default"
+
+
+def add_realm(s: Session, name: str) -> RealmRecord:
+    """:raises Invalid: the name can't be, or is taken"""
+    name = normal_name(name, "name of a realm")
+    if s.scalar(select(Realm.id).where(Realm.name == name)) is not None:
+        raise Invalid(f"there is a realm '{name}' already")
+    realm_id = s.scalars(insert(Realm).values(name=name).returning(Realm.id)).one()
+    return RealmRecord(realm_id, name)
+
+
+def list_realms(s: Session) -> list[RealmRecord]:
+    """All realms, by name."""
+    return [RealmRecord(*row) for row in s.execute(select(Realm.id, Realm.name).order_by(Realm.name))]
+
+
+def realm_id(s: Session, name: str) -> int:
+    """:raises NotFound: no such realm"""
+    found = s.scalar(select(Realm.id).where(Realm.name == _plain(name)))
+    if found is None:
+        raise NotFound("there is no such realm")
+    return found
+
+
+def find_user(s: Session, name: str, realm: str = DEFAULT_REALM) -> UserRecord | None:
+    """The user of that name, in whatever case it is written; also a disabled one."""
+    row = s.execute(_users().where(User.name == _plain(name), Realm.name == _plain(realm))).one_or_none()
+    return None if row is None else UserRecord(*row)
+
+
+def get_user(s: Session, user_id: int) -> UserRecord | None:
+    """The user of that number."""
+    row = s.execute(_users().where(User.id == user_id)).one_or_none()
+    return None if row is None else UserRecord(*row)
+
+
+def list_users(s: Session, realm: str | None = None) -> list[UserRecord]:
+    """All users, of one realm or of all, by name."""
+    query = _users().order_by(User.name)
+    if realm is not None:
+        query = query.where(Realm.name == _plain(realm))
+    return [UserRecord(*row) for row in s.execute(query)]
+
+
+def count_users(s: Session) -> int:
+    """How many users there are; none means a relay that was never set up."""
+    return s.scalar(select(func.count(User.id))) or 0
+
+
+def add_user(
+    s: Session, name: str, password_hash: str | None, admin: bool = False, realm: str = DEFAULT_REALM
+) -> UserRecord:
+    """:param password_hash: None for a user that only tokens let in
+    :raises Invalid: the name can't be, or is taken
+    :raises NotFound: no such realm
+    """
+    name = normal_name(name, "name of a user")
+    if find_user(s, name, realm) is not None:
+        raise Invalid(f"there is a user '{name}' already")
+    bump(s)
+    user_id = s.scalars(
+        insert(User)
+        .values(
+            realm_id=realm_id(s, realm), name=name, password_hash=password_hash, admin=admin, disabled=False
+        )
+        .returning(User.id)
+    ).one()
+    return UserRecord(user_id, name, realm, admin, False, password_hash)
+
+
+def set_password(
+    s: Session, user_id: int, password_hash: str | None, *, keep_token: int | None = None
+) -> None:
+    """Change the password and end all browser sessions opened with the old one.
+
+    :param keep_token: number of the session that asks for the change and goes on
+    :raises NotFound: no such user
+    """
+    bump(s)
+    _change_user(s, user_id, password_hash=password_hash)
+    s.execute(
+        delete(AccessToken).where(
+            AccessToken.user_id == user_id,
+            AccessToken.kind.in_(("session", "login")),
+            AccessToken.id != (-1 if keep_token is None else keep_token),
+        )
+    )
+
+
+def set_disabled(s: Session, user_id: int, disabled: bool) -> None:
+    """Shut a user out, or let it in again; its rights and tokens stay.
+
+    :raises NotFound: no such user
+    """
+    bump(s)
+    _change_user(s, user_id, disabled=disabled)
+
+
+def set_admin(s: Session, user_id: int, admin: bool) -> None:
+    """:raises NotFound: no such user"""
+    bump(s)
+    _change_user(s, user_id, admin=admin)
+
+
+def remove_user(s: Session, user_id: int) -> None:
+    """Remove a user with its rights, memberships and tokens.
+
+    :raises NotFound: no such user
+    """
+    bump(s)
+    if s.scalar(delete(User).where(User.id == user_id).returning(User.id)) is None:
+        raise NotFound("there is no such user")
+
+
+def user_is_live(s: Session, user_id: int) -> bool:
+    """Whether the user is there and not disabled."""
+    return _holds(s, (User.id == user_id) & User.disabled.is_(False))
+
+
+def find_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord | None:
+    """The group of that name, in whatever case it is written."""
+    row = s.execute(
+        select(Group.id, Group.name, Realm.name)
+        .join(Realm, Realm.id == Group.realm_id)
+        .where(Group.name == _plain(name), Realm.name == _plain(realm))
+    ).one_or_none()
+    return None if row is None else _with_members(s, row)
+
+
+def list_groups(s: Session, realm: str | None = None) -> list[GroupRecord]:
+    """All groups with their members, of one realm or of all, by name."""
+    query = (
+        select(Group.id, Group.name, Realm.name).join(Realm, Realm.id == Group.realm_id).order_by(Group.name)
+    )
+    if realm is not None:
+        query = query.where(Realm.name == _plain(realm))
+    return [_with_members(s, row) for row in s.execute(query).all()]
+
+
+def add_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord:
+    """:raises Invalid: the name can't be, or is taken
+    :raises NotFound: no such realm
+    """
+    name = normal_name(name, "name of a group")
+    if find_group(s, name, realm) is not None:
+        raise Invalid(f"there is a group '{name}' already")
+    bump(s)
+    group_id = s.scalars(
+        insert(Group).values(realm_id=realm_id(s, realm), name=name).returning(Group.id)
+    ).one()
+    return GroupRecord(group_id, name, realm, ())
+
+
+def remove_group(s: Session, group_id: int) -> None:
+    """Remove a group with its rights; its members stay.
+
+    :raises NotFound: no such group
+    """
+    bump(s)
+    if s.scalar(delete(Group).where(Group.id == group_id).returning(Group.id)) is None:
+        raise NotFound("there is no such group")
+
+
+def add_member(s: Session, group_id: int, user_id: int) -> None:
+    """Put a user into a group; nothing happens if it is in it.
+
+    :raises NotFound: no such group or user
+    :raises Invalid: they are of different realms
+    """
+    group_realm = s.scalar(select(Group.realm_id).where(Group.id == group_id))
+    user_realm = s.scalar(select(User.realm_id).where(User.id == user_id))
+    if group_realm is None or user_realm is None:
+        raise NotFound("there is no such group or user")
+    if group_realm != user_realm:
+        raise Invalid("the group and the user are of different realms")
+    if not _holds(s, (Membership.group_id == group_id) & (Membership.user_id == user_id)):
+        bump(s)
+        s.execute(insert(Membership).values(group_id=group_id, user_id=user_id))
+
+
+def remove_member(s: Session, group_id: int, user_id: int) -> bool:
+    """Take a user out of a group; false if it was not in it."""
+    bump(s)
+    gone = delete(Membership).where(Membership.group_id == group_id, Membership.user_id == user_id)
+    return s.scalar(gone.returning(Membership.user_id)) is not None
+
+
+def _users() -> Select[int, str, str, bool, bool, str | None]:
+    return select(User.id, User.name, Realm.name, User.admin, User.disabled, User.password_hash).join(
+        Realm, Realm.id == User.realm_id
+    )
+
+
+def _change_user(s: Session, user_id: int, **values: str | bool | None) -> None:
+    if s.scalar(update(User).where(User.id == user_id).values(**values).returning(User.id)) is None:
+        raise NotFound("there is no such user")
+
+
+def _with_members(s: Session, group: Row[int, str, str]) -> GroupRecord:
+    members = s.scalars(
+        select(User.name)
+        .join(Membership, Membership.user_id == User.id)
+        .where(Membership.group_id == group[0])
+        .order_by(User.name)
+    )
+    return GroupRecord(group[0], group[1], group[2], tuple(members))
+
+
+def _holds(s: Session, condition: ColumnElement[bool]) -> bool:
+    return bool(s.scalar(select(exists().where(condition))))
+
+
+def _plain(name: str) -> str:
+    """A name to look for. One that can't be is looked for as the empty one, which nobody has."""
+    try:
+        return normal_name(name)
+    except Invalid:
+        return ""
