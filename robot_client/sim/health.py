@@ -1,0 +1,53 @@
+"""What the robot says about its own health. Pure: facts in, findings out."""
+
+from __future__ import annotations
+
+import enum
+from typing import NamedTuple
+
+BATTERY_LOW = 0.20
+BATTERY_NEARLY_EMPTY = 0.05
+
+
+class Severity(enum.IntEnum):
+    """Values of diagnostic_msgs/DiagnosticStatus.level."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+class Finding(NamedTuple):
+    """One part of the robot, how it is, and the figures behind it."""
+
+    part: str
+    severity: Severity
+    message: str
+    values: dict[str, str]
+
+
+def motors(speed: float, turn: float, blocked: bool, travelled: float) -> Finding:
+    """:param speed: m/s; :param turn: rad/s; :param travelled: metres since the last reset"""
+    values = {"speed_m_s": f"{speed:.3f}", "turn_rad_s": f"{turn:.3f}", "travelled_m": f"{travelled:.2f}"}
+    if blocked:
+        return Finding("motors", Severity.WARN, "stalled: an obstacle holds the robot back", values)
+    return Finding("motors", Severity.OK, "driving" if speed or turn else "standing", values)
+
+
+def battery(charge: float, volts: float, amperes: float) -> Finding:
+    """:param charge: share of the capacity left, 0 to 1"""
+    values = {"charge_percent": f"{charge * 100:.1f}", "volts": f"{volts:.2f}", "amperes": f"{amperes:.2f}"}
+    if charge < BATTERY_NEARLY_EMPTY:
+        return Finding("battery", Severity.ERROR, "nearly empty: charge it now", values)
+    if charge < BATTERY_LOW:
+        return Finding("battery", Severity.WARN, "low: charge it soon", values)
+    return Finding("battery", Severity.OK, "charged", values)
+
+
+def camera(enabled: bool, viewers: int, frames: int, render_ms: float) -> Finding:
+    """:param viewers: subscriptions to its topics; :param frames: pictures sent so far"""
+    values = {"viewers": str(viewers), "frames": str(frames), "render_ms": f"{render_ms:.2f}"}
+    if not enabled:
+        return Finding("camera", Severity.STALE, "switched off", values)
+    return Finding("camera", Severity.OK, "streaming" if viewers else "waiting for viewers", values)

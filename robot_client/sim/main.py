@@ -1,0 +1,125 @@
+"""The command `switchboard-sim`."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import click
+
+from robot_client.sim.worlds import WORLDS
+
+_LONGEST_SPIN = 0.1
+"""Seconds; how long a signal may wait to be seen."""
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--namespace", default="", metavar="NS", help="Put before all names, so that several can run.")
+@click.option(
+    "--record",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Append what the robot was told and did to this file, one JSON object per line.",
+)
+@click.option("--seed", type=int, help="Seed of the scanner's noise; without it every run differs.")
+@click.option("--world", type=click.Choice(sorted(WORLDS)), default="default", show_default=True)
+@click.option("--camera/--no-camera", default=True, help="Offer pictures (drawn only while somebody looks).")
+def main(namespace: str, record: Path | None, seed: int | None, world: str, camera: bool) -> None:
+    """Run a simulated ROS 2 robot: differential drive, scanner, camera and battery in a small world.
+
+    Prints READY when its topics are there. SIGINT and SIGTERM end it.
+    """
+    try:
+        import rclpy  # noqa: F401
+    except ImportError as error:
+        raise click.ClickException(
+            f"there is no ROS 2 for this Python ({error}): "
+            "source your ROS installation, or install 'robot-switchboard[robot,sim,ros]'"
+        ) from None
+    with _opened(record) as stream, _stop_requested() as stop:
+        _run(namespace, stream, seed, world, camera, stop)
+
+
+class _Stop:
+    requested = False
+
+
+def _run(
+    namespace: str, stream: IO[bytes] | None, seed: int | None, world: str, camera: bool, stop: _Stop
+) -> None:
+    """Imports late: `--help` and a missing ROS must not wait for, or fall over, OpenCV and rclpy."""
+    import cv2
+    import rclpy
+    from rclpy.exceptions import InvalidNamespaceException
+    from rclpy.signals import SignalHandlerOptions
+
+    from robot_client.sim.camera import Camera
+    from robot_client.sim.node import SimNode
+    from robot_client.sim.recorder import Recorder
+    from robot_client.sim.robot import Robot
+
+    cv2.setNumThreads(1)  # pictures are small: threads would cost more than they give
+    place = WORLDS[world]()
+    robot = Robot(place, Recorder(stream), seed, time.monotonic)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = SimNode(robot, Camera(place) if camera else None, namespace)
+    except InvalidNamespaceException as error:
+        rclpy.try_shutdown()
+        raise click.BadParameter(f"'{namespace}' is no ROS namespace: {error}") from None
+    executor = _executor()
+    executor.add_node(node)
+    try:
+        pause = node.run_due()
+        click.echo("READY")
+        while not stop.requested:
+            executor.spin_once(timeout_sec=min(pause, _LONGEST_SPIN))
+            pause = node.run_due()
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _executor() -> Any:
+    """The events executor where there is one (it costs a third), else the one every ROS 2 has."""
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+@contextlib.contextmanager
+def _opened(path: Path | None) -> Iterator[IO[bytes] | None]:
+    if path is None:
+        yield None
+        return
+    try:
+        stream = path.open("ab")
+    except OSError as error:
+        raise click.ClickException(f"the record {path} can't be written: {error.strerror}") from None
+    with stream:
+        yield stream
+
+
+@contextlib.contextmanager
+def _stop_requested() -> Iterator[_Stop]:
+    """Signals only set a mark: the loop ends by itself, at a place where all is in order."""
+    stop = _Stop()
+
+    def note(*_: object) -> None:
+        stop.requested = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, note)
+    yield stop
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""The simulated robot's state as ROS 2 messages. Built new each time they are needed; no publishing here."""
+
+from __future__ import annotations
+
+import array
+import math
+
+import numpy as np
+import numpy.typing as npt
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Quaternion, TransformStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
+
+from robot_client.sim import robot as scanner
+from robot_client.sim.battery import CAPACITY_AH, Battery
+from robot_client.sim.camera import HEIGHT, WIDTH
+from robot_client.sim.drive import Twist
+from robot_client.sim.health import Finding
+from robot_client.sim.world import Pose
+
+LASER_HEIGHT = 0.18
+_POSITION_VARIANCE = 1e-4
+_VELOCITY_VARIANCE = 1e-4
+_UNUSED_VARIANCE = 1e6
+_COVARIANCE_DIAGONAL = tuple(range(0, 36, 7))
+
+
+class Frames:
+    """Names of the coordinate frames; robots that share a graph have their namespace before them."""
+
+    def __init__(self, namespace: str) -> None:
+        prefix = namespace.strip("/")
+        prefix = f"{prefix}/" if prefix else ""
+        self.odom = f"{prefix}odom"
+        self.base = f"{prefix}base_link"
+        self.laser = f"{prefix}laser"
+        self.camera = f"{prefix}camera"
+
+
+def odometry(stamp: Time, frames: Frames, pose: Pose, velocity: Twist) -> Odometry:
+    """Pose relative to where the world's origin is, velocity in the body's frame."""
+    message = Odometry()
+    message.header.stamp = stamp
+    message.header.frame_id = frames.odom
+    message.child_frame_id = frames.base
+    message.pose.pose.position.x = pose.x
+    message.pose.pose.position.y = pose.y
+    message.pose.pose.orientation = _yaw(pose.heading)
+    message.twist.twist.linear.x = velocity.speed
+    message.twist.twist.angular.z = velocity.turn
+    message.pose.covariance = _covariance(_POSITION_VARIANCE)
+    message.twist.covariance = _covariance(_VELOCITY_VARIANCE)
+    return message
+
+
+def transform(stamp: Time, frames: Frames, pose: Pose) -> TransformStamped:
+    """odom → base_link."""
+    return _transform(stamp, frames.odom, frames.base, pose, 0.0)
+
+
+def static_transforms(stamp: Time, frames: Frames, camera_height: float) -> list[TransformStamped]:
+    """base_link → laser and camera; both sit in the middle of the robot.
+
+    :param camera_height: metres over the floor
+    """
+    middle = Pose(0.0, 0.0, 0.0)
+    return [
+        _transform(stamp, frames.base, frames.laser, middle, LASER_HEIGHT),
+        _transform(stamp, frames.base, frames.camera, middle, camera_height),
+    ]
+
+
+def scan(stamp: Time, frames: Frames, ranges: npt.NDArray[np.float32], period: float) -> LaserScan:
+    """:param ranges: metres per ray; :param period: seconds from one scan to the next"""
+    message = LaserScan()
+    message.header.stamp = stamp
+    message.header.frame_id = frames.laser
+    message.angle_min = scanner.SCAN_BEGIN
+    message.angle_max = scanner.SCAN_BEGIN + scanner.SCAN_STEP * (len(ranges) - 1)
+    message.angle_increment = scanner.SCAN_STEP
+    message.scan_time = period
+    message.time_increment = period / len(ranges)
+    message.range_min = scanner.SCAN_NEAREST
+    message.range_max = scanner.SCAN_FARTHEST
+    message.ranges = array.array("f", ranges.tobytes())
+    return message
+
+
+def image(stamp: Time, frames: Frames, pixels: bytes) -> Image:
+    """:param pixels: rows of R, G, B"""
+    message = Image()
+    message.header.stamp = stamp
+    message.header.frame_id = frames.camera
+    message.height, message.width, message.step = HEIGHT, WIDTH, WIDTH * 3
+    message.encoding = "rgb8"
+    message.data = array.array("B", pixels)
+    return message
+
+
+def compressed(stamp: Time, frames: Frames, jpeg: bytes) -> CompressedImage:
+    """:param jpeg: a JPEG file"""
+    message = CompressedImage()
+    message.header.stamp = stamp
+    message.header.frame_id = frames.camera
+    message.format = "rgb8; jpeg compressed bgr8"
+    message.data = array.array("B", jpeg)
+    return message
+
+
+def battery(stamp: Time, frames: Frames, pack: Battery) -> BatteryState:
+    """What isn't measured is NaN, as the message's definition wants it."""
+    message = BatteryState()
+    message.header.stamp = stamp
+    message.header.frame_id = frames.base
+    message.voltage = pack.voltage
+    message.current = -pack.current
+    message.charge = pack.charge * CAPACITY_AH
+    message.capacity = message.design_capacity = CAPACITY_AH
+    message.percentage = pack.charge
+    message.temperature = math.nan
+    message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
+    message.power_supply_health = BatteryState.POWER_SUPPLY_HEALTH_GOOD
+    message.power_supply_technology = BatteryState.POWER_SUPPLY_TECHNOLOGY_LION
+    message.present = True
+    return message
+
+
+def diagnostics(stamp: Time, robot: str, findings: list[Finding]) -> DiagnosticArray:
+    """:param robot: the name that stands before each part"""
+    message = DiagnosticArray()
+    message.header.stamp = stamp
+    message.status = [
+        DiagnosticStatus(
+            level=bytes((finding.severity,)),
+            name=f"{robot}: {finding.part}",
+            message=finding.message,
+            hardware_id=robot,
+            values=[KeyValue(key=key, value=value) for key, value in finding.values.items()],
+        )
+        for finding in findings
+    ]
+    return message
+
+
+def _transform(stamp: Time, parent: str, child: str, pose: Pose, height: float) -> TransformStamped:
+    message = TransformStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = parent
+    message.child_frame_id = child
+    message.transform.translation.x = pose.x
+    message.transform.translation.y = pose.y
+    message.transform.translation.z = height
+    message.transform.rotation = _yaw(pose.heading)
+    return message
+
+
+def _yaw(heading: float) -> Quaternion:
+    return Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2), w=math.cos(heading / 2))
+
+
+def _covariance(variance: float) -> npt.NDArray[np.float64]:
+    """6 × 6, row by row: x, y and yaw are known, the other three are not."""
+    matrix = np.zeros(36)
+    matrix[list(_COVARIANCE_DIAGONAL)] = _UNUSED_VARIANCE
+    matrix[[0, 7, 35]] = variance
+    return matrix

@@ -1,0 +1,48 @@
+"""Things to be done at fixed rates, in one thread. Pure: the clock is asked, never waited for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+Task = Callable[[], None]
+
+
+@dataclass
+class _Entry:
+    period: float
+    task: Task
+    catch_up: int
+    due: float
+
+
+class Schedule:
+    """Runs tasks when they are due.
+
+    :param clock: seconds, monotonic
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._entries: list[_Entry] = []
+
+    def every(self, period: float, task: Task, catch_up: int = 1) -> None:
+        """Do a task now and then regularly.
+
+        :param period: seconds
+        :param catch_up: times it is done at most when the process was held up; what is beyond is let go
+        """
+        self._entries.append(_Entry(period, task, catch_up, self._clock()))
+
+    def run_due(self) -> float:
+        """Do what is due and return the seconds until something is due again."""
+        for entry in self._entries:
+            for _ in range(entry.catch_up):
+                if self._clock() < entry.due:
+                    break
+                entry.task()
+                entry.due += entry.period
+            missed = (self._clock() - entry.due) // entry.period
+            if missed > 0:
+                entry.due += missed * entry.period
+        return max(0.0, min(entry.due for entry in self._entries) - self._clock())
