@@ -6,7 +6,7 @@ The length counts the kind and the body. It is checked against the limit before 
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple, Union
+from typing import NamedTuple
 
 from relay_protocol.errors import FrameTooLarge, MalformedMessage
 
@@ -51,7 +51,7 @@ class VideoFrame(NamedTuple):
     body: bytes
 
 
-Frame = Union[JsonFrame, SampleFrame, VideoFrame]
+Frame = JsonFrame | SampleFrame | VideoFrame
 
 
 def encode_json(body: bytes) -> bytes:

@@ -1,7 +1,7 @@
-"""How a robot proves who it is: Ed25519 (RFC 8032) over a text that names the purpose, the relay and the robot.
+"""How a robot proves who it is: Ed25519 (RFC 8032) over a text naming purpose, relay and robot.
 
-The private key never leaves the robot; the relay keeps the public half. A signature is good for one nonce of one
-connection, so a recorded one is worthless.
+The private key never leaves the robot; the relay keeps the public half. A signature is good for one nonce
+of one connection, so a recorded one is worthless.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def check_robot_name(name: str) -> str:
     """
     if len(name) > ROBOT_NAME or not _ROBOT_NAME.match(name):
         raise Invalid(
-            "a robot's name has lower-case letters, digits, '-' and '_', begins and ends with a letter or digit, "
-            f"and has at most {ROBOT_NAME} characters"
+            "a robot's name has lower-case letters, digits, '-' and '_', begins and ends with a letter or "
+            f"digit, and has at most {ROBOT_NAME} characters"
         )
     return name
 

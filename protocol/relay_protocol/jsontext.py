@@ -1,12 +1,14 @@
 """Strict JSON at the edge: valid UTF-8, bounded depth, no NaN, and errors that name the fault.
 
-msgspec skips values it does not need without looking into them: neither their UTF-8 nor their depth is checked
-there. So the text is checked once, as a whole, before anything is decoded.
+msgspec skips values it does not need without looking into them: neither their UTF-8 nor their depth is
+checked there. So the text is checked once, as a whole, before anything is decoded.
 """
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+import re
+from itertools import accumulate
+from typing import Any, TypeVar, get_args
 
 import msgspec
 
@@ -28,23 +30,21 @@ def check_text(data: bytes, depth: int = JSON_DEPTH) -> None:
             str(data, "utf-8")
         except UnicodeDecodeError as error:
             raise MalformedMessage(f"the message is not valid UTF-8 (byte {error.start})") from None
-    # A text with fewer opening brackets than the limit can't be nested deeper: the usual case costs two counts.
-    if data.count(b"[") + data.count(b"{") > depth and not _nests_within(data, depth):
-        raise MalformedMessage(f"the message nests arrays and objects deeper than {depth}, or not in pairs")
+    # Fewer opening brackets than the limit can't be nested deeper: the usual case costs two counts.
+    if data.count(b"[") + data.count(b"{") > depth and _deepest(data) > depth:
+        raise MalformedMessage(f"the message nests arrays and objects deeper than {depth}")
 
 
-def _nests_within(data: bytes, depth: int) -> bool:
-    """Whether taking away the innermost pairs of brackets ``depth`` times leaves nothing (all of it in C)."""
+def _deepest(data: bytes) -> int:
+    """Deepest nesting, by a running sum of brackets outside strings (all loops are in C)."""
     unescaped = data.replace(b"\\\\", b"").replace(b'\\"', b"")
-    brackets = b"".join(unescaped.split(b'"')[::2]).translate(None, _NOT_BRACKETS)
-    for _ in range(depth):
-        if not brackets:
-            break
-        brackets = brackets.replace(b"[]", b"").replace(b"{}", b"")
-    return not brackets
+    outside = b"".join(unescaped.split(b'"')[::2])
+    steps = memoryview(outside.translate(_STEPS, _NOT_BRACKETS)).cast("b")
+    return max(accumulate(steps), default=0)
 
 
 _NOT_BRACKETS = bytes(byte for byte in range(256) if byte not in b"[]{}")
+_STEPS = bytes.maketrans(b"[{]}", b"\x01\x01\xff\xff")
 
 
 def decode(decoder: msgspec.json.Decoder[T], data: bytes) -> T:
@@ -56,7 +56,7 @@ def decode(decoder: msgspec.json.Decoder[T], data: bytes) -> T:
     try:
         return decoder.decode(data)
     except msgspec.ValidationError as error:
-        raise MalformedMessage(_sentence(error)) from None
+        raise MalformedMessage(_sentence(str(error), decoder.type)) from None
     except (msgspec.DecodeError, RecursionError, ValueError) as error:
         raise MalformedMessage(f"the message is not JSON: {error}") from None
 
@@ -69,9 +69,18 @@ def decode_any(data: bytes) -> Any:
     return decode(_ANY, data)
 
 
-def _sentence(error: Exception) -> str:
-    text = str(error)
-    return text[:1].lower() + text[1:]
+_UNKNOWN_OP = re.compile(r"Invalid value '(.*)' - at `\$\.op`\Z", re.DOTALL)
+
+
+def _sentence(text: str, wanted: Any) -> str:
+    unknown = _UNKNOWN_OP.match(text)
+    if unknown is None:
+        return text[:1].lower() + text[1:]
+    op = unknown[1] if len(unknown[1]) <= 40 else unknown[1][:37] + "..."
+    known = sorted(str(each.__struct_config__.tag) for each in get_args(wanted))
+    if op in known:
+        return "the message has 'op' twice"
+    return f"unknown op '{op}'; known are {', '.join(known)}"
 
 
 encode = msgspec.json.Encoder().encode

@@ -1,4 +1,5 @@
-"""JSON messages of the robot link (SPEC section 2): who says what, before and after a robot has proved itself.
+"""JSON messages of the robot link (SPEC section 2): who says what, before and after a robot has proved
+itself.
 
 Every message is an object with ``op``. Unknown fields are passed over, an unknown ``op`` is an error.
 A sender leaves out fields at their default.
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-from typing import Any, Optional, Union
+from typing import Any
 
 import msgspec
 
@@ -26,10 +27,10 @@ class Message(msgspec.Struct, tag_field="op", tag=lower_tag, omit_defaults=True,
     """Base of everything with an ``op``."""
 
 
-# --- before the robot is known -------------------------------------------------------------------------------------
+# --- before the robot is known ---
 
 
-class Hello(Message, kw_only=True):
+class Hello(Message, frozen=True, kw_only=True):
     """Robot: this is who I am going to prove to be.
 
     :param key: fingerprint of the public key that will sign, see :func:`relay_protocol.identity.fingerprint`
@@ -44,20 +45,20 @@ class Hello(Message, kw_only=True):
     agent: str = ""
 
 
-class Challenge(Message, kw_only=True):
+class Challenge(Message, frozen=True, kw_only=True):
     """Relay: sign this. ``nonce`` is 32 random bytes in base64, good for this connection only."""
 
     nonce: str
     relay: str
 
 
-class Prove(Message, kw_only=True):
+class Prove(Message, frozen=True, kw_only=True):
     """Robot: the Ed25519 signature (base64) of :func:`relay_protocol.identity.proof_text`."""
 
     signature: str
 
 
-class Enroll(Message, kw_only=True):
+class Enroll(Message, frozen=True, kw_only=True):
     """Robot: register my public key (32 bytes, base64) by this code of one use."""
 
     version: int
@@ -67,28 +68,28 @@ class Enroll(Message, kw_only=True):
     agent: str = ""
 
 
-class Enrolled(Message, kw_only=True):
+class Enrolled(Message, frozen=True, kw_only=True):
     """Relay: done; dial again with ``hello``. The robot keeps ``relay`` and refuses another name later."""
 
     robot: str
     relay: str
 
 
-class Join(Message, kw_only=True):
+class Join(Message, frozen=True, kw_only=True):
     """Robot, on a new connection: this is the channel you asked me to open."""
 
     version: int
     ticket: str
 
 
-class Joined(Message, kw_only=True):
-    """Relay: go on. ``at`` is the relay's monotonic clock in nanoseconds, the first estimate of the offset."""
+class Joined(Message, frozen=True, kw_only=True):
+    """Relay: go on. ``at`` is the relay's monotonic clock (ns), the first estimate of the offset."""
 
     channel: str
     at: int
 
 
-class Refused(Message, kw_only=True):
+class Refused(Message, frozen=True, kw_only=True):
     """Relay: no, and the connection ends.
 
     :param retry_after: seconds after which trying again makes sense; ``None`` when only a person can help
@@ -96,10 +97,10 @@ class Refused(Message, kw_only=True):
 
     reason: str
     code: str = "refused"
-    retry_after: Optional[float] = None
+    retry_after: float | None = None
 
 
-class Welcome(Message, kw_only=True):
+class Welcome(Message, frozen=True, kw_only=True):
     """Relay: you are registered.
 
     :param session: name of this registration, for logs on both ends
@@ -112,29 +113,29 @@ class Welcome(Message, kw_only=True):
     frame_limit: int
 
 
-# --- both ways, on every link --------------------------------------------------------------------------------------
+# --- both ways, on every link ---
 
 
-class Ping(Message, kw_only=True):
+class Ping(Message, frozen=True, kw_only=True):
     """Either end: answer at once. ``t`` is the asker's monotonic clock in nanoseconds."""
 
     t: int
 
 
-class Pong(Message, kw_only=True):
+class Pong(Message, frozen=True, kw_only=True):
     """The answer: ``t`` as it came, ``at`` the answerer's monotonic clock in nanoseconds."""
 
     t: int
     at: int
 
 
-class Bye(Message, kw_only=True):
+class Bye(Message, frozen=True, kw_only=True):
     """Either end: I am closing this link on purpose."""
 
     reason: str
 
 
-# --- control link, robot to relay ----------------------------------------------------------------------------------
+# --- control link, robot to relay ---
 
 
 class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -152,7 +153,7 @@ class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     stop_within_ms: int = STOP_WITHIN_MS
 
 
-class Describe(Message, kw_only=True):
+class Describe(Message, frozen=True, kw_only=True):
     """Robot: facts about myself, whole; sent after ``welcome`` and whenever they change.
 
     :param platform: ``ros2``, ``mqtt``, …
@@ -186,21 +187,21 @@ class Service(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     providers: list[str] = msgspec.field(default_factory=list)
 
 
-class Graph(Message, kw_only=True):
+class Graph(Message, frozen=True, kw_only=True):
     """Robot: the ROS graph, or what has changed in it.
 
-    With ``full`` the maps are all there is. Otherwise each map holds the names that changed, with ``null`` for a
-    name that is gone. Nodes are keys with an empty object. The daemon's own node is left out.
+    With ``full`` the maps are all there is. Otherwise each map holds the names that changed, with ``null`` for
+    a name that is gone. Nodes are keys with an empty object. The daemon's own node is left out.
     """
 
     full: bool = False
-    topics: dict[str, Optional[Topic]] = msgspec.field(default_factory=dict)
-    services: dict[str, Optional[Service]] = msgspec.field(default_factory=dict)
-    actions: dict[str, Optional[Service]] = msgspec.field(default_factory=dict)
-    nodes: dict[str, Optional[dict[str, Any]]] = msgspec.field(default_factory=dict)
+    topics: dict[str, Topic | None] = msgspec.field(default_factory=dict)
+    services: dict[str, Service | None] = msgspec.field(default_factory=dict)
+    actions: dict[str, Service | None] = msgspec.field(default_factory=dict)
+    nodes: dict[str, dict[str, Any] | None] = msgspec.field(default_factory=dict)
 
 
-class Health(Message, kw_only=True):
+class Health(Message, frozen=True, kw_only=True):
     """Robot: how I am, every few seconds.
 
     :param battery: charge, 0 to 1; ``None`` when unknown
@@ -212,26 +213,26 @@ class Health(Message, kw_only=True):
     :param dropped_samples: samples dropped because the uplink was full, since start
     """
 
-    battery: Optional[float] = None
-    cpu: Optional[float] = None
-    memory: Optional[float] = None
-    rtt_ms: Optional[float] = None
+    battery: float | None = None
+    cpu: float | None = None
+    memory: float | None = None
+    rtt_ms: float | None = None
     stale_commands: int = 0
     watchdog_stops: int = 0
     dropped_samples: int = 0
 
 
-class Alert(Message, kw_only=True):
+class Alert(Message, frozen=True, kw_only=True):
     """Robot: something a person should know. ``level`` is ``info``, ``warning`` or ``error``."""
 
     level: str
     text: str
 
 
-# --- control link, relay to robot ----------------------------------------------------------------------------------
+# --- control link, relay to robot ---
 
 
-class OpenChannel(Message, kw_only=True):
+class OpenChannel(Message, frozen=True, kw_only=True):
     """Relay: dial and ``join`` with this ticket.
 
     :param address: ``host:port`` to dial; empty for the address of the control link
@@ -242,28 +243,28 @@ class OpenChannel(Message, kw_only=True):
     address: str = ""
 
 
-class CloseChannel(Message, kw_only=True):
+class CloseChannel(Message, frozen=True, kw_only=True):
     """Relay: nobody is left on this channel."""
 
     channel: str
 
 
-# --- channel link, relay to robot ----------------------------------------------------------------------------------
+# --- channel link, relay to robot ---
 
 
 class QoS(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """ROS 2 quality of service as a client may ask for it (PROTOCOL: ``qos``); ``None`` leaves it to the robot."""
+    """ROS 2 quality of service as a client may ask for it (``qos``); ``None`` leaves it to the robot."""
 
-    history: Optional[str] = None
-    depth: Optional[int] = None
-    reliability: Optional[str] = None
-    durability: Optional[str] = None
-    deadline: Optional[float] = None
-    lifespan: Optional[float] = None
+    history: str | None = None
+    depth: int | None = None
+    reliability: str | None = None
+    durability: str | None = None
+    deadline: float | None = None
+    lifespan: float | None = None
 
 
-class Subscribe(Message, kw_only=True):
-    """Relay: send me this topic, as samples of this number. Again with a known number: change ``throttle_ms``.
+class Subscribe(Message, frozen=True, kw_only=True):
+    """Relay: send me this topic, as samples of this number. With a known number: change ``throttle_ms``.
 
     :param type: the type, where the asker knows it; else the robot takes the topic's one type from its graph
     :param throttle_ms: least time between two samples, milliseconds; 0 for all
@@ -273,14 +274,14 @@ class Subscribe(Message, kw_only=True):
     topic: str
     type: str = ""
     throttle_ms: int = 0
-    qos: Optional[QoS] = None
+    qos: QoS | None = None
 
 
-class Unsubscribe(Message, kw_only=True):
+class Unsubscribe(Message, frozen=True, kw_only=True):
     number: int
 
 
-class Advertise(Message, kw_only=True):
+class Advertise(Message, frozen=True, kw_only=True):
     """Relay: samples of this number are to be published on this topic.
 
     :param source: who publishes, for the robot's own log
@@ -291,15 +292,15 @@ class Advertise(Message, kw_only=True):
     type: str
     latch: bool = False
     queue_size: int = 0
-    qos: Optional[QoS] = None
+    qos: QoS | None = None
     source: str = ""
 
 
-class Unadvertise(Message, kw_only=True):
+class Unadvertise(Message, frozen=True, kw_only=True):
     number: int
 
 
-class CallService(Message, kw_only=True):
+class CallService(Message, frozen=True, kw_only=True):
     """Relay: call a service. Arguments are ``cdr`` (base64) or, for a robot without CDR, ``args``.
 
     :param timeout: seconds the robot waits for the answer
@@ -309,20 +310,20 @@ class CallService(Message, kw_only=True):
     service: str
     type: str
     timeout: float
-    cdr: Optional[str] = None
-    args: Optional[msgspec.Raw] = None
+    cdr: str | None = None
+    args: msgspec.Raw | None = None
 
 
-class GetType(Message, kw_only=True):
-    """Relay: send the definition of a type such as ``sensor_msgs/msg/LaserScan`` or ``std_srvs/srv/Trigger``."""
+class GetType(Message, frozen=True, kw_only=True):
+    """Relay: send the definition of a type, say ``sensor_msgs/msg/Joy`` or ``std_srvs/srv/Trigger``."""
 
     type: str
 
 
-# --- channel link, robot to relay ----------------------------------------------------------------------------------
+# --- channel link, robot to relay ---
 
 
-class Subscribed(Message, kw_only=True):
+class Subscribed(Message, frozen=True, kw_only=True):
     """Robot: samples will come.
 
     :param encoding: ``cdr`` (kind-1 frames), or ``json`` (kind-1 frames with a JSON body)
@@ -338,7 +339,7 @@ class Subscribed(Message, kw_only=True):
     publishers: int = 0
 
 
-class Advertised(Message, kw_only=True):
+class Advertised(Message, frozen=True, kw_only=True):
     """Robot: the publisher stands.
 
     :param motion: the robot's safety counts this topic as motion
@@ -351,7 +352,7 @@ class Advertised(Message, kw_only=True):
     motion: bool = False
 
 
-class Failed(Message, kw_only=True):
+class Failed(Message, frozen=True, kw_only=True):
     """Robot: a request could not be done. ``what`` is its ``op``, ``ref`` its number, id or type."""
 
     what: str
@@ -359,18 +360,18 @@ class Failed(Message, kw_only=True):
     reason: str
 
 
-class ServiceResponse(Message, kw_only=True):
+class ServiceResponse(Message, frozen=True, kw_only=True):
     """Robot: the answer to ``call_service``; ``reason`` when ``result`` is false."""
 
     id: str
     result: bool
-    cdr: Optional[str] = None
-    values: Optional[msgspec.Raw] = None
+    cdr: str | None = None
+    values: msgspec.Raw | None = None
     reason: str = ""
 
 
-class TypeDefinition(Message, kw_only=True):
-    """Robot: the .msg or .srv text, then every type it contains, each after a line of ``=`` and ``MSG: name``.
+class TypeDefinition(Message, frozen=True, kw_only=True):
+    """Robot: the .msg or .srv text, then every type in it, each after a line of 80 ``=`` and ``MSG: name``.
 
     The layout is that of rosbag2's ``ros2msg``. For a service the main part has the request and the response
     divided by ``---``.
@@ -383,16 +384,16 @@ class TypeDefinition(Message, kw_only=True):
     hash: str = ""
 
 
-Opening = Union[Hello, Prove, Enroll, Join]
+Opening = Hello | Prove | Enroll | Join
 """What a robot may say before it is known."""
 
-OpeningReply = Union[Challenge, Welcome, Enrolled, Joined, Refused]
+OpeningReply = Challenge | Welcome | Enrolled | Joined | Refused
 """What the relay answers to that."""
 
-RobotControl = Union[Describe, Graph, Health, Alert, Ping, Pong, Bye]
-RelayControl = Union[OpenChannel, CloseChannel, Ping, Pong, Bye]
-RobotChannel = Union[Subscribed, Advertised, Failed, ServiceResponse, TypeDefinition, Ping, Pong, Bye]
-RelayChannel = Union[Subscribe, Unsubscribe, Advertise, Unadvertise, CallService, GetType, Ping, Pong, Bye]
+RobotControl = Describe | Graph | Health | Alert | Ping | Pong | Bye
+RelayControl = OpenChannel | CloseChannel | Ping | Pong | Bye
+RobotChannel = Subscribed | Advertised | Failed | ServiceResponse | TypeDefinition | Ping | Pong | Bye
+RelayChannel = Subscribe | Unsubscribe | Advertise | Unadvertise | CallService | GetType | Ping | Pong | Bye
 
 opening_decoder: msgspec.json.Decoder[Opening] = msgspec.json.Decoder(Opening)
 opening_reply_decoder: msgspec.json.Decoder[OpeningReply] = msgspec.json.Decoder(OpeningReply)

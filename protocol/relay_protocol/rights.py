@@ -1,7 +1,7 @@
 """Rights on a robot, compiled once and asked at every message.
 
-A right is a level, with optional patterns that allow or deny more. Deny beats allow, allow beats the level, and
-what nothing allows is denied.
+A right is a level, with optional patterns that allow or deny more. Deny beats allow, allow beats the
+level, and what nothing allows is denied.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def parse_level(text: str) -> Level:
 def parse_pattern(text: str) -> str:
     """Check one allow or deny pattern and return it normalised.
 
-    :raises Invalid: not ``operation:resource`` with a known operation (or ``*``) and an absolute resource name
+    :raises Invalid: not ``operation:resource`` with a known operation (or ``*``) and an absolute name
     """
     operation, colon, resource = text.partition(":")
     if not colon or operation not in {_ALL, *(str(each) for each in Operation)}:

@@ -1,98 +1,98 @@
 """rosbridge v2 operations a client may send, as one tagged union (SPEC section 1).
 
-Message bodies stay undecoded (:class:`msgspec.Raw`): the relay decodes only what it judges, and the body once,
-when its type is known.
+Message bodies stay undecoded (:class:`msgspec.Raw`): the relay decodes only what it judges, and the body
+once, when its type is known.
 """
 
 from __future__ import annotations
 
-from typing import Any, Optional, Union
+from typing import Any
 
 import msgspec
 
 from relay_protocol import jsontext
 from relay_protocol.link import Message, QoS
 
-Id = Union[str, int, None]
+Id = str | int | None
 """rosbridge says a string; some clients number their calls."""
 
-Bodies = Union[list[msgspec.Raw], dict[str, msgspec.Raw]]
+Bodies = list[msgspec.Raw] | dict[str, msgspec.Raw]
 
 
-class Advertise(Message, kw_only=True):
+class Advertise(Message, frozen=True, kw_only=True):
     topic: str
     type: str
     id: Id = None
     latch: bool = False
     queue_size: int = 100
-    qos: Optional[QoS] = None
+    qos: QoS | None = None
 
 
-class Unadvertise(Message, kw_only=True):
+class Unadvertise(Message, frozen=True, kw_only=True):
     topic: str
     id: Id = None
 
 
-class Publish(Message, kw_only=True):
+class Publish(Message, frozen=True, kw_only=True):
     topic: str
     msg: msgspec.Raw = msgspec.Raw(b"{}")
     id: Id = None
     latch: bool = False
     queue_size: int = 100
-    qos: Optional[QoS] = None
+    qos: QoS | None = None
     type: str = ""
 
 
-class Subscribe(Message, kw_only=True):
+class Subscribe(Message, frozen=True, kw_only=True):
     topic: str
     id: Id = None
-    type: Optional[str] = None
+    type: str | None = None
     throttle_rate: float = 0
     queue_length: int = 0
-    fragment_size: Optional[int] = None
+    fragment_size: int | None = None
     compression: str = "none"
-    qos: Optional[QoS] = None
+    qos: QoS | None = None
 
 
-class Unsubscribe(Message, kw_only=True):
+class Unsubscribe(Message, frozen=True, kw_only=True):
     topic: str
     id: Id = None
 
 
-class CallService(Message, kw_only=True):
+class CallService(Message, frozen=True, kw_only=True):
     service: str
     id: Id = None
-    args: Optional[msgspec.Raw] = None
+    args: msgspec.Raw | None = None
     type: str = ""
-    fragment_size: Optional[int] = None
+    fragment_size: int | None = None
     compression: str = "none"
-    timeout: Optional[float] = None
+    timeout: float | None = None
 
 
-class ServiceResponse(Message, kw_only=True):
+class ServiceResponse(Message, frozen=True, kw_only=True):
     service: str
     result: bool = True
     id: Id = None
-    values: Optional[msgspec.Raw] = None
+    values: msgspec.Raw | None = None
 
 
-class AdvertiseService(Message, kw_only=True):
+class AdvertiseService(Message, frozen=True, kw_only=True):
     service: str
     type: str
     id: Id = None
 
 
-class UnadvertiseService(Message, kw_only=True):
+class UnadvertiseService(Message, frozen=True, kw_only=True):
     service: str
     id: Id = None
 
 
-class SetLevel(Message, kw_only=True, tag="set_level"):
+class SetLevel(Message, frozen=True, kw_only=True, tag="set_level"):
     level: str
     id: Id = None
 
 
-class Auth(Message, kw_only=True):
+class Auth(Message, frozen=True, kw_only=True):
     """rosauth's message; ``mac`` carries the access token, the rest is taken and not used."""
 
     mac: str
@@ -105,19 +105,19 @@ class Auth(Message, kw_only=True):
     id: Id = None
 
 
-ClientOp = Union[
-    Advertise,
-    Unadvertise,
-    Publish,
-    Subscribe,
-    Unsubscribe,
-    CallService,
-    ServiceResponse,
-    AdvertiseService,
-    UnadvertiseService,
-    SetLevel,
-    Auth,
-]
+ClientOp = (
+    Advertise
+    | Unadvertise
+    | Publish
+    | Subscribe
+    | Unsubscribe
+    | CallService
+    | ServiceResponse
+    | AdvertiseService
+    | UnadvertiseService
+    | SetLevel
+    | Auth
+)
 
 _decoder: msgspec.json.Decoder[ClientOp] = msgspec.json.Decoder(ClientOp)
 
@@ -136,7 +136,7 @@ def publish(topic: str, body: bytes) -> bytes:
 
 
 def service_response(service: str, id: Id, result: bool, values: bytes) -> bytes:
-    """A ``service_response`` towards a client; ``values`` is JSON already, a string when ``result`` is false."""
+    """A ``service_response`` towards a client; ``values`` is JSON, a string when ``result`` is false."""
     head = b'{"op":"service_response","service":' + jsontext.encode(service)
     if id is not None:
         head += b',"id":' + jsontext.encode(id)

@@ -1,0 +1,361 @@
+"""ROS 2 interface definitions, parsed from the text a robot sends.
+
+The text is a stranger's: it is read line by line with patterns that can't backtrack, and everything that
+decides how much memory or time a message costs (nesting, fixed lengths, number of fields) is bounded here,
+before anything is built from it.
+
+Source: the ROS 2 interface definition format (design.ros2.org, "Interface definition using .msg / .srv /
+.action files"), in rosbag2's ``ros2msg`` layout.
+"""
+
+from __future__ import annotations
+
+import enum
+import re
+import struct
+from typing import Any, NamedTuple
+
+from relay_protocol.errors import Invalid
+from relay_protocol.limits import NAME, ROBOT_FRAME, TYPE_DEFINITION
+
+MAX_NESTING = 32
+"""Deepest nesting of messages in messages."""
+
+MAX_PARTS = 20_000
+"""Most single values that one message holds even when all its sequences are empty."""
+
+MAX_FIELDS = 20_000
+"""Most fields and constants in one text."""
+
+
+class Primitive(NamedTuple):
+    """One basic type.
+
+    :param code: its letter in :mod:`struct`; empty for strings
+    :param size: bytes on the wire, which is its alignment too
+    :param idl: its name in IDL, which is what rosapi shows
+    :param zero: the value it has when nobody sets it
+    """
+
+    code: str
+    size: int
+    idl: str
+    zero: Any
+
+
+PRIMITIVES = {
+    "bool": Primitive("?", 1, "boolean", False),
+    "byte": Primitive("B", 1, "octet", 0),
+    "char": Primitive("B", 1, "uint8", 0),
+    "int8": Primitive("b", 1, "int8", 0),
+    "uint8": Primitive("B", 1, "uint8", 0),
+    "int16": Primitive("h", 2, "int16", 0),
+    "uint16": Primitive("H", 2, "uint16", 0),
+    "int32": Primitive("i", 4, "int32", 0),
+    "uint32": Primitive("I", 4, "uint32", 0),
+    "int64": Primitive("q", 8, "int64", 0),
+    "uint64": Primitive("Q", 8, "uint64", 0),
+    "float32": Primitive("f", 4, "float", 0.0),
+    "float64": Primitive("d", 8, "double", 0.0),
+    "string": Primitive("", 4, "string", ""),
+    "wstring": Primitive("", 4, "wstring", ""),
+}
+BYTES = frozenset({"byte", "char", "uint8"})
+"""Types whose arrays are base64 in JSON."""
+
+
+class Shape(enum.Enum):
+    """How many values a field holds."""
+
+    SCALAR = "one"
+    ARRAY = "a fixed number"
+    SEQUENCE = "any number up to a bound"
+
+
+class FieldType(NamedTuple):
+    """Type of a field.
+
+    :param base: a basic type or the full name of a message, ``geometry_msgs/msg/Point``
+    :param bound: longest string, bytes; 0 for any
+    :param length: of an array; of a sequence the most it holds, 0 for any
+    """
+
+    base: str
+    bound: int = 0
+    shape: Shape = Shape.SCALAR
+    length: int = 0
+
+    @property
+    def primitive(self) -> Primitive | None:
+        """The basic type, or ``None`` for a message."""
+        return PRIMITIVES.get(self.base)
+
+
+class Field(NamedTuple):
+    """One field; ``default`` is ``None`` where the text gives none."""
+
+    name: str
+    type: FieldType
+    default: Any = None
+
+
+class Constant(NamedTuple):
+    """A named value of a definition; nothing of it is on the wire."""
+
+    name: str
+    type: FieldType
+    value: Any
+
+
+class Definition(NamedTuple):
+    """One message, or one half of a service."""
+
+    name: str
+    fields: tuple[Field, ...]
+    constants: tuple[Constant, ...]
+
+
+_PARTS = {"msg": ("",), "srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(?:(?:msg|srv|action)/)?[A-Za-z][A-Za-z0-9_]*\Z")
+_SEPARATOR = re.compile(r"={80,}[ \t\r]*\Z")
+_LINE = re.compile(
+    r"(?P<base>[A-Za-z][A-Za-z0-9_/]*)(?:<=(?P<bound>[0-9]{1,9}))?"
+    r"(?P<brackets>\[(?P<upto><=)?(?P<length>[0-9]{0,9})\])?"
+    r"[ \t]+(?P<name>[A-Za-z][A-Za-z0-9_]*)(?P<rest>.*)\Z"
+)
+_QUOTED = re.compile(r"""[ \t]*(?:"((?:[^"\\]|\\.)*)"|'((?:[^'\\]|\\.)*)')[ \t]*""")
+_ITEM = re.compile(r"""(?:[ \t]*(?:"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')[ \t]*|[^,"']*)(?:,|\Z)""")
+_BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
+_BUILT_IN = {
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec",
+}
+
+
+def normalise(type_name: str) -> str:
+    """The full form of a type name: ``std_msgs/String`` is ``std_msgs/msg/String``.
+
+    :raises Invalid: no type name
+    """
+    if len(type_name) > NAME or not _TYPE_NAME.match(type_name):
+        raise Invalid(f"{_quote(type_name)} is no type name; write package/msg/Name or package/srv/Name")
+    package, *kind, name = type_name.split("/")
+    return f"{package}/{kind[0] if kind else 'msg'}/{name}"
+
+
+def parts_of(type_name: str) -> tuple[str, ...]:
+    """Names of the messages a text of this type defines: itself, or the parts of a service or action."""
+    kind = type_name.split("/")[1]
+    return tuple(type_name + suffix for suffix in _PARTS[kind])
+
+
+def parse(type_name: str, text: str) -> dict[str, Definition]:
+    """Read a definition with all it contains; the parts of ``type_name`` come first.
+
+    :param type_name: a normalised name
+    :param text: see :class:`relay_protocol.link.TypeDefinition`
+    :raises Invalid: the text is no definition, is not complete, or makes messages beyond the limits
+    """
+    if len(text) > TYPE_DEFINITION:
+        raise Invalid(f"{type_name}: the definition has more than {TYPE_DEFINITION} characters")
+    try:
+        definitions = _parse_all(type_name, text)
+        _check_size(definitions)
+    except Invalid as error:
+        raise Invalid(f"definition of {type_name}: {error}") from None
+    return definitions
+
+
+def _parse_all(type_name: str, text: str) -> dict[str, Definition]:
+    main, *contained = _sections(text.split("\n"))
+    names = parts_of(type_name)
+    bodies = _split_parts(main, len(names))
+    found = {name: _parse_one(name, body) for name, body in zip(names, bodies, strict=True)}
+    for lines in contained:
+        title = lines[0].strip() if lines else ""
+        if not title.startswith("MSG:"):
+            raise Invalid(f"after a line of '=' comes 'MSG: package/msg/Name', not {_quote(title)}")
+        name = normalise(title[4:].strip())
+        if name not in found:
+            found[name] = _parse_one(name, lines[1:])
+    for name, body in _BUILT_IN.items():
+        if name not in found:
+            found[name] = _parse_one(name, body.split("\n"))
+    if sum(len(each.fields) + len(each.constants) for each in found.values()) > MAX_FIELDS:
+        raise Invalid(f"more than {MAX_FIELDS} fields")
+    return found
+
+
+def _sections(lines: list[str]) -> list[list[str]]:
+    sections: list[list[str]] = [[]]
+    for line in lines:
+        if _SEPARATOR.match(line):
+            sections.append([])
+        else:
+            sections[-1].append(line)
+    return sections
+
+
+def _split_parts(lines: list[str], wanted: int) -> list[list[str]]:
+    parts: list[list[str]] = [[]]
+    for line in lines:
+        if line.rstrip() == "---":
+            parts.append([])
+        else:
+            parts[-1].append(line)
+    if len(parts) != wanted:
+        raise Invalid(f"{len(parts)} parts divided by '---' where {wanted} are wanted")
+    return parts
+
+
+def _parse_one(name: str, lines: list[str]) -> Definition:
+    fields: dict[str, Field] = {}
+    constants: dict[str, Constant] = {}
+    for line in lines:
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        match = _LINE.match(line)
+        if match is None:
+            raise Invalid(f"{_quote(line)} is no field")
+        kind = _field_type(match, name.split("/")[0])
+        label, rest = match["name"], match["rest"].lstrip()
+        if label in fields or label in constants:
+            raise Invalid(f"{name} has two fields '{label}'")
+        if rest.startswith("="):
+            constants[label] = Constant(label, kind, _literal(kind, rest[1:], label))
+        else:
+            default = _literal(kind, rest, label) if rest and not rest.startswith("#") else None
+            fields[label] = Field(label, kind, default)
+    return Definition(name, tuple(fields.values()), tuple(constants.values()))
+
+
+def _field_type(match: re.Match[str], package: str) -> FieldType:
+    base = match["base"]
+    if base not in PRIMITIVES:
+        base = normalise(base if "/" in base else f"{package}/msg/{base}")
+    bound = int(match["bound"] or 0)
+    if bound and base not in ("string", "wstring"):
+        raise Invalid(f"{base} can't have a bound; only strings have")
+    if not match["brackets"]:
+        return FieldType(base, bound)
+    length = int(match["length"] or 0)
+    if match["length"] and not match["upto"]:
+        if length == 0:
+            raise Invalid(f"'{match['name']}' is an array of length 0")
+        return FieldType(base, bound, Shape.ARRAY, length)
+    return FieldType(base, bound, Shape.SEQUENCE, length)
+
+
+def _literal(kind: FieldType, text: str, label: str) -> Any:
+    """A constant's or default's value, checked to fit its type."""
+    primitive = kind.primitive
+    if primitive is None:
+        raise Invalid(f"'{label}' is a message and can't have a value in the text")
+    try:
+        if kind.shape is Shape.SCALAR:
+            return _scalar(kind, primitive, text)
+        values = [_scalar(kind, primitive, item) for item in _items(text)]
+    except (ValueError, OverflowError, struct.error):
+        raise Invalid(f"{_quote(text.strip())} is no value for '{label}', which is {kind.base}") from None
+    if (kind.shape is Shape.ARRAY and len(values) != kind.length) or (
+        kind.length and len(values) > kind.length
+    ):
+        raise Invalid(f"'{label}' can't hold {len(values)} values")
+    return values
+
+
+def _scalar(kind: FieldType, primitive: Primitive, text: str) -> Any:
+    if not primitive.code:
+        quoted = _QUOTED.match(text)
+        value = text.partition("#")[0].strip() if quoted is None else _unescape(quoted[1] or quoted[2] or "")
+        if "\0" in value or (kind.bound and len(value.encode()) > kind.bound):
+            raise ValueError
+        return value
+    text = text.partition("#")[0].strip()
+    if primitive.code == "?":
+        if text.lower() not in _BOOLEANS:
+            raise ValueError
+        return _BOOLEANS[text.lower()]
+    number = float(text) if primitive.code in "fd" else _integer(text)
+    struct.pack(primitive.code, number)
+    return number
+
+
+def _integer(text: str) -> int:
+    try:
+        return int(text, 0)
+    except ValueError:
+        return int(text)
+
+
+def _unescape(text: str) -> str:
+    return re.sub(r"\\(.)", r"\1", text)
+
+
+def _items(text: str) -> list[str]:
+    text = text.strip()
+    end = text.rfind("]")
+    if not text.startswith("[") or end < 0 or text[end + 1 :].strip()[:1] not in ("", "#"):
+        raise ValueError
+    inner = text[1:end]
+    items: list[str] = []
+    position = 0
+    while position < len(inner):
+        match = _ITEM.match(inner, position)
+        if match is None:
+            raise ValueError
+        items.append(match[0].removesuffix(","))
+        position = match.end()
+    return items
+
+
+class _Cost(NamedTuple):
+    """What one message costs when all its sequences are empty: single values, bytes, levels of nesting."""
+
+    parts: int
+    size: int
+    depth: int
+
+
+def _check_size(definitions: dict[str, Definition]) -> None:
+    """Refuse cycles, missing types, deep nesting, and messages that are huge even when empty."""
+    costs: dict[str, _Cost] = {}
+    for name in definitions:
+        _cost(name, definitions, costs, ())
+
+
+def _cost(
+    name: str, definitions: dict[str, Definition], costs: dict[str, _Cost], path: tuple[str, ...]
+) -> _Cost:
+    if name in costs:
+        return costs[name]
+    if name in path:
+        raise Invalid(f"{name} contains itself")
+    if name not in definitions:
+        raise Invalid(f"{path[-1]} contains {name}, whose definition is not in the text")
+    parts, size, depth = 1, 0, 0
+    for field in definitions[name].fields:
+        kind = field.type
+        if kind.primitive is not None:
+            one = _Cost(1, kind.primitive.size, 0)
+        elif len(path) < MAX_NESTING:
+            one = _cost(kind.base, definitions, costs, (*path, name))
+            depth = max(depth, one.depth + 1)
+        if depth > MAX_NESTING or (kind.primitive is None and len(path) >= MAX_NESTING):
+            raise Invalid(f"messages are nested deeper than {MAX_NESTING}")
+        if kind.shape is Shape.SEQUENCE:
+            parts, size = parts + 1, size + 4
+        elif kind.shape is Shape.ARRAY:
+            packed = kind.primitive is not None and kind.primitive.code
+            parts, size = parts + (1 if packed else one.parts * kind.length), size + one.size * kind.length
+        else:
+            parts, size = parts + one.parts, size + one.size
+        if parts > MAX_PARTS or size > ROBOT_FRAME:
+            raise Invalid(f"a {name} is too large even when its sequences are empty")
+    costs[name] = _Cost(parts, size, depth)
+    return costs[name]
+
+
+def _quote(text: str) -> str:
+    return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -1,0 +1,207 @@
+"""The types of one robot: their definitions, and conversion of messages between CDR and JSON.
+
+JSON has rosbridge's form: arrays of bytes are base64, NaN and infinity are ``null``. For the relay only; a
+robot passes CDR on unread.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+from typing import Any
+
+import orjson
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Invalid, MalformedMessage, NotFound
+from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
+from relay_protocol.ros.reader import Reader, ReaderFactory
+from relay_protocol.ros.typedefs import typedef
+from relay_protocol.ros.writer import Mismatch, Write, WriterFactory, as_invalid
+
+_LITTLE = b"\x00\x01"
+_BIG = b"\x00\x00"
+_WRITTEN_HEAD = b"\x00\x01\x00\x00"
+_TEXTS_SHARED = 1024
+
+Body = bytes | dict[str, Any]
+
+
+class _Compiled:
+    """All types of one text. Readers and writers are built when first needed, and then kept."""
+
+    def __init__(self, type_name: str, text: str) -> None:
+        self.text = text
+        self.definitions: dict[str, Definition] = parse(type_name, text)
+        self._writers = WriterFactory(self.definitions)
+        self._readers = {
+            _LITTLE: ReaderFactory(self.definitions, "<"),
+            _BIG: ReaderFactory(self.definitions, ">"),
+        }
+
+    def reader(self, type_name: str, encapsulation: bytes) -> Reader:
+        factory = self._readers.get(encapsulation)
+        if factory is None:
+            raise Invalid(f"{type_name}: bytes 0 and 1 are {encapsulation.hex()}; plain CDR has 0001 or 0000")
+        return factory.reader(type_name)
+
+    def writer(self, type_name: str) -> Write:
+        return self._writers.writer(type_name)
+
+
+_shared: OrderedDict[tuple[str, str], _Compiled] = OrderedDict()
+"""A fleet of like robots sends the same texts: each is compiled once."""
+
+
+def _compile(type_name: str, text: str) -> _Compiled:
+    key = (type_name, text)
+    compiled = _shared.get(key)
+    if compiled is None:
+        compiled = _shared[key] = _Compiled(type_name, text)
+        if len(_shared) > _TEXTS_SHARED:
+            _shared.popitem(last=False)
+    else:
+        _shared.move_to_end(key)
+    return compiled
+
+
+class TypeRegistry:
+    """What one robot's types look like. Names may be given as ``pkg/Name`` or ``pkg/msg/Name``."""
+
+    def __init__(self) -> None:
+        self._types: dict[str, _Compiled] = {}
+        self._texts: dict[str, str] = {}
+        self._known_by: dict[str, str] = {}
+
+    def add(self, type_name: str, text: str) -> None:
+        """Register a definition; the same again changes nothing, another one replaces the former.
+
+        :param type_name: of a message, service or action
+        :param text: as in :class:`relay_protocol.link.TypeDefinition`
+        :raises Invalid: a bad name, or a text that is no complete definition
+        """
+        name = normalise(type_name)
+        if self._texts.get(name) == text:
+            return
+        compiled = _compile(name, text)
+        self._texts[name] = text
+        for part in parts_of(name):
+            self._types[part] = compiled
+            self._known_by[part] = name
+        # What it contains is known too, unless the robot sent a text of its own for it.
+        for contained in compiled.definitions:
+            self._types.setdefault(contained, compiled)
+
+    def knows(self, type_name: str) -> bool:
+        """Whether messages of this type (all parts of this service or action) can be converted."""
+        name = normalise(type_name)
+        return name in self._types or all(part in self._types for part in parts_of(name))
+
+    def definition(self, type_name: str) -> str:
+        """The text as the robot sent it.
+
+        :raises NotFound: none was sent for just this type
+        """
+        text = self._texts.get(normalise(type_name))
+        if text is None:
+            raise NotFound(f"the definition of {type_name} is not known")
+        return text
+
+    def to_json(self, type_name: str, cdr: bytes) -> bytes:
+        """A message from a robot as compact JSON.
+
+        :param cdr: with its four-byte encapsulation header, little or big endian
+        :raises NotFound: the type is not registered
+        :raises Invalid: the bytes are no message of this type
+        """
+        name, compiled = self._find(type_name)
+        if len(cdr) < 4:
+            raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
+        body = cdr[4:]
+        try:
+            value, end = compiled.reader(name, cdr[:2]).read(body, 0)
+        except Invalid as error:
+            raise Invalid(f"{name}: {error}") from None
+        except struct.error:
+            raise Invalid(f"{name}: the message ends too early, after {len(body)} bytes") from None
+        # A writer may pad to a multiple of four.
+        if len(body) - end > 3:
+            raise Invalid(
+                f"{name}: {len(body) - end} bytes are left over; is it another version of the type?"
+            )
+        return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
+
+    def from_json(self, type_name: str, body: Body, now_ns: int) -> bytes:
+        """A message for a robot as CDR with its header, little endian.
+
+        :param body: a JSON object, as text or decoded
+        :param now_ns: nanoseconds since 1970 for headers without a stamp
+        :raises NotFound: the type is not registered
+        :raises Invalid: it does not fit the type; the sentence names the field
+        """
+        name, compiled = self._find(type_name)
+        return self._write(name, compiled, _decoded(name, body), now_ns)
+
+    def args_from_json(self, type_name: str, body: Body | list[Any] | None, now_ns: int) -> bytes:
+        """A service request as CDR, from an object or from a list of arguments in order.
+
+        :param type_name: the service (``pkg/srv/Name``) or its request (``pkg/srv/Name_Request``)
+        :param body: ``None`` or nothing for no arguments
+        :raises NotFound: the type is not registered
+        :raises Invalid: see :meth:`from_json`
+        """
+        name = normalise(type_name)
+        name, compiled = self._find(f"{name}_Request" if name in self._texts else name)
+        value = _decoded(name, body) if body else None
+        if isinstance(value, list):
+            fields = compiled.definitions[name].fields
+            if len(value) > len(fields):
+                raise Invalid(f"{name} has {len(fields)} arguments, not {len(value)}")
+            value = {field.name: part for field, part in zip(fields, value, strict=False)}
+        return self._write(name, compiled, {} if value is None else value, now_ns)
+
+    def zero(self, type_name: str) -> bytes:
+        """The message in which every field has its default."""
+        return self.from_json(type_name, {}, 0)
+
+    def typedefs(self, type_name: str) -> list[dict[str, Any]]:
+        """rosapi's typedefs of a message and of all it contains.
+
+        :raises NotFound: the type is not registered
+        """
+        name, compiled = self._find(type_name)
+        waiting, found = [name], dict[str, dict[str, Any]]()
+        while waiting:
+            name = waiting.pop(0)
+            if name not in found:
+                definition = compiled.definitions[name]
+                found[name] = typedef(definition)
+                waiting += [each.type.base for each in definition.fields if each.type.primitive is None]
+        return list(found.values())
+
+    def _find(self, type_name: str) -> tuple[str, _Compiled]:
+        compiled = self._types.get(type_name)
+        if compiled is not None:
+            return type_name, compiled
+        name = normalise(type_name)
+        compiled = self._types.get(name)
+        if compiled is None:
+            raise NotFound(f"the definition of {name} is not known")
+        return name, compiled
+
+    def _write(self, name: str, compiled: _Compiled, value: Any, now_ns: int) -> bytes:
+        out = bytearray()
+        try:
+            compiled.writer(name)(out, value, now_ns)
+        except Mismatch as error:
+            raise as_invalid(name, error) from None
+        return _WRITTEN_HEAD + out
+
+
+def _decoded(name: str, body: Any) -> Any:
+    if not isinstance(body, bytes):
+        return body
+    try:
+        return jsontext.decode_any(body)
+    except MalformedMessage as error:
+        raise Invalid(f"{name}: {error}") from None
