@@ -1,0 +1,36 @@
+"""The battery drains with time and more so with motion."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot_client.sim.battery import CAPACITY_AH, EMPTY_VOLTS, FULL_VOLTS, IDLE_AMPERES, Battery
+
+
+def test_standing_drains_the_idle_current() -> None:
+    """An hour at 1.2 A takes 1.2 Ah."""
+    battery = Battery()
+    battery.step(3600, 0.0, 0.0)
+    assert battery.charge == pytest.approx(1 - IDLE_AMPERES / CAPACITY_AH)
+
+
+@given(speed=st.floats(0.01, 2), turn=st.floats(0.01, 3))
+def test_motion_costs_whichever_way(speed: float, turn: float) -> None:
+    """Driving and turning draw more than standing, backwards as much as forwards."""
+    idle, ahead, back = Battery(), Battery(), Battery()
+    idle.step(60, 0.0, 0.0)
+    ahead.step(60, speed, turn)
+    back.step(60, -speed, -turn)
+    assert ahead.charge < idle.charge
+    assert ahead == back
+
+
+@given(st.lists(st.tuples(st.floats(0, 1e5), st.floats(-2, 2), st.floats(-3, 3)), max_size=20))
+def test_charge_only_falls_and_stays_within_bounds(steps: list[tuple[float, float, float]]) -> None:
+    """No step brings charge back, none goes below empty, and the voltage stays that of a pack."""
+    battery = Battery()
+    for seconds, speed, turn in steps:
+        before = battery.charge
+        battery.step(seconds, speed, turn)
+        assert 0 <= battery.charge <= before
+        assert EMPTY_VOLTS - 1 < battery.voltage <= FULL_VOLTS

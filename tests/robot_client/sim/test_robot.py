@@ -1,0 +1,113 @@
+"""The robot without ROS: commands, time-out, reset, scan, and a record that is the truth."""
+
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+
+from robot_client.sim.recorder import Recorder
+from robot_client.sim.robot import SCAN_FARTHEST, SCAN_RAYS, Robot
+from robot_client.sim.worlds import WORLDS
+
+STEP = 0.02
+
+
+class Bench:
+    """A robot with its clock and record."""
+
+    def __init__(self, world: str = "open", seed: int | None = 1) -> None:
+        self.now = 0.0
+        self.stream = io.BytesIO()
+        recorder = Recorder(self.stream, clock=lambda: round(self.now * 1e9))
+        self.robot = Robot(WORLDS[world](), recorder, seed, clock=lambda: self.now)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP)):
+            self.now += STEP
+            self.robot.step(STEP)
+
+    @property
+    def record(self) -> list[dict[str, object]]:
+        return [json.loads(line) for line in self.stream.getvalue().splitlines()]
+
+
+def test_record_tells_commands_motion_and_rest_with_times() -> None:
+    """Command, moving with the next step, zero, standstill within 60 ms."""
+    bench = Bench()
+    bench.robot.command(0.5, 0.0)
+    bench.run(1.0)
+    bench.robot.command(0.0, 0.0)
+    bench.run(1.0)
+    events = bench.record
+    assert [event["event"] for event in events] == ["command", "moving", "command", "standstill"]
+    times = [event["t"] for event in events]
+    assert times[1] - times[0] <= 20_000_000
+    assert times[3] - times[2] <= 60_000_000
+    assert (events[0]["v"], events[0]["w"]) == (0.5, 0.0)
+
+
+def test_without_timeout_the_last_command_holds() -> None:
+    """Like many bases, it drives on: what is above it has to stop it."""
+    bench = Bench()
+    bench.robot.command(0.3, 0.0)
+    bench.run(10.0)
+    assert bench.robot.body.velocity.speed == pytest.approx(0.3)
+
+
+def test_timeout_stops_the_robot() -> None:
+    """With the parameter set it stops by itself and says when."""
+    bench = Bench()
+    bench.robot.command_timeout = 0.5
+    bench.robot.command(0.3, 0.0)
+    bench.run(2.0)
+    assert bench.record[-1]["event"] == "standstill"
+    assert 0.5e9 < bench.record[-1]["t"] < 0.6e9
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(math.nan, 0.0), (0.2, math.inf)])
+def test_what_is_no_number_stops(speed: float, turn: float) -> None:
+    """NaN and infinity are a stop, and null in the record."""
+    bench = Bench()
+    bench.robot.command(0.3, 0.0)
+    bench.run(0.5)
+    bench.robot.command(speed, turn)
+    bench.run(0.5)
+    assert not bench.robot.body.moving
+    assert None in (bench.record[2]["v"], bench.record[2]["w"])
+
+
+def test_reset_brings_everything_back() -> None:
+    """Place and charge are those of the beginning; the record tells reset, then standstill."""
+    bench = Bench()
+    bench.robot.command(0.5, 0.5)
+    bench.run(3.0)
+    bench.robot.reset()
+    assert bench.robot.body.pose == bench.robot.world.start
+    assert bench.robot.battery.charge == 1.0
+    assert [event["event"] for event in bench.record[-2:]] == ["reset", "standstill"]
+
+
+def test_scan_is_true_up_to_its_noise() -> None:
+    """The ray straight ahead and the one to the left are at their indices."""
+    bench = Bench("default")
+    scan = bench.robot.scan()
+    start = bench.robot.world.start
+    for index, direction in ((180, 0.0), (270, math.pi / 2), (90, -math.pi / 2)):
+        true = bench.robot.world.cast(start.x, start.y, np.array([start.heading + direction])).distance[0]
+        assert scan[index] == pytest.approx(true, abs=0.05)
+    assert scan.shape == (SCAN_RAYS,)
+
+
+def test_scan_of_the_open_field_is_infinite() -> None:
+    """Beyond the scanner's reach there is nothing, not a distance."""
+    assert np.isinf(Bench("open").robot.scan()).all()
+
+
+def test_noise_repeats_with_its_seed_only() -> None:
+    """Same seed, same scan; another seed, another scan; never beyond the range."""
+    one, same, other = (Bench("default", seed).robot.scan() for seed in (5, 5, 6))
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+    assert one[np.isfinite(one)].max() <= SCAN_FARTHEST
