@@ -1,0 +1,105 @@
+/** Numbers, times and messages as text. */
+
+const NONE = '–'
+
+export function number(value: number | null | undefined, digits: number): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return NONE
+  const text = value.toFixed(digits)
+  return Number(text) === 0 ? (0).toFixed(digits) : text.replace('-', '−')
+}
+
+export function milliseconds(value: number | null | undefined): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return NONE
+  return value < 1 ? '< 1 ms' : `${Math.round(value)} ms`
+}
+
+export function percent(share: number | null | undefined): string {
+  if (share === null || share === undefined || !Number.isFinite(share)) return NONE
+  return `${Math.round(Math.max(0, Math.min(1, share)) * 100)} %`
+}
+
+export function hertz(value: number): string {
+  if (value <= 0) return '0 Hz'
+  return value < 10 ? `${value.toFixed(1)} Hz` : `${Math.round(value)} Hz`
+}
+
+/** How long ago a moment was, in words. Both in Unix seconds. */
+export function ago(then: number | null, now: number): string {
+  if (then === null) return 'never'
+  const seconds = Math.max(0, Math.round(now - then))
+  if (seconds < 5) return 'just now'
+  if (seconds < 60) return `${seconds} s ago`
+  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ago`
+  if (seconds < 86_400) return `${Math.floor(seconds / 3600)} h ago`
+  const days = Math.floor(seconds / 86_400)
+  return days === 1 ? 'a day ago' : `${days} days ago`
+}
+
+/** Names in a sentence, each once: "ann, bob and 2 more". */
+export function people(names: string[], shown = 2): string {
+  const once = Array.from(new Set(names))
+  if (once.length === 0) return 'nobody'
+  if (once.length <= shown) return once.join(', ')
+  return `${once.slice(0, shown).join(', ')} and ${once.length - shown} more`
+}
+
+const ARRAY_SHOWN = 6
+const STRING_SHOWN = 120
+const LINES_SHOWN = 400
+const DEPTH_SHOWN = 24
+
+/** A message as indented JSON, with long arrays and strings cut short and the cut named. */
+export function pretty(message: unknown): string {
+  const lines: string[] = []
+  write(message, '', '', lines, 0)
+  if (lines.length <= LINES_SHOWN) return lines.join('\n')
+  return [...lines.slice(0, LINES_SHOWN), `… ${lines.length - LINES_SHOWN} more lines`].join('\n')
+}
+
+function write(value: unknown, lead: string, tail: string, lines: string[], depth: number): void {
+  const indent = '  '.repeat(depth)
+  // Past this, more lines would only be cut off again.
+  if (depth > DEPTH_SHOWN || lines.length > LINES_SHOWN * 4) {
+    lines.push(`${indent}${lead}…${tail}`)
+    return
+  }
+  if (Array.isArray(value)) writeArray(value, lead, tail, lines, depth)
+  else if (typeof value === 'object' && value !== null) writeObject(value, lead, tail, lines, depth)
+  else lines.push(`${indent}${lead}${scalar(value)}${tail}`)
+}
+
+function writeArray(value: unknown[], lead: string, tail: string, lines: string[], depth: number): void {
+  const indent = '  '.repeat(depth)
+  const shown = value.slice(0, ARRAY_SHOWN)
+  const more = value.length - shown.length
+  if (shown.every((item) => typeof item !== 'object' || item === null)) {
+    const rest = more > 0 ? [`… ${more} more`] : []
+    lines.push(`${indent}${lead}[${[...shown.map(scalar), ...rest].join(', ')}]${tail}`)
+    return
+  }
+  lines.push(`${indent}${lead}[`)
+  shown.forEach((item, i) => write(item, '', i < value.length - 1 ? ',' : '', lines, depth + 1))
+  if (more > 0) lines.push(`${indent}  … ${more} more`)
+  lines.push(`${indent}]${tail}`)
+}
+
+function writeObject(value: object, lead: string, tail: string, lines: string[], depth: number): void {
+  const entries = Object.entries(value)
+  const indent = '  '.repeat(depth)
+  if (entries.length === 0) {
+    lines.push(`${indent}${lead}{}${tail}`)
+    return
+  }
+  lines.push(`${indent}${lead}{`)
+  entries.forEach(([key, item], i) => {
+    write(item, `${JSON.stringify(key)}: `, i < entries.length - 1 ? ',' : '', lines, depth + 1)
+  })
+  lines.push(`${indent}}${tail}`)
+}
+
+function scalar(value: unknown): string {
+  if (typeof value === 'string' && value.length > STRING_SHOWN) {
+    return `${JSON.stringify(value.slice(0, STRING_SHOWN))} … ${value.length} characters`
+  }
+  return JSON.stringify(value) ?? 'null'
+}

@@ -1,0 +1,76 @@
+/** Round trips to the relay and to the robot, and whether the link is late. Times in milliseconds. */
+
+export const PONG_TIMEOUT_MS = 500
+
+/** How often to ping while driving and otherwise. */
+export const PING_DRIVING_MS = 200
+export const PING_IDLE_MS = 1000
+
+const FORGET_MS = 30_000
+
+export interface Legs {
+  clientRelay: number | null
+  relayRobot: number | null
+  clientRobot: number | null
+}
+
+/** Remembers pings that are out and how long the last ones took. */
+export class PingTracker {
+  private out = new Map<number, number>()
+  private next = 1
+  private smooth: number | null = null
+
+  /** A ping leaves; the number names it. */
+  sent(nowMs: number): number {
+    const number = this.next++
+    this.out.set(number, nowMs)
+    for (const [other, atMs] of this.out) if (nowMs - atMs > FORGET_MS) this.out.delete(other)
+    return number
+  }
+
+  /** Its answer came; returns the round trip, or null when it was given up before. */
+  answered(number: number, nowMs: number): number | null {
+    const atMs = this.out.get(number)
+    if (atMs === undefined) return null
+    // Answers keep their order, so what left earlier and is still out won't be answered any more.
+    for (const other of this.out.keys()) if (other <= number) this.out.delete(other)
+    const rtt = nowMs - atMs
+    this.smooth = this.smooth === null ? rtt : this.smooth + 0.3 * (rtt - this.smooth)
+    return rtt
+  }
+
+  /** A ping failed for another reason than time, it says nothing about the link. */
+  dropped(number: number): void {
+    this.out.delete(number)
+  }
+
+  /** Whether a ping has been out for longer than the pong timeout. */
+  isLate(nowMs: number): boolean {
+    return this.silentFor(nowMs) > PONG_TIMEOUT_MS
+  }
+
+  /** How long the oldest unanswered ping has been out, 0 when none is. */
+  silentFor(nowMs: number): number {
+    let longest = 0
+    for (const atMs of this.out.values()) longest = Math.max(longest, nowMs - atMs)
+    return longest
+  }
+
+  /** Smoothed round trip, or null before the first answer. */
+  get rtt(): number | null {
+    return this.smooth
+  }
+
+  reset(): void {
+    this.out.clear()
+    this.smooth = null
+  }
+}
+
+export type Grade = 'good' | 'fair' | 'poor'
+
+/** How a round trip feels for driving. */
+export function grade(rttMs: number): Grade {
+  if (rttMs < 100) return 'good'
+  return rttMs < 250 ? 'fair' : 'poor'
+}

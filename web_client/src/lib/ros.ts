@@ -1,0 +1,248 @@
+/** The link to one robot: a rosbridge websocket that reconnects, built on roslib.
+ *
+ * Every connection gets a `Ros` of its own. roslib keeps what is sent while disconnected and flushes it on
+ * reconnect; a `Ros` that is thrown away flushes nothing, so no old command ever arrives late.
+ */
+import { AbstractTransport, Ros, Service, Topic } from 'roslib'
+import { pause } from './backoff'
+import { ending, type Ending } from './closing'
+
+export type LinkState = 'connecting' | 'open' | 'waiting' | 'ended'
+
+/** More than this unsent means the link is stalled: a command would arrive late. Bytes. */
+const UNSENT_LIMIT = 4096
+
+export interface RelayMessage {
+  level: string
+  words: string
+}
+
+export interface LinkEvents {
+  state(state: LinkState, why: Ending | null): void
+  /** The relay tells something in words, e.g. why it refused a message. */
+  told(message: RelayMessage): void
+}
+
+class SocketTransport extends AbstractTransport {
+  constructor(readonly socket: WebSocket) {
+    super()
+    socket.binaryType = 'arraybuffer'
+    socket.onopen = (event) => this.emit('open', event)
+    socket.onclose = (event) => this.emit('close', event)
+    socket.onerror = (event) => this.emit('error', event)
+    socket.onmessage = (event) => this.handleRawMessage(event.data)
+  }
+  override send(message: object): void {
+    this.socket.send(JSON.stringify(message))
+  }
+  override close(): void {
+    this.socket.close()
+  }
+  override isConnecting(): boolean {
+    return this.socket.readyState === WebSocket.CONNECTING
+  }
+  override isOpen(): boolean {
+    return this.socket.readyState === WebSocket.OPEN
+  }
+  override isClosing(): boolean {
+    return this.socket.readyState === WebSocket.CLOSING
+  }
+  override isClosed(): boolean {
+    return this.socket.readyState === WebSocket.CLOSED
+  }
+}
+
+interface Connection {
+  ros: Ros
+  socket: WebSocket
+  publishers: Map<string, Topic<unknown>>
+  /** Calls that are out, to be failed when the connection closes. */
+  calls: Set<(error: Error) => void>
+}
+
+interface Subscription {
+  name: string
+  type: string
+  throttleMs: number
+  take: (message: never) => void
+  topic: Topic<unknown> | null
+}
+
+export class Link {
+  private connection: Connection | null = null
+  private subscriptions = new Set<Subscription>()
+  private stateNow: LinkState = 'connecting'
+  private attempt = 0
+  private timer: ReturnType<typeof setTimeout> | undefined
+
+  constructor(
+    private readonly url: string,
+    private readonly events: LinkEvents,
+  ) {}
+
+  get state(): LinkState {
+    return this.stateNow
+  }
+
+  get isOpen(): boolean {
+    return this.stateNow === 'open' && this.connection?.socket.readyState === WebSocket.OPEN
+  }
+
+  /** Bytes handed over but not sent yet. */
+  get unsent(): number {
+    return this.connection?.socket.bufferedAmount ?? 0
+  }
+
+  get isStalled(): boolean {
+    return this.unsent > UNSENT_LIMIT
+  }
+
+  connect(): void {
+    clearTimeout(this.timer)
+    this.become('connecting', null)
+    const socket = new WebSocket(this.url)
+    const transport = new SocketTransport(socket)
+    const ros = new Ros({ transportFactory: () => Promise.resolve(transport) })
+    const connection: Connection = { ros, socket, publishers: new Map(), calls: new Set() }
+    this.connection = connection
+    ros.on('connection', () => this.opened(connection))
+    ros.on('close', (event) => this.closed(connection, event as CloseEvent))
+    void ros.connect(this.url)
+    transport.on('message', (message) => this.listen(message))
+  }
+
+  /** Tries at once instead of waiting for the pause to end. */
+  retryNow(): void {
+    if (this.stateNow === 'waiting') this.connect()
+  }
+
+  /** Gives up a connection that has fallen silent, and dials anew. */
+  abandon(): void {
+    const connection = this.connection
+    if (connection === null) return
+    connection.socket.close()
+    // A dead link may take minutes to report its own close.
+    this.closed(connection, { code: 1006, reason: '' })
+  }
+
+  close(): void {
+    clearTimeout(this.timer)
+    const socket = this.connection?.socket
+    this.drop(new Error('The page was left.'))
+    this.stateNow = 'ended'
+    socket?.close(1000)
+  }
+
+  /** Receives a topic, across reconnects, until the returned function is called.
+   *
+   * @param throttleMs least time between messages, 0 for all of them
+   */
+  subscribe<T>(name: string, type: string, take: (message: T) => void, throttleMs = 0): () => void {
+    const subscription: Subscription = { name, type, throttleMs, take, topic: null }
+    this.subscriptions.add(subscription)
+    if (this.isOpen) this.start(subscription)
+    return () => {
+      this.subscriptions.delete(subscription)
+      if (this.isOpen) subscription.topic?.unsubscribe()
+      subscription.topic = null
+    }
+  }
+
+  /** Announces a topic before the first message, so that the robot is ready for it. */
+  advertise(name: string, type: string): void {
+    if (this.isOpen) this.publisher(name, type)?.advertise()
+  }
+
+  /** Publishes at once or not at all. Returns whether it was handed to an open socket. */
+  publish(name: string, type: string, message: unknown): boolean {
+    const topic = this.isOpen ? this.publisher(name, type) : null
+    if (topic === null) return false
+    topic.publish(message)
+    return true
+  }
+
+  /** Calls a service.
+   *
+   * @param timeoutS seconds until the relay gives up
+   * @throws Error in the relay's words, or when the connection closes first
+   */
+  call<Q, A>(name: string, type: string, args: Q, timeoutS = 5): Promise<A> {
+    const connection = this.connection
+    if (!this.isOpen || connection === null) return Promise.reject(new Error('There is no connection.'))
+    return new Promise<A>((resolve, reject) => {
+      const done = <V>(settle: (value: V) => void) => (value: V) => {
+        connection.calls.delete(reject)
+        settle(value)
+      }
+      connection.calls.add(reject)
+      new Service<Q, A>({ ros: connection.ros, name, serviceType: type }).callService(
+        args,
+        done(resolve),
+        done((words: string) => reject(new Error(words || `The call of ${name} failed.`))),
+        timeoutS,
+      )
+    })
+  }
+
+  private publisher(name: string, type: string): Topic<unknown> | null {
+    const connection = this.connection
+    if (connection === null) return null
+    let topic = connection.publishers.get(name)
+    if (topic === undefined) {
+      topic = new Topic({ ros: connection.ros, name, messageType: type, queue_size: 1, reconnect_on_close: false })
+      connection.publishers.set(name, topic)
+    }
+    return topic
+  }
+
+  private start(subscription: Subscription): void {
+    if (this.connection === null) return
+    const { name, type, throttleMs, take } = subscription
+    subscription.topic = new Topic<unknown>({
+      ros: this.connection.ros,
+      name,
+      messageType: type,
+      throttle_rate: throttleMs,
+      queue_length: 1,
+      reconnect_on_close: false,
+    })
+    subscription.topic.subscribe(take as (message: unknown) => void)
+  }
+
+  private opened(connection: Connection): void {
+    if (connection !== this.connection) return
+    this.attempt = 0
+    connection.ros.setStatusLevel('warning')
+    this.become('open', null)
+    for (const subscription of this.subscriptions) this.start(subscription)
+  }
+
+  private closed(connection: Connection, event: Pick<CloseEvent, 'code' | 'reason'>): void {
+    if (connection !== this.connection) return
+    const why = ending(event.code, event.reason)
+    this.drop(new Error(why.words))
+    if (why.after !== 'retry') {
+      this.become('ended', why)
+      return
+    }
+    this.become('waiting', why)
+    this.timer = setTimeout(() => this.connect(), pause(this.attempt++, Math.random()))
+  }
+
+  private drop(error: Error): void {
+    for (const reject of this.connection?.calls ?? []) reject(error)
+    this.connection = null
+    for (const subscription of this.subscriptions) subscription.topic = null
+  }
+
+  /** roslib hands on status messages only by their id, which is not known beforehand. */
+  private listen(message: { op: string; level?: unknown; msg?: unknown }): void {
+    if (message.op !== 'status' || typeof message.msg !== 'string') return
+    this.events.told({ level: String(message.level), words: message.msg })
+  }
+
+  private become(state: LinkState, why: Ending | null): void {
+    this.stateNow = state
+    this.events.state(state, why)
+  }
+}

@@ -1,0 +1,9 @@
+import 'bootstrap/dist/css/bootstrap.min.css'
+import './app.css'
+import { mount } from 'svelte'
+import App from './App.svelte'
+
+const target = document.getElementById('app')
+if (target === null) throw new Error('The page has no element with the id app.')
+
+export default mount(App, { target })
