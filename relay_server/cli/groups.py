@@ -1,0 +1,92 @@
+"""``switchboard group``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from relay_db import queries
+from relay_protocol.errors import Invalid
+from relay_server.cli.app import App, examples, group_of, json_option, pass_app, sure, yes_option
+from relay_server.cli.output import show, tell
+
+
+@click.group()
+def group() -> None:
+    """Give users rights together."""
+
+
+@group.command(epilog=examples("switchboard group add lab"))
+@click.argument("name")
+@json_option
+@pass_app
+def add(app: App, name: str, as_json: bool) -> None:
+    """Add a group NAME."""
+    with app.change() as change:
+        added = queries.add_group(change.session, name)
+        change.audit("group.add", added.name)
+    tell(as_json, _json(added), f"Added group {added.name}.")
+
+
+@group.command("list", epilog=examples("switchboard group list"))
+@json_option
+@pass_app
+def list_(app: App, as_json: bool) -> None:
+    """List all groups and who is in them."""
+    with app.reading() as session:
+        groups = queries.list_groups(session)
+    cells = ((each.name, ", ".join(each.members)) for each in groups)
+    show(as_json, map(_json, groups), ("group", "members"), cells)
+
+
+@group.command(epilog=examples("switchboard group remove lab --yes"))
+@click.argument("name")
+@yes_option
+@json_option
+@pass_app
+def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
+    """Remove group NAME with its rights; its members stay users."""
+    with app.reading() as session:
+        found = group_of(session, name)
+    sure(f"Remove group {found.name} with its rights?", yes)
+    with app.change() as change:
+        found = change.group(name)
+        queries.remove_group(change.session, found.id)
+        change.audit("group.remove", found.name)
+    tell(as_json, {"group": found.name, "removed": True}, f"Removed group {found.name}.")
+
+
+@group.command(epilog=examples("switchboard group join lab ann"))
+@click.argument("group_name", metavar="GROUP")
+@click.argument("user_name", metavar="USER")
+@json_option
+@pass_app
+def join(app: App, group_name: str, user_name: str, as_json: bool) -> None:
+    """Put USER into GROUP."""
+    with app.change() as change:
+        found, member = change.group(group_name), change.user(user_name)
+        queries.add_member(change.session, found.id, member.id)
+        change.audit("group.join", found.name, user=member.name)
+        found = change.group(group_name)
+    tell(as_json, _json(found), f"{member.name} is in group {found.name}.")
+
+
+@group.command(epilog=examples("switchboard group leave lab ann"))
+@click.argument("group_name", metavar="GROUP")
+@click.argument("user_name", metavar="USER")
+@json_option
+@pass_app
+def leave(app: App, group_name: str, user_name: str, as_json: bool) -> None:
+    """Take USER out of GROUP."""
+    with app.change() as change:
+        found, member = change.group(group_name), change.user(user_name)
+        if not queries.remove_member(change.session, found.id, member.id):
+            raise Invalid(f"{member.name} is not in group {found.name}")
+        change.audit("group.leave", found.name, user=member.name)
+        found = change.group(group_name)
+    tell(as_json, _json(found), f"{member.name} is no longer in group {found.name}.")
+
+
+def _json(record: queries.GroupRecord) -> dict[str, Any]:
+    return {"group": record.name, "members": list(record.members)}

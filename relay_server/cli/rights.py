@@ -1,0 +1,134 @@
+"""``switchboard right``."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import click
+
+from relay_db import queries
+from relay_protocol.errors import Invalid
+from relay_protocol.rights import Level
+from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, user_of
+from relay_server.cli.output import show, tell
+
+_GROUP_MARK = "@"
+
+
+@click.group()
+def right() -> None:
+    """Say who may do what on which robot."""
+
+
+class _Holder(NamedTuple):
+    """Whom a right belongs to, as queries take it and as people write it."""
+
+    user_id: int | None
+    group_id: int | None
+    text: str
+
+
+@right.command(
+    epilog=examples(
+        "switchboard right grant ann rover operator",
+        "switchboard right grant @lab rover viewer --allow call:/reset",
+        "switchboard right grant bob rover operator --deny 'publish:/arm/*'",
+    )
+)
+@click.argument("holder", metavar="USER|@GROUP")
+@click.argument("robot")
+@click.argument("level", type=click.Choice([str(each) for each in Level]))
+@click.option("--allow", metavar="PATTERN", multiple=True, help="Allow more: operation:resource. Repeatable.")
+@click.option("--deny", metavar="PATTERN", multiple=True, help="Deny in spite of the rest. Repeatable.")
+@json_option
+@pass_app
+def grant(
+    app: App,
+    holder: str,
+    robot: str,
+    level: str,
+    allow: tuple[str, ...],
+    deny: tuple[str, ...],
+    as_json: bool,
+) -> None:
+    """Give USER or GROUP a right on ROBOT; it replaces the one they have there.
+
+    A viewer may subscribe, an operator also publish and call, an owner also change rights. Patterns are
+    operation:resource with subscribe, publish, call, provide, manage or *, and wildcards in the resource.
+    """
+    with app.change() as change:
+        found, whose = change.robot(robot), _holder(change, holder)
+        queries.grant_right(
+            change.session,
+            found.id,
+            level,
+            user_id=whose.user_id,
+            group_id=whose.group_id,
+            allow=allow,
+            deny=deny,
+        )
+        detail = {"level": level, "allow": list(allow), "deny": list(deny)}
+        change.audit("right.grant", f"{whose.text} on {found.name}", **detail)
+    tell(
+        as_json,
+        {"holder": whose.text, "robot": found.name, **detail},
+        f"{whose.text} is {level} on {found.name}.",
+    )
+
+
+@right.command(epilog=examples("switchboard right revoke ann rover"))
+@click.argument("holder", metavar="USER|@GROUP")
+@click.argument("robot")
+@json_option
+@pass_app
+def revoke(app: App, holder: str, robot: str, as_json: bool) -> None:
+    """Take the right of USER or GROUP on ROBOT away; what is open is cut at once."""
+    with app.change() as change:
+        found, whose = change.robot(robot), _holder(change, holder)
+        if not queries.revoke_right(change.session, found.id, user_id=whose.user_id, group_id=whose.group_id):
+            raise Invalid(f"{whose.text} has no right of its own on {found.name}")
+        change.audit("right.revoke", f"{whose.text} on {found.name}")
+    answer = {"holder": whose.text, "robot": found.name, "revoked": True}
+    tell(as_json, answer, f"{whose.text} has no right of its own on {found.name} any more.")
+
+
+@right.command("list", epilog=examples("switchboard right list", "switchboard right list --user ann --json"))
+@click.option("--robot", metavar="NAME", help="Only rights on this robot.")
+@click.option("--user", metavar="NAME", help="Only rights of this user, also through groups.")
+@json_option
+@pass_app
+def list_(app: App, robot: str | None, user: str | None, as_json: bool) -> None:
+    """List rights as they were given. Administrators are owners everywhere without one."""
+    with app.reading() as session:
+        rights = queries.list_rights(
+            session,
+            robot_id=None if robot is None else robot_of(session, robot).id,
+            user_id=None if user is None else user_of(session, user).id,
+        )
+    cells = (
+        (_text(each), each.robot, str(each.level), " ".join(each.allow), " ".join(each.deny))
+        for each in rights
+    )
+    show(as_json, map(_json, rights), ("holder", "robot", "level", "allow", "deny"), cells)
+
+
+def _holder(change: Change, text: str) -> _Holder:
+    if text.startswith(_GROUP_MARK):
+        group = change.group(text.removeprefix(_GROUP_MARK))
+        return _Holder(None, group.id, f"{_GROUP_MARK}{group.name}")
+    user = change.user(text)
+    return _Holder(user.id, None, user.name)
+
+
+def _text(record: queries.RightRecord) -> str:
+    return f"{_GROUP_MARK}{record.group}" if record.user is None else record.user
+
+
+def _json(record: queries.RightRecord) -> dict[str, Any]:
+    return {
+        "holder": _text(record),
+        "robot": record.robot,
+        "level": str(record.level),
+        "allow": list(record.allow),
+        "deny": list(record.deny),
+    }

@@ -1,0 +1,149 @@
+"""``switchboard robot``."""
+
+from __future__ import annotations
+
+import shlex
+import socket
+import time
+from typing import Any
+
+import click
+
+from relay_db import queries
+from relay_protocol.errors import Unavailable
+from relay_protocol.limits import ENROLMENT_SECONDS
+from relay_server import passwords
+from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, sure, yes_option
+from relay_server.cli.output import show, tell
+from relay_server.cli.relaysocket import ask_status
+from relay_server.cli.text import duration, moment
+
+_ROBOTS_PORT = 9091
+
+
+@click.group()
+def robot() -> None:
+    """Add, list and remove robots and their keys."""
+
+
+@robot.command(
+    epilog=examples("switchboard robot add rover", 'switchboard robot add arm-2 --description "Lab 3"')
+)
+@click.argument("name")
+@click.option("--description", default="", help="One line for people.")
+@json_option
+@pass_app
+def add(app: App, name: str, description: str, as_json: bool) -> None:
+    """Add a robot NAME and print the code with which it enrols."""
+    code = passwords.new_enrolment_code()
+    with app.change() as change:
+        added = queries.add_robot(change.session, name, description)
+        _issue(change, added, code)
+        change.audit("robot.add", added.name, description=description)
+    _tell_code(app, added, code, as_json, f"Added robot {added.name}.")
+
+
+@robot.command(epilog=examples("switchboard robot code rover"))
+@click.argument("name")
+@json_option
+@pass_app
+def code(app: App, name: str, as_json: bool) -> None:
+    """Print a new enrolment code for robot NAME; one that was not used yet is void."""
+    new = passwords.new_enrolment_code()
+    with app.change() as change:
+        found = change.robot(name)
+        _issue(change, found, new)
+        change.audit("robot.code", found.name)
+    _tell_code(app, found, new, as_json)
+
+
+@robot.command("list", epilog=examples("switchboard robot list --json"))
+@json_option
+@pass_app
+def list_(app: App, as_json: bool) -> None:
+    """List all robots; 'switchboard status' tells which are online."""
+    with app.reading() as session:
+        robots = queries.list_robots(session)
+        live = {each.id: _live_keys(queries.list_keys(session, each.id)) for each in robots}
+    rows = ({"robot": each.name, "description": each.description, "keys": live[each.id]} for each in robots)
+    cells = (
+        (each.name, str(live[each.id]) if live[each.id] else "not enrolled", each.description)
+        for each in robots
+    )
+    show(as_json, rows, ("robot", "live keys", "description"), cells)
+
+
+@robot.command(epilog=examples("switchboard robot remove rover --yes"))
+@click.argument("name")
+@yes_option
+@json_option
+@pass_app
+def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
+    """Remove robot NAME with its keys and all rights on it; its link is cut at once."""
+    with app.reading() as session:
+        found = robot_of(session, name)
+    sure(f"Remove robot {found.name} with its keys and all rights on it?", yes)
+    with app.change() as change:
+        found = change.robot(name)
+        queries.remove_robot(change.session, found.id)
+        change.audit("robot.remove", found.name)
+    tell(as_json, {"robot": found.name, "removed": True}, f"Removed robot {found.name}.")
+
+
+@robot.command(
+    epilog=examples("switchboard robot keys rover", "switchboard robot keys rover --revoke 0f3a52c1d4e5b697")
+)
+@click.argument("name")
+@click.option("--revoke", metavar="FINGERPRINT", help="Retire this key; a link that uses it is cut at once.")
+@json_option
+@pass_app
+def keys(app: App, name: str, revoke: str | None, as_json: bool) -> None:
+    """List the keys of robot NAME, or retire one."""
+    if revoke is not None:
+        with app.change() as change:
+            found = change.robot(name)
+            queries.revoke_key(change.session, found.id, revoke, time.time())
+            change.audit("robot.key.revoke", found.name, fingerprint=revoke)
+    with app.reading() as session:
+        known = queries.list_keys(session, robot_of(session, name).id)
+    cells = ((each.fingerprint, moment(each.created), _state(each), each.agent) for each in known)
+    show(as_json, (each._asdict() for each in known), ("fingerprint", "enrolled", "state", "agent"), cells)
+
+
+def _issue(change: Change, found: queries.RobotRecord, new: str) -> None:
+    expires = time.time() + ENROLMENT_SECONDS
+    queries.issue_enrolment_code(change.session, found.id, passwords.code_hash(new), expires)
+
+
+def _tell_code(app: App, found: queries.RobotRecord, new: str, as_json: bool, *before: str) -> None:
+    answer: dict[str, Any] = {"robot": found.name, "enrolment_code": new, "expires_in": ENROLMENT_SECONDS}
+    if as_json:
+        tell(True, answer)
+        return
+    command = ["switchboard-robot", "enroll", "--relay", _relay_address(app), "--robot", found.name]
+    command += ["--code", new, "--state", f"/var/lib/switchboard-robot/{found.name}"]
+    tell(
+        False,
+        answer,
+        *before,
+        f"Enrolment code: {new} (good once, for {duration(ENROLMENT_SECONDS)})",
+        "On the robot, run:",
+        f"  {shlex.join(command)}",
+    )
+
+
+def _relay_address(app: App) -> str:
+    """Where robots dial: this machine, and the port of the relay that runs here, if one does."""
+    try:
+        port = ask_status(app.data).get("robots_port", _ROBOTS_PORT)
+    except Unavailable:
+        port = _ROBOTS_PORT
+    return f"{socket.gethostname()}:{port}"
+
+
+def _live_keys(known: list[queries.KeyRecord]) -> int:
+    return sum(each.retired is None for each in known)
+
+
+def _state(key: queries.KeyRecord) -> str:
+    return "live" if key.retired is None else f"retired {moment(key.retired)}"

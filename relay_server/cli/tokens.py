@@ -1,0 +1,96 @@
+"""``switchboard token``."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import click
+
+from relay_db import queries
+from relay_protocol.errors import Invalid, NotFound
+from relay_server import passwords
+from relay_server.cli.app import App, examples, json_option, pass_app, user_of
+from relay_server.cli.output import show, tell
+from relay_server.cli.text import duration, moment, parse_duration
+
+
+@click.group()
+def token() -> None:
+    """Create, list and revoke access tokens."""
+
+
+@token.command(
+    epilog=examples(
+        "switchboard token create ann --ttl 1h",
+        'switchboard token create fleet-report --ttl 30d --label "nightly report" --json',
+    )
+)
+@click.argument("user")
+@click.option("--ttl", default="24h", show_default=True, help="How long it is good: 90s, 15m, 1h, 7d, 2w.")
+@click.option("--label", default="", help="What it is for, one line.")
+@json_option
+@pass_app
+def create(app: App, user: str, ttl: str, label: str, as_json: bool) -> None:
+    """Create a token that acts as USER. It is shown once and not stored."""
+    seconds, secret, now = parse_duration(ttl), passwords.new_token(), time.time()
+    with app.change() as change:
+        found = change.user(user)
+        if found.disabled:
+            raise Invalid(f"user '{found.name}' is disabled; enable it first")
+        number = queries.create_token(
+            change.session,
+            found.id,
+            passwords.token_hash(secret),
+            kind="access",
+            label=label,
+            expires=now + seconds,
+            now=now,
+        )
+        change.audit("token.create", found.name, id=number, ttl_s=seconds, label=label)
+    answer = {"token": secret, "expires_in": seconds, "id": number, "user": found.name}
+    tell(as_json, answer, secret)
+    if not as_json:
+        # not to stdout, which a script may take as the token
+        click.echo(f"Number {number}, good for {duration(seconds)}. It is not shown again.", err=True)
+
+
+@token.command("list", epilog=examples("switchboard token list", "switchboard token list --user ann"))
+@click.option("--user", metavar="NAME", help="Only tokens of this user.")
+@json_option
+@pass_app
+def list_(app: App, user: str | None, as_json: bool) -> None:
+    """List tokens and browser sessions, without the tokens themselves."""
+    with app.reading() as session:
+        tokens = queries.list_tokens(session, None if user is None else user_of(session, user).id)
+    now = time.time()
+    cells = (
+        (str(each.id), each.user, each.kind, _expiry(each, now), moment(each.created), each.label)
+        for each in tokens
+    )
+    columns = ("id", "user", "kind", "expires", "created", "label")
+    show(as_json, (_json(each) for each in tokens), columns, cells)
+
+
+@token.command(epilog=examples("switchboard token revoke 7"))
+@click.argument("number", metavar="ID", type=click.IntRange(min=1, max=2**31 - 1))
+@json_option
+@pass_app
+def revoke(app: App, number: int, as_json: bool) -> None:
+    """Make the token of number ID worthless; what it opened is cut at once."""
+    with app.change() as change:
+        if not queries.revoke_token(change.session, number):
+            raise NotFound(f"there is no token {number}; see 'switchboard token list'")
+        change.audit("token.revoke", str(number))
+    tell(as_json, {"id": number, "revoked": True}, f"Revoked token {number}.")
+
+
+def _json(record: queries.TokenRecord) -> dict[str, Any]:
+    row = record._asdict()
+    del row["user_id"]
+    return row
+
+
+def _expiry(record: queries.TokenRecord, now: float) -> str:
+    over = record.expires is not None and record.expires <= now
+    return f"{moment(record.expires)} (over)" if over else moment(record.expires)

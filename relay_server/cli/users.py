@@ -1,0 +1,134 @@
+"""``switchboard user``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from relay_db import queries
+from relay_db.names import normal_name
+from relay_protocol.errors import Invalid
+from relay_server.cli.app import App, examples, json_option, pass_app, sure, user_of, yes_option
+from relay_server.cli.output import show, tell
+from relay_server.cli.secrets_in import new_password_hash, stdin_option
+
+
+@click.group()
+def user() -> None:
+    """Add, list, change and remove users."""
+
+
+@user.command(
+    epilog=examples(
+        "switchboard user add ann",
+        "switchboard user add ops --admin --password-stdin < password.txt",
+        "switchboard user add fleet-report --no-password",
+    )
+)
+@click.argument("name")
+@click.option("--admin", is_flag=True, help="An administrator: owner of every robot.")
+@stdin_option
+@click.option("--no-password", is_flag=True, help="No password: only access tokens let this user in.")
+@json_option
+@pass_app
+def add(app: App, name: str, admin: bool, password_stdin: bool, no_password: bool, as_json: bool) -> None:
+    """Add a user NAME. Asks for the password unless told otherwise."""
+    if password_stdin and no_password:
+        raise click.UsageError("--password-stdin and --no-password exclude each other.")
+    name = normal_name(name, "name of a user")
+    with app.reading() as session:
+        # before anyone types a password twice for nothing
+        if queries.find_user(session, name) is not None:
+            raise Invalid(f"there is a user '{name}' already")
+    hashed = None if no_password else new_password_hash(password_stdin)
+    with app.change() as change:
+        added = queries.add_user(change.session, name, hashed, admin=admin)
+        change.audit("user.add", added.name, admin=admin)
+    tell(as_json, _json(added), f"Added {'administrator' if admin else 'user'} {added.name}.")
+
+
+@user.command("list", epilog=examples("switchboard user list", "switchboard user list --json"))
+@json_option
+@pass_app
+def list_(app: App, as_json: bool) -> None:
+    """List all users."""
+    with app.reading() as session:
+        users = queries.list_users(session)
+    cells = ((each.name, _role(each), "yes" if each.password_hash else "no") for each in users)
+    show(as_json, map(_json, users), ("user", "role", "password"), cells)
+
+
+@user.command(epilog=examples("switchboard user passwd ann", "switchboard user passwd ann --password-stdin"))
+@click.argument("name")
+@stdin_option
+@json_option
+@pass_app
+def passwd(app: App, name: str, password_stdin: bool, as_json: bool) -> None:
+    """Set the password of user NAME; its browser sessions end, its access tokens stay."""
+    with app.reading() as session:
+        user_of(session, name)
+    hashed = new_password_hash(password_stdin)
+    with app.change() as change:
+        found = change.user(name)
+        queries.set_password(change.session, found.id, hashed)
+        change.audit("user.password", found.name)
+    tell(as_json, _json(found._replace(password_hash=hashed)), f"Changed the password of {found.name}.")
+
+
+@user.command(epilog=examples("switchboard user disable ann"))
+@click.argument("name")
+@json_option
+@pass_app
+def disable(app: App, name: str, as_json: bool) -> None:
+    """Shut user NAME out at once; rights and tokens are kept for later."""
+    _set_disabled(app, name, True, as_json)
+
+
+@user.command(epilog=examples("switchboard user enable ann"))
+@click.argument("name")
+@json_option
+@pass_app
+def enable(app: App, name: str, as_json: bool) -> None:
+    """Let a disabled user NAME in again."""
+    _set_disabled(app, name, False, as_json)
+
+
+@user.command(epilog=examples("switchboard user remove ann", "switchboard user remove ann --yes"))
+@click.argument("name")
+@yes_option
+@json_option
+@pass_app
+def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
+    """Remove user NAME with its rights and tokens."""
+    with app.reading() as session:
+        found = user_of(session, name)
+    sure(f"Remove user {found.name} with all rights and tokens?", yes)
+    with app.change() as change:
+        found = change.user(name)
+        queries.remove_user(change.session, found.id)
+        change.audit("user.remove", found.name)
+    tell(as_json, {"user": found.name, "removed": True}, f"Removed user {found.name}.")
+
+
+def _set_disabled(app: App, name: str, disabled: bool, as_json: bool) -> None:
+    with app.change() as change:
+        found = change.user(name)
+        queries.set_disabled(change.session, found.id, disabled)
+        change.audit("user.disable" if disabled else "user.enable", found.name)
+    sentence = f"{'Disabled' if disabled else 'Enabled'} user {found.name}."
+    tell(as_json, _json(found._replace(disabled=disabled)), sentence)
+
+
+def _json(record: queries.UserRecord) -> dict[str, Any]:
+    return {
+        "user": record.name,
+        "admin": record.admin,
+        "disabled": record.disabled,
+        "password": record.password_hash is not None,
+    }
+
+
+def _role(record: queries.UserRecord) -> str:
+    role = "admin" if record.admin else "user"
+    return f"{role}, disabled" if record.disabled else role
