@@ -190,8 +190,8 @@ class Service(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 class Graph(Message, frozen=True, kw_only=True):
     """Robot: the ROS graph, or what has changed in it.
 
-    With ``full`` the maps are all there is. Otherwise each map holds the names that changed, with ``null`` for
-    a name that is gone. Nodes are keys with an empty object. The daemon's own node is left out.
+    With ``full`` the maps are all there is. Otherwise each map holds the names that changed, with ``null``
+    for a name that is gone. Nodes are keys with an empty object. The daemon's own node is left out.
     """
 
     full: bool = False

@@ -14,6 +14,7 @@ import orjson
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
+from relay_protocol.limits import MIB
 from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
 from relay_protocol.ros.reader import Reader, ReaderFactory
 from relay_protocol.ros.typedefs import typedef
@@ -22,7 +23,8 @@ from relay_protocol.ros.writer import Mismatch, Write, WriterFactory, as_invalid
 _LITTLE = b"\x00\x01"
 _BIG = b"\x00\x00"
 _WRITTEN_HEAD = b"\x00\x01\x00\x00"
-_TEXTS_SHARED = 1024
+_SHARED_CHARACTERS = 8 * MIB
+_TYPES_OF_A_ROBOT = 4096
 
 Body = bytes | dict[str, Any]
 
@@ -31,7 +33,6 @@ class _Compiled:
     """All types of one text. Readers and writers are built when first needed, and then kept."""
 
     def __init__(self, type_name: str, text: str) -> None:
-        self.text = text
         self.definitions: dict[str, Definition] = parse(type_name, text)
         self._writers = WriterFactory(self.definitions)
         self._readers = {
@@ -49,20 +50,28 @@ class _Compiled:
         return self._writers.writer(type_name)
 
 
-_shared: OrderedDict[tuple[str, str], _Compiled] = OrderedDict()
-"""A fleet of like robots sends the same texts: each is compiled once."""
+class _Shared:
+    """A fleet of like robots sends the same texts: each is compiled once. The least used make room."""
+
+    def __init__(self, characters: int) -> None:
+        self._room = characters
+        self._kept: OrderedDict[tuple[str, str], _Compiled] = OrderedDict()
+
+    def compiled(self, type_name: str, text: str) -> _Compiled:
+        key = (type_name, text)
+        found = self._kept.get(key)
+        if found is not None:
+            self._kept.move_to_end(key)
+            return found
+        found = self._kept[key] = _Compiled(type_name, text)
+        self._room -= len(text)
+        while self._room < 0:
+            (_, former), _ = self._kept.popitem(last=False)
+            self._room += len(former)
+        return found
 
 
-def _compile(type_name: str, text: str) -> _Compiled:
-    key = (type_name, text)
-    compiled = _shared.get(key)
-    if compiled is None:
-        compiled = _shared[key] = _Compiled(type_name, text)
-        if len(_shared) > _TEXTS_SHARED:
-            _shared.popitem(last=False)
-    else:
-        _shared.move_to_end(key)
-    return compiled
+_shared = _Shared(_SHARED_CHARACTERS)
 
 
 class TypeRegistry:
@@ -71,7 +80,6 @@ class TypeRegistry:
     def __init__(self) -> None:
         self._types: dict[str, _Compiled] = {}
         self._texts: dict[str, str] = {}
-        self._known_by: dict[str, str] = {}
 
     def add(self, type_name: str, text: str) -> None:
         """Register a definition; the same again changes nothing, another one replaces the former.
@@ -83,18 +91,22 @@ class TypeRegistry:
         name = normalise(type_name)
         if self._texts.get(name) == text:
             return
-        compiled = _compile(name, text)
+        if len(self._texts) >= _TYPES_OF_A_ROBOT and name not in self._texts:
+            raise Invalid(f"{name}: this robot has sent {_TYPES_OF_A_ROBOT} types already")
+        compiled = _shared.compiled(name, text)
         self._texts[name] = text
         for part in parts_of(name):
             self._types[part] = compiled
-            self._known_by[part] = name
         # What it contains is known too, unless the robot sent a text of its own for it.
         for contained in compiled.definitions:
             self._types.setdefault(contained, compiled)
 
     def knows(self, type_name: str) -> bool:
         """Whether messages of this type (all parts of this service or action) can be converted."""
-        name = normalise(type_name)
+        try:
+            name = normalise(type_name)
+        except Invalid:
+            return False
         return name in self._types or all(part in self._types for part in parts_of(name))
 
     def definition(self, type_name: str) -> str:
@@ -119,16 +131,13 @@ class TypeRegistry:
             raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
         body = cdr[4:]
         try:
-            value, end = compiled.reader(name, cdr[:2]).read(body, 0)
+            value, _ = compiled.reader(name, cdr[:2]).read(body, 0)
         except Invalid as error:
             raise Invalid(f"{name}: {error}") from None
         except struct.error:
             raise Invalid(f"{name}: the message ends too early, after {len(body)} bytes") from None
-        # A writer may pad to a multiple of four.
-        if len(body) - end > 3:
-            raise Invalid(
-                f"{name}: {len(body) - end} bytes are left over; is it another version of the type?"
-            )
+        # Bytes left over are no error: rclpy's serialize_message counts gaps before empty sequences that it
+        # does not write, and pads the end.
         return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
 
     def from_json(self, type_name: str, body: Body, now_ns: int) -> bytes:
@@ -145,13 +154,12 @@ class TypeRegistry:
     def args_from_json(self, type_name: str, body: Body | list[Any] | None, now_ns: int) -> bytes:
         """A service request as CDR, from an object or from a list of arguments in order.
 
-        :param type_name: the service (``pkg/srv/Name``) or its request (``pkg/srv/Name_Request``)
+        :param type_name: the service (``pkg/srv/Name`` or ``pkg/Name``) or its request (``…/Name_Request``)
         :param body: ``None`` or nothing for no arguments
         :raises NotFound: the type is not registered
         :raises Invalid: see :meth:`from_json`
         """
-        name = normalise(type_name)
-        name, compiled = self._find(f"{name}_Request" if name in self._texts else name)
+        name, compiled = self._find(self._request_of(type_name))
         value = _decoded(name, body) if body else None
         if isinstance(value, list):
             fields = compiled.definitions[name].fields
@@ -178,6 +186,12 @@ class TypeRegistry:
                 found[name] = typedef(definition)
                 waiting += [each.type.base for each in definition.fields if each.type.primitive is None]
         return list(found.values())
+
+    def _request_of(self, type_name: str) -> str:
+        if type_name.count("/") == 1:
+            type_name = type_name.replace("/", "/srv/")
+        request = f"{normalise(type_name)}_Request"
+        return request if request in self._types else type_name
 
     def _find(self, type_name: str) -> tuple[str, _Compiled]:
         compiled = self._types.get(type_name)

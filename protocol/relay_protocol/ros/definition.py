@@ -16,15 +16,15 @@ import struct
 from typing import Any, NamedTuple
 
 from relay_protocol.errors import Invalid
-from relay_protocol.limits import NAME, ROBOT_FRAME, TYPE_DEFINITION
+from relay_protocol.limits import COMMAND_FRAME, NAME, TYPE_DEFINITION
 
 MAX_NESTING = 32
 """Deepest nesting of messages in messages."""
 
 MAX_PARTS = 20_000
-"""Most single values that one message holds even when all its sequences are empty."""
+"""Most single values of one message when all its sequences are empty; an array of numbers counts as one."""
 
-MAX_FIELDS = 20_000
+MAX_FIELDS = 4_000
 """Most fields and constants in one text."""
 
 
@@ -351,8 +351,8 @@ def _cost(
             parts, size = parts + (1 if packed else one.parts * kind.length), size + one.size * kind.length
         else:
             parts, size = parts + one.parts, size + one.size
-        if parts > MAX_PARTS or size > ROBOT_FRAME:
-            raise Invalid(f"a {name} is too large even when its sequences are empty")
+        if parts > MAX_PARTS or size > COMMAND_FRAME:
+            raise Invalid(f"{name} is too large even when its sequences are empty")
     costs[name] = _Cost(parts, size, depth)
     return costs[name]
 

@@ -95,7 +95,7 @@ class ReaderFactory:
         return Reader(read, least)
 
     def _run(self, run: Run) -> Read:
-        names = run.names
+        names = [field.name for field in run.fields]
         choices = [(codec.unpack_from, size) for codec, size in layouts(run.primitives, self._order)]
 
         def read(data: bytes, position: int) -> tuple[Any, int]:
@@ -213,27 +213,24 @@ class ReaderFactory:
 class Run(NamedTuple):
     """Neighbouring single numbers of a message."""
 
-    names: tuple[str, ...]
+    fields: list[Field]
     primitives: list[Primitive]
 
 
 def group_numbers(fields: tuple[Field, ...]) -> list[Run | Field]:
     """Fields in order, neighbouring single numbers taken together."""
     groups: list[Run | Field] = []
-    names: list[str] = []
-    primitives: list[Primitive] = []
+    run = Run([], [])
     for field in fields:
         primitive = field.type.primitive
         if field.type.shape is Shape.SCALAR and primitive is not None and primitive.code:
-            names.append(field.name)
-            primitives.append(primitive)
-            continue
-        if names:
-            groups.append(Run(tuple(names), primitives))
-            names, primitives = [], []
-        groups.append(field)
-    if names:
-        groups.append(Run(tuple(names), primitives))
+            if not run.fields:
+                groups.append(run)
+            run.fields.append(field)
+            run.primitives.append(primitive)
+        else:
+            groups.append(field)
+            run = Run([], [])
     return groups
 
 

@@ -35,6 +35,8 @@ _NUMBERS = {
     "d": frozenset({float, int}),
 }
 _INTEGER = frozenset({int})
+_ZEROS = object()
+"""Default of a fixed array of numbers, which may be long."""
 _KINDS = {
     type(None): "null",
     bool: "a boolean",
@@ -76,7 +78,7 @@ class WriterFactory:
     def _message(self, definition: Definition) -> Write:
         known = {field.name for field in definition.fields}
         steps = [
-            _run(each, definition) if isinstance(each, Run) else self._named(each)
+            _run(each) if isinstance(each, Run) else self._named(each)
             for each in group_numbers(definition.fields)
         ]
         ros1 = definition.name in _ROS1_TIME
@@ -127,6 +129,8 @@ def _default(field: Field) -> Any:
     zero: Any = {} if kind.primitive is None else kind.primitive.zero
     if kind.shape is Shape.SCALAR:
         return zero
+    if kind.shape is Shape.ARRAY and kind.primitive is not None and kind.primitive.code:
+        return _ZEROS
     return [] if kind.shape is Shape.SEQUENCE else [zero] * kind.length
 
 
@@ -141,12 +145,11 @@ def _empty(definition: Definition) -> Write:
     return write
 
 
-def _run(run: Run, definition: Definition) -> Write:
+def _run(run: Run) -> Write:
     """Neighbouring numbers: packed at once, looked at one by one only when that fails."""
-    defaults = {field.name: field.default for field in definition.fields}
     parts = [
-        (name, primitive.zero if defaults[name] is None else defaults[name], accepted(primitive))
-        for name, primitive in zip(run.names, run.primitives, strict=True)
+        (field.name, _default(field), accepted(primitive))
+        for field, primitive in zip(run.fields, run.primitives, strict=True)
     ]
     packers = [codec.pack for codec, _ in layouts(run.primitives, "<")]
 
@@ -219,7 +222,9 @@ def _number_array(kind: FieldType, primitive: Primitive) -> Write:
     code = "B" if primitive.code == "?" else primitive.code
 
     def write(out: bytearray, value: Any, now: int) -> None:
-        if is_bytes and type(value) is str:
+        if value is _ZEROS:
+            body = bytes(kind.length * primitive.size)
+        elif is_bytes and type(value) is str:
             body = _from_base64(value)
             _check_length(kind, len(body))
         else:
