@@ -15,6 +15,8 @@ from relay_protocol.errors import Invalid
 
 _POSTGRES_NAMES = {"postgresql", "postgres", "postgresql+psycopg"}
 
+_SQLITE_NAMES = {"sqlite", "sqlite+pysqlite"}
+
 
 class Database:
     """One database. Methods may be called from any thread; a session belongs to the thread that opened it.
@@ -89,6 +91,12 @@ def _view(engine: Engine, *, write: bool) -> Engine:
 
 
 def _parse(url: str) -> URL:
+    scheme, _, path = url.partition(":///")
+    if scheme in _SQLITE_NAMES:
+        if path in ("", ":memory:") or "?" in path:
+            raise Invalid("give the database a file: sqlite:///FILE, without anything after it")
+        # taken as it is: whether SQLAlchemy decodes %20 in a path depends on its version
+        return URL.create("sqlite", database=path)
     try:
         parsed = make_url(url)
     except ArgumentError:
@@ -97,8 +105,6 @@ def _parse(url: str) -> URL:
         ) from None
     if parsed.drivername in _POSTGRES_NAMES:
         return parsed.set(drivername="postgresql+psycopg")
-    if parsed.drivername in {"sqlite", "sqlite+pysqlite"}:
-        if parsed.database in (None, "", ":memory:") or parsed.query:
-            raise Invalid("give the database a file: sqlite:///FILE, without anything after it")
-        return parsed
+    if parsed.drivername in _SQLITE_NAMES:
+        raise Invalid("give the database a file: sqlite:///FILE")
     raise Invalid(f"'{parsed.drivername}' is no database known here; use sqlite or postgresql")

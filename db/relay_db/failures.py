@@ -28,8 +28,7 @@ _SQLITE = {
 
 _POSTGRES = {
     "08": "the database server can't be reached",
-    "28": "the database server refuses the login; check user and password in the database URL",
-    "3D": "the database named in the URL does not exist; create it",
+    "28": "the database server refuses the connection; check user, password and database in the database URL",
     "40": "another change came in between; try again",
     "53": "the database server is out of disk, memory or connections",
     "55": "the database is locked by another process; try again",
@@ -70,7 +69,12 @@ def _sentence(error: exc.DBAPIError) -> str | None:
         return _SQLITE.get(code & _PRIMARY)
     state = getattr(original, "sqlstate", None)
     if state is None:
-        # psycopg gives no SQLSTATE when there is no server to give one
-        lost = isinstance(error, (exc.OperationalError, exc.InterfaceError)) or error.connection_invalidated
-        return _POSTGRES["08"] if lost else None
+        return _unconnected(error)
     return _POSTGRES.get(state[:2])
+
+
+def _unconnected(error: exc.DBAPIError) -> str | None:
+    """libpq gives no SQLSTATE for what goes wrong while connecting; FATAL is a server that says no."""
+    if not isinstance(error, (exc.OperationalError, exc.InterfaceError)) and not error.connection_invalidated:
+        return None
+    return _POSTGRES["28"] if "FATAL" in str(error.orig) else _POSTGRES["08"]

@@ -1,0 +1,170 @@
+"""Transactions, and what becomes of the database's own troubles."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import psycopg
+import pytest
+from sqlalchemy import text
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_protocol.errors import Invalid, Unavailable
+
+
+def test_a_transaction_is_committed_at_its_end(database: Database) -> None:
+    """What one transaction wrote, the next session reads."""
+    with database.begin() as s:
+        queries.add_robot(s, "rover")
+    with database.reading() as s:
+        assert queries.find_robot(s, "rover") is not None
+
+
+def test_an_error_rolls_the_transaction_back(database: Database) -> None:
+    """An error in the body leaves nothing behind and goes on as it is."""
+    with pytest.raises(Invalid), database.begin() as s:
+        queries.add_robot(s, "rover")
+        queries.add_robot(s, "rover")
+    with database.reading() as s:
+        assert queries.find_robot(s, "rover") is None
+
+
+def test_a_reading_session_cannot_write(database: Database) -> None:
+    """A change through reading() is refused by the database itself, and later changes are not."""
+    with pytest.raises(Unavailable), database.reading() as s:
+        queries.add_robot(s, "rover")
+    with database.begin() as s:
+        queries.add_robot(s, "rover")
+
+
+def test_a_reading_session_sees_one_state(sqlite: Database) -> None:
+    """On SQLite a change made meanwhile is not seen by a session that has begun to read."""
+    with sqlite.reading() as reader:
+        before = queries.revision(reader)
+        with sqlite.begin() as s:
+            queries.add_robot(s, "rover")
+        assert queries.revision(reader) == before
+
+
+def test_sqlite_has_one_writer_and_postgresql_several(sqlite: Database, postgresql: Database) -> None:
+    """``writers`` tells how many threads are of use."""
+    assert sqlite.writers == 1
+    assert postgresql.writers > 1
+
+
+def test_a_locked_row_is_told_in_words(postgresql: Database) -> None:
+    """On PostgreSQL a change that waits too long for another is given up with a sentence."""
+    with postgresql.begin() as holder:
+        queries.add_robot(holder, "one")
+        with pytest.raises(Unavailable, match="locked"), postgresql.begin() as s:
+            s.execute(text("SET LOCAL lock_timeout = '50ms'"))
+            queries.add_robot(s, "two")
+
+
+def test_two_changes_that_contradict_are_told_in_words(postgresql: Database) -> None:
+    """On PostgreSQL the second of two users of one name, added at once, is refused by the constraint."""
+    with postgresql.begin() as s:
+        realm = s.execute(text("SELECT id FROM realm")).scalar_one()
+        insert = text(
+            "INSERT INTO user_account (realm_id, name, admin, disabled) VALUES (:realm, 'ann', false, false)"
+        )
+        s.execute(insert, {"realm": realm})
+    with pytest.raises(Unavailable, match="same time"), postgresql.begin() as s:
+        s.execute(insert, {"realm": realm})
+
+
+def test_lost_connections_are_replaced(postgresql: Database, postgres_url: str) -> None:
+    """When the server drops our connections, the next session simply gets a new one."""
+    with postgresql.reading() as s:
+        before = queries.revision(s)
+    with psycopg.connect(postgres_url, autocommit=True) as other:
+        other.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+            "WHERE datname = current_database() AND pid <> pg_backend_pid()"
+        )
+    with postgresql.reading() as s:
+        assert queries.revision(s) == before
+
+
+def test_a_connection_lost_in_a_transaction_is_told_in_words(postgresql: Database, postgres_url: str) -> None:
+    """When the server goes in the middle, the change fails with a sentence and nothing is written."""
+    with pytest.raises(Unavailable), postgresql.begin() as s:
+        queries.add_robot(s, "rover")
+        with psycopg.connect(postgres_url, autocommit=True) as other:
+            other.execute(
+                "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+                "WHERE datname = current_database() AND pid <> pg_backend_pid()"
+            )
+        queries.add_robot(s, "other")
+    with postgresql.reading() as s:
+        assert queries.list_robots(s) == []
+
+
+def test_a_server_that_is_not_there_is_told_in_words(free_port: int) -> None:
+    """Nothing listens: a sentence, in which neither user nor password occurs."""
+    database = Database(f"postgresql://someone:hunter22@127.0.0.1:{free_port}/switchboard")
+    with pytest.raises(Unavailable, match="can't be reached") as caught:
+        database.upgrade()
+    assert "hunter22" not in str(caught.value)
+    assert "hunter22" not in database.url
+
+
+@pytest.fixture
+def free_port() -> int:
+    """A port nobody listens on."""
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+def test_a_missing_database_is_told_in_words(postgres_url: str) -> None:
+    """A server without the named database says so."""
+    database = Database(postgres_url.replace("/test_", "/nowhere_"))
+    with pytest.raises(Unavailable, match="refuses the connection"):
+        database.upgrade()
+
+
+@pytest.mark.parametrize("scheme", ["postgresql", "postgres", "postgresql+psycopg"])
+def test_the_usual_ways_to_name_postgresql_work(new_postgres_url: Callable[[], str], scheme: str) -> None:
+    """The driver need not be named."""
+    database = Database(new_postgres_url().replace("postgresql:", f"{scheme}:"))
+    database.upgrade()
+    with database.reading() as s:
+        assert queries.revision(s) == 1
+    database.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("nonsense", "no database URL"),
+        ("mysql://host/name", "mysql"),
+        ("sqlite://", "file"),
+        ("sqlite:///:memory:", "file"),
+        ("sqlite:///some.db?mode=ro", "without anything after"),
+    ],
+)
+def test_a_url_that_cannot_be_is_refused(url: str, words: str) -> None:
+    """The error says what to write instead."""
+    with pytest.raises(Invalid, match=words):
+        Database(url)
+
+
+def test_without_the_driver_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PostgreSQL without psycopg: the sentence tells which extra to install."""
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    with pytest.raises(Invalid, match="extra 'postgresql'"):
+        Database("postgresql://localhost/switchboard")
+
+
+def test_errors_show_no_parameters(database: Database) -> None:
+    """Values of a failed statement, among them hashes, stay out of errors and so out of logs."""
+    insert = text("INSERT INTO realm (id, name) VALUES (1, :name)")
+    with pytest.raises(Unavailable) as caught, database.connection() as connection:
+        connection.execute(insert, {"name": "f00dface"})
+    assert "f00dface" not in str(caught.value)
+    assert "f00dface" not in str(caught.value.__cause__)

@@ -1,0 +1,142 @@
+"""The tables that migrations make are the tables the models describe."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import CheckConstraint, inspect, text
+
+from relay_db import queries, schema
+from relay_db.base import Base
+from relay_db.engine import Database
+from relay_protocol.errors import Unavailable
+
+FOLDER = Path(schema.__file__).parent / "migrations"
+
+
+def _scripts() -> ScriptDirectory:
+    config = Config()
+    config.set_main_option("script_location", str(FOLDER))
+    return ScriptDirectory.from_config(config)
+
+
+def test_models_match_the_migrations(database: Database) -> None:
+    """Alembic finds nothing to change after an upgrade from empty."""
+    with database.connection() as connection:
+        context = MigrationContext.configure(
+            connection, opts={"compare_type": True, "compare_server_default": True}
+        )
+        assert compare_metadata(context, Base.metadata) == []
+
+
+def test_check_constraints_match_the_migrations(database: Database) -> None:
+    """Alembic does not compare CHECK constraints, so their names are compared here."""
+    with database.connection() as connection:
+        inspector = inspect(connection)
+        made = {
+            (table, check["name"])
+            for table in Base.metadata.tables
+            for check in inspector.get_check_constraints(table)
+        }
+    meant = {
+        (table.name, str(constraint.name))
+        for table in Base.metadata.tables.values()
+        for constraint in table.constraints
+        if isinstance(constraint, CheckConstraint)
+    }
+    assert made == meant
+    assert meant
+
+
+def test_the_head_in_the_code_is_the_newest_migration() -> None:
+    """The quick look at the version compares with the right one."""
+    assert _scripts().get_heads() == [schema.HEAD]
+
+
+def test_an_upgrade_of_a_current_database_changes_nothing(database: Database) -> None:
+    """A second upgrade keeps what is there."""
+    with database.begin() as s:
+        queries.add_robot(s, "rover")
+    database.upgrade()
+    with database.reading() as s:
+        assert queries.find_robot(s, "rover") is not None
+
+
+def test_a_new_database_has_the_default_realm_and_revision_one(database: Database) -> None:
+    """Seeds are there."""
+    with database.reading() as s:
+        assert [realm.name for realm in queries.list_realms(s)] == ["default"]
+        assert queries.revision(s) == 1
+
+
+def test_a_newer_schema_is_refused_in_words(database: Database) -> None:
+    """Old code does not touch the database of newer code."""
+    with database.connection() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    with pytest.raises(Unavailable, match=r"newer Switchboard.*9999"):
+        database.upgrade()
+
+
+def test_a_failing_migration_leaves_nothing(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Migrations run in one transaction on both databases: half a schema is never seen."""
+    from alembic import command
+
+    run = command.upgrade
+
+    def run_and_fail(*args: object) -> None:
+        run(*args)  # type: ignore[arg-type]
+        raise RuntimeError("power cut")
+
+    monkeypatch.setattr(command, "upgrade", run_and_fail)
+    database = Database(url)
+    with pytest.raises(RuntimeError, match="power cut"):
+        database.upgrade()
+    with database.connection() as connection:
+        assert inspect(connection).get_table_names() == []
+    monkeypatch.undo()
+    database.upgrade()
+    database.close()
+
+
+def test_processes_that_start_at_once_upgrade_once(url: str) -> None:
+    """Three processes find an empty database; all of them end well, with one set of tables."""
+    program = (
+        "import sys; from relay_db.engine import Database; d = Database(sys.argv[1]); d.upgrade(); d.close()"
+    )
+    paths = [path for path in sys.path if path]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", f"import sys; sys.path[:0] = {paths!r}; {program}", url],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(3)
+    ]
+    errors = [process.communicate(timeout=60)[1] for process in started]
+    assert [(process.returncode, error) for process, error in zip(started, errors, strict=True)] == [
+        (0, "")
+    ] * 3
+    database = Database(url)
+    with database.reading() as s:
+        assert [realm.name for realm in queries.list_realms(s)] == ["default"]
+    database.close()
+
+
+@pytest.mark.parametrize(
+    "statement", ["UPDATE audit_entry SET actor = 'someone else'", "DELETE FROM audit_entry"]
+)
+def test_the_audit_log_only_grows(database: Database, statement: str) -> None:
+    """The database itself refuses to change or remove an entry."""
+    with database.begin() as s:
+        queries.append_audit(s, at=1.0, actor="user:ann", action="test", target="x")
+    with pytest.raises(Exception, match=r"only grows|same time"), database.connection() as connection:
+        connection.execute(text(statement))
+    with database.reading() as s:
+        assert [entry.actor for entry in queries.list_audit(s)] == ["user:ann"]

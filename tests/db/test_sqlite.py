@@ -1,0 +1,127 @@
+"""The embedded database: durable, private, and its troubles in words."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from relay_db import queries
+from relay_db import sqlite as edge
+from relay_db.engine import Database
+from relay_protocol.errors import Unavailable
+
+
+@pytest.fixture
+def open_umask() -> Iterator[None]:
+    """A process that would make everything world-readable."""
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.usefixtures("open_umask")
+def test_the_files_are_for_their_owner_only(sqlite_url: str, tmp_path: Path) -> None:
+    """The folder and all files of the database are closed to others, whatever the umask."""
+    database = Database(sqlite_url)
+    database.upgrade()
+    with database.begin() as s:
+        queries.add_robot(s, "rover")
+        modes = {each.name: stat.S_IMODE(each.stat().st_mode) for each in (tmp_path / "data").iterdir()}
+    database.close()
+    assert modes == {"switchboard.db": 0o600, "switchboard.db-wal": 0o600, "switchboard.db-shm": 0o600}
+    assert stat.S_IMODE((tmp_path / "data").stat().st_mode) == 0o700
+
+
+def test_a_world_readable_file_is_closed(sqlite_url: str, tmp_path: Path) -> None:
+    """A database that came with an open mode loses it when it is opened; the group's rights stay."""
+    Database(sqlite_url).close()
+    path = tmp_path / "data" / "switchboard.db"
+    path.chmod(0o664)
+    Database(sqlite_url).close()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o660
+
+
+def test_the_settings_are_those_of_a_durable_database(sqlite: Database) -> None:
+    """WAL, foreign keys, and a sync at every commit."""
+    with sqlite.reading() as s:
+        connection = s.connection()
+        values = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "foreign_keys", "synchronous")
+        }
+    assert values == {"journal_mode": "wal", "foreign_keys": 1, "synchronous": 2}
+
+
+def test_odd_paths_work(tmp_path: Path) -> None:
+    """Blanks, percent signs and hashes in a path are taken as they are."""
+    path = tmp_path / "a b%20#c" / "d.db"
+    database = Database(f"sqlite:///{path}")
+    database.upgrade()
+    database.close()
+    assert path.exists()
+
+
+def test_a_locked_database_is_told_in_words(
+    sqlite_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process holds the write lock for too long: a sentence; afterwards it works again."""
+    monkeypatch.setattr(edge, "BUSY_SECONDS", 0.05)
+    database = Database(sqlite_url)
+    database.upgrade()
+    other = sqlite3.connect(tmp_path / "data" / "switchboard.db", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(Unavailable, match="locked"), database.begin() as s:
+        queries.add_robot(s, "rover")
+    with database.reading() as s:
+        assert queries.revision(s) == 1
+    other.execute("ROLLBACK")
+    other.close()
+    with database.begin() as s:
+        queries.add_robot(s, "rover")
+    database.close()
+
+
+def test_a_full_disk_is_told_in_words(sqlite: Database) -> None:
+    """No page can be added: a sentence, nothing half-written, and reading goes on."""
+    with pytest.raises(Unavailable, match="full"), sqlite.begin() as s:
+        pages = s.connection().exec_driver_sql("PRAGMA page_count").scalar_one()
+        s.connection().exec_driver_sql(f"PRAGMA max_page_count = {pages}")
+        for number in range(10_000):
+            queries.add_robot(s, f"rover-{number}", "x" * 255)
+    with sqlite.reading() as s:
+        assert queries.list_robots(s) == []
+
+
+def test_a_vanished_file_is_told_in_words_and_not_made_anew(sqlite_url: str, tmp_path: Path) -> None:
+    """A database that disappears is an error, not a fresh one without users."""
+    database = Database(sqlite_url)
+    path = tmp_path / "data" / "switchboard.db"
+    for each in path.parent.iterdir():
+        each.unlink()
+    with pytest.raises(Unavailable, match="can't be opened"):
+        database.upgrade()
+    assert not path.exists()
+
+
+def test_a_file_that_is_no_database_is_told_in_words(sqlite_url: str, tmp_path: Path) -> None:
+    """Something else under the name: a sentence, and the file stays as it was."""
+    path = tmp_path / "data" / "switchboard.db"
+    path.parent.mkdir()
+    path.write_bytes(b"a letter to aunt Emma\n" * 100)
+    database = Database(sqlite_url)
+    with pytest.raises(Unavailable, match="no SQLite database"):
+        database.upgrade()
+    assert path.read_bytes() == b"a letter to aunt Emma\n" * 100
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_words(tmp_path: Path) -> None:
+    """A file where the folder should be: a sentence without the path."""
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(Unavailable, match="can't be used") as caught:
+        Database(f"sqlite:///{tmp_path}/taken/switchboard.db")
+    assert str(tmp_path) not in str(caught.value)
