@@ -311,7 +311,7 @@ class CallService(Message, frozen=True, kw_only=True):
     type: str
     timeout: float
     cdr: str | None = None
-    args: msgspec.Raw | None = None
+    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
 
 
 class GetType(Message, frozen=True, kw_only=True):
@@ -366,7 +366,7 @@ class ServiceResponse(Message, frozen=True, kw_only=True):
     id: str
     result: bool
     cdr: str | None = None
-    values: msgspec.Raw | None = None
+    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
     reason: str = ""
 
 

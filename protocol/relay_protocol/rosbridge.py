@@ -62,7 +62,7 @@ class Unsubscribe(Message, frozen=True, kw_only=True):
 class CallService(Message, frozen=True, kw_only=True):
     service: str
     id: Id = None
-    args: msgspec.Raw | None = None
+    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
     type: str = ""
     fragment_size: int | None = None
     compression: str = "none"
@@ -73,7 +73,7 @@ class ServiceResponse(Message, frozen=True, kw_only=True):
     service: str
     result: bool = True
     id: Id = None
-    values: msgspec.Raw | None = None
+    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
 
 
 class AdvertiseService(Message, frozen=True, kw_only=True):

@@ -278,7 +278,7 @@ def _scalar(kind: FieldType, primitive: Primitive, text: str) -> Any:
             raise ValueError
         return _BOOLEANS[text.lower()]
     number = float(text) if primitive.code in "fd" else _integer(text)
-    struct.pack(primitive.code, number)
+    struct.pack("<" + primitive.code, number)
     return number
 
 

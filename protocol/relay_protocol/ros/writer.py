@@ -202,7 +202,7 @@ def fit(value: Any, primitive: Primitive) -> Any:
     elif type(value) is not int:
         raise Mismatch(f"must be an integer, not {_fraction(value)}")
     try:
-        struct.pack(primitive.code, value)
+        struct.pack("<" + primitive.code, value)
     except (struct.error, OverflowError):
         raise Mismatch(f"is out of range for {_msg_name(primitive)}") from None
     return value

@@ -1,0 +1,134 @@
+"""JSON messages of the robot link."""
+
+from __future__ import annotations
+
+import types
+import typing
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_protocol import frames, jsontext, link
+from relay_protocol.errors import Invalid, MalformedMessage
+
+DECODERS = {
+    name: decoder for name, decoder in vars(link).items() if isinstance(decoder, msgspec.json.Decoder)
+}
+MESSAGES = [
+    (name, message) for name, decoder in DECODERS.items() for message in typing.get_args(decoder.type)
+]
+TEXT = st.text(max_size=8)
+
+
+def values(kind: Any) -> st.SearchStrategy[Any]:
+    """Values of one annotation."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return st.one_of(*map(values, arguments))
+    if origin is list:
+        return st.lists(values(arguments[0]), max_size=3)
+    if origin is dict:
+        return st.dictionaries(TEXT, values(arguments[1]), max_size=3)
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return structs(kind)
+    return {
+        str: TEXT,
+        int: st.integers(-(2**63), 2**63 - 1),
+        bool: st.booleans(),
+        float: st.floats(allow_nan=False, allow_infinity=False),
+        type(None): st.none(),
+        msgspec.UnsetType: st.just(msgspec.UNSET),
+        Any: st.none() | st.booleans() | TEXT,
+        msgspec.Raw: st.sampled_from([b"{}", b'{"a":1}', b"[1,2]"]).map(msgspec.Raw),
+    }[kind]
+
+
+def structs(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
+    """Messages of one type with any fields."""
+    hints = typing.get_type_hints(kind)
+    return st.fixed_dictionaries({name: values(hints[name]) for name in kind.__struct_fields__}).map(
+        lambda fields: kind(**fields)
+    )
+
+
+def comparable(value: Any) -> Any:
+    """Raw values compare by identity; their text compares by content."""
+    if isinstance(value, msgspec.Raw):
+        return bytes(value)
+    if isinstance(value, msgspec.Struct):
+        return type(value), {name: comparable(getattr(value, name)) for name in value.__struct_fields__}
+    return value
+
+
+@given(st.sampled_from(MESSAGES), st.data())
+def test_every_message_survives_the_wire(case: tuple[str, type[msgspec.Struct]], data: st.DataObject) -> None:
+    """Encoded, framed, cut out and decoded, each message of each link is what it was."""
+    decoder, message = case
+    sent = data.draw(structs(message))
+    (frame,) = frames.FrameDecoder(limit=100_000).feed(link.frame(sent))
+    assert isinstance(frame, frames.JsonFrame)
+    assert comparable(jsontext.decode(DECODERS[decoder], frame.body)) == comparable(sent)
+
+
+@given(st.sampled_from(sorted(DECODERS)), st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
+def test_junk_raises_nothing_but_malformed(decoder: str, data: bytes) -> None:
+    """No bytes make a decoder fail otherwise."""
+    with pytest.raises(MalformedMessage):
+        jsontext.decode(DECODERS[decoder], data)
+
+
+def test_tags_are_the_snake_case_names() -> None:
+    """The op of a message follows from its name."""
+    tags = {message.__struct_config__.tag for _, message in MESSAGES}
+    assert {"open_channel", "call_service", "type_definition", "hello"} <= tags
+
+
+def test_defaults_are_left_out() -> None:
+    """A sender writes only what is not the default."""
+    assert (
+        jsontext.encode(link.Subscribe(number=1, topic="/a")) == b'{"op":"subscribe","number":1,"topic":"/a"}'
+    )
+
+
+def test_unknown_fields_are_passed_over() -> None:
+    """A newer peer may say more."""
+    message = jsontext.decode(link.relay_control_decoder, b'{"op":"bye","reason":"x","later":[1]}')
+    assert message == link.Bye(reason="x")
+
+
+def test_an_unknown_op_is_told_with_those_known() -> None:
+    """The error says what would have been right here."""
+    with pytest.raises(MalformedMessage) as caught:
+        jsontext.decode(link.relay_control_decoder, b'{"op":"subscribe","number":1,"topic":"/a"}')
+    assert (
+        str(caught.value) == "unknown op 'subscribe'; known are bye, close_channel, open_channel, ping, pong"
+    )
+
+
+def test_a_long_unknown_op_is_cut_short() -> None:
+    """A stranger's text does not fill the log."""
+    with pytest.raises(MalformedMessage) as caught:
+        jsontext.decode(link.opening_decoder, b'{"op":"' + b"x" * 10_000 + b'"}')
+    assert len(str(caught.value)) < 120
+
+
+def test_a_missing_field_is_named() -> None:
+    """The error says what is missing."""
+    with pytest.raises(MalformedMessage, match="missing required field `nonce`"):
+        jsontext.decode(link.opening_reply_decoder, b'{"op":"challenge","relay":"r"}')
+
+
+@given(st.binary(max_size=40))
+def test_base64_fields_survive(data: bytes) -> None:
+    """Bytes in a JSON field come back as they were."""
+    assert link.from_base64(link.to_base64(data), "x") == data
+
+
+@pytest.mark.parametrize("text", ["a", "ab=c", "####", "YQ", "ß", "YQ==\n"])
+def test_what_is_no_base64_is_refused_by_name(text: str) -> None:
+    """The error names the field."""
+    with pytest.raises(Invalid, match="nonce is not base64"):
+        link.from_base64(text, "nonce")

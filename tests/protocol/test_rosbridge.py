@@ -1,0 +1,81 @@
+"""rosbridge operations of clients."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_protocol import rosbridge
+from relay_protocol.errors import MalformedMessage
+
+
+def test_a_publish_keeps_its_body_undecoded() -> None:
+    """The body is the client's own text, byte for byte."""
+    message = rosbridge.decode(b'{"op":"publish","topic":"/a","msg":{"x" : 1.50}}')
+    assert isinstance(message, rosbridge.Publish)
+    assert bytes(message.msg) == b'{"x" : 1.50}'
+
+
+@pytest.mark.parametrize(("text", "wanted"), [('"a"', "a"), ("7", 7), ("null", None)])
+def test_ids_are_strings_numbers_or_none(text: str, wanted: object) -> None:
+    """Clients that number their calls are understood."""
+    message = rosbridge.decode(f'{{"op":"unsubscribe","topic":"/a","id":{text}}}'.encode())
+    assert isinstance(message, rosbridge.Unsubscribe)
+    assert message.id == wanted
+
+
+def test_arguments_may_be_a_list_or_an_object() -> None:
+    """Both of rosbridge's forms pass to the type's judge undecoded."""
+    for args in (b"[1,2]", b'{"a":1}'):
+        message = rosbridge.decode(b'{"op":"call_service","service":"/s","args":' + args + b"}")
+        assert isinstance(message, rosbridge.CallService)
+        assert isinstance(message.args, msgspec.Raw)
+        assert bytes(message.args) == args
+
+
+def test_absent_arguments_are_told_from_null() -> None:
+    """No arguments are falsy; null is a text like any other."""
+    absent = rosbridge.decode(b'{"op":"call_service","service":"/s"}')
+    null = rosbridge.decode(b'{"op":"call_service","service":"/s","args":null}')
+    assert isinstance(absent, rosbridge.CallService)
+    assert isinstance(null, rosbridge.CallService)
+    assert not absent.args
+    assert isinstance(null.args, msgspec.Raw)
+    assert bytes(null.args) == b"null"
+
+
+def test_an_unknown_op_is_told_with_those_known() -> None:
+    """The error names the op and what would have been right."""
+    with pytest.raises(MalformedMessage, match=r"unknown op 'subscrbe'; known are advertise, .*unsubscribe"):
+        rosbridge.decode(b'{"op":"subscrbe","topic":"/a"}')
+
+
+def test_two_ops_are_refused_as_such() -> None:
+    """A message with op twice is not taken for an unknown one."""
+    with pytest.raises(MalformedMessage, match="'op' twice"):
+        rosbridge.decode(b'{"op":"subscribe","op":"publish","topic":"/a"}')
+
+
+@given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
+def test_junk_raises_nothing_but_malformed(data: bytes) -> None:
+    """No bytes make the decoder fail otherwise."""
+    with pytest.raises(MalformedMessage):
+        rosbridge.decode(data)
+
+
+@given(st.text(max_size=20), st.none() | st.integers(-(2**53), 2**53) | st.text(max_size=5), st.booleans())
+def test_what_the_relay_sends_is_json(text: str, ident: rosbridge.Id, result: bool) -> None:
+    """Messages to clients are put together from parts and are whole JSON all the same."""
+    publish = json.loads(rosbridge.publish(text, b'{"a":1}'))
+    assert publish == {"op": "publish", "topic": text, "msg": {"a": 1}}
+    response = json.loads(rosbridge.service_response(text, ident, result, msgspec.json.encode(text)))
+    wanted = {"op": "service_response", "service": text, "result": result, "values": text}
+    assert response == (wanted if ident is None else {**wanted, "id": ident})
+    status = json.loads(rosbridge.status("error", text, ident))
+    assert status["level"] == "error"
+    assert status["msg"] == text
+    assert status.get("id") == ident
