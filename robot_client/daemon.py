@@ -1,0 +1,290 @@
+"""The daemon: a control link for ever, channels as the relay asks for them, graph and health told."""
+
+from __future__ import annotations
+
+import platform as machine
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.protocol import Factory
+from twisted.internet.task import LoopingCall
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError
+from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
+from robot_client.channel import Channel, Wire
+from robot_client.config import Settings
+from robot_client.connection import Connection, Dial
+from robot_client.link import ChannelLink, Ended, Event, JoinedChannel, Said, Sampled
+from robot_client.monitor import Machine
+from robot_client.motion import GuardFeed, MotionDesk
+from robot_client.platforms.base import GraphView, Platform, difference, whole
+from robot_client.tls import explain
+from robot_client.transport import LinkLost, LinkProtocol
+
+ALERTS_KEPT = 32
+
+
+class ChannelEnd(Wire):
+    """Joins a channel to its connection."""
+
+    def __init__(self, name: str, protocol: LinkProtocol, on_gone: Callable[[ChannelEnd, str], None]) -> None:
+        self.name = name
+        self.protocol = protocol
+        self.channel: Channel
+        self._on_gone = on_gone
+
+    def say(self, message: link.Message) -> None:
+        """Send a message."""
+        self.protocol.link.say(message)
+        self.protocol.flush()
+
+    def write(self, frames: list[bytes]) -> None:
+        """Send sample frames."""
+        self.protocol.write(frames)
+
+    def on_event(self, event: Event) -> None:
+        """The relay said something."""
+        if isinstance(event, Sampled):
+            self.channel.sample(event.frame)
+        elif isinstance(event, Said):
+            self.channel.handle(event.message)
+        elif isinstance(event, JoinedChannel) and event.channel != self.name:
+            self.protocol.end(LinkLost(f"the relay joined us to '{event.channel}' instead of '{self.name}'"))
+        elif isinstance(event, Ended):
+            self.protocol.end(LinkLost(f"the relay closed the channel: {event.reason}"), gently=True)
+
+    def on_lost(self, reason: SwitchboardError) -> None:
+        """The connection is gone."""
+        self._on_gone(self, str(reason))
+
+    def on_pause(self) -> None:
+        """The transport is full."""
+        self.channel.pause()
+
+    def on_resume(self) -> None:
+        """The transport has room."""
+        self.channel.resume()
+
+
+class Daemon:
+    """Everything between the relay and one platform.
+
+    :param dial: endpoints by address
+    :param now: monotonic clock, nanoseconds
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        connection: Connection,
+        platform: Platform,
+        guard: GuardFeed,
+        clock: Any,
+        dial: Dial,
+        agent: str,
+        now: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.motion = MotionDesk(settings.safety.policy, platform, clock, now, guard)
+        self._settings = settings
+        self._connection = connection
+        self._platform = platform
+        self._clock = clock
+        self._dial = dial
+        self._agent = agent
+        self._now = now
+        self._started = time.time()
+        self._ends: dict[str, ChannelEnd] = {}
+        self._opening: dict[str, Deferred[Any]] = {}
+        self._dropped = 0
+        self._heartbeat = HEARTBEAT_SECONDS
+        self._frame_limit = ROBOT_FRAME
+        self._told: GraphView | None = None
+        self._alerts: deque[link.Alert] = deque(maxlen=ALERTS_KEPT)
+        self._machine = Machine()
+        self._troubled = False
+        self._loops = [
+            (LoopingCall(self._look_at_graph), 1.0 / settings.ros.graph_hz),
+            (LoopingCall(self._tell_health), settings.monitor.health_seconds),
+        ]
+        self._log = Logger("daemon")
+        connection.follower = self
+
+    def start(self) -> None:
+        """Begin; the platform runs already."""
+        for loop, every in self._loops:
+            loop.clock = self._clock
+            loop.start(every, now=False)
+        self._connection.start()
+
+    def stop(self) -> Deferred[Any]:
+        """Stop the robot, then leave; fires when all connections are gone."""
+        self.motion.stop_all("the daemon is leaving")
+        for loop, _ in self._loops:
+            if loop.running:
+                loop.stop()
+        self._close_channels("the robot's daemon is leaving")
+        return self._connection.stop("the robot's daemon is leaving")
+
+    def alert(self, level: str, text: str) -> None:
+        """Tell a person, now or when the relay can be reached again."""
+        {"error": self._log.error, "warning": self._log.warn}.get(level, self._log.info)("{text}", text=text)
+        message = link.Alert(level=level, text=text)
+        if self._connection.registered:
+            self._connection.say(message)
+        else:
+            self._alerts.append(message)
+
+    # --- control link --------------------------------------------------------------------------------------
+
+    def on_registered(self, welcome: link.Welcome) -> None:
+        """Describe the robot."""
+        self._heartbeat = welcome.heartbeat
+        self._frame_limit = welcome.frame_limit
+        self._connection.say(self._description())
+        self._told = self._platform.graph()
+        self._connection.say(whole(self._told))
+        self._tell_health()
+        while self._alerts:
+            self._connection.say(self._alerts.popleft())
+
+    def on_order(self, message: link.Message) -> None:
+        """The relay wants a channel opened or closed."""
+        if isinstance(message, link.OpenChannel):
+            self._open(message)
+        elif isinstance(message, link.CloseChannel):
+            self._close(message.channel, "nobody is left on this channel")
+
+    def on_unregistered(self, reason: str) -> None:
+        """Without a control link nobody may drive; channels are joined anew."""
+        self.motion.stop_all("the control link is lost")
+        self._told = None
+        self._close_channels(reason)
+
+    # --- channels ------------------------------------------------------------------------------------------
+
+    def _open(self, message: link.OpenChannel) -> None:
+        self._close(message.channel, "it is opened anew")
+        factory = Factory.forProtocol(lambda: self._make_channel(message))
+        factory.noisy = False
+        try:
+            attempt = self._dial(message.address).connect(factory)
+        except SwitchboardError as error:
+            self._log.warn("channel {name} can't be opened: {why}", name=message.channel, why=str(error))
+            return
+        self._opening[message.channel] = attempt
+        attempt.addErrback(self._unreachable, message.channel)
+        attempt.addBoth(lambda _: self._opened(message.channel, attempt))
+
+    def _opened(self, name: str, attempt: Deferred[Any]) -> None:
+        if self._opening.get(name) is attempt:
+            del self._opening[name]
+
+    def _unreachable(self, failure: Failure, name: str) -> None:
+        self._log.warn("channel {name} can't be opened: {why}", name=name, why=explain(failure))
+
+    def _make_channel(self, message: link.OpenChannel) -> LinkProtocol:
+        channel_link = ChannelLink(message.ticket, self._now, self._heartbeat)
+
+        def make_end(protocol: LinkProtocol) -> ChannelEnd:
+            end = ChannelEnd(message.channel, protocol, self._gone)
+            end.channel = Channel(
+                message.channel,
+                end,
+                channel_link.offset,
+                self._platform,
+                self.motion,
+                self._clock,
+                self._frame_limit,
+            )
+            self._ends[message.channel] = end
+            return end
+
+        return LinkProtocol(channel_link, make_end, self._clock)
+
+    def _gone(self, end: ChannelEnd, reason: str) -> None:
+        end.channel.close()
+        self._dropped += end.channel.uplink.dropped
+        if self._ends.get(end.name) is end:
+            del self._ends[end.name]
+        self._log.info("channel {name} ended: {reason}", name=end.name, reason=reason)
+
+    def _close(self, name: str, why: str) -> None:
+        attempt = self._opening.pop(name, None)
+        if attempt is not None:
+            attempt.cancel()
+        end = self._ends.pop(name, None)
+        if end is not None:
+            # At once, not when the connection is gone: what moves must stop, what is subscribed must end.
+            end.channel.close()
+            end.say(link.Bye(reason=why))
+            end.protocol.end(LinkLost(why), gently=True)
+
+    def _close_channels(self, why: str) -> None:
+        for name in {*self._opening, *self._ends}:
+            self._close(name, why)
+
+    # --- what the relay is told ----------------------------------------------------------------------------
+
+    def _description(self) -> link.Describe:
+        facts = self._platform.facts()
+        return link.Describe(
+            host=socket.gethostname(),
+            platform=facts.platform,
+            distro=facts.distro,
+            os=_operating_system(),
+            agent=self._agent,
+            started=self._started,
+            motion=self.motion.policy,
+            extra=facts.extra,
+        )
+
+    def _look_at_graph(self) -> None:
+        self._look_for_trouble()
+        if self._told is None:
+            return
+        try:
+            view = self._platform.graph()
+        except Exception:  # a look that fails must not be the last one
+            self._log.failure("the graph could not be read")
+            return
+        changes = difference(self._told, view)
+        self._told = view
+        if changes is not None:
+            self._connection.say(changes)
+
+    def _look_for_trouble(self) -> None:
+        trouble = self._platform.trouble()
+        if trouble is not None and not self._troubled:
+            self.alert("error", trouble)
+        elif trouble is None and self._troubled:
+            self.alert("info", "the robot's middleware serves again")
+        self._troubled = trouble is not None
+
+    def _tell_health(self) -> None:
+        round_trip = self._connection.round_trip
+        self._connection.say(
+            link.Health(
+                battery=self._platform.battery(),
+                cpu=self._machine.cpu(),
+                memory=self._machine.memory(),
+                rtt_ms=round(round_trip * 1000, 3) if round_trip is not None else None,
+                stale_commands=self.motion.stale_commands,
+                watchdog_stops=self.motion.watchdog_stops,
+                dropped_samples=self._dropped
+                + sum(each.channel.uplink.dropped for each in self._ends.values()),
+            )
+        )
+
+
+def _operating_system() -> str:
+    try:
+        return machine.freedesktop_os_release().get("PRETTY_NAME", "")
+    except OSError:
+        return f"{machine.system()} {machine.release()}"

@@ -1,0 +1,159 @@
+"""The daemon's side of its guard: start it, feed it, see that it lives, start it again."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred, succeed
+from twisted.internet.error import ProcessExitedAlready
+from twisted.internet.protocol import ProcessProtocol
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from robot_client.guard_protocol import Command, Leave, Line, Probe, Topic, encode
+from robot_client.reactors import Timer
+
+PROBE_EVERY = 5.0
+SILENT = 20.0
+"""Seconds without an answer after which a guard is taken for frozen; its start may take some."""
+
+RESTART = (1.0, 30.0)
+LEAVE = 2.0
+
+
+class GuardKeeper:
+    """Feeds a guard that is always there; a :class:`~robot_client.motion.GuardFeed`.
+
+    :param reactor: for processes and timers
+    :param node: name of the guard's node
+    :param within_ms: time to stop, milliseconds
+    """
+
+    def __init__(self, reactor: Any, node: str, within_ms: int) -> None:
+        self.on_alert: Callable[[str, str], None] = lambda level, text: None
+        self._reactor = reactor
+        self._arguments = ["-m", "robot_client.guard", "--node", node, "--within-ms", str(within_ms)]
+        self._process: _Process | None = None
+        self._topics: dict[str, Topic] = {}
+        self._commands: dict[str, Command] = {}
+        self._failures = 0
+        self._timer: Timer | None = None
+        self._left: Deferred[None] | None = None
+        self._log = Logger("guard")
+
+    def start(self) -> None:
+        """Start a guard and tell it all that matters now."""
+        self._timer = None
+        self._process = process = _Process(self)
+        try:
+            self._reactor.spawnProcess(
+                process,
+                sys.executable,
+                [sys.executable, *self._arguments],
+                # Whole: the wheels of ROS keep their library path in it, and the domain must be the same.
+                env=dict(os.environ),
+                childFDs={0: "w", 1: "r", 2: 2},
+            )
+        except OSError as error:
+            self.lost(f"it can't be started: {error.strerror}")
+            return
+        lines: list[Line] = [*self._topics.values(), *self._commands.values()]
+        for line in lines:
+            process.tell(line)
+        self._heard = self._reactor.seconds()
+        self._timer = self._reactor.callLater(PROBE_EVERY, self._probe)
+
+    def stop(self) -> Deferred[None]:
+        """Let the guard leave; fires when it has."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._process is None:
+            return succeed(None)
+        self._left = Deferred()
+        self._process.tell(Leave())
+        self._process.transport.closeStdin()
+        self._timer = self._reactor.callLater(LEAVE, self._process.kill)
+        return self._left
+
+    @property
+    def pid(self) -> int | None:
+        """Process of the guard that lives now."""
+        return self._process.transport.pid if self._process else None
+
+    def topic(self, topic: str, type: str) -> None:
+        """Commands may come on this topic."""
+        if topic not in self._topics:
+            self._topics[topic] = line = Topic(topic, type)
+            self._tell(line)
+
+    def command(self, topic: str, moving: bool, at: int) -> None:
+        """A command went out."""
+        self._commands[topic] = line = Command(topic, moving, at)
+        self._tell(line)
+
+    def heard(self) -> None:
+        """The guard answered."""
+        self._heard = self._reactor.seconds()
+        self._failures = 0
+
+    def lost(self, why: str) -> None:
+        """The guard is gone; get another."""
+        self._process = None
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._timer = None
+        if self._left is not None:
+            self._left.callback(None)
+            return
+        least, most = RESTART
+        delay = min(most, least * 2**self._failures)
+        self._failures += 1
+        self.on_alert("error", f"the motion guard is gone ({why}); another one is started in {delay:.0f} s")
+        self._timer = self._reactor.callLater(delay, self.start)
+
+    def _tell(self, line: Line) -> None:
+        if self._process is not None:
+            self._process.tell(line)
+
+    def _probe(self) -> None:
+        self._timer = None
+        if self._process is None:
+            return
+        if self._reactor.seconds() - self._heard > SILENT:
+            self._log.warn("the motion guard does not answer; it is ended and started anew")
+            self._process.kill()
+            return
+        self._process.tell(Probe())
+        self._timer = self._reactor.callLater(PROBE_EVERY, self._probe)
+
+
+class _Process(ProcessProtocol):
+    """One guard process."""
+
+    transport: Any
+
+    def __init__(self, keeper: GuardKeeper) -> None:
+        self._keeper = keeper
+
+    def tell(self, line: Line) -> None:
+        """Write a line to it."""
+        self.transport.write(encode(line))
+
+    def kill(self) -> None:
+        """End it the hard way."""
+        try:
+            self.transport.signalProcess("KILL")
+        except ProcessExitedAlready:
+            return
+
+    def outReceived(self, data: bytes) -> None:
+        """It answered."""
+        self._keeper.heard()
+
+    def processEnded(self, reason: Failure) -> None:
+        """It is gone and reaped."""
+        self._keeper.lost(reason.getErrorMessage())

@@ -1,0 +1,145 @@
+"""The text of ROS 2 interfaces with every type they contain, in the layout of rosbag2's ``ros2msg``.
+
+Texts come from the ``.msg``, ``.srv`` and ``.action`` files under ``share/``; no ROS is imported here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.limits import TYPE_DEFINITION
+
+RULE = "=" * 80
+_TYPE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)\Z")
+_FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_/]*)(<=\d+)?(\[[^\]]*\])?\s+[A-Za-z]")
+_PRIMITIVES = frozenset(
+    [
+        "bool",
+        "byte",
+        "char",
+        "float32",
+        "float64",
+        "int8",
+        "uint8",
+        "int16",
+        "uint16",
+        "int32",
+        "uint32",
+        "int64",
+        "uint64",
+        "string",
+        "wstring",
+    ]
+)
+
+Lookup = Callable[[str], str | None]
+
+
+def normalise(name: str, kind: str = "msg") -> str:
+    """A type's full name: ``std_msgs/String`` is short for ``std_msgs/msg/String``.
+
+    :param kind: ``msg`` or ``srv``, what a short name means
+    :raises Invalid: no type name
+    """
+    if name.count("/") == 1:
+        name = name.replace("/", f"/{kind}/")
+    if not _TYPE_NAME.match(name):
+        raise Invalid(f"'{name}' is no type; write package/msg/Name or package/srv/Name")
+    return name
+
+
+def prefixes() -> list[Path]:
+    """Where interfaces may be installed: each ``AMENT_PREFIX_PATH``, then where Python's own packages are."""
+    found = [Path(each) for each in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if each]
+    found.append(Path(sys.prefix))
+    for entry in sys.path:
+        # <prefix>/lib/python3.x/site-packages
+        parents = Path(entry).parents
+        if entry.endswith(("site-packages", "dist-packages")) and len(parents) > 2:
+            found.append(parents[2])
+    return list(dict.fromkeys(found))
+
+
+def installed(name: str, where: Iterable[Path], suffix: str = "") -> str | None:
+    """The content of a type's file, ``None`` if there is none.
+
+    :param name: full type name
+    :param suffix: ``.json`` for the description with the hashes, empty for the text
+    """
+    package, kind, short = name.split("/")
+    for prefix in where:
+        path = prefix / "share" / package / kind / (short + (suffix or "." + kind))
+        try:
+            return path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            continue
+    return None
+
+
+def type_hash(name: str, where: Iterable[Path]) -> str:
+    """The RIHS01 hash a distribution wrote beside the type; empty if it has none."""
+    text = installed(name, where, ".json")
+    if text is None:
+        return ""
+    try:
+        hashes = {each["type_name"]: each["hash_string"] for each in json.loads(text)["type_hashes"]}
+    except (ValueError, KeyError, TypeError):
+        return ""
+    return str(hashes.get(name, ""))
+
+
+def full_text(name: str, lookup: Lookup) -> str:
+    """A type's text, then each type it contains after a rule and ``MSG: package/Name``.
+
+    :param lookup: gives the text of one type by its full name
+    :raises NotFound: the type, or one it contains, is not installed
+    :raises Invalid: all together are too large to send
+    """
+    main = lookup(name)
+    if main is None:
+        raise NotFound(f"the type {name} is not installed on this robot")
+    parts = [main.rstrip("\n") + "\n"]
+    known = {name}
+    waiting = contained(main, name.split("/")[0])
+    while waiting:
+        each = waiting.pop(0)
+        if each in known:
+            continue
+        known.add(each)
+        text = lookup(each)
+        if text is None:
+            raise NotFound(f"{name} contains {each}, which is not installed on this robot")
+        package, _, short = each.split("/")
+        parts.append(f"{RULE}\nMSG: {package}/{short}\n{text.rstrip(chr(10))}\n")
+        waiting += contained(text, package)
+    whole = "".join(parts)
+    if len(whole.encode()) > TYPE_DEFINITION:
+        raise Invalid(f"the definition of {name} is larger than {TYPE_DEFINITION} bytes")
+    return whole
+
+
+def contained(text: str, package: str) -> list[str]:
+    """Full names of the messages a text has fields of, in order."""
+    found: dict[str, None] = {}
+    for line in text.splitlines():
+        match = _FIELD.match(line.split("#", 1)[0])
+        if match is None or match[1] in _PRIMITIVES:
+            continue
+        found[_full(match[1], package)] = None
+    return list(found)
+
+
+def _full(name: str, package: str) -> str:
+    parts = name.split("/")
+    if len(parts) == 1:
+        # ROS 1 left a short form that is still written: Header of std_msgs.
+        return (
+            "std_msgs/msg/Header" if name == "Header" and package != "std_msgs" else f"{package}/msg/{name}"
+        )
+    return f"{parts[0]}/msg/{parts[-1]}"

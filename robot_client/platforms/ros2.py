@@ -1,0 +1,221 @@
+"""ROS 2 as a platform, with whatever rclpy the robot has (Humble and later).
+
+The executor turns in a thread of its own (:mod:`~robot_client.platforms.ros2_executor`); everything else
+runs on the reactor's thread.
+"""
+
+from __future__ import annotations
+
+import os
+import platform as machine
+from collections.abc import Callable
+from importlib import metadata
+from typing import Any
+
+import rclpy
+from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
+from twisted.internet.defer import Deferred, fail
+
+from relay_protocol import link
+from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
+from robot_client.platforms import ros2_graph, ros2_qos
+from robot_client.platforms.base import Facts, GraphView, Motion, OnSample, Platform
+from robot_client.platforms.ros2_calls import Calls
+from robot_client.platforms.ros2_executor import Hop, Spinner, make_executor
+from robot_client.platforms.ros2_topics import RosSink, RosSource, check_name, service_type, topic_type
+from robot_client.platforms.ros2_types import Types
+
+BATTERY = "sensor_msgs/msg/BatteryState"
+
+
+class Ros2Platform(Platform):
+    """One node in the robot's ROS 2 graph.
+
+    :param reactor: for timers, and for the way back from the executor's thread
+    :param name: of the node
+    :param guard: name of the guard's node, left out of the graph like our own
+    :param executor: ``events`` or ``single``
+    :param battery: whether to listen to the first battery topic there is
+    """
+
+    encoding = "cdr"
+
+    def __init__(
+        self, reactor: Any, name: str, guard: str = "", executor: str = "events", battery: bool = True
+    ) -> None:
+        self._reactor = reactor
+        self._name = name
+        self._guard = guard
+        self._kind = executor
+        self._want_battery = battery
+        self._own = frozenset("/" + each for each in (name, guard) if each)
+        self._types = Types()
+        self._hop = Hop(reactor.callFromThread)
+        self._sources: list[RosSource] = []
+        self._sinks: list[RosSink] = []
+        self._battery: RosSource | None = None
+        self._battery_sample: bytes | None = None
+        self._context: Any = None
+        self._node: Any = None
+        self._spinner: Any = None
+        self._calls: Any = None
+
+    def start(self) -> None:
+        """Enter the graph."""
+        self._context = rclpy.Context()
+        try:
+            rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+            self._node = rclpy.create_node(
+                self._name, context=self._context, start_parameter_services=False, enable_rosout=False
+            )
+            self._spinner = Spinner(make_executor(self._kind, self._context), self._node)
+        except Exception as error:
+            raise Unavailable(f"ROS 2 does not start: {error}") from error
+        self._calls = Calls(self._node, self._hop, self._types, self._reactor)
+        self._spinner.start()
+
+    def stop(self) -> None:
+        """Leave the graph."""
+        if self._spinner is None:
+            return
+        self._calls.close()
+        for source in list(self._sources):
+            source.close()
+        for sink in list(self._sinks):
+            sink.close()
+        self._spinner.stop()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+        self._spinner = None
+
+    def facts(self) -> Facts:
+        """ROS 2, its distribution and middleware."""
+        return Facts(
+            "ros2",
+            os.environ.get("ROS_DISTRO", "") or _distro(),
+            {
+                "rmw": rclpy.get_rmw_implementation_identifier(),
+                "domain": os.environ.get("ROS_DOMAIN_ID", "0"),
+                "python": machine.python_version(),
+            },
+        )
+
+    def graph(self) -> GraphView:
+        """Read the graph; subscriptions follow what changed in it."""
+        for source in list(self._sources):
+            source.refresh()
+        self._calls.sweep()
+        view = ros2_graph.read(self._node, self._own)
+        if self._want_battery:
+            self._find_battery(view)
+        return view
+
+    def subscribe(
+        self,
+        topic: str,
+        type: str,
+        qos: link.QoS | None,
+        on_sample: OnSample,
+        on_change: Callable[[], None],
+    ) -> RosSource:
+        """Listen to a topic, present or not yet."""
+        check_name(self._node.resolve_topic_name, topic, "topic")
+        full = topic_type(topic, type, self._node.get_topic_names_and_types())
+        try:
+            source = RosSource(
+                self._node,
+                self._hop,
+                self._types,
+                topic,
+                full,
+                qos,
+                on_sample,
+                on_change,
+                self._sources.remove,
+                self._guard,
+            )
+        except SwitchboardError:
+            raise
+        except Exception as error:
+            raise Invalid(f"ROS 2 refuses the subscription of {topic} as {full}: {error}") from None
+        self._sources.append(source)
+        return source
+
+    def advertise(self, topic: str, type: str, latch: bool, qos: link.QoS | None) -> RosSink:
+        """Make a publisher."""
+        check_name(self._node.resolve_topic_name, topic, "topic")
+        full = topic_type(topic, type, self._node.get_topic_names_and_types())
+        kind = self._types.message(full)
+        listening = self._node.get_subscriptions_info_by_topic(topic)
+        profile = ros2_qos.for_publisher([each.qos_profile for each in listening], latch, qos)
+        try:
+            publisher = self._node.create_publisher(kind, topic, profile)
+        except Exception as error:
+            raise Invalid(f"ROS 2 refuses to publish {topic} as {full}: {error}") from None
+        sink = RosSink(self._node, publisher, self._sinks.remove)
+        self._sinks.append(sink)
+        return sink
+
+    def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
+        """Call a service once."""
+        try:
+            check_name(self._node.resolve_service_name, service, "service")
+            full = service_type(service, type, self._node.get_service_names_and_types())
+            call: Deferred[bytes] = self._calls.call(service, full, request, timeout)
+        except SwitchboardError as error:
+            return fail(error)
+        return call
+
+    def definition(self, type: str) -> link.TypeDefinition:
+        """The text of a type and all it contains."""
+        return self._types.definition(type)
+
+    def judge(self, type: str, body: bytes) -> Motion:
+        """What this command would do."""
+        return self._types.judge(type, body)
+
+    def zero(self, type: str) -> bytes:
+        """The message that stands still."""
+        return self._types.zero(type, self._node.get_clock().now().to_msg())
+
+    def battery(self) -> float | None:
+        """Charge as the first battery topic tells it."""
+        if self._battery_sample is None:
+            return None
+        state: Any = deserialize_message(self._battery_sample, self._types.message(BATTERY))
+        return float(state.percentage) if 0.0 <= state.percentage <= 1.0 else None
+
+    def trouble(self) -> str | None:
+        """Whether the executor is stuck."""
+        trouble: str | None = self._spinner.trouble()
+        return trouble
+
+    def _find_battery(self, view: GraphView) -> None:
+        if self._battery is not None:
+            return
+        topic = next((name for name, each in sorted(view.topics.items()) if BATTERY in each.types), None)
+        if topic is None or not view.topics[topic].publishers:
+            return
+
+        def keep(body: bytes) -> None:
+            self._battery_sample = body
+
+        try:
+            self._battery = self.subscribe(topic, BATTERY, link.QoS(depth=1), keep, lambda: None)
+        except SwitchboardError:
+            self._want_battery = False  # no such type here; a robot without a gauge is a robot
+
+
+_DISTROS = {3: "humble", 4: "iron", 7: "jazzy", 9: "kilted"}
+"""By the major version of rclpy."""
+
+
+def _distro() -> str:
+    """The distribution, for installations that don't set ``ROS_DISTRO``."""
+    for name in ("ros-rclpy", "rclpy"):
+        try:
+            return _DISTROS.get(int(metadata.version(name).split(".")[0]), "")
+        except (metadata.PackageNotFoundError, ValueError):
+            continue
+    return ""

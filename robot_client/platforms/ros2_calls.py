@@ -1,0 +1,171 @@
+"""Service calls of the ROS 2 platform: never blocking, never waiting for a service that is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rclpy.serialization import deserialize_message, serialize_message
+from twisted.internet.defer import Deferred
+
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from robot_client.platforms.ros2_executor import Hop
+from robot_client.platforms.ros2_types import Types
+from robot_client.reactors import Clock, Timer
+
+LOOK = 0.02
+"""Seconds between looks for a service whose client was just made."""
+
+APPEAR = 1.0
+"""Seconds a service in the graph has to be reached."""
+
+WATCH = 0.25
+GONE = 1.0
+"""Seconds a called service may be out of reach before the call is given up."""
+
+IDLE = 30.0
+
+
+class _Client(NamedTuple):
+    client: Any
+    used: list[float]
+
+
+class Calls:
+    """All calls of one node.
+
+    :param clock: timers and seconds
+    """
+
+    def __init__(self, node: Any, hop: Hop, types: Types, clock: Clock) -> None:
+        self.node = node
+        self.hop = hop
+        self.clock = clock
+        self._types = types
+        self._clients: dict[tuple[str, str], _Client] = {}
+        self._pending: set[_Call] = set()
+
+    def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
+        """Call once; see :meth:`robot_client.platforms.base.Platform.call`."""
+        kind = self._types.service(type)
+        try:
+            message = deserialize_message(request, kind.Request)
+        except Exception:
+            raise Invalid(f"the arguments for {service} are no request of type {type}") from None
+        client = self._client(service, type, kind)
+        call = _Call(self, service, client, message, timeout, self._pending.discard)
+        self._pending.add(call)
+        call.begin()
+        return call.result
+
+    def sweep(self) -> None:
+        """Destroy the clients nobody used for a while."""
+        now = self.clock.seconds()
+        busy = {call.client for call in self._pending}
+        for key, (client, used) in list(self._clients.items()):
+            if client not in busy and now - used[0] > IDLE:
+                del self._clients[key]
+                self.node.destroy_client(client)
+
+    def close(self) -> None:
+        """Give up everything."""
+        for call in list(self._pending):
+            call.give_up(Unavailable("the robot is shutting down"))
+        for client, _ in self._clients.values():
+            self.node.destroy_client(client)
+        self._clients.clear()
+
+    def _client(self, service: str, type: str, kind: Any) -> Any:
+        known = self._clients.get((service, type))
+        if known is None:
+            known = self._clients[service, type] = _Client(self.node.create_client(kind, service), [0.0])
+        known.used[0] = self.clock.seconds()
+        return known.client
+
+
+class _Call:
+    """One call, from looking for the service to its answer."""
+
+    def __init__(
+        self,
+        calls: Calls,
+        service: str,
+        client: Any,
+        request: Any,
+        timeout: float,
+        on_done: Callable[[_Call], None],
+    ) -> None:
+        self.client = client
+        self.result: Deferred[bytes] = Deferred(lambda _: self._end())
+        self._service = service
+        self._request = request
+        self._calls = calls
+        self._timeout = timeout
+        self._on_done = on_done
+        self._future: Any = None
+        self._seen = self._began = calls.clock.seconds()
+        self._next: Timer | None = None
+        self._limit: Timer | None = None
+
+    def begin(self) -> None:
+        """Look for the service; ask it once it is there."""
+        self._limit = self._calls.clock.callLater(self._timeout, self._too_late)
+        self._look()
+
+    def give_up(self, reason: SwitchboardError) -> None:
+        """End without an answer."""
+        self._end()
+        self.result.errback(reason)
+
+    def _look(self) -> None:
+        if self.client.service_is_ready():
+            self._ask()
+        elif self._calls.clock.seconds() - self._began > APPEAR:
+            self.give_up(
+                NotFound(f"the service {self._service} can't be reached; its node is gone or silent")
+            )
+        else:
+            self._next = self._calls.clock.callLater(LOOK, self._look)
+
+    def _ask(self) -> None:
+        hop = self._calls.hop
+        self._future = self.client.call_async(self._request)
+        self._future.add_done_callback(lambda future: hop.put(self._answered, future))
+        self._seen = self._calls.clock.seconds()
+        self._next = self._calls.clock.callLater(WATCH, self._watch)
+
+    def _watch(self) -> None:
+        now = self._calls.clock.seconds()
+        if self.client.service_is_ready():
+            self._seen = now
+        elif now - self._seen > GONE:
+            self.give_up(Unavailable(f"the service {self._service} vanished before it answered"))
+            return
+        self._next = self._calls.clock.callLater(WATCH, self._watch)
+
+    def _answered(self, future: Any) -> None:
+        if self.result.called or self._on_done is _nothing:
+            return
+        try:
+            body = bytes(serialize_message(future.result()))
+        except Exception as error:
+            self.give_up(Unavailable(f"the call of {self._service} failed: {error}"))
+            return
+        self._end()
+        self.result.callback(body)
+
+    def _too_late(self) -> None:
+        self.give_up(Unavailable(f"the service {self._service} did not answer within {self._timeout:g} s"))
+
+    def _end(self) -> None:
+        for timer in (self._next, self._limit):
+            if timer is not None and timer.active():
+                timer.cancel()
+        if self._future is not None and not self._future.done():
+            self.client.remove_pending_request(self._future)
+        self._on_done(self)
+        self._on_done = _nothing
+
+
+def _nothing(call: _Call) -> None:
+    """Said once already."""

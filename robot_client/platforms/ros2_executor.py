@@ -1,0 +1,130 @@
+"""The thread that serves ROS callbacks, and the way from there to the reactor."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from twisted.logger import Logger
+
+from relay_protocol.limits import MIB
+
+TURN = 0.05
+"""Seconds of one turn of the executor. ``spin`` of rclpy 7.1's EventsExecutor hangs; single turns don't."""
+
+STUCK_SECONDS = 5.0
+BACKLOG = 32 * MIB
+"""Bytes of samples that may wait for the reactor: a stall must not eat the robot's memory."""
+
+
+def make_executor(kind: str, context: Any) -> Any:
+    """An executor of rclpy.
+
+    :param kind: ``events`` where this rclpy has it (a fifth of the load), else and for ``single`` the plain one
+    """
+    if kind == "events":
+        try:
+            from rclpy.experimental.events_executor import EventsExecutor
+
+            return EventsExecutor(context=context)
+        except ImportError:
+            Logger("ros2").info("this rclpy has no EventsExecutor; the single-threaded one is used")
+    from rclpy.executors import SingleThreadedExecutor
+
+    return SingleThreadedExecutor(context=context)
+
+
+class Spinner:
+    """Turns an executor in a thread of its own and knows, by a timer of the node, whether it still serves.
+
+    :param clock: seconds
+
+    """
+
+    def __init__(self, executor: Any, node: Any, clock: Callable[[], float] = time.monotonic) -> None:
+        self._executor = executor
+        self._clock = clock
+        self._stop = threading.Event()
+        self._served = clock()
+        self._thread = threading.Thread(target=self._turn, name="ros2-executor", daemon=True)
+        self._timer = node.create_timer(1.0, self._beat)
+        executor.add_node(node)
+
+    def start(self) -> None:
+        """Begin to turn."""
+        self._served = self._clock()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Turn no more; waits for the turn under way, not for ever."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        if not self._thread.is_alive():
+            self._executor.shutdown()
+
+    def trouble(self) -> str | None:
+        """A sentence when callbacks have not been served for :data:`STUCK_SECONDS`."""
+        silent = self._clock() - self._served
+        if silent > STUCK_SECONDS:
+            return f"the ROS 2 executor has served nothing for {silent:.0f} s"
+        return None
+
+    def _beat(self) -> None:
+        self._served = self._clock()
+
+    def _turn(self) -> None:
+        log = Logger("ros2")
+        while not self._stop.is_set():
+            try:
+                self._executor.spin_once(timeout_sec=TURN)
+            except Exception:
+                if self._stop.is_set():
+                    return
+                log.failure("a ROS callback failed")
+                time.sleep(TURN)  # an executor that fails at once each time must not take the processor
+
+
+class Hop:
+    """Carries calls to the reactor's thread, a batch at a time.
+
+    :param call_from_thread: of the reactor
+    """
+
+    def __init__(self, call_from_thread: Callable[[Callable[[], None]], Any]) -> None:
+        self.dropped = 0
+        self._call_from_thread = call_from_thread
+        self._queue: deque[tuple[Callable[[Any], None], Any, int]] = deque()
+        self._size = 0
+        self._lock = threading.Lock()
+        self._scheduled = False
+
+    def put(self, function: Callable[[Any], None], argument: Any, size: int = 0) -> None:
+        """Have ``function(argument)`` called on the reactor's thread; from any thread.
+
+        :param size: bytes of a sample, which is dropped when too many wait; 0 for what must arrive
+        """
+        with self._lock:
+            if size and self._size + size > BACKLOG:
+                self.dropped += 1
+                return
+            self._size += size
+            self._queue.append((function, argument, size))
+            if self._scheduled:
+                return
+            self._scheduled = True
+        self._call_from_thread(self._drain)
+
+    def _drain(self) -> None:
+        with self._lock:
+            batch, self._queue = self._queue, deque()
+            self._size = 0
+            self._scheduled = False
+        for function, argument, _ in batch:
+            try:
+                function(argument)
+            except Exception:  # one receiver's fault must not lose the others their samples
+                Logger("ros2").failure("a sample could not be passed on")

@@ -1,0 +1,101 @@
+"""Quality of service matched to who is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from relay_protocol.errors import Invalid
+from relay_protocol.link import QoS
+
+DEPTH = 64
+MAX_DEPTH = 1000
+
+
+class Match(NamedTuple):
+    """What a subscription has to know of its publishers.
+
+    :param reliable: all of them send again what was lost
+    :param latched: all of them keep messages for late joiners
+    """
+
+    reliable: bool
+    latched: bool
+    publishers: int
+
+
+def match(publishers: Sequence[QoSProfile]) -> Match:
+    """What suits all these publishers; none yet: the usual."""
+    if not publishers:
+        return Match(False, False, 0)
+    return Match(
+        all(each.reliability == ReliabilityPolicy.RELIABLE for each in publishers),
+        all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers),
+        len(publishers),
+    )
+
+
+def for_subscription(found: Match, asked: QoS | None) -> QoSProfile:
+    """The profile to listen with."""
+    profile = QoSProfile(
+        depth=DEPTH,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if found.reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if found.latched else DurabilityPolicy.VOLATILE,
+    )
+    return _override(profile, asked)
+
+
+def for_publisher(subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | None) -> QoSProfile:
+    """The profile to publish with: reliable serves every subscriber; durable if asked or if all want it."""
+    durable = latch or (
+        bool(subscribers) and all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in subscribers)
+    )
+    profile = QoSProfile(
+        depth=1 if latch else DEPTH,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
+    )
+    return _override(profile, asked)
+
+
+def _override(profile: QoSProfile, asked: QoS | None) -> QoSProfile:
+    if asked is None:
+        return profile
+    for name, policies in (
+        ("history", HistoryPolicy),
+        ("reliability", ReliabilityPolicy),
+        ("durability", DurabilityPolicy),
+    ):
+        wish = getattr(asked, name)
+        if wish is not None:
+            setattr(profile, name, _policy(name, policies, wish))
+    if asked.depth is not None:
+        if not 0 < asked.depth <= MAX_DEPTH:
+            raise Invalid(f"qos: depth is 1 to {MAX_DEPTH}")
+        profile.depth = asked.depth
+    for name in ("deadline", "lifespan"):
+        seconds = getattr(asked, name)
+        if seconds is not None:
+            if not 0 < seconds < 1e9:
+                raise Invalid(f"qos: {name} is a time in seconds above 0")
+            setattr(profile, name, Duration(nanoseconds=int(seconds * 1e9)))
+    return profile
+
+
+_WISHES = {
+    "history": ("keep_last", "keep_all"),
+    "reliability": ("reliable", "best_effort", "best_available"),
+    "durability": ("volatile", "transient_local", "best_available"),
+}
+
+
+def _policy(name: str, policies: Any, wish: str) -> Any:
+    # BEST_AVAILABLE came with Iron.
+    if wish not in _WISHES[name] or not hasattr(policies, wish.upper()):
+        raise Invalid(f"qos: {name} is {', '.join(_WISHES[name])}, not '{wish}'")
+    return getattr(policies, wish.upper())

@@ -1,0 +1,174 @@
+"""Subscriptions and publishers of the ROS 2 platform."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.link import QoS
+from robot_client.platforms import ros2_qos
+from robot_client.platforms.base import OnSample
+from robot_client.platforms.definitions import normalise
+from robot_client.platforms.ros2_executor import Hop
+from robot_client.platforms.ros2_types import Types
+
+
+def check_name(resolve: Callable[[str], str], name: str, what: str) -> None:
+    """See that rclpy takes a name.
+
+    :param what: ``topic`` or ``service``, for the error
+    :raises Invalid: it does not
+    """
+    try:
+        resolve(name)
+    except Exception as error:
+        reason = str(error).splitlines()[0].rstrip(".:") if str(error) else "not allowed"
+        raise Invalid(f"'{name}' is no {what} name: {reason}") from None
+
+
+def topic_type(topic: str, asked: str, known: Iterable[tuple[str, list[str]]]) -> str:
+    """The type to use for a topic, which need not exist yet if its type is said.
+
+    :param asked: what the client says, may be empty
+    :param known: names and types of the graph
+    :raises NotFound: no type was said, and the graph has none
+    :raises Invalid: the graph has another, or several
+    """
+    types = next((types for each, types in known if each == topic), [])
+    if asked and not types:
+        return normalise(asked)
+    if not types:
+        raise NotFound(f"there is no topic {topic} on this robot; name its type to wait for it")
+    return _one_of(types, asked, f"topic {topic}", "msg")
+
+
+def service_type(service: str, asked: str, known: Iterable[tuple[str, list[str]]]) -> str:
+    """The type to use for a service, which must exist; see :func:`topic_type`."""
+    types = next((types for each, types in known if each == service), [])
+    if not types:
+        raise NotFound(f"there is no service {service} on this robot")
+    return _one_of(types, asked, f"service {service}", "srv")
+
+
+def _one_of(types: list[str], asked: str, what: str, kind: str) -> str:
+    if not asked:
+        if len(types) > 1:
+            raise Invalid(f"the {what} has several types ({', '.join(types)}); name one")
+        return types[0]
+    full = normalise(asked, kind)
+    if full not in types:
+        raise Invalid(f"the {what} is of type {', '.join(types)} on this robot, not {asked}")
+    return full
+
+
+class RosSource:
+    """A raw subscription that follows its publishers' quality of service.
+
+    :param ignore: name of a node whose publishers don't count
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        hop: Hop,
+        types: Types,
+        topic: str,
+        type: str,
+        qos: QoS | None,
+        on_sample: OnSample,
+        on_change: Callable[[], None],
+        on_close: Callable[[RosSource], None],
+        ignore: str = "",
+    ) -> None:
+        self.type = type
+        self._node = node
+        self._hop = hop
+        self._topic = topic
+        self._class = types.message(type)
+        self._asked = qos
+        self._on_sample: OnSample | None = on_sample
+        self._on_change = on_change
+        self._on_close = on_close
+        self._ignore = ignore
+        self._generation = 0
+        self._subscription: Any = None
+        self._match = self._look()
+        self._build()
+
+    @property
+    def latched(self) -> bool:
+        """Whether all publishers keep their last messages."""
+        return self._match.latched
+
+    @property
+    def publishers(self) -> int:
+        """How many publish now."""
+        return self._match.publishers
+
+    def refresh(self) -> None:
+        """Look at the publishers again; subscribe anew if they want another quality of service."""
+        old, new = self._match, self._look()
+        if new == old:
+            return
+        if new.publishers == 0:
+            # Whoever comes back is likely to be as before.
+            new = old._replace(publishers=0)
+        self._match = new
+        if (new.reliable, new.latched) != (old.reliable, old.latched):
+            self._build()
+        self._on_change()
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._on_sample is None:
+            return
+        self._on_sample = None
+        self._generation += 1
+        self._node.destroy_subscription(self._subscription)
+        self._on_close(self)
+
+    def _look(self) -> ros2_qos.Match:
+        infos = self._node.get_publishers_info_by_topic(self._topic)
+        return ros2_qos.match([each.qos_profile for each in infos if each.node_name != self._ignore])
+
+    def _build(self) -> None:
+        self._generation += 1
+        generation = self._generation
+        old = self._subscription
+        profile = ros2_qos.for_subscription(self._match, self._asked)
+        put = self._hop.put
+
+        def arrived(body: bytes) -> None:
+            put(lambda sample: self._deliver(generation, sample), body, len(body))
+
+        self._subscription = self._node.create_subscription(
+            self._class, self._topic, arrived, profile, raw=True
+        )
+        if old is not None:
+            self._node.destroy_subscription(old)
+
+    def _deliver(self, generation: int, body: bytes) -> None:
+        # What an older subscription still had in flight would come twice.
+        if generation == self._generation and self._on_sample is not None:
+            self._on_sample(body)
+
+
+class RosSink:
+    """A publisher of CDR bytes."""
+
+    def __init__(self, node: Any, publisher: Any, on_close: Callable[[RosSink], None]) -> None:
+        self._node = node
+        self._publisher = publisher
+        self._on_close = on_close
+
+    def publish(self, body: bytes) -> None:
+        """Publish one message."""
+        self._publisher.publish(body)
+
+    def close(self) -> None:
+        """Take the publisher away."""
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None
+            self._on_close(self)

@@ -1,0 +1,184 @@
+"""ROS 2 types in Python: found by name, described, judged, zeroed."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from rclpy.serialization import deserialize_message, serialize_message
+
+from relay_protocol import link
+from relay_protocol.errors import Invalid, NotFound
+from robot_client.platforms import definitions
+from robot_client.platforms.base import Motion
+
+HEADER = "std_msgs/Header"
+
+
+class Types:
+    """All types of this robot, each looked up once."""
+
+    def __init__(self) -> None:
+        self._classes: dict[str, Any] = {}
+        self._definitions: dict[str, link.TypeDefinition] = {}
+        self._prefixes = definitions.prefixes()
+
+    def message(self, name: str) -> Any:
+        """The class of a message type.
+
+        :raises NotFound: it is not installed
+        """
+        return self._class(name, "msg")
+
+    def service(self, name: str) -> Any:
+        """The class of a service type.
+
+        :raises NotFound: it is not installed
+        """
+        return self._class(name, "srv")
+
+    def _class(self, name: str, kind: str) -> Any:
+        found = self._classes.get(name)
+        if found is None:
+            full = definitions.normalise(name, kind)
+            package, has, short = full.split("/")
+            if has != kind:
+                raise Invalid(f"{name} is not a {'message' if kind == 'msg' else 'service'} type")
+            found = self._classes[name] = _load(package, kind, short, full)
+        return found
+
+    def definition(self, name: str) -> link.TypeDefinition:
+        """Text and hash of a type.
+
+        :raises NotFound: it is not installed
+        """
+        full = definitions.normalise(name)
+        known = self._definitions.get(full)
+        if known is None:
+            text = definitions.full_text(full, self._text)
+            known = link.TypeDefinition(
+                type=name, text=text, hash=definitions.type_hash(full, self._prefixes)
+            )
+            self._definitions[full] = known
+        return known
+
+    def _text(self, name: str) -> str | None:
+        text = definitions.installed(name, self._prefixes)
+        if text is not None:
+            return text
+        package, kind, short = name.split("/")
+        try:
+            found = _load(package, kind, short, name)
+        except NotFound:
+            return None
+        return introspected(found, kind)
+
+    def judge(self, type: str, body: bytes) -> Motion:
+        """What a command of this type would do."""
+        try:
+            message = deserialize_message(body, self.message(type))
+        except Exception:  # rclpy names its errors differently from release to release
+            return Motion.INVALID
+        return _judge(message)
+
+    def zero(self, type: str, stamp: Any) -> bytes:
+        """The message that stands still, with this stamp in its header if it has one."""
+        message = self.message(type)()
+        if message.get_fields_and_field_types().get("header") == HEADER:
+            message.header.stamp = stamp
+        return bytes(serialize_message(message))
+
+
+def _load(package: str, kind: str, short: str, name: str) -> Any:
+    try:
+        found = getattr(importlib.import_module(f"{package}.{kind}"), short)
+    except (ImportError, AttributeError):
+        raise NotFound(f"the type {name} is not installed on this robot") from None
+    try:
+        # Types of other distributions import well but have no C library for this one.
+        found.__class__.__import_type_support__()
+    except Exception:
+        raise NotFound(
+            f"the type {name} is installed on this robot, but its library can't be loaded"
+        ) from None
+    return found
+
+
+def _judge(value: Any) -> Motion:
+    """The worst of all numbers in a message, headers left out."""
+    verdict = Motion.STILL
+    for field, type in value.get_fields_and_field_types().items():
+        if type == HEADER:
+            continue
+        inner = _judge_value(getattr(value, field))
+        if inner is Motion.INVALID:
+            return inner
+        if inner is Motion.MOVING:
+            verdict = inner
+    return verdict
+
+
+def _judge_value(value: Any) -> Motion:
+    if isinstance(value, (bool, int, float)):
+        return Motion.MOVING if value else Motion.STILL if math.isfinite(value) else Motion.INVALID
+    if hasattr(value, "get_fields_and_field_types"):
+        return _judge(value)
+    if isinstance(value, (str, bytes)):
+        return Motion.STILL
+    verdicts = {_judge_value(each.item() if hasattr(each, "item") else each) for each in value}
+    for worst in (Motion.INVALID, Motion.MOVING):
+        if worst in verdicts:
+            return worst
+    return Motion.STILL
+
+
+def introspected(found: Any, kind: str) -> str:
+    """The text of a type as its Python class tells it: fields and constants, no comments, no defaults."""
+    if kind == "srv":
+        return f"{_fields(found.Request)}---\n{_fields(found.Response)}"
+    if kind == "action":
+        return f"{_fields(found.Goal)}---\n{_fields(found.Result)}---\n{_fields(found.Feedback)}"
+    return _fields(found)
+
+
+def _fields(found: Any) -> str:
+    lines = [f"{_constant(name, value)}" for name, value in sorted(_constants(found).items())]
+    for field, type in found.get_fields_and_field_types().items():
+        lines.append(f"{_written(type)} {field}")
+    return "".join(line + "\n" for line in lines)
+
+
+def _constants(found: Any) -> Mapping[str, Any]:
+    for name, value in vars(type(found)).items():
+        if name.endswith("__constants") and isinstance(value, dict):
+            return value
+    return {}
+
+
+def _constant(name: str, value: Any) -> str:
+    # The class keeps a constant's value, not its width; the widest type holds them all.
+    if isinstance(value, bool):
+        return f"bool {name}={str(value).lower()}"
+    if isinstance(value, int):
+        return f"{'uint64' if value > 2**63 - 1 else 'int64'} {name}={value}"
+    if isinstance(value, float):
+        return f"float64 {name}={value!r}"
+    if isinstance(value, bytes):
+        return f"byte {name}={value[0]}"
+    return f'string {name}="{value}"'
+
+
+def _written(type: str) -> str:
+    """A field's type as .msg files write it: ``sequence<double, 3>`` is ``float64[<=3]``."""
+    if type.startswith("sequence<"):
+        inner, _, bound = type[len("sequence<") : -1].partition(", ")
+        return f"{_written(inner)}[{'<=' + bound if bound else ''}]"
+    if type.endswith("]"):
+        inner, _, size = type[:-1].rpartition("[")
+        return f"{_written(inner)}[{size}]"
+    for plain in ("string", "wstring"):
+        if type.startswith(plain + "<"):
+            return f"{plain}<={type[len(plain) + 1 : -1]}"
+    return {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}.get(type, type)

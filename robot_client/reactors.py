@@ -1,0 +1,39 @@
+"""What we use of Twisted's reactor, as types: its interfaces are zope's, which type checkers can't read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from twisted.internet.defer import Deferred
+from twisted.internet.protocol import Factory
+
+
+class Timer(Protocol):
+    """A call to come."""
+
+    def active(self) -> bool:
+        """Whether it is still to come."""
+
+    def cancel(self) -> None:
+        """Let it not come."""
+
+    def getTime(self) -> float:
+        """When it comes, on the clock's seconds."""
+
+
+class Clock(Protocol):
+    """A reactor, or :class:`twisted.internet.task.Clock`."""
+
+    def seconds(self) -> float:
+        """The time; only differences mean anything."""
+
+    def callLater(self, delay: float, callable: Callable[..., Any], *args: Any) -> Timer:
+        """Call after ``delay`` seconds."""
+
+
+class Endpoint(Protocol):
+    """Where to dial."""
+
+    def connect(self, factory: Factory[Any]) -> Deferred[Any]:
+        """Dial; fires with the protocol."""

@@ -1,0 +1,120 @@
+"""The one place where the daemon is put together."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import time
+from importlib import metadata
+from typing import Any
+
+from twisted.internet.defer import Deferred, DeferredList
+from twisted.logger import Logger
+
+from relay_protocol.errors import Unavailable
+from robot_client.backoff import Backoff
+from robot_client.config import Settings
+from robot_client.connection import Connection
+from robot_client.daemon import Daemon
+from robot_client.guarding import GuardKeeper
+from robot_client.identity import Enrolment
+from robot_client.link import ControlLink, Identity
+from robot_client.motion import NoGuard
+from robot_client.platforms.base import Platform
+from robot_client.reactors import Endpoint
+from robot_client.systemd import Notifier
+from robot_client.tls import endpoint, split_address
+
+LEAVE_SECONDS = 4.0
+
+
+def agent() -> str:
+    """Name and version of this software."""
+    try:
+        return f"switchboard-robot {metadata.version('robot-switchboard')}"
+    except metadata.PackageNotFoundError:
+        return "switchboard-robot"
+
+
+def make_ros(reactor: Any, settings: Settings, suffix: str) -> Platform:
+    """The ROS 2 platform.
+
+    :raises Unavailable: there is no rclpy
+    """
+    try:
+        from robot_client.platforms.ros2 import Ros2Platform
+    except ImportError as error:
+        raise Unavailable(
+            f"no ROS 2 found ({error}): source /opt/ros/<distro>/setup.bash or install the extra 'ros'"
+        ) from None
+    return Ros2Platform(
+        reactor,
+        f"switchboard_{suffix}",
+        guard=f"switchboard_guard_{suffix}",
+        executor=settings.ros.executor,
+        battery=settings.ros.battery,
+    )
+
+
+class Runner:
+    """One run of the daemon.
+
+    :param reactor: its clock must be monotonic
+    """
+
+    def __init__(
+        self,
+        reactor: Any,
+        settings: Settings,
+        enrolment: Enrolment,
+        me: Identity,
+        platform: Platform | None = None,
+    ) -> None:
+        suffix = secrets.token_hex(3)
+        self.reactor = reactor
+        self.platform = platform or make_ros(reactor, settings, suffix)
+        self.keeper: GuardKeeper | None = None
+        if settings.safety.guard:
+            self.keeper = GuardKeeper(reactor, f"switchboard_guard_{suffix}", settings.safety.stop_within_ms)
+        self._enrolment = enrolment
+        connection = Connection(
+            self._dial,
+            lambda: ControlLink(me, agent(), time.monotonic_ns),
+            reactor,
+            Backoff(secrets.SystemRandom().random),
+            me.robot,
+            enrolment.address,
+        )
+        self.daemon = Daemon(
+            settings, connection, self.platform, self.keeper or NoGuard(), reactor, self._dial, agent()
+        )
+        self._notifier = Notifier(reactor, os.environ, lambda: self.platform.trouble() is None)
+        self._log = Logger("daemon")
+
+    def start(self) -> None:
+        """Begin.
+
+        :raises Unavailable: the platform can't start
+        """
+        self.platform.start()
+        if self.keeper is not None:
+            self.keeper.on_alert = self.daemon.alert
+            self.keeper.start()
+        self.daemon.start()
+        self._notifier.start()
+
+    def stop(self) -> Deferred[Any]:
+        """Stop the robot and leave, within seconds whatever hangs."""
+        self._log.info("leaving")
+        self._notifier.stop()
+        leaving: list[Deferred[Any]] = [self.daemon.stop()]
+        if self.keeper is not None:
+            leaving.append(self.keeper.stop())
+        gone = DeferredList(leaving, consumeErrors=True)
+        gone.addTimeout(LEAVE_SECONDS, self.reactor)
+        return gone.addBoth(lambda _: self.platform.stop())
+
+    def _dial(self, address: str) -> Endpoint:
+        host, port = split_address(address or self._enrolment.address)
+        own = self._enrolment
+        return endpoint(self.reactor, host, port, own.tls, own.ca, own.server_name)

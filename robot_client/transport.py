@@ -1,0 +1,174 @@
+"""The thin edge between a link and a Twisted connection: bytes, timers, backpressure, last words."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Callable
+from typing import Protocol
+
+from twisted.internet.interfaces import IPushProducer
+from twisted.internet.protocol import Protocol as TwistedProtocol
+from twisted.internet.protocol import connectionDone
+from twisted.python.failure import Failure
+from zope.interface import implementer  # type: ignore[import-untyped]
+
+from relay_protocol.errors import PeerError, SwitchboardError
+from relay_protocol.limits import UNPROVEN_SECONDS
+from robot_client.link import Event, Link, State
+from robot_client.reactors import Clock, Timer
+from robot_client.tls import explain
+
+_UNSENT = 128 * 1024
+"""Bytes the kernel may hold unsent; more would be delay nobody sees."""
+
+_TCP_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", 25 if sys.platform == "linux" else None)
+_TCP_USER_TIMEOUT = getattr(socket, "TCP_USER_TIMEOUT", None)
+
+_UNKNOWN = frozenset((State.GREETING, State.PROVING, State.ENROLLING, State.JOINING))
+
+
+class Owner(Protocol):
+    """Who is told what happens on a link."""
+
+    def on_event(self, event: Event) -> None:
+        """The relay said something."""
+
+    def on_lost(self, reason: SwitchboardError) -> None:
+        """The link is gone; called once."""
+
+    def on_pause(self) -> None:
+        """The transport is full."""
+
+    def on_resume(self) -> None:
+        """The transport has room."""
+
+
+class LinkLost(SwitchboardError):
+    """A link ended; the text says why."""
+
+
+@implementer(IPushProducer)
+class LinkProtocol(TwistedProtocol):
+    """Carries one link.
+
+    :param clock: for heartbeats and deadlines
+    """
+
+    transport: Any
+
+    def __init__(self, link: Link, make_owner: Callable[[LinkProtocol], Owner], clock: Clock) -> None:
+        self.link = link
+        self.owner = make_owner(self)
+        self._clock = clock
+        self._ping: Timer | None = None
+        self._deadline: Timer | None = None
+        self._reason: SwitchboardError | None = None
+
+    def connectionMade(self) -> None:
+        """The connection stands."""
+        tune(self.transport, self.link.heartbeat * 3)
+        self.transport.registerProducer(self, True)
+        self._deadline = self._clock.callLater(UNPROVEN_SECONDS, self._too_slow)
+        self.link.begin()
+        self.flush()
+
+    def dataReceived(self, data: bytes) -> None:
+        """Bytes from the relay."""
+        if self._reason is not None:
+            return
+        try:
+            events = self.link.receive(data)
+        except SwitchboardError as reason:
+            self.end(reason)
+            return
+        if self._deadline is not None and self.link.state not in _UNKNOWN:
+            self._deadline.cancel()
+            self._deadline = None
+            self._beat()
+        for event in events:
+            self.owner.on_event(event)
+        self.flush()
+
+    def connectionLost(self, reason: Failure = connectionDone) -> None:
+        """The connection is gone."""
+        for timer in (self._ping, self._deadline):
+            if timer is not None and timer.active():
+                timer.cancel()
+        lost = self._reason or LinkLost(explain(reason))
+        self._reason = lost
+        self.owner.on_lost(lost)
+
+    def flush(self) -> None:
+        """Write what the link has to say."""
+        out = self.link.take()
+        if out and self.transport is not None:
+            self.transport.write(b"".join(out))
+
+    def write(self, frames: list[bytes]) -> None:
+        """Write sample frames behind all that was said before."""
+        self.flush()
+        self.transport.writeSequence(frames)
+
+    def end(self, reason: SwitchboardError, gently: bool = False) -> None:
+        """Close the connection; ``gently`` lets what was written leave first."""
+        if self._reason is not None:
+            return
+        self._reason = reason
+        self.transport.unregisterProducer()
+        if gently:
+            self.flush()
+            self.transport.loseConnection()
+        else:
+            self.transport.abortConnection()
+
+    def _beat(self) -> None:
+        try:
+            self.link.check_silence()
+        except PeerError as reason:
+            self.end(reason)
+            return
+        self.link.ping()
+        self.flush()
+        self._ping = self._clock.callLater(self.link.ping_every, self._beat)
+
+    def _too_slow(self) -> None:
+        self._deadline = None
+        self.end(LinkLost(f"the relay did not answer within {UNPROVEN_SECONDS:.0f} s"))
+
+    def pauseProducing(self) -> None:
+        """The transport is full."""
+        self.owner.on_pause()
+
+    def resumeProducing(self) -> None:
+        """The transport has room."""
+        self.owner.on_resume()
+
+    def stopProducing(self) -> None:
+        """The transport wants no more."""
+        self.owner.on_pause()
+
+
+def tune(transport: object, patience: float) -> None:
+    """Set what the kernel should do: no delay, no long silent retries, little data unsent.
+
+    :param patience: seconds after which unacknowledged data means the connection is lost
+    """
+    handle = _socket_of(transport)
+    if handle is None:
+        return
+    handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    handle.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in ((_TCP_USER_TIMEOUT, int(patience * 1000)), (_TCP_NOTSENT_LOWAT, _UNSENT)):
+        if option is not None:
+            handle.setsockopt(socket.IPPROTO_TCP, option, value)
+
+
+def _socket_of(transport: object) -> socket.socket | None:
+    """The socket under a transport, through TLS; ``None`` in memory."""
+    while transport is not None:
+        handle = getattr(transport, "getHandle", lambda: None)()
+        if isinstance(handle, socket.socket):
+            return handle
+        transport = getattr(transport, "transport", None)
+    return None

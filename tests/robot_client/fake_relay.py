@@ -1,0 +1,174 @@
+"""A relay for tests: real TCP, real frames of the contract, driven step by step by the test."""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import socket
+import ssl
+import threading
+import time
+from typing import Any, TypeVar
+
+from relay_protocol import frames, identity, link
+
+T = TypeVar("T", bound=link.Message)
+PATIENCE = 20.0
+
+
+class Peer:
+    """One accepted connection."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._decoder = frames.FrameDecoder(2**25)
+        self._inbox: queue.Queue[Any] = queue.Queue()
+        self.read = link.opening_decoder
+        self.skipped: list[Any] = []
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        try:
+            while data := self._connection.recv(65536):
+                for frame in self._decoder.feed(data):
+                    self._take(frame)
+        except OSError:
+            pass
+        self._inbox.put(None)
+
+    def _take(self, frame: frames.Frame) -> None:
+        if isinstance(frame, frames.SampleFrame):
+            self._inbox.put(frame)
+            return
+        message = self.read.decode(frame.body)
+        if isinstance(message, link.Prove):
+            self.read = link.robot_control_decoder
+        elif isinstance(message, link.Join):
+            self.read = link.robot_channel_decoder
+        if isinstance(message, link.Ping):
+            self.say(link.Pong(t=message.t, at=time.monotonic_ns()))
+        else:
+            self._inbox.put(message)
+
+    def say(self, message: link.Message) -> None:
+        self.raw(link.frame(message))
+
+    def sample(self, number: int, body: bytes, age: float = 0.0) -> None:
+        self.raw(frames.encode_sample(number, time.monotonic_ns() - int(age * 1e9), body))
+
+    def raw(self, data: bytes) -> None:
+        try:
+            self._connection.sendall(data)
+        except OSError:
+            pass
+
+    def expect(self, kind: type[T], timeout: float = PATIENCE) -> T:
+        """The next message of a kind; others are passed over."""
+        deadline = time.monotonic() + timeout
+        while True:
+            message = self._inbox.get(timeout=max(0.01, deadline - time.monotonic()))
+            assert message is not None, f"the robot hung up before it said {kind.__name__}"
+            if isinstance(message, kind):
+                return message
+            self.skipped.append(message)
+
+    def expect_sample(self, timeout: float = PATIENCE) -> frames.SampleFrame:
+        return self.expect(frames.SampleFrame, timeout)  # type: ignore[type-var]
+
+    def expect_end(self, timeout: float = PATIENCE) -> list[Any]:
+        """Wait until the robot hangs up; what it still said."""
+        deadline = time.monotonic() + timeout
+        said = []
+        while (message := self._inbox.get(timeout=max(0.01, deadline - time.monotonic()))) is not None:
+            said.append(message)
+        return said
+
+    def cut(self) -> None:
+        try:
+            self._connection.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            pass
+        self._connection.close()
+
+
+class FakeRelay:
+    """Listens; robots are answered by the test."""
+
+    def __init__(self, name: str = "relay-1", tls: ssl.SSLContext | None = None) -> None:
+        self.name = name
+        self.public_key = b""
+        self._tls = tls
+        self._peers: queue.Queue[Peer] = queue.Queue()
+        self._all: list[Peer] = []
+        self.port = 0
+        self.open()
+
+    def open(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", self.port))
+        self.port = self._listener.getsockname()[1]
+        threading.Thread(target=self._serve, args=(self._listener,), daemon=True).start()
+
+    def _serve(self, listener: socket.socket) -> None:
+        while True:
+            try:
+                connection, _ = listener.accept()
+            except OSError:
+                return
+            try:
+                if self._tls is not None:
+                    connection = self._tls.wrap_socket(connection, server_side=True)
+            except (OSError, ssl.SSLError):
+                connection.close()
+                continue
+            peer = Peer(connection)
+            self._all.append(peer)
+            self._peers.put(peer)
+
+    @property
+    def address(self) -> str:
+        return f"127.0.0.1:{self.port}"
+
+    def accept(self, timeout: float = PATIENCE) -> Peer:
+        return self._peers.get(timeout=timeout)
+
+    def enroll(self) -> link.Enroll:
+        peer = self.accept()
+        asked = peer.expect(link.Enroll)
+        self.public_key = link.from_base64(asked.public_key, "public_key")
+        peer.say(link.Enrolled(robot=asked.robot, relay=self.name))
+        return asked
+
+    def challenge(self, peer: Peer) -> tuple[link.Hello, bytes]:
+        hello = peer.expect(link.Hello)
+        nonce = secrets.token_bytes(32)
+        peer.say(link.Challenge(nonce=link.to_base64(nonce), relay=self.name))
+        return hello, nonce
+
+    def register(self, heartbeat: float = 1.0) -> Peer:
+        """Take one robot in, its proof checked."""
+        peer = self.accept()
+        hello, nonce = self.challenge(peer)
+        proof = link.from_base64(peer.expect(link.Prove).signature, "signature")
+        assert identity.verify(self.public_key, self.name, hello.robot, nonce, proof)
+        peer.say(link.Welcome(session="s", heartbeat=heartbeat, frame_limit=2**24))
+        return peer
+
+    def channel(self, control: Peer, name: str = "c1") -> Peer:
+        """Have a channel opened and joined."""
+        ticket = secrets.token_hex(8)
+        control.say(link.OpenChannel(channel=name, ticket=ticket))
+        peer = self.accept()
+        assert peer.expect(link.Join).ticket == ticket
+        peer.say(link.Joined(channel=name, at=time.monotonic_ns()))
+        return peer
+
+    def close(self) -> None:
+        # Wakes the thread in accept(), which close() alone would not.
+        try:
+            self._listener.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            pass
+        self._listener.close()
+        for peer in self._all:
+            peer.cut()
+        self._all.clear()
