@@ -138,8 +138,12 @@ stage_interfaces() {
     wanted=$(find scripts/build_interfaces.py scripts/interfaces -type f -print0 | LC_ALL=C sort -z |
         xargs -0 cat | fingerprint -)
     done_for interfaces "$wanted" && return
-    if ! command -v gcc >/dev/null; then
-        say "no gcc: tf2_msgs is not built, the simulated robot publishes no /tf (apt install gcc libc6-dev)"
+    if ! $venv/bin/python -c 'import rosidl_generator_py' 2>/dev/null; then
+        say "no ROS 2 wheels for this machine: nothing is built, your own ROS brings tf2_msgs"
+        return
+    fi
+    if ! command -v gcc >/dev/null || ! command -v g++ >/dev/null; then
+        say "no gcc and g++: tf2_msgs is not built, the simulated robot publishes no /tf (apt install g++)"
         return
     fi
     if run "ROS interfaces (tf2_msgs)" $venv/bin/python scripts/build_interfaces.py scripts/interfaces/tf2_msgs; then

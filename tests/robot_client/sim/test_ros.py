@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import os
 import signal
@@ -23,7 +24,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
 from std_srvs.srv import Trigger
 
@@ -191,6 +192,26 @@ def test_pictures_raw_and_compressed(robot: subprocess.Popen[str], graph: Graph)
     above_captions = slice(0, 430)
     difference = decoded[above_captions, :, ::-1].astype(int) - pixels[above_captions]
     assert np.abs(difference).mean() < 6
+
+
+def test_transforms_agree_with_odometry(robot: subprocess.Popen[str], graph: Graph) -> None:
+    """/tf tells where the body stands, /tf_static (latched) where the sensors sit."""
+    graph.watch("/odom", Odometry)()
+    topics = dict(graph.node.get_topic_names_and_types())
+    if importlib.util.find_spec("tf2_msgs") is None:
+        assert "/tf" not in topics
+        return
+    from tf2_msgs.msg import TFMessage
+
+    graph.call(Trigger, "/reset", Trigger.Request())
+    graph.driver("/cmd_vel")(0.0, 0.0)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    fixed = graph.watch("/tf_static", TFMessage, latched)().transforms
+    assert {each.child_frame_id for each in fixed} == {"laser", "camera"}
+    (moving,) = graph.watch("/tf", TFMessage)().transforms
+    assert (moving.header.frame_id, moving.child_frame_id) == ("odom", "base_link")
+    stands_at = graph.watch("/odom", Odometry)().pose.pose.position
+    assert (moving.transform.translation.x, moving.transform.translation.y) == (stands_at.x, stands_at.y)
 
 
 def test_battery_drains(robot: subprocess.Popen[str], graph: Graph) -> None:
