@@ -1,0 +1,154 @@
+"""The only judge: may this principal do this to that resource of that robot?
+
+A session asks its :class:`Permit` at every message. Permits live here: when rights change in the database they are
+compiled anew in place, and whoever holds one is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sqlalchemy.orm import Session
+
+from relay_db import queries
+from relay_db.queries import PrincipalRecord, RobotRecord
+from relay_protocol.rights import Grant, Operation, Rules, Verdict
+from relay_server.store import Store
+
+Changed = Callable[[], None]
+Revoked = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Principal:
+    """Who is asking, once proved.
+
+    :param token_id: the token that proved it; when that one ends, so does all that was opened with it
+    :param expires: Unix seconds at which the token ends by itself, or ``None``
+    """
+
+    user_id: int
+    name: str
+    realm: str
+    admin: bool
+    token_id: int
+    expires: float | None
+
+    @classmethod
+    def of(cls, record: PrincipalRecord) -> Principal:
+        """From the database's row."""
+        return cls(record.user_id, record.name, record.realm, record.admin, record.token_id, record.expires)
+
+
+class Permit:
+    """What one principal may do on one robot, now. Hold it for as long as something is open, then release it."""
+
+    def __init__(self, principal: Principal, robot_id: int, rules: Rules) -> None:
+        self.principal = principal
+        self.robot_id = robot_id
+        self.rules = rules
+        self.on_change: Changed = _ignore
+        self.on_revoke: Revoked = _ignore_reason
+
+    def judge(self, operation: Operation, resource: str) -> Verdict:
+        """Yes or no with the reason, by the rights as they stand."""
+        return self.rules.judge(operation, resource)
+
+
+def _ignore() -> None:
+    """Nobody listens yet."""
+
+
+def _ignore_reason(reason: str) -> None:
+    """Nobody listens yet."""
+
+
+class Access:
+    """Compiles rights from the database and keeps every open permit in step with them.
+
+    :param wall: current Unix time in seconds
+    """
+
+    def __init__(self, store: Store, wall: Callable[[], float]) -> None:
+        self._store = store
+        self._wall = wall
+        self._permits: set[Permit] = set()
+        self._robots: dict[int, list[tuple[RobotRecord, Rules]]] = {}
+
+    async def permit(self, principal: Principal, robot_id: int) -> Permit | None:
+        """A live permit, or ``None`` when the principal has no right at all on the robot."""
+        grants = await self._store.read(queries.grants_for, principal.user_id, robot_id)
+        if not grants:
+            return None
+        permit = Permit(principal, robot_id, Rules(grants))
+        self._permits.add(permit)
+        return permit
+
+    async def robots(self, principal: Principal) -> list[tuple[RobotRecord, Rules]]:
+        """The robots a principal has any right on, kept until something changes in the database."""
+        found = self._robots.get(principal.user_id)
+        if found is None:
+            rows = await self._store.read(queries.robots_with_grants, principal.user_id)
+            found = self._robots[principal.user_id] = [(record, Rules(grants)) for record, grants in rows]
+        return found
+
+    def release(self, permit: Permit) -> None:
+        """Nothing is open under this permit any more."""
+        self._permits.discard(permit)
+
+    def expire(self) -> None:
+        """Revoke the permits whose token's time is over. Asks nothing of the database."""
+        now = self._wall()
+        for permit in list(self._permits):
+            if permit.principal.expires is not None and permit.principal.expires <= now:
+                self._revoke(permit, "your session has expired; log in again")
+
+    async def refresh(self) -> None:
+        """Judge all open permits anew, after something changed in the database.
+
+        :raises Unavailable: the database can't be asked; what is open goes on under the rights last seen
+        """
+        self._robots.clear()
+        asked = list(self._permits)
+        if not asked:
+            return
+        keys = {(permit.principal.user_id, permit.principal.token_id, permit.robot_id) for permit in asked}
+        standing = await self._store.read(_standing, keys, self._wall())
+        for permit in asked:
+            if permit not in self._permits:
+                continue
+            principal = permit.principal
+            now = standing[(principal.user_id, principal.token_id, permit.robot_id)]
+            if now.ended:
+                self._revoke(permit, now.ended)
+            elif tuple(now.grants) != permit.rules.grants:
+                permit.rules = Rules(now.grants)
+                permit.on_change()
+
+    def _revoke(self, permit: Permit, reason: str) -> None:
+        self._permits.discard(permit)
+        permit.rules = Rules()
+        permit.on_revoke(reason)
+
+
+@dataclass(frozen=True)
+class _Standing:
+    ended: str
+    grants: tuple[Grant, ...] = ()
+
+
+def _standing(
+    session: Session, keys: set[tuple[int, int, int]], now: float
+) -> dict[tuple[int, int, int], _Standing]:
+    found = {}
+    for key in keys:
+        user_id, token_id, robot_id = key
+        if not queries.token_is_live(session, token_id, now):
+            found[key] = _Standing("your session was ended; log in again")
+        elif not queries.user_is_live(session, user_id):
+            found[key] = _Standing("your account was disabled")
+        else:
+            grants = tuple(queries.grants_for(session, user_id, robot_id))
+            found[key] = _Standing("" if grants else "your right on this robot was revoked", grants)
+    return found

@@ -1,0 +1,70 @@
+"""Type definitions of a robot, asked for once each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from twisted.internet.defer import Deferred, succeed
+
+from relay_protocol import link
+from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
+from relay_server.channel.wire import Wire
+
+
+class Definitions:
+    """Asks the robot for the definitions that its channel needs.
+
+    :param defined: called with the name of each type that becomes known
+    """
+
+    def __init__(self, wire: Wire, defined: Callable[[str], None]) -> None:
+        self._wire = wire
+        self._defined = defined
+        self._asked: dict[str, list[Deferred[None]]] = {}
+
+    def want(self, type_name: str) -> None:
+        """Ask for a type unless it is known or asked for already."""
+        if self._wire.robot.types.knows(type_name) or type_name in self._asked:
+            return
+        if self._wire.cdr and self._wire.link is not None:
+            self._asked[type_name] = []
+            self._wire.send(link.GetType(type=type_name))
+
+    def ready(self, type_name: str) -> Deferred[None]:
+        """Fires when the type is known; fails in words when the robot does not know it or is lost."""
+        if self._wire.robot.types.knows(type_name) or not self._wire.cdr:
+            return succeed(None)
+        self.want(type_name)
+        waiting: Deferred[None] = Deferred()
+        self._asked.setdefault(type_name, []).append(waiting)
+        return waiting
+
+    def add(self, message: link.TypeDefinition) -> None:
+        """The robot has sent a definition."""
+        waiting = self._asked.pop(message.type, None)
+        if waiting is None:
+            return
+        try:
+            self._wire.robot.types.add(message.type, message.text)
+        except SwitchboardError as error:
+            self._fail(waiting, Invalid(f"the robot's definition of {message.type} is unusable: {error}"))
+            return
+        for each in waiting:
+            each.callback(None)
+        self._defined(message.type)
+
+    def refused(self, type_name: str, reason: str) -> None:
+        """The robot does not have the type."""
+        waiting = self._asked.pop(type_name, [])
+        self._fail(waiting, Invalid(f"type {type_name}: {reason}"))
+
+    def reset(self) -> None:
+        """The link is gone."""
+        asked, self._asked = self._asked, {}
+        for waiting in asked.values():
+            self._fail(waiting, Unavailable(f"robot {self._wire.robot.name} lost its connection"))
+
+    @staticmethod
+    def _fail(waiting: list[Deferred[None]], error: SwitchboardError) -> None:
+        for each in waiting:
+            each.errback(error)

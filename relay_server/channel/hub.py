@@ -1,0 +1,81 @@
+"""All channels of a relay, and the tickets with which robots join them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+
+from relay_protocol.errors import Refused
+from relay_protocol.limits import CHANNEL_TICKET_SECONDS
+from relay_server.channel.lifecycle import Channel
+from relay_server.clock import Clock
+from relay_server.registry import Presence
+
+
+class Channels:
+    """Opens channels on demand and tells robots' joining links to which one they belong.
+
+    :param new_ticket: makes an unguessable text
+    :param wall_ns: Unix time in nanoseconds
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        linger: float,
+        new_ticket: Callable[[], str],
+        wall_ns: Callable[[], int],
+    ) -> None:
+        self._clock = clock
+        self._linger = linger
+        self._new_ticket = new_ticket
+        self._wall_ns = wall_ns
+        self._channels: dict[int, Channel] = {}
+        self._tickets: dict[str, tuple[Channel, float]] = {}
+        self._counter = itertools.count(1)
+
+    def __iter__(self) -> Iterator[Channel]:
+        return iter(list(self._channels.values()))
+
+    def of(self, robot: Presence) -> Channel:
+        """The robot's channel, a new one when there is none."""
+        channel = self._channels.get(robot.robot_id)
+        if channel is None:
+            channel = self._channels[robot.robot_id] = Channel(
+                self._clock,
+                robot,
+                f"{robot.name}#{next(self._counter)}",
+                linger=self._linger,
+                issue_ticket=self._issue,
+                closed=self._forget,
+                wall_ns=self._wall_ns,
+            )
+        return channel
+
+    def find(self, robot: Presence) -> Channel | None:
+        """The robot's channel, if it has one."""
+        return self._channels.get(robot.robot_id)
+
+    def redeem(self, ticket: str) -> Channel:
+        """The channel a ticket is for; the ticket is spent.
+
+        :raises Refused: unknown, used or too old
+        """
+        found = self._tickets.pop(ticket, None)
+        if found is None or found[1] < self._clock.seconds():
+            raise Refused("the channel ticket is unknown, used or too old")
+        return found[0]
+
+    def _issue(self, channel: Channel) -> str:
+        now = self._clock.seconds()
+        for old in [key for key, (held, until) in self._tickets.items() if held is channel or until < now]:
+            del self._tickets[old]
+        ticket = self._new_ticket()
+        self._tickets[ticket] = (channel, now + CHANNEL_TICKET_SECONDS)
+        return ticket
+
+    def _forget(self, channel: Channel) -> None:
+        if self._channels.get(channel.robot.robot_id) is channel:
+            del self._channels[channel.robot.robot_id]
+        self._tickets = {key: held for key, held in self._tickets.items() if held[0] is not channel}

@@ -1,0 +1,291 @@
+"""A channel's life, as a table of states and events, and the messages that pass through it."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_server.channel.calls import Calls
+from relay_server.channel.definitions import Definitions
+from relay_server.channel.publications import Publications
+from relay_server.channel.subscriptions import Subscriptions
+from relay_server.channel.wire import ChannelLink, Member, Wire
+from relay_server.clock import Clock, Timer, cancel
+from relay_server.registry import Presence
+
+JOIN_SECONDS = 10.0
+"""A robot that has not joined by then is asked again."""
+
+REOPEN_SECONDS = 0.5
+"""Pause before a broken channel link is asked for anew."""
+
+
+class State(enum.Enum):
+    """Where a channel is in its life."""
+
+    NEW = "new"
+    WAITING = "waiting for the robot"
+    OPENING = "opening"
+    OPEN = "open"
+    CLOSED = "closed"
+
+
+class Event(enum.Enum):
+    """What happens to a channel."""
+
+    WANTED = "somebody is here"
+    ROBOT_ONLINE = "the robot registered"
+    ROBOT_OFFLINE = "the robot is gone"
+    JOINED = "the robot joined"
+    LINK_LOST = "the channel's link broke"
+    LATE = "the robot did not join in time"
+    SHUT = "nobody needs it any more"
+
+
+NEXT: dict[tuple[State, Event], State] = {
+    (State.NEW, Event.WANTED): State.WAITING,
+    (State.WAITING, Event.ROBOT_ONLINE): State.OPENING,
+    (State.WAITING, Event.SHUT): State.CLOSED,
+    (State.OPENING, Event.JOINED): State.OPEN,
+    (State.OPENING, Event.ROBOT_ONLINE): State.OPENING,
+    (State.OPENING, Event.ROBOT_OFFLINE): State.WAITING,
+    (State.OPENING, Event.LATE): State.OPENING,
+    (State.OPENING, Event.SHUT): State.CLOSED,
+    (State.OPEN, Event.LINK_LOST): State.OPENING,
+    (State.OPEN, Event.ROBOT_OFFLINE): State.WAITING,
+    (State.OPEN, Event.SHUT): State.CLOSED,
+}
+"""An event that is not listed for a state changes nothing."""
+
+
+class Channel:
+    """Everything that goes on with one robot in use.
+
+    :param linger: seconds it stays open after the last member
+    :param issue_ticket: makes the ticket the robot joins with
+    :param closed: called once, when it is over
+    :param wall_ns: Unix time in nanoseconds
+    """
+
+    log = Logger()
+
+    def __init__(
+        self,
+        clock: Clock,
+        robot: Presence,
+        name: str,
+        *,
+        linger: float,
+        issue_ticket: Callable[[Channel], str],
+        closed: Callable[[Channel], None],
+        wall_ns: Callable[[], int],
+    ) -> None:
+        self._clock = clock
+        self.robot = robot
+        self.name = name
+        self._linger = linger
+        self._issue_ticket = issue_ticket
+        self._closed = closed
+        self._wall_ns = wall_ns
+        self.state = State.NEW
+        self.members: set[Member] = set()
+        self._timer: Timer | None = None
+        self._idle: Timer | None = None
+        self._opened: list[Deferred[None]] = []
+        self.wire = Wire(robot)
+        definitions = Definitions(self.wire, self._typed)
+        self._definitions = definitions
+        self.subscriptions = Subscriptions(self.wire, definitions)
+        self.publications = Publications(self.wire, definitions, wall_ns)
+        self._calls = Calls(clock, self.wire, definitions)
+        robot.watchers.append(self)
+
+    # --- members ------------------------------------------------------------------------------------------
+
+    def attach(self, member: Member) -> None:
+        """A session begins to use the robot."""
+        self.members.add(member)
+        if self._idle is not None:
+            self._idle.cancel()
+            self._idle = None
+        if self.state is State.NEW:
+            self._happen(Event.WANTED)
+            if self.robot.control is not None:
+                self._happen(Event.ROBOT_ONLINE)
+
+    def detach(self, member: Member) -> None:
+        """A session has ended: what only it wanted is given back to the robot at once."""
+        self.members.discard(member)
+        self.subscriptions.forget(member)
+        self.publications.forget(member)
+        if not self.members and self._idle is None and self.state is not State.CLOSED:
+            self._idle = self._clock.callLater(self._linger, self._idle_over)
+
+    def _idle_over(self) -> None:
+        self._idle = None
+        self._happen(Event.SHUT)
+
+    def shut(self) -> None:
+        """Close at once, whoever is here."""
+        if self._idle is not None:
+            self._idle.cancel()
+            self._idle = None
+        self._happen(Event.SHUT)
+
+    async def call(self, service: str, type_name: str, args: bytes, timeout: float | None) -> bytes:
+        """Call a service of the robot; see :meth:`Calls.call`. Waits for the channel while it opens.
+
+        :raises Unavailable: besides the cases there, the robot is offline
+        """
+        await self._open()
+        return await self._calls.call(service, type_name, args, timeout, self._wall_ns())
+
+    async def round_trip(self) -> float:
+        """Seconds for a ping to the robot over this channel's own link.
+
+        :raises Unavailable: the robot is offline or lost before it answers
+        """
+        await self._open()
+        if self.wire.link is None:
+            raise Unavailable(f"robot {self.robot.name} is not connected")
+        return await self.wire.link.round_trip()
+
+    async def definition(self, type_name: str) -> None:
+        """Wait until the robot's definition of a type is known.
+
+        :raises Invalid: the robot does not have it
+        :raises Unavailable: the robot is offline
+        """
+        await self._open()
+        await self._definitions.ready(type_name)
+
+    async def _open(self) -> None:
+        if self.state is State.WAITING:
+            raise Unavailable(f"robot {self.robot.name} is offline")
+        if self.state is State.OPENING:
+            waiting: Deferred[None] = Deferred()
+            self._opened.append(waiting)
+            await waiting
+
+    # --- the robot ----------------------------------------------------------------------------------------
+
+    def robot_online(self) -> None:
+        """The robot has registered (again)."""
+        self._happen(Event.ROBOT_ONLINE)
+
+    def robot_offline(self) -> None:
+        """The control link is gone, and with it what the robot did for us."""
+        self._happen(Event.ROBOT_OFFLINE)
+
+    def graph_changed(self) -> None:
+        """The robot told of a change in its graph."""
+        self.subscriptions.graph_changed()
+
+    def joined(self, channel_link: ChannelLink) -> None:
+        """The robot has come with our ticket."""
+        if self.state is not State.OPENING:
+            channel_link.close("this channel is not being opened")
+            return
+        self.wire.link = channel_link
+        self._happen(Event.JOINED)
+
+    def link_lost(self, channel_link: ChannelLink) -> None:
+        """The channel's link has ended."""
+        if self.wire.link is channel_link:
+            self._happen(Event.LINK_LOST)
+
+    def sample(self, number: int, body: bytes) -> None:
+        """A sample came over the channel's link."""
+        self.subscriptions.sample(number, body)
+
+    def message(self, message: link.RobotChannel) -> None:
+        """A message came over the channel's link."""
+        handler = _HANDLERS.get(type(message))
+        if handler is not None:
+            handler(self, message)
+
+    def _failed(self, message: link.Failed) -> None:
+        reason = message.reason
+        if message.what == "get_type":
+            self._definitions.refused(message.ref, reason)
+            self.subscriptions.type_refused(message.ref, reason)
+            self.publications.type_refused(message.ref, reason)
+        elif message.ref.isdecimal():
+            refuse = {"subscribe": self.subscriptions.refused, "advertise": self.publications.refused}
+            if message.what in refuse:
+                refuse[message.what](int(message.ref), reason)
+
+    def _typed(self, type_name: str) -> None:
+        self.subscriptions.typed(type_name)
+        self.publications.typed(type_name)
+
+    # --- life ---------------------------------------------------------------------------------------------
+
+    def _happen(self, event: Event) -> None:
+        following = NEXT.get((self.state, event))
+        if following is None:
+            return
+        before, self.state = self.state, following
+        self.log.debug("channel {name}: {event}, now {state}", name=self.name, event=event, state=following)
+        cancel(self._timer)
+        self._timer = None
+        if before is State.OPEN:
+            self._leave_open(event)
+        if following is State.OPENING:
+            pause = REOPEN_SECONDS if event is Event.LINK_LOST else 0.0
+            self._timer = self._clock.callLater(pause, self._ask_to_open)
+        elif following is State.WAITING:
+            self._tell_waiting(Unavailable(f"robot {self.robot.name} is offline"))
+        elif following is State.OPEN:
+            self._enter_open()
+        elif following is State.CLOSED:
+            self._end()
+
+    def _ask_to_open(self) -> None:
+        if self.robot.control is not None:
+            ticket = self._issue_ticket(self)
+            self.robot.control.send(link.OpenChannel(channel=self.name, ticket=ticket))
+        self._timer = self._clock.callLater(JOIN_SECONDS, self._happen, Event.LATE)
+
+    def _enter_open(self) -> None:
+        self.subscriptions.opened()
+        self.publications.opened()
+        self._tell_waiting(None)
+
+    def _leave_open(self, event: Event) -> None:
+        broken, self.wire.link = self.wire.link, None
+        if broken is not None:
+            broken.close(event.value)
+        self.subscriptions.lost()
+        self.publications.lost()
+        self._definitions.reset()
+        self._calls.lost()
+
+    def _end(self) -> None:
+        if self.robot.control is not None:
+            self.robot.control.send(link.CloseChannel(channel=self.name))
+        self._tell_waiting(Unavailable("the channel was closed"))
+        self.robot.watchers.remove(self)
+        self._closed(self)
+
+    def _tell_waiting(self, error: SwitchboardError | None) -> None:
+        waiting, self._opened = self._opened, []
+        for each in waiting:
+            if error is None:
+                each.callback(None)
+            else:
+                each.errback(error)
+
+
+_HANDLERS: dict[type, Callable[[Channel, object], None]] = {
+    link.Subscribed: lambda channel, message: channel.subscriptions.subscribed(message),  # type: ignore[arg-type]
+    link.Advertised: lambda channel, message: channel.publications.advertised(message),  # type: ignore[arg-type]
+    link.ServiceResponse: lambda channel, message: channel._calls.answered(message),  # type: ignore[arg-type]
+    link.TypeDefinition: lambda channel, message: channel._definitions.add(message),  # type: ignore[arg-type]
+    link.Failed: lambda channel, message: channel._failed(message),  # type: ignore[arg-type]
+}

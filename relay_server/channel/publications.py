@@ -1,0 +1,202 @@
+"""Topics clients publish to: each advertised once on the robot, JSON turned into the robot's encoding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from relay_protocol import jsontext, link, rosbridge
+from relay_protocol.errors import Invalid, SwitchboardError
+from relay_protocol.rights import Operation
+from relay_server.access import Permit
+from relay_server.channel.definitions import Definitions
+from relay_server.channel.topics import Phase, Publication
+from relay_server.channel.wire import Member, Wire, resolve
+
+Failed = Callable[[str], None]
+
+
+class Publications:
+    """Keeps the robot's publishers in step with what clients advertise, and carries their messages.
+
+    :param wall_ns: Unix time in nanoseconds, for header stamps a client leaves out
+    """
+
+    def __init__(self, wire: Wire, definitions: Definitions, wall_ns: Callable[[], int]) -> None:
+        self._wire = wire
+        self._definitions = definitions
+        self._wall_ns = wall_ns
+        self._topics: dict[str, Publication] = {}
+        self._numbers: dict[int, Publication] = {}
+
+    def advertise(self, member: Member, ask: rosbridge.Advertise, type_name: str) -> None:
+        """A client is going to publish.
+
+        :raises Invalid: the topic has another type; too many topics
+        """
+        publication = self._get(resolve(ask.topic), type_name)
+        publication.holders.setdefault(member, set()).add(ask.id)
+        if publication.phase is Phase.WAITING:
+            publication.latch = publication.latch or ask.latch
+            publication.queue_size = max(publication.queue_size, ask.queue_size)
+            publication.qos = ask.qos or publication.qos
+        if publication.phase in (Phase.WAITING, Phase.FAILED):
+            self._ask(publication)
+
+    def unadvertise(self, member: Member, topic: str, id: rosbridge.Id) -> None:
+        """A client takes one advertisement back, or all of a topic when ``id`` is ``None``."""
+        publication = self._topics.get(topic)
+        if publication is None:
+            return
+        ids = publication.holders.get(member, set())
+        ids.discard(id)
+        if id is None or not ids:
+            self._let_go(publication, member)
+
+    def forget(self, member: Member) -> None:
+        """A client has gone."""
+        for publication in list(self._topics.values()):
+            self._let_go(publication, member)
+
+    def forget_denied(self, member: Member, permit: Permit) -> None:
+        """A client's rights have changed: what it may not publish any more is taken back."""
+        for publication in list(self._topics.values()):
+            if member in publication.holders:
+                verdict = permit.judge(Operation.PUBLISH, publication.topic)
+                if not verdict.allowed:
+                    self._let_go(publication, member)
+                    member.tell("error", f"unadvertised {publication.topic}: {verdict.reason}")
+
+    def get(self, member: Member, topic: str, type_name: str) -> Publication:
+        """The publication a client publishes to, advertised now if it was not.
+
+        :raises Invalid: nobody knows the topic's type, or it has another one
+        """
+        publication = self._topics.get(topic)
+        if publication is None or member not in publication.holders:
+            wanted = type_name or self._known(topic)
+            if not wanted:
+                raise Invalid(f"topic {topic} does not exist and no type was given; advertise it first")
+            publication = self._get(topic, wanted)
+            publication.holders.setdefault(member, set()).add(None)
+            if publication.phase is Phase.WAITING:
+                self._ask(publication)
+        return publication
+
+    def publish(self, publication: Publication, body: bytes, stamp: int, failed: Failed) -> None:
+        """Send one message to the robot, or hold it for the moment until the link or the type is there.
+
+        :param body: JSON of the message
+        :param stamp: the relay's monotonic nanoseconds; the message can't have been sent before
+        :param failed: told in words when it could not be sent
+        """
+        if publication.phase is Phase.FAILED:
+            failed(f"the robot could not advertise {publication.topic}; the message was dropped")
+        elif self._wire.link is None or self._untyped(publication):
+            publication.held.append((body, stamp, failed))
+        else:
+            self._convert(publication, body, stamp, failed)
+
+    def opened(self) -> None:
+        """The robot is there: advertise everything."""
+        for publication in list(self._topics.values()):
+            self._ask(publication)
+
+    def lost(self) -> None:
+        """The robot's side is gone; what was held is older than anyone would want executed."""
+        for publication in self._topics.values():
+            publication.phase = Phase.WAITING
+            publication.held.clear()
+
+    def typed(self, type_name: str) -> None:
+        """A definition has come: what was held for it goes."""
+        for publication in list(self._topics.values()):
+            if publication.type == type_name:
+                self._flush(publication)
+
+    def advertised(self, message: link.Advertised) -> None:
+        """The publisher stands."""
+        publication = self._numbers.get(message.number)
+        if publication is not None:
+            publication.phase = Phase.ACTIVE
+
+    def refused(self, number: int, reason: str) -> None:
+        """The robot could not advertise."""
+        publication = self._numbers.get(number)
+        if publication is None:
+            return
+        publication.phase = Phase.FAILED
+        publication.held.clear()
+        for member in list(publication.holders):
+            member.tell("error", f"advertise {publication.topic}: {reason}")
+
+    def type_refused(self, type_name: str, reason: str) -> None:
+        """A type is not to be had."""
+        for publication in self._topics.values():
+            if publication.type == type_name and publication.phase is not Phase.WAITING:
+                self.refused(publication.number, reason)
+
+    def _known(self, topic: str) -> str:
+        publication = self._topics.get(topic)
+        return (publication.type if publication else None) or self._wire.robot.graph.topic_type(topic) or ""
+
+    def _untyped(self, publication: Publication) -> bool:
+        return self._wire.cdr and not self._wire.robot.types.knows(publication.type)
+
+    def _get(self, topic: str, type_name: str) -> Publication:
+        known = self._known(topic)
+        if known and known != type_name:
+            raise Invalid(f"topic {topic} has the type {known}, not {type_name}")
+        publication = self._topics.get(topic)
+        if publication is None:
+            publication = Publication(self._wire.number(), topic, type_name)
+            self._topics[topic] = self._numbers[publication.number] = publication
+        return publication
+
+    def _ask(self, publication: Publication) -> None:
+        if self._wire.link is None:
+            return
+        publication.phase = Phase.ASKED
+        self._wire.send(
+            link.Advertise(
+                number=publication.number,
+                topic=publication.topic,
+                type=publication.type,
+                latch=publication.latch,
+                queue_size=publication.queue_size,
+                qos=publication.qos,
+            )
+        )
+        if self._untyped(publication):
+            self._definitions.want(publication.type)
+        else:
+            self._flush(publication)
+
+    def _flush(self, publication: Publication) -> None:
+        held = list(publication.held)
+        publication.held.clear()
+        for body, stamp, failed in held:
+            self._convert(publication, body, stamp, failed)
+
+    def _convert(self, publication: Publication, body: bytes, stamp: int, failed: Failed) -> None:
+        try:
+            message = jsontext.decode_any(body)
+            if not isinstance(message, dict):
+                raise Invalid("'msg' must be an object")
+            if self._wire.cdr:
+                encoded = self._wire.robot.types.from_json(publication.type, message, self._wall_ns())
+            else:
+                encoded = jsontext.encode(message)
+        except SwitchboardError as error:
+            failed(f"publish {publication.topic}: {error}")
+            return
+        if self._wire.link is not None:
+            self._wire.link.sample(publication.number, stamp, encoded)
+
+    def _let_go(self, publication: Publication, member: Member) -> None:
+        if publication.holders.pop(member, None) is None or publication.holders:
+            return
+        del self._topics[publication.topic]
+        del self._numbers[publication.number]
+        self._wire.names -= 1
+        if publication.phase in (Phase.ASKED, Phase.ACTIVE):
+            self._wire.send(link.Unadvertise(number=publication.number))

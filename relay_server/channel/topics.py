@@ -1,0 +1,207 @@
+"""One topic of one robot, on its way to the clients and from them."""
+
+from __future__ import annotations
+
+import enum
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+from relay_protocol import jsontext, rosbridge
+from relay_protocol.errors import SwitchboardError
+from relay_protocol.link import QoS
+from relay_protocol.ros_types import TypeRegistry
+from relay_server.channel.wire import Member
+from relay_server.clock import Clock, Timer
+
+LATCHED_KEPT = 64
+"""Most latched samples kept for late joiners of one topic (one for each publisher)."""
+
+
+class Sample:
+    """One message from the robot. It is converted at most once, and only if somebody takes it."""
+
+    __slots__ = ("_body", "_convert", "_encoded", "_payloads", "failure")
+
+    def __init__(self, body: bytes, convert: Callable[[bytes], bytes]) -> None:
+        self._body = body
+        self._convert = convert
+        self._encoded: bytes | None = None
+        self._payloads: dict[str, bytes] = {}
+        self.failure: str = ""
+
+    def payload(self, topic: str) -> bytes | None:
+        """The rosbridge ``publish`` for a client that calls the topic so; ``None`` when it can't be converted."""
+        found = self._payloads.get(topic)
+        if found is None:
+            if self._encoded is None:
+                if self.failure:
+                    return None
+                try:
+                    self._encoded = self._convert(self._body)
+                except SwitchboardError as error:
+                    self.failure = str(error)
+                    return None
+            found = self._payloads[topic] = rosbridge.publish(topic, self._encoded)
+        return found
+
+
+def converter(types: TypeRegistry, type_name: str, encoding: str) -> Callable[[bytes], bytes]:
+    """What turns a sample's body into JSON."""
+    if encoding == "json":
+        # A robot's own JSON is decoded and written anew: what goes out is well-formed whatever came in.
+        return lambda body: jsontext.encode(jsontext.decode_any(body))
+    return lambda body: types.to_json(type_name, body)
+
+
+class Receiver(Protocol):
+    """A session, as a topic's listeners use it."""
+
+    def deliver(self, topic: str, payload: bytes, depth: int) -> None:
+        """Queue a sample for the client."""
+
+
+class Listener:
+    """One client's interest in one topic: its subscriptions merged, as rosbridge does.
+
+    :param name: the topic as the client writes it
+    """
+
+    def __init__(self, clock: Clock, receiver: Receiver, name: str) -> None:
+        self._clock = clock
+        self._receiver = receiver
+        self.name = name
+        self.asks: dict[rosbridge.Id, rosbridge.Subscribe] = {}
+        self._next_at = 0.0
+        self._waiting: Sample | None = None
+        self._timer: Timer | None = None
+
+    @property
+    def throttle(self) -> float:
+        """Least seconds between two samples: the least any of the subscriptions asks for."""
+        return max(0.0, min((ask.throttle_rate for ask in self.asks.values()), default=0.0)) / 1000
+
+    @property
+    def depth(self) -> int:
+        """Samples that may wait for this client; 0 leaves it to the relay."""
+        return max((ask.queue_length for ask in self.asks.values()), default=0)
+
+    def offer(self, sample: Sample) -> None:
+        """A new sample. Within the throttle the newest waits, so the last of a burst always arrives."""
+        throttle = self.throttle
+        if throttle:
+            now = self._clock.seconds()
+            if now < self._next_at:
+                self._waiting = sample
+                if self._timer is None:
+                    self._timer = self._clock.callLater(self._next_at - now, self._due)
+                return
+            self._next_at = now + throttle
+        self._send(sample)
+
+    def close(self) -> None:
+        """Stop; nothing more is sent."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._waiting = None
+
+    def _due(self) -> None:
+        self._timer = None
+        sample, self._waiting = self._waiting, None
+        if sample is not None:
+            self._next_at = self._clock.seconds() + self.throttle
+            self._send(sample)
+
+    def _send(self, sample: Sample) -> None:
+        payload = sample.payload(self.name)
+        if payload is not None:
+            self._receiver.deliver(self.name, payload, self.depth)
+
+
+class Phase(enum.Enum):
+    """How far a subscription or publication has come on the robot."""
+
+    WAITING = "waiting"
+    """Not asked: the robot is away, or the topic's type is not known yet."""
+    ASKED = "asked"
+    ACTIVE = "active"
+    FAILED = "failed"
+
+
+class TopicUplink:
+    """A topic the relay subscribes to on the robot, once, for all its listeners.
+
+    :param type_name: as the first client gave it, or from the graph; empty when nobody knows it yet
+    """
+
+    def __init__(self, number: int, topic: str, type_name: str, qos: QoS | None) -> None:
+        self.number = number
+        self.topic = topic
+        self.type = type_name
+        self.qos = qos
+        self.phase = Phase.WAITING
+        self.throttle_ms = 0
+        self.encoding = "cdr"
+        self.latched = False
+        self.listeners: dict[Member, Listener] = {}
+        self._recent: deque[Sample] = deque(maxlen=1)
+        self._untyped: deque[bytes] = deque(maxlen=LATCHED_KEPT)
+        self.failures = 0
+
+    def activate(self, type_name: str, encoding: str, latched: bool, publishers: int) -> None:
+        """The robot has subscribed."""
+        self.phase = Phase.ACTIVE
+        self.type = type_name
+        self.encoding = encoding
+        self.latched = latched
+        self._recent = deque(self._recent, maxlen=min(max(publishers, 1), LATCHED_KEPT))
+
+    def reset(self) -> None:
+        """The robot's side is gone."""
+        self.phase = Phase.WAITING
+        self._recent.clear()
+        self._untyped.clear()
+
+    def least_throttle_ms(self) -> int:
+        """The throttle that still satisfies every listener."""
+        return int(min((listener.throttle for listener in self.listeners.values()), default=0.0) * 1000)
+
+    def sample(self, body: bytes, types: TypeRegistry) -> Sample | None:
+        """Take a sample from the robot and hand it to the listeners."""
+        if self.encoding == "cdr" and not types.knows(self.type):
+            self._untyped.append(body)
+            return None
+        sample = Sample(body, converter(types, self.type, self.encoding))
+        if self.latched:
+            self._recent.append(sample)
+        for listener in list(self.listeners.values()):
+            listener.offer(sample)
+        return sample
+
+    def typed(self, types: TypeRegistry) -> None:
+        """The type's definition has come: hand on what waited for it."""
+        waiting = list(self._untyped)
+        self._untyped.clear()
+        for body in waiting:
+            self.sample(body, types)
+
+    def replay(self, listener: Listener) -> None:
+        """Give a late joiner the latched samples the others have had."""
+        for sample in list(self._recent):
+            listener.offer(sample)
+
+
+class Publication:
+    """A topic clients publish to, advertised once on the robot."""
+
+    def __init__(self, number: int, topic: str, type_name: str) -> None:
+        self.number = number
+        self.topic = topic
+        self.type = type_name
+        self.latch = False
+        self.queue_size = 0
+        self.qos: QoS | None = None
+        self.phase = Phase.WAITING
+        self.holders: dict[Member, set[rosbridge.Id]] = {}
+        self.held: deque[tuple[bytes, int, Callable[[str], None]]] = deque(maxlen=64)

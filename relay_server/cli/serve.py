@@ -1,0 +1,106 @@
+"""``switchboard serve``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from relay_protocol.errors import Invalid
+from relay_server.cli.app import App, examples, pass_app
+
+if TYPE_CHECKING:
+    from relay_server.service import Relay
+
+
+@click.command(
+    epilog=examples(
+        "switchboard serve --data /var/lib/switchboard --http 0.0.0.0:9090 --robots 0.0.0.0:9091 \\",
+        "    --tls-cert chain.pem --tls-key key.pem --origin https://robots.example.org",
+        "switchboard serve --http 127.0.0.1:0 --robots 127.0.0.1:0",
+    )
+)
+@click.option(
+    "--data", type=click.Path(file_okay=False, path_type=Path), help="Data folder (also before 'serve')."
+)
+@click.option(
+    "--http",
+    default="127.0.0.1:9090",
+    metavar="HOST:PORT",
+    show_default=True,
+    envvar="SWITCHBOARD_HTTP",
+    help="Where browsers and rosbridge clients come in. Port 0: any free one.",
+)
+@click.option(
+    "--robots",
+    default="127.0.0.1:9091",
+    metavar="HOST:PORT",
+    show_default=True,
+    envvar="SWITCHBOARD_ROBOTS",
+    help="Where robots dial in.",
+)
+@click.option("--tls-cert", type=click.Path(dir_okay=False, path_type=Path), help="PEM certificate chain.")
+@click.option("--tls-key", type=click.Path(dir_okay=False, path_type=Path), help="PEM private key.")
+@click.option(
+    "--origin",
+    "origins",
+    multiple=True,
+    metavar="URL",
+    help="Origin under which people open the portal, as https://robots.example.org. May be repeated.",
+)
+@click.option("--name", default="", help="Name robots sign for; made up once when not given.")
+@click.option("--heartbeat", default=2.0, show_default=True, help="Seconds between pings on robot links.")
+@click.option("--log-json", is_flag=True, help="Log one JSON object a line.")
+@click.option("--debug", is_flag=True, help="Log more.")
+@pass_app
+def serve(
+    app: App,
+    data: Path | None,
+    http: str,
+    robots: str,
+    tls_cert: Path | None,
+    tls_key: Path | None,
+    origins: tuple[str, ...],
+    name: str,
+    heartbeat: float,
+    log_json: bool,
+    debug: bool,
+) -> None:
+    """Run the relay until SIGTERM or Ctrl-C.
+
+    Prints READY with both ports once everything listens. SIGHUP reads the TLS certificate again. On the very first
+    start a one-time login link for the user 'admin' is printed.
+    """
+    from relay_server import logs
+    from relay_server.config import Endpoint, Settings
+    from relay_server.run import run
+
+    if data is not None:
+        app.data = data
+    if (tls_cert is None) != (tls_key is None):
+        raise Invalid("--tls-cert and --tls-key go together")
+    if heartbeat <= 0:
+        raise Invalid("--heartbeat must be more than 0 s")
+    app.data.mkdir(mode=0o700, parents=True, exist_ok=True)
+    settings = Settings(
+        data=app.data,
+        database=app.database_url,
+        http=Endpoint.parse(http),
+        robots=Endpoint.parse(robots),
+        tls_cert=tls_cert,
+        tls_key=tls_key,
+        origins=origins,
+        name=name,
+        heartbeat=heartbeat,
+    )
+    logs.begin(log_json, debug)
+    sys.exit(run(settings, _ready))
+
+
+def _ready(relay: Relay, link: str | None) -> None:
+    if link is not None:
+        click.echo(f"Nobody can log in yet. Open this once, within an hour, as 'admin':\n  {link}")
+    click.echo(f"READY http={relay.http_port} robots={relay.robots_port}")
+    sys.stdout.flush()

@@ -1,0 +1,44 @@
+"""Time as the relay's parts see it: Twisted's reactor in service, ``twisted.internet.task.Clock`` in tests.
+
+Twisted's own interfaces say the same (``IReactorTime``, ``IDelayedCall``); these are for the type checker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from twisted.internet.task import LoopingCall
+
+
+class Timer(Protocol):
+    """A call that is due later."""
+
+    def active(self) -> bool:
+        """Neither called nor cancelled yet."""
+
+    def cancel(self) -> None:
+        """Don't call."""
+
+
+class Clock(Protocol):
+    """Monotonic time."""
+
+    def seconds(self) -> float:
+        """Now, from an arbitrary start."""
+
+    def callLater(self, delay: float, call: Callable[..., object], *args: Any) -> Timer:
+        """Call after ``delay`` seconds."""
+
+
+def cancel(timer: Timer | None) -> None:
+    """Cancel a timer that may be absent, due already or cancelled."""
+    if timer is not None and timer.active():
+        timer.cancel()
+
+
+def looping(clock: Clock, call: Callable[[], object]) -> LoopingCall:
+    """A call to be repeated on this clock."""
+    loop = LoopingCall(call)
+    loop.clock = clock  # type: ignore[assignment]
+    return loop

@@ -1,0 +1,11 @@
+"""Close codes of a client's websocket (RFC 6455 section 7.4; 4000–4999 are for applications)."""
+
+GOING_AWAY = 1001
+TOO_BIG = 1009
+INTERNAL = 1011
+UNAUTHENTICATED = 4401
+FORBIDDEN = 4403
+NOT_FOUND = 4404
+TOO_SLOW = 4408
+TOO_MANY_ERRORS = 4429
+UNAVAILABLE = 4503

@@ -1,0 +1,86 @@
+"""Settings of one relay. Read once, by the composition root."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from relay_protocol import limits
+from relay_protocol.errors import Invalid
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """Where to listen: a host (name or address) and a TCP port, 0 for any free one."""
+
+    host: str
+    port: int
+
+    @classmethod
+    def parse(cls, text: str) -> Endpoint:
+        """``HOST:PORT``, with an IPv6 address in brackets.
+
+        :raises Invalid: not of that form
+        """
+        try:
+            parts = urlsplit("//" + text)
+            port = parts.port
+        except ValueError:
+            port = None
+            parts = urlsplit("//")
+        if not parts.hostname or port is None or parts.path or parts.username:
+            raise Invalid(f"'{text}' is no address to listen on; write HOST:PORT, as in 127.0.0.1:9090")
+        return cls(parts.hostname, port)
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{host}:{self.port}"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an operator can set.
+
+    :param data: folder of the embedded database, the local socket and the pid file
+    :param database: SQLAlchemy URL
+    :param tls_cert: PEM chain; both it and ``tls_key``, or neither
+    :param origins: further origins (``https://host[:port]``) whose pages may use cookies here
+    :param heartbeat: seconds between pings on a robot link
+    :param linger: seconds a channel stays open after its last client
+    :param client_ping: seconds between pings to an idle client
+    :param driving_ping: seconds between pings to a client that is driving
+    :param stall_limit: seconds a client may take nothing before it is cut
+    :param refresh: seconds between looks at the database's revision counter
+    """
+
+    data: Path
+    database: str
+    http: Endpoint
+    robots: Endpoint
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    origins: tuple[str, ...] = field(default=())
+    name: str = ""
+    heartbeat: float = limits.HEARTBEAT_SECONDS
+    linger: float = limits.LINGER_SECONDS
+    client_ping: float = 2.0
+    driving_ping: float = 0.1
+    stall_limit: float = 5.0
+    refresh: float = 0.25
+    connections_per_address: int = 512
+
+    @property
+    def tls(self) -> bool:
+        """Whether both listeners speak TLS."""
+        return self.tls_cert is not None
+
+    @property
+    def scheme(self) -> str:
+        """``https`` with TLS, else ``http``."""
+        return "https" if self.tls else "http"
+
+    @property
+    def socket_path(self) -> Path:
+        """The local socket the admin command line talks to."""
+        return self.data / "relay.sock"

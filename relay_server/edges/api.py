@@ -1,0 +1,356 @@
+"""``/api/v1``: sessions, robots, tickets; ``/healthz`` and ``/metrics``.
+
+A cookie that changes state counts only with a listed Origin. Every error is problem details (RFC 9457).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+from klein import Klein
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+from twisted.web.server import Request
+from werkzeug.exceptions import HTTPException
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Invalid, MalformedMessage, NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.limits import TICKET_SECONDS
+from relay_server.access import Principal
+from relay_server.auth import SESSION_SECONDS, BadCredentials, TooManyTries
+from relay_server.clock import Clock, cancel
+from relay_server.edges.origins import Origins
+from relay_server.edges.site import problem
+
+T = TypeVar("T")
+
+STREAM_SECONDS = 5.0
+COALESCE_SECONDS = 0.25
+
+
+class Desk(Protocol):
+    """What the API asks for; the composition root's."""
+
+    async def password(self, user: str, password: str, address: str) -> tuple[Principal, str]:
+        """A principal and the token of a new portal session."""
+
+    async def login_code(self, code: str, address: str) -> tuple[Principal, str]:
+        """The same for a one-time login link."""
+
+    async def token(self, token: str) -> Principal:
+        """The principal of a token."""
+
+    async def logout(self, principal: Principal) -> None:
+        """End the session the principal came with."""
+
+    async def robots(self, principal: Principal) -> list[dict[str, Any]]:
+        """What the principal may see of its robots."""
+
+    async def issue_ticket(self, principal: Principal, robot: str) -> str:
+        """A websocket ticket."""
+
+    async def healthy(self) -> bool:
+        """Whether the database answers."""
+
+    def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call ``listener`` when something about robots may have changed; returns what ends that."""
+
+
+class Login(msgspec.Struct):
+    """Body of ``POST /api/v1/session``: a user with a password, or a code from a login link."""
+
+    user: str = ""
+    password: str = ""
+    code: str = ""
+
+
+class TicketFor(msgspec.Struct):
+    """Body of ``POST /api/v1/tickets``."""
+
+    robot: str
+
+
+Handler = Callable[..., Awaitable[Any]]
+
+
+class Api:
+    """The HTTP API as a klein application.
+
+    :param cookie: name of the session cookie
+    :param secure: cookies only over TLS
+    """
+
+    log = Logger()
+    app = Klein()
+
+    def __init__(
+        self,
+        clock: Clock,
+        desk: Desk,
+        origins: Origins,
+        metrics: CollectorRegistry,
+        *,
+        cookie: str,
+        secure: bool,
+    ) -> None:
+        self._clock = clock
+        self._desk = desk
+        self._origins = origins
+        self._metrics = metrics
+        self._cookie = cookie
+        self._secure = secure
+
+    # --- who asks -----------------------------------------------------------------------------------------
+
+    async def principal(self, request: Request) -> Principal:
+        """Who sent this request.
+
+        :raises BadCredentials: nobody that can be told
+        :raises Refused: a cookie that changes state without a listed Origin
+        """
+        scheme, _, token = (request.getHeader("authorization") or "").partition(" ")
+        if scheme.lower() == "bearer":
+            return await self._desk.token(token.strip())
+        cookie = request.getCookie(self._cookie.encode())
+        if cookie is None:
+            raise BadCredentials(
+                "log in first: send an access token (Authorization: Bearer …) or a session cookie"
+            )
+        if request.method not in (b"GET", b"HEAD"):
+            self._origins.check(request.getHeader("origin"), request.getHeader("host") or "")
+        return await self._desk.token(cookie.decode("ascii", "replace"))
+
+    def _set_cookie(self, request: Request, token: str, seconds: float) -> None:
+        request.addCookie(
+            self._cookie,
+            token,
+            path="/",
+            max_age=str(int(seconds)),
+            httpOnly=True,
+            secure=self._secure,
+            sameSite="strict",
+        )
+
+    # --- sessions -----------------------------------------------------------------------------------------
+
+    @app.route("/api/v1/session", methods=["POST"])
+    def login(self, request: Request) -> Any:
+        return self._answer(request, self._login(request))
+
+    async def _login(self, request: Request) -> Any:
+        if request.getHeader("origin") is not None:
+            self._origins.check(request.getHeader("origin"), request.getHeader("host") or "")
+        body = _body(request, Login)
+        address = getattr(request.getClientAddress(), "host", "local")
+        if body.code:
+            principal, token = await self._desk.login_code(body.code, address)
+        elif body.user and body.password:
+            principal, token = await self._desk.password(body.user, body.password, address)
+        else:
+            raise Invalid("send 'user' and 'password', or 'code' from a login link")
+        self._set_cookie(request, token, SESSION_SECONDS)
+        return _me(principal)
+
+    @app.route("/api/v1/session", methods=["GET"])
+    def session(self, request: Request) -> Any:
+        return self._answer(request, self._session(request))
+
+    async def _session(self, request: Request) -> Any:
+        return _me(await self.principal(request))
+
+    @app.route("/api/v1/session", methods=["DELETE"])
+    def logout(self, request: Request) -> Any:
+        return self._answer(request, self._logout(request))
+
+    async def _logout(self, request: Request) -> Any:
+        await self._desk.logout(await self.principal(request))
+        self._set_cookie(request, "", 0)
+        return None
+
+    # --- robots -------------------------------------------------------------------------------------------
+
+    @app.route("/api/v1/robots", methods=["GET"])
+    def robots(self, request: Request) -> Any:
+        return self._answer(request, self._robots(request))
+
+    async def _robots(self, request: Request) -> Any:
+        return {"robots": await self._desk.robots(await self.principal(request))}
+
+    @app.route("/api/v1/robots/stream", methods=["GET"])
+    def stream(self, request: Request) -> Any:
+        return self._answer(request, self._stream(request))
+
+    async def _stream(self, request: Request) -> Any:
+        await self.principal(request)
+        request.setHeader(b"content-type", b"text/event-stream")
+        request.setHeader(b"cache-control", b"no-store")
+        request.setHeader(b"x-accel-buffering", b"no")
+        await _RobotStream(self._clock, self, self._desk, request).run()
+        return _STREAMED
+
+    @app.route("/api/v1/robots/<name>", methods=["GET"])
+    def robot(self, request: Request, name: str) -> Any:
+        return self._answer(request, self._robot(request, name))
+
+    async def _robot(self, request: Request, name: str) -> Any:
+        for robot in await self._desk.robots(await self.principal(request)):
+            if robot["name"] == name:
+                return robot
+        raise NotFound("there is no such robot, or you have no right on it")
+
+    @app.route("/api/v1/tickets", methods=["POST"])
+    def tickets(self, request: Request) -> Any:
+        return self._answer(request, self._tickets(request))
+
+    async def _tickets(self, request: Request) -> Any:
+        principal = await self.principal(request)
+        robot = _body(request, TicketFor).robot
+        request.setResponseCode(201)
+        return {
+            "ticket": await self._desk.issue_ticket(principal, robot),
+            "expires_in": TICKET_SECONDS,
+            "robot": robot,
+        }
+
+    # --- operations ---------------------------------------------------------------------------------------
+
+    @app.route("/healthz", methods=["GET"])
+    def healthz(self, request: Request) -> Any:
+        return self._answer(request, self._healthz(request))
+
+    async def _healthz(self, request: Request) -> Any:
+        if not await self._desk.healthy():
+            raise Unavailable("the database does not answer; what is open goes on, new logins fail")
+        return {"status": "ok"}
+
+    @app.route("/metrics", methods=["GET"])
+    def metrics(self, request: Request) -> Any:
+        return self._answer(request, self._show_metrics(request))
+
+    async def _show_metrics(self, request: Request) -> Any:
+        principal = await self.principal(request)
+        if not principal.admin:
+            raise Refused("metrics are for administrators")
+        request.setHeader(b"content-type", CONTENT_TYPE_LATEST.encode())
+        request.write(generate_latest(self._metrics))
+        return _STREAMED
+
+    # --- answering ----------------------------------------------------------------------------------------
+
+    def _answer(self, request: Request, work: Any) -> Deferred[bytes]:
+        request.setHeader(b"cache-control", b"no-store")
+        running = Deferred.fromCoroutine(self._finish(request, work))
+        # A client that leaves early ends the work.
+        request.notifyFinish().addErrback(lambda _: running.cancel())
+        running.addErrback(self._unexpected, request)
+        return running
+
+    async def _finish(self, request: Request, work: Awaitable[Any]) -> bytes:
+        try:
+            result = await work
+        except SwitchboardError as error:
+            if isinstance(error, TooManyTries):
+                request.setHeader(b"retry-after", str(int(error.retry_after) + 1).encode())
+            if isinstance(error, BadCredentials):
+                request.setHeader(b"www-authenticate", b"Bearer")
+            return problem(request, _status_of(error), str(error), code=error.code)
+        if result is _STREAMED:
+            return b""
+        if result is None:
+            request.setResponseCode(204)
+            return b""
+        request.setHeader(b"content-type", b"application/json")
+        return jsontext.encode(result)
+
+    def _unexpected(self, failure: Any, request: Request) -> bytes:
+        if request._disconnected:
+            return b""
+        self.log.failure("{method} {path} failed", failure, method=request.method, path=request.path)
+        return problem(request, 500, "The relay failed on this request; its log tells more.")
+
+    @app.handle_errors(HTTPException)
+    def _unrouted(self, request: Request, failure: Any) -> bytes:
+        error = failure.value
+        details = {404: "There is nothing at this address.", 405: "This address does not take that method."}
+        status = error.code or 500
+        return problem(request, status, details.get(status, "The request can't be served."))
+
+
+_STREAMED = object()
+
+
+def _body(request: Request, kind: type[T]) -> T:
+    if (request.getHeader("content-type") or "").partition(";")[0].strip().lower() != "application/json":
+        raise Invalid("send the body as application/json")
+    return jsontext.decode(msgspec.json.Decoder(kind), request.content.read())
+
+
+def _me(principal: Principal) -> dict[str, Any]:
+    return {"user": principal.name, "admin": principal.admin, "realm": principal.realm}
+
+
+_STATUS: list[tuple[type[SwitchboardError], int]] = [
+    (BadCredentials, 401),
+    (TooManyTries, 429),
+    (NotFound, 404),
+    (Refused, 403),
+    (Invalid, 400),
+    (MalformedMessage, 400),
+    (Unavailable, 503),
+]
+
+
+def _status_of(error: SwitchboardError) -> int:
+    return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
+
+
+class _RobotStream:
+    """Server-sent events (WHATWG HTML section 9.2): the caller's robots, at every change."""
+
+    def __init__(self, clock: Clock, api: Api, desk: Desk, request: Request) -> None:
+        self._clock = clock
+        self._api = api
+        self._desk = desk
+        self._request = request
+        self._wake: Deferred[None] | None = None
+
+    async def run(self) -> None:
+        """Until the client leaves or its credentials end."""
+        stop = self._desk.on_change(self._changed)
+        try:
+            while not self._request._disconnected:
+                principal = await self._api.principal(self._request)
+                body = jsontext.encode({"robots": await self._desk.robots(principal)})
+                self._request.write(b"event: robots\ndata: " + body + b"\n\n")
+                await self._sleep(COALESCE_SECONDS)
+                await self._until_change()
+        except BadCredentials:
+            self._request.write(b"event: ended\ndata: {}\n\n")
+        finally:
+            stop()
+
+    def _changed(self) -> None:
+        wake, self._wake = self._wake, None
+        if wake is not None:
+            wake.callback(None)
+
+    async def _until_change(self) -> None:
+        wake: Deferred[None] = Deferred()
+        self._wake = wake
+        timer = self._clock.callLater(STREAM_SECONDS, self._changed)
+        try:
+            await wake
+        finally:
+            cancel(timer)
+
+    async def _sleep(self, seconds: float) -> None:
+        done: Deferred[None] = Deferred()
+        timer = self._clock.callLater(seconds, done.callback, None)
+        try:
+            await done
+        finally:
+            cancel(timer)

@@ -1,0 +1,60 @@
+"""Which pages' cookies count here (RFC 6454): the relay's own, and those that were listed."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterable
+from urllib.parse import urlsplit
+
+from relay_protocol.errors import Refused
+
+
+class Origins:
+    """The list of origins a cookie may come from.
+
+    The relay's own origin counts when it is an address or ``localhost``: a host name could be rebound by whoever
+    owns it, so a name must be listed.
+
+    :param scheme: ``http`` or ``https``, what the relay itself speaks
+    :param listed: ``https://host[:port]`` each
+    """
+
+    def __init__(self, scheme: str, listed: Iterable[str] = ()) -> None:
+        self.tls = scheme == "https"
+        self._scheme = scheme
+        self._listed = {_normal(each) for each in listed}
+
+    def check(self, origin: str | None, host: str) -> None:
+        """Take or refuse a cookie that came with this ``Origin`` and ``Host``.
+
+        :raises Refused: no Origin at all, or one that is neither listed nor the relay's own
+        """
+        if origin is None:
+            raise Refused("a session cookie counts only with an Origin header; programs use an access token")
+        if _normal(origin) in self._listed:
+            return
+        own = _normal(f"{self._scheme}://{host}")
+        if _normal(origin) != own or not _unrebindable(urlsplit(own).hostname or ""):
+            raise Refused(
+                f"pages of {origin[:100]} may not use this relay; start it with --origin to allow that"
+            )
+
+
+def _normal(origin: str) -> str:
+    try:
+        parts = urlsplit(origin.strip().lower())
+        port = parts.port
+    except ValueError:
+        return ""
+    standard = {"http": 80, "https": 443}.get(parts.scheme)
+    return f"{parts.scheme}://{parts.hostname}:{port or standard}"
+
+
+def _unrebindable(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,276 @@
+"""What a robot's connection is for: opening, then control link or channel link (SPEC sections 2.2 to 2.4)."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+
+from relay_db import queries
+from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
+from relay_protocol.errors import Invalid, MalformedMessage, Refused
+from relay_protocol.frames import SampleFrame
+from relay_server import passwords
+from relay_server.channel import Channel, Channels
+from relay_server.edges.robots import RobotConnection
+from relay_server.journal import Journal
+from relay_server.registry import Presence, Registry
+from relay_server.store import Store
+
+REPLACE_SECONDS = 3.0
+"""A registration younger than this is not replaced: two daemons with one key would flap for ever."""
+
+
+@dataclass(frozen=True)
+class RobotHall:
+    """What the roles of robot connections share.
+
+    :param relay: the relay's name, part of what robots sign
+    :param seconds: a monotonic clock
+    :param wall: Unix time in seconds
+    """
+
+    relay: str
+    store: Store
+    registry: Registry
+    channels: Channels
+    journal: Journal
+    seconds: Callable[[], float]
+    wall: Callable[[], float]
+
+
+class Opening:
+    """A connection that has not said yet, or not proved, what it is."""
+
+    def __init__(self, hall: RobotHall, connection: RobotConnection) -> None:
+        self._hall = hall
+        self._connection = connection
+        self._hello: link.Hello | None = None
+        self._nonce = b""
+
+    def message(self, body: bytes) -> None:
+        """``hello``, ``enroll`` or ``join`` first; after ``hello``, ``prove``."""
+        message = jsontext.decode(link.opening_decoder, body)
+        if isinstance(message, link.Prove):
+            if self._hello is None:
+                raise MalformedMessage("'prove' came before 'hello'")
+            hello, self._hello = self._hello, None
+            self._run(self._prove(hello, message))
+        elif self._nonce:
+            raise MalformedMessage(f"'{link.lower_tag(type(message).__name__)}' can't come after 'hello'")
+        else:
+            if message.version != PROTOCOL_VERSION:
+                raise _wrong_version(message.version)
+            if isinstance(message, link.Hello):
+                self._challenge(message)
+            elif isinstance(message, link.Enroll):
+                self._run(self._enroll(message))
+            else:
+                self._join(message)
+
+    def sample(self, frame: SampleFrame) -> None:
+        """Nothing but JSON before the proof."""
+        raise MalformedMessage("a sample came before the robot proved itself")
+
+    def lost(self, reason: str) -> None:
+        """Nothing was opened."""
+
+    def _run(self, work: object) -> None:
+        self._connection.wait_for(Deferred.fromCoroutine(work))  # type: ignore[arg-type]
+
+    def _challenge(self, hello: link.Hello) -> None:
+        # Unknown robots are challenged like known ones: who is enrolled here is nobody's business.
+        self._hello = hello
+        self._nonce = secrets.token_bytes(identity.NONCE_BYTES)
+        self._connection.send(link.Challenge(nonce=link.to_base64(self._nonce), relay=self._hall.relay))
+
+    async def _prove(self, hello: link.Hello, proof: link.Prove) -> None:
+        hall = self._hall
+        signature = link.from_base64(proof.signature, "the signature")
+        record = await hall.store.read(queries.robot_key, hello.robot, hello.key)
+        if record is None or not identity.verify(
+            record.public_key, hall.relay, hello.robot, self._nonce, signature
+        ):
+            hall.journal.event(
+                "robot.refused",
+                "relay",
+                claimed=hello.robot[: limits.ROBOT_NAME],
+                address=self._connection.address,
+            )
+            raise Refused("this key is not accepted for this robot; enroll the robot again if it should be")
+        robot = hall.registry.presence(record.robot_id, record.robot, record.realm)
+        control = Control(hall, self._connection, robot, hello)
+        control.begin()
+
+    async def _enroll(self, message: link.Enroll) -> None:
+        hall = self._hall
+        identity.check_robot_name(message.robot)
+        public_key = link.from_base64(message.public_key, "the public key")
+        if len(public_key) != identity.PUBLIC_KEY_BYTES:
+            raise Invalid(f"an Ed25519 public key has {identity.PUBLIC_KEY_BYTES} bytes")
+        try:
+            record = await hall.store.write(
+                queries.redeem_enrolment_code,
+                message.robot,
+                passwords.token_hash(passwords.normalise_code(message.code)),
+                public_key,
+                identity.fingerprint(public_key),
+                message.agent[:200],
+                hall.wall(),
+            )
+        except Refused:
+            hall.journal.event(
+                "robot.enrolment_refused",
+                "relay",
+                claimed=message.robot[: limits.ROBOT_NAME],
+                address=self._connection.address,
+            )
+            raise
+        hall.journal.audit(
+            f"robot:{record.name}",
+            "robot.enrolled",
+            record.name,
+            self._connection.address,
+            key=identity.fingerprint(public_key),
+        )
+        self._connection.send(link.Enrolled(robot=record.name, relay=hall.relay))
+        self._connection.close("enrolled; dial again with hello")
+
+    def _join(self, message: link.Join) -> None:
+        try:
+            channel = self._hall.channels.redeem(message.ticket)
+        except Refused as error:
+            self._connection.refuse(link.Refused(reason=str(error), code=error.code))
+            return
+        self._connection.send(link.Joined(channel=channel.name, at=self._connection.clock_ns()))
+        end = ChannelEnd(channel, self._connection)
+        self._connection.proven(end, limits.ROBOT_FRAME)
+        channel.joined(self._connection)
+
+
+def _wrong_version(version: int) -> MalformedMessage:
+    """What a robot of another protocol version is told."""
+    return MalformedMessage(
+        f"this relay speaks version {PROTOCOL_VERSION} of the robot link, the robot {version}; update the older one"
+    )
+
+
+class Control:
+    """The control link of a registered robot."""
+
+    log = Logger()
+
+    def __init__(
+        self, hall: RobotHall, connection: RobotConnection, robot: Presence, hello: link.Hello
+    ) -> None:
+        self._hall = hall
+        self._connection = connection
+        self._robot = robot
+        self._hello = hello
+
+    def begin(self) -> None:
+        """Register the robot, unless it has only just registered from elsewhere."""
+        robot, hall, connection = self._robot, self._hall, self._connection
+        now = hall.seconds()
+        if robot.control is not None and now - robot.registered_at < REPLACE_SECONDS:
+            connection.refuse(
+                link.Refused(
+                    reason="this robot registered a moment ago on another connection; is its key used twice?",
+                    retry_after=REPLACE_SECONDS,
+                )
+            )
+            return
+        session = secrets.token_hex(4)
+        connection.send(
+            link.Welcome(
+                session=session, heartbeat=connection.timing.heartbeat, frame_limit=limits.ROBOT_FRAME
+            )
+        )
+        robot.registered_at = now
+        robot.session = session
+        robot.key = self._hello.key
+        robot.encodings = tuple(self._hello.encodings)
+        robot.address = connection.address
+        connection.on_round_trip = self._round_trip
+        connection.proven(self, limits.ROBOT_FRAME)
+        hall.registry.registered(robot, connection)
+        hall.journal.event("robot.online", "relay", robot_id=robot.robot_id, address=connection.address)
+        self.log.info(
+            "robot {robot} is online from {address} ({agent})",
+            robot=robot.name,
+            address=connection.address,
+            agent=self._hello.agent[:100],
+        )
+
+    def message(self, body: bytes) -> None:
+        """What the robot tells of itself."""
+        self._hall.registry.seen(self._robot)
+        message = jsontext.decode(link.robot_control_decoder, body)
+        if isinstance(message, link.Graph):
+            self._hall.registry.graph(self._robot, message)
+        elif isinstance(message, link.Health):
+            self._robot.health = message
+            self._hall.registry.changed()
+        elif isinstance(message, link.Describe):
+            self._robot.description = message
+            self._hall.registry.changed()
+        elif isinstance(message, link.Alert):
+            self.log.warn(
+                "robot {robot}: {level}: {text}",
+                robot=self._robot.name,
+                level=message.level,
+                text=message.text,
+            )
+            self._hall.journal.event(
+                "robot.alert",
+                f"robot:{self._robot.name}",
+                robot_id=self._robot.robot_id,
+                level=message.level[:20],
+                text=message.text[:500],
+            )
+        elif isinstance(message, link.Bye):
+            self._connection.close("bye")
+
+    def sample(self, frame: SampleFrame) -> None:
+        """The control link never carries bulk data."""
+        raise MalformedMessage("samples go over the channel link, not the control link")
+
+    def lost(self, reason: str) -> None:
+        """The robot is gone."""
+        robot = self._robot
+        was_ours = robot.control is self._connection
+        self._hall.registry.lost(robot, self._connection)
+        if was_ours:
+            self.log.info("robot {robot} is offline: {reason}", robot=robot.name, reason=reason)
+            self._hall.journal.event("robot.offline", "relay", robot_id=robot.robot_id, reason=reason[:200])
+
+    def _round_trip(self, seconds: float) -> None:
+        self._robot.rtt = seconds
+        self._hall.registry.seen(self._robot)
+
+
+class ChannelEnd:
+    """The robot's end of a channel."""
+
+    def __init__(self, channel: Channel, connection: RobotConnection) -> None:
+        self._channel = channel
+        self._connection = connection
+
+    def message(self, body: bytes) -> None:
+        """An answer, or a definition."""
+        message = jsontext.decode(link.robot_channel_decoder, body)
+        if isinstance(message, link.Bye):
+            self._connection.close("bye")
+        else:
+            self._channel.message(message)
+
+    def sample(self, frame: SampleFrame) -> None:
+        """A sample of a subscribed topic."""
+        self._channel.sample(frame.number, frame.body)
+
+    def lost(self, reason: str) -> None:
+        """The link has ended."""
+        self._channel.link_lost(self._connection)

@@ -1,0 +1,326 @@
+"""The edge towards robots: bytes of one TCP or TLS connection become frames and messages (SPEC section 2).
+
+A connection begins in the role of :class:`Opening`. What the robot proves decides its role from then on: a control
+link or the link of a channel.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import msgspec
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IAddress
+from twisted.internet.protocol import Factory, connectionDone
+from twisted.internet.protocol import Protocol as TwistedProtocol
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_protocol import jsontext, limits, link
+from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
+from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, encode_sample
+from relay_server.clock import Clock, Timer, cancel, looping
+from relay_server.edges.caps import AddressCap
+from relay_server.outbox import Outbox
+
+
+class Role(Protocol):
+    """What a robot's connection is for, at the moment."""
+
+    def message(self, body: bytes) -> None:
+        """A JSON message.
+
+        :raises PeerError: it breaks the protocol
+        """
+
+    def sample(self, frame: SampleFrame) -> None:
+        """A topic sample.
+
+        :raises PeerError: it has no place here
+        """
+
+    def lost(self, reason: str) -> None:
+        """The connection has ended."""
+
+
+@dataclass(frozen=True)
+class LinkTiming:
+    """Times of a robot's connection, seconds."""
+
+    heartbeat: float
+
+
+class RobotConnection(TwistedProtocol):
+    """One connection of a robot, whatever its role.
+
+    :param clock: for deadlines and heartbeats
+    :param clock_ns: the relay's monotonic clock, told to robots in ``pong`` and ``joined``
+    :param first_role: makes the role a new connection begins with
+    """
+
+    log = Logger()
+    transport: Any
+
+    def __init__(
+        self,
+        clock: Clock,
+        clock_ns: Callable[[], int],
+        timing: LinkTiming,
+        first_role: Callable[[RobotConnection], Role],
+        cap: AddressCap,
+    ) -> None:
+        self._clock = clock
+        self.clock_ns = clock_ns
+        self.timing = timing
+        self._cap = cap
+        self._decoder = FrameDecoder(limits.HANDSHAKE_FRAME)
+        self._role: Role | None = first_role(self)
+        self._deadline: Timer | None = None
+        self._unproven_bytes = 0
+        self._waiting: deque[Frame] = deque()
+        self._busy = False
+        self._heard = clock.seconds()
+        self._beating = looping(clock, self._beat)
+        self._pings: dict[int, Deferred[float] | None] = {}
+        self.on_round_trip: Callable[[float], None] = lambda seconds: None
+        self._outbox = Outbox(self._write, clock.seconds, self._overflow)
+        self.address = ""
+
+    # --- Twisted ------------------------------------------------------------------------------------------
+
+    def connectionMade(self) -> None:
+        """A robot has dialled."""
+        self.address = getattr(self.transport.getPeer(), "host", "")
+        harden(self.transport)
+        self.transport.registerProducer(_Flow(self._outbox), True)
+        if not self._cap.enter(self.address):
+            self.refuse(link.Refused(reason="too many connections from your address", retry_after=10.0))
+            return
+        self._deadline = self._clock.callLater(limits.UNPROVEN_SECONDS, self._too_late)
+
+    def dataReceived(self, data: bytes) -> None:
+        """Bytes from the robot."""
+        if self._role is None:
+            return
+        self._heard = self._clock.seconds()
+        if self._deadline is not None:
+            self._unproven_bytes += len(data)
+            if self._unproven_bytes > limits.UNPROVEN_BYTES:
+                self._break(MalformedMessage(f"more than {limits.UNPROVEN_BYTES} bytes before the proof"))
+                return
+        try:
+            self._waiting += self._decoder.feed(data)
+            self._work()
+        except PeerError as error:
+            self._break(error)
+
+    def connectionLost(self, reason: Failure = connectionDone) -> None:
+        """The connection is gone."""
+        self._cap.leave(self.address)
+        self._end(reason.getErrorMessage())
+
+    # --- for roles ----------------------------------------------------------------------------------------
+
+    def send(self, message: link.Message) -> None:
+        """Queue a message that must not be lost."""
+        self._outbox.control(link.frame(message))
+
+    def sample(self, number: int, stamp: int, body: bytes) -> None:
+        """Queue a sample; when the robot is slow the newest survive."""
+        self._outbox.data(number, encode_sample(number, stamp, body))
+
+    def close(self, reason: str) -> None:
+        """Say ``bye`` and end the connection."""
+        if self._role is not None:
+            self.send(link.Bye(reason=reason))
+            self._hang_up(reason)
+
+    def refuse(self, refusal: link.Refused) -> None:
+        """Say no in words and end the connection."""
+        if self._role is not None:
+            self.log.info(
+                "a robot at {address} is refused: {reason}", address=self.address, reason=refusal.reason
+            )
+            self.send(refusal)
+            self._hang_up(refusal.reason)
+
+    def proven(self, role: Role, frame_limit: int) -> None:
+        """The robot is known; from now on the connection has this role, heartbeats run both ways."""
+        self._role = role
+        self._decoder.limit = frame_limit
+        self._stop_deadline()
+        self._beating.start(self.timing.heartbeat, now=True)
+
+    def wait_for(self, work: Deferred[None]) -> None:
+        """Hold further frames until ``work`` is done."""
+        self._busy = True
+        self.transport.pauseProducing()
+        work.addErrback(self._broken_work)
+        work.addBoth(self._go_on)
+
+    def round_trip(self) -> Deferred[float]:
+        """Ping the robot; seconds, or :class:`Unavailable` when the connection ends first."""
+        waiting: Deferred[float] = Deferred()
+        self._ping(waiting)
+        return waiting
+
+    # --- inside -------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while self._waiting and not self._busy and self._role is not None:
+            frame = self._waiting.popleft()
+            if isinstance(frame, SampleFrame):
+                self._role.sample(frame)
+            elif isinstance(frame, JsonFrame):
+                if not self._heartbeat(frame.body):
+                    self._role.message(frame.body)
+            else:
+                raise MalformedMessage("pictures have a link of their own")
+
+    def _heartbeat(self, body: bytes) -> bool:
+        """Ping and pong are the same in every role; the first is answered before anything else is looked at."""
+        if self._deadline is not None or not body.startswith((b'{"op":"ping"', b'{"op":"pong"')):
+            return False
+        message = jsontext.decode(_heartbeats, body)
+        if isinstance(message, link.Ping):
+            self.send(link.Pong(t=message.t, at=self.clock_ns()))
+        elif message.t in self._pings:
+            waiting = self._pings.pop(message.t)
+            seconds = (self.clock_ns() - message.t) / 1e9
+            self.on_round_trip(seconds)
+            if waiting is not None:
+                waiting.callback(seconds)
+        return True
+
+    def _ping(self, waiting: Deferred[float] | None) -> None:
+        now = self.clock_ns()
+        while now in self._pings:
+            now += 1
+        self._pings[now] = waiting
+        self.send(link.Ping(t=now))
+
+    def _beat(self) -> None:
+        silent = self._clock.seconds() - self._heard
+        if silent > self.timing.heartbeat * limits.HEARTBEATS_MISSED:
+            self.log.info(
+                "robot at {address} is silent for {silent:.1f} s", address=self.address, silent=silent
+            )
+            self._end(f"silent for {silent:.1f} s")
+            self.transport.abortConnection()
+            return
+        self._ping(None)
+
+    def _too_late(self) -> None:
+        self._deadline = None
+        self.refuse(
+            link.Refused(reason=f"no proof of identity within {limits.UNPROVEN_SECONDS:g} s", retry_after=5.0)
+        )
+
+    def _broken_work(self, failure: Failure) -> None:
+        error = failure.value
+        if isinstance(error, PeerError):
+            self._break(error)
+        elif isinstance(error, SwitchboardError):
+            retry = 5.0 if isinstance(error, Unavailable) else None
+            self.refuse(link.Refused(reason=str(error), code=error.code, retry_after=retry))
+        else:
+            self.log.failure("opening a robot's link failed", failure)
+            self.refuse(link.Refused(reason="the relay failed; its log tells more", retry_after=5.0))
+
+    def _go_on(self, _: Any) -> None:
+        self._busy = False
+        if self._role is None:
+            return
+        self.transport.resumeProducing()
+        try:
+            self._work()
+        except PeerError as error:
+            self._break(error)
+
+    def _break(self, error: PeerError) -> None:
+        self.log.warn(
+            "the robot at {address} broke the protocol: {reason}", address=self.address, reason=str(error)
+        )
+        self.send(link.Refused(reason=str(error), code=error.code))
+        self._hang_up(str(error))
+
+    def _hang_up(self, reason: str) -> None:
+        self._end(reason)
+        self.transport.loseConnection()
+        self._clock.callLater(2.0, self.transport.abortConnection)
+
+    def _end(self, reason: str) -> None:
+        role, self._role = self._role, None
+        self._stop_deadline()
+        self._outbox.close()
+        self._waiting.clear()
+        if self._beating.running:
+            self._beating.stop()
+        pings, self._pings = self._pings, {}
+        for waiting in pings.values():
+            if waiting is not None:
+                waiting.errback(Unavailable("the robot lost its connection"))
+        if role is not None:
+            role.lost(reason)
+
+    def _stop_deadline(self) -> None:
+        cancel(self._deadline)
+        self._deadline = None
+
+    def _write(self, data: bytes) -> None:
+        self.transport.write(data)
+
+    def _overflow(self) -> None:
+        self.log.warn("the robot at {address} takes nothing; it is cut", address=self.address)
+        self._end("the robot takes nothing")
+        self.transport.abortConnection()
+
+
+_heartbeats: msgspec.json.Decoder[link.Ping | link.Pong] = msgspec.json.Decoder(link.Ping | link.Pong)
+
+
+class _Flow:
+    """Twisted's push producer interface in front of an outbox."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        self._outbox = outbox
+
+    def pauseProducing(self) -> None:
+        self._outbox.pause()
+
+    def resumeProducing(self) -> None:
+        self._outbox.resume()
+
+    def stopProducing(self) -> None:
+        self._outbox.close()
+
+
+def harden(transport: Any) -> None:
+    """Small messages go at once; a dead peer is noticed by the kernel too, where it can."""
+    transport.setTcpNoDelay(True)
+    transport.setTcpKeepAlive(True)
+    while hasattr(transport, "transport") and not hasattr(transport.getHandle(), "setsockopt"):
+        transport = transport.transport  # TLS wraps the socket
+    handle = transport.getHandle()
+    option = getattr(socket, "TCP_USER_TIMEOUT", None)
+    if option is not None and hasattr(handle, "setsockopt"):
+        handle.setsockopt(socket.IPPROTO_TCP, option, 10_000)
+
+
+class RobotFactory(Factory):
+    """Builds a :class:`RobotConnection` for each robot that dials."""
+
+    noisy = False
+
+    def __init__(self, build: Callable[[], RobotConnection]) -> None:
+        self._build = build
+
+    def buildProtocol(self, addr: IAddress | None) -> RobotConnection:
+        """One connection."""
+        connection = self._build()
+        connection.factory = self
+        return connection

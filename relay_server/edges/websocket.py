@@ -1,0 +1,302 @@
+"""The edge towards clients: one websocket is one client on one robot (``/robots/<robot>``).
+
+Autobahn speaks RFC 6455; this module proves who is there and hands whole messages to a session. A client proves
+itself in the handshake (Bearer header, ``bearer.`` subprotocol, ticket, or cookie with a listed Origin) or by a
+rosbridge ``auth`` as its first message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+from urllib.parse import unquote
+
+from autobahn.twisted.websocket import WebSocketServerFactory, WebSocketServerProtocol
+from autobahn.websocket.types import ConnectionDeny, ConnectionRequest
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+
+from relay_protocol import limits, rosbridge
+from relay_protocol.errors import NotFound, PeerError, SwitchboardError, Unavailable
+from relay_server import closing
+from relay_server.access import Principal
+from relay_server.auth import BadCredentials
+from relay_server.clock import Clock, Timer, cancel
+from relay_server.session import ClientTransport, Session
+
+HANDSHAKE_STATUS = {
+    closing.UNAUTHENTICATED: 401,
+    closing.NOT_FOUND: 403,
+    closing.UNAVAILABLE: 503,
+    closing.GOING_AWAY: 503,
+}
+REASON_BYTES = 123
+"""Room for words in a close frame (RFC 6455 section 5.5.1)."""
+
+
+class Gate(Protocol):
+    """Who may come in; the composition root's."""
+
+    accepting: bool
+
+    async def bearer(self, token: str) -> Principal:
+        """The principal of an access token."""
+
+    async def ticket(self, ticket: str, robot: str) -> Principal:
+        """The principal of a single-use ticket."""
+
+    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
+        """The principal of a session cookie, ``None`` when there is no such cookie."""
+
+    async def session(
+        self, principal: Principal, robot: str, transport: ClientTransport, address: str, opened_ns: int
+    ) -> Session:
+        """A session on a robot the principal has a right on."""
+
+
+class ClientProtocol(WebSocketServerProtocol):
+    """One client's websocket."""
+
+    log = Logger()
+    factory: ClientFactory
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._robot = ""
+        self._principal: Principal | None = None
+        self._failure: tuple[int, str] | None = None
+        self._session: Session | None = None
+        self._opening = False
+        self._early: list[bytes] = []
+        self._early_bytes = 0
+        self._deadline: Timer | None = None
+        self._open = False
+        self._opened_ns = 0
+
+    # --- handshake ----------------------------------------------------------------------------------------
+
+    def onConnect(self, request: ConnectionRequest) -> Deferred[str | None]:
+        """Find out who it is before the handshake is answered."""
+        return Deferred.fromCoroutine(self._connect(request))
+
+    async def _connect(self, request: ConnectionRequest) -> str | None:
+        self._robot = unquote(request.path.removeprefix("/robots/"))
+        chosen = None
+        try:
+            if not self.factory.gate.accepting:
+                raise Unavailable("the relay is going down; connect again in a moment")
+            chosen = await self._identify(request)
+        except SwitchboardError as error:
+            self._failure = (_code_of(error), str(error))
+        if self._failure is not None and request.origin is None:
+            # Programs read the status; browsers can't, so they get a close code after the handshake.
+            code, reason = self._failure
+            raise ConnectionDeny(HANDSHAKE_STATUS.get(code, 403), reason)
+        return chosen
+
+    async def _identify(self, request: ConnectionRequest) -> str | None:
+        gate = self.factory.gate
+        scheme, _, token = request.headers.get("authorization", "").partition(" ")
+        bearer = next((each for each in request.protocols if each.startswith("bearer.")), None)
+        ticket = request.params.get("ticket")
+        if scheme.lower() == "bearer" and token:
+            self._principal = await gate.bearer(token.strip())
+        elif bearer is not None:
+            self._principal = await gate.bearer(bearer.removeprefix("bearer."))
+        elif ticket:
+            self._principal = await gate.ticket(ticket[0], self._robot)
+        else:
+            self._principal = await gate.cookie(
+                request.headers.get("cookie", ""), request.origin, request.headers.get("host", "")
+            )
+        return bearer or next((each for each in request.protocols if each.startswith("rosbridge")), None)
+
+    def onOpen(self) -> None:
+        """The handshake is done."""
+        self._open = True
+        self._opened_ns = self.factory.clock_ns()
+        # Twisted's HTTP channel was the producer of this transport until now.
+        self.transport.unregisterProducer()
+        self.transport.registerProducer(_Flow(self), True)
+        if self._failure is not None:
+            self.close(*self._failure)
+        elif self._principal is not None:
+            self._begin()
+        else:
+            self._deadline = self.factory.clock.callLater(limits.UNPROVEN_SECONDS, self._nobody)
+
+    def _nobody(self) -> None:
+        self._deadline = None
+        self.close(
+            closing.UNAUTHENTICATED, "log in: no credentials came with the connection, nor an auth message"
+        )
+
+    def _begin(self) -> None:
+        self._opening = True
+        Deferred.fromCoroutine(self._start()).addErrback(self._failed)
+
+    async def _start(self) -> None:
+        assert self._principal is not None
+        session = await self.factory.gate.session(
+            self._principal, self._robot, self, self._address(), self._opened_ns
+        )
+        self._stop_deadline()
+        self._opening = False
+        if not self._open:
+            session.end()
+            return
+        self._session = session
+        session.start()
+        early, self._early = self._early, []
+        for message in early:
+            session.message(message)
+
+    def _failed(self, failure: Any) -> None:
+        self._opening = False
+        error = failure.value
+        if isinstance(error, SwitchboardError):
+            self.close(_code_of(error), str(error))
+        else:
+            self.log.failure("a client's session could not be opened", failure)
+            self.close(closing.INTERNAL, "the relay failed; its log tells more")
+
+    def _address(self) -> str:
+        return getattr(self.transport.getPeer(), "host", "")
+
+    # --- messages -----------------------------------------------------------------------------------------
+
+    def onMessage(self, payload: bytes, isBinary: bool) -> None:
+        """One whole message."""
+        if isBinary:
+            self.close(closing.FORBIDDEN, "binary messages are not taken; send rosbridge JSON as text")
+        elif self._session is not None:
+            self._session.message(payload)
+        elif self._open:
+            self._message_early(payload)
+
+    def _message_early(self, payload: bytes) -> None:
+        self._early_bytes += len(payload)
+        if self._early_bytes > limits.UNPROVEN_BYTES:
+            self.close(closing.TOO_BIG, f"more than {limits.UNPROVEN_BYTES} bytes before the session began")
+        elif self._principal is not None or self._opening:
+            self._early.append(payload)
+        else:
+            self._authenticate(payload)
+
+    def _authenticate(self, payload: bytes) -> None:
+        try:
+            message = rosbridge.decode(payload)
+        except PeerError as error:
+            self.close(closing.UNAUTHENTICATED, f"log in first: {error}")
+            return
+        if not isinstance(message, rosbridge.Auth):
+            self.close(closing.UNAUTHENTICATED, "log in first: send op 'auth' with the access token in 'mac'")
+            return
+        self._opening = True
+        Deferred.fromCoroutine(self._authenticated(message.mac)).addErrback(self._failed)
+
+    async def _authenticated(self, token: str) -> None:
+        self._principal = await self.factory.gate.bearer(token)
+        await self._start()
+
+    def onPong(self, payload: bytes) -> None:
+        """The answer to a ping."""
+        if self._session is not None:
+            self._session.pong(payload)
+
+    def onClose(self, wasClean: bool, code: int | None, reason: str | None) -> None:
+        """The websocket is gone."""
+        self._open = False
+        self._stop_deadline()
+        self._early.clear()
+        session, self._session = self._session, None
+        if session is not None:
+            session.end()
+
+    # --- ClientTransport ----------------------------------------------------------------------------------
+
+    def send(self, message: bytes) -> None:
+        """One text message."""
+        self.sendMessage(message, isBinary=False)
+
+    def ping(self, payload: bytes) -> None:
+        """A websocket ping."""
+        self.sendPing(payload)
+
+    def close(self, code: int, reason: str) -> None:
+        """Close with a code; the peer has a moment to answer, then the connection is dropped."""
+        self._stop_deadline()
+        if self._open:
+            self._open = False
+            text = reason.encode()[:REASON_BYTES].decode(errors="ignore")
+            self.sendClose(code, text)
+
+    def pause(self) -> None:
+        """The transport's buffer is full."""
+        if self._session is not None:
+            self._session.pause()
+
+    def resume(self) -> None:
+        """The transport takes bytes again."""
+        if self._session is not None:
+            self._session.resume()
+
+    def _stop_deadline(self) -> None:
+        cancel(self._deadline)
+        self._deadline = None
+
+
+class _Flow:
+    """Twisted's push producer interface in front of a client."""
+
+    def __init__(self, client: ClientProtocol) -> None:
+        self._client = client
+
+    def pauseProducing(self) -> None:
+        self._client.pause()
+
+    def resumeProducing(self) -> None:
+        self._client.resume()
+
+    def stopProducing(self) -> None:
+        """The connection is gone; ``onClose`` follows."""
+
+
+def _code_of(error: SwitchboardError) -> int:
+    if isinstance(error, BadCredentials):
+        return closing.UNAUTHENTICATED
+    if isinstance(error, NotFound):
+        return closing.NOT_FOUND
+    if isinstance(error, Unavailable):
+        return closing.UNAVAILABLE
+    return closing.FORBIDDEN
+
+
+class ClientFactory(WebSocketServerFactory):
+    """Builds a :class:`ClientProtocol` for each websocket. Autobahn's open defaults are all closed here."""
+
+    protocol = ClientProtocol
+
+    def __init__(self, clock: Clock, clock_ns: Callable[[], int], gate: Gate) -> None:
+        super().__init__(reactor=clock)
+        self.clock = clock
+        self.clock_ns = clock_ns
+        self.gate = gate
+        self.setProtocolOptions(
+            webStatus=False,
+            # Text is checked once, as a whole, by relay_protocol.jsontext.
+            utf8validateIncoming=False,
+            requireMaskedClientFrames=True,
+            maxFramePayloadSize=limits.CLIENT_FRAME,
+            maxMessagePayloadSize=limits.CLIENT_MESSAGE,
+            failByDrop=False,
+            openHandshakeTimeout=limits.UNPROVEN_SECONDS,
+            closeHandshakeTimeout=1,
+            tcpNoDelay=True,
+            # Pings are the session's: they also tell how old a command can be.
+            autoPingInterval=0,
+            # The Origin matters where a cookie is the credential, and is checked there (Gate.cookie).
+            allowedOrigins=["*"],
+            allowNullOrigin=True,
+            maxConnections=0,
+        )

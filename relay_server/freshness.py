@@ -1,0 +1,62 @@
+"""How old can a client's message be at most? Told by pings, without help from the client.
+
+A websocket carries no sending times, and clients are not ours. But messages keep their order: whatever arrives after
+the pong to a ping was sent after that ping had reached the client, so after the ping was sent. The sending time of
+the latest ping that came back is therefore a moment before which nothing that arrives now can have been sent. It
+holds through stalls of any kind: a frozen relay, a frozen client, a partition that heals.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+PENDING = 64
+"""Pings out at once; a client that answers none is soon cut for its silence."""
+
+
+class Freshness:
+    """The earliest possible sending time of what one client says now.
+
+    :param clock: monotonic nanoseconds
+    :param opened: when the websocket's handshake was answered; the client can't have spoken before
+    :param token: eight unguessable bytes at each call, so that a pong can't be sent in advance
+    """
+
+    def __init__(self, clock: Callable[[], int], opened: int, token: Callable[[], bytes]) -> None:
+        self._clock = clock
+        self._token = token
+        self._out: OrderedDict[bytes, int] = OrderedDict()
+        self.not_before = opened
+        self.last_pong = opened
+        self.rtt: int | None = None
+
+    def ping(self) -> bytes:
+        """The payload of a ping that is sent now."""
+        payload = self._token()
+        self._out[payload] = self._clock()
+        if len(self._out) > PENDING:
+            self._out.popitem(last=False)
+        return payload
+
+    def pong(self, payload: bytes) -> bool:
+        """Take a pong; False when it answers no ping of ours (RFC 6455 section 5.5.3 allows that)."""
+        sent = self._out.get(payload)
+        if sent is None:
+            return False
+        while self._out:
+            key, _ = self._out.popitem(last=False)
+            if key == payload:
+                break
+        self.not_before = max(self.not_before, sent)
+        self.last_pong = self._clock()
+        self.rtt = self.last_pong - sent
+        return True
+
+    def age(self) -> int:
+        """Nanoseconds: no message arriving now is older than this."""
+        return self._clock() - self.not_before
+
+    def silence(self) -> int:
+        """Nanoseconds since the client last answered a ping."""
+        return self._clock() - self.last_pong

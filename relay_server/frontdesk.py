@@ -1,0 +1,265 @@
+"""What edges ask for, put together from who it is, what it may, and who is there."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Iterator
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+
+from relay_db import queries
+from relay_protocol.errors import NotFound, SwitchboardError
+from relay_server import closing
+from relay_server.access import Access, Principal
+from relay_server.auth import Authenticator, BadCredentials
+from relay_server.channel import Channels
+from relay_server.clock import Clock
+from relay_server.edges.origins import Origins
+from relay_server.freshness import Freshness
+from relay_server.journal import Journal
+from relay_server.local import RelayNode
+from relay_server.local.node import milliseconds
+from relay_server.registry import Presence, Registry
+from relay_server.session import ClientTransport, Session, Timing
+from relay_server.store import Store
+
+NO_ROBOT = "there is no such robot, or you have no right on it"
+
+
+class FrontDesk:
+    """Serves the HTTP API and the websockets; keeps the open sessions.
+
+    :param cookie: name of the session cookie
+    :param clock_ns: monotonic nanoseconds
+    :param wall: Unix time in seconds
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        store: Store,
+        authenticator: Authenticator,
+        access: Access,
+        registry: Registry,
+        channels: Channels,
+        journal: Journal,
+        origins: Origins,
+        timing: Timing,
+        *,
+        cookie: str,
+        clock_ns: Callable[[], int],
+        wall: Callable[[], float],
+    ) -> None:
+        self.accepting = True
+        self._clock = clock
+        self._store = store
+        self._auth = authenticator
+        self._access = access
+        self._registry = registry
+        self._channels = channels
+        self._journal = journal
+        self._origins = origins
+        self._timing = timing
+        self._cookie = cookie
+        self._clock_ns = clock_ns
+        self._wall = wall
+        self._sessions: dict[int, dict[int, Session]] = {}
+        self._local = RelayNode(self.sessions_of)
+
+    def __iter__(self) -> Iterator[Session]:
+        return iter([session for each in self._sessions.values() for session in each.values()])
+
+    def sessions_of(self, robot_id: int) -> list[Session]:
+        """The open sessions on a robot, oldest first."""
+        return list(self._sessions.get(robot_id, {}).values())
+
+    # --- who is it ----------------------------------------------------------------------------------------
+
+    async def password(self, user: str, password: str, address: str) -> tuple[Principal, str]:
+        """Log in by password; a principal and the token of a new portal session."""
+        try:
+            principal = await self._auth.password(user, password, address)
+        except SwitchboardError as error:
+            self._journal.event("login.refused", "relay", user=user[:64], address=address, reason=error.code)
+            raise
+        return await self._logged_in(principal, address, "password")
+
+    async def login_code(self, code: str, address: str) -> tuple[Principal, str]:
+        """Log in by a one-time link."""
+        principal = await self._auth.login_code(code, address)
+        return await self._logged_in(principal, address, "link")
+
+    async def _logged_in(self, principal: Principal, address: str, how: str) -> tuple[Principal, str]:
+        token = await self._auth.open_session(principal)
+        self._journal.audit(f"user:{principal.name}", "login", principal.name, address, how=how)
+        return principal, token
+
+    async def logout(self, principal: Principal) -> None:
+        """End the session the principal came with, and what was opened with it."""
+        await self._store.write(queries.revoke_token, principal.token_id)
+        await self._access.refresh()
+
+    async def token(self, token: str) -> Principal:
+        """The principal of an access token or session."""
+        return await self._auth.token(token)
+
+    bearer = token
+
+    async def ticket(self, ticket: str, robot: str) -> Principal:
+        """The principal of a single-use ticket."""
+        return await self._auth.ticket(ticket, robot)
+
+    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
+        """The principal of a session cookie in a websocket's handshake.
+
+        :raises Refused: a cookie without a listed Origin
+        """
+        try:
+            morsel = SimpleCookie(header).get(self._cookie)
+        except CookieError:
+            morsel = None
+        if morsel is None:
+            if origin is not None and origin == f"{'https' if self._origins.tls else 'http'}://{host}":
+                raise BadCredentials("your session has ended; log in again")
+            return None
+        self._origins.check(origin, host)
+        return await self._auth.token(morsel.value)
+
+    # --- robots -------------------------------------------------------------------------------------------
+
+    async def session(
+        self, principal: Principal, robot: str, transport: ClientTransport, address: str, opened_ns: int
+    ) -> Session:
+        """A session on a robot.
+
+        :param opened_ns: when the websocket's handshake was answered, monotonic nanoseconds
+        :raises NotFound: no such robot, or no right on it: one and the same answer
+        """
+        record = await self._store.read(queries.find_robot, robot, principal.realm)
+        permit = None if record is None else await self._access.permit(principal, record.id)
+        if record is None or permit is None:
+            self._journal.event(
+                "client.refused", "relay", user_id=principal.user_id, robot=robot[:64], address=address
+            )
+            raise NotFound(NO_ROBOT)
+        presence = self._registry.presence(record.id, record.name, record.realm)
+        session = Session(
+            self._clock,
+            transport,
+            permit,
+            presence,
+            self._channels.of(presence),
+            self._local,
+            Freshness(self._clock_ns, opened_ns, lambda: secrets.token_bytes(8)),
+            self._timing,
+            address=address,
+            since=self._wall(),
+            ended=self._ended,
+        )
+        self._sessions.setdefault(record.id, {})[session.number] = session
+        presence.users = len(self._sessions[record.id])
+        self._journal.event(
+            "client.joined",
+            f"user:{principal.name}",
+            robot_id=record.id,
+            user_id=principal.user_id,
+            address=address,
+        )
+        self._registry.changed()
+        return session
+
+    def _ended(self, session: Session) -> None:
+        self._access.release(session.permit)
+        open_here = self._sessions.get(session.robot.robot_id, {})
+        open_here.pop(session.number, None)
+        session.robot.users = len(open_here)
+        principal = session.permit.principal
+        self._journal.event(
+            "client.left",
+            f"user:{principal.name}",
+            robot_id=session.robot.robot_id,
+            user_id=principal.user_id,
+            drops=session.outbox.dropped,
+            refusals=session.refusals,
+        )
+        self._registry.changed()
+
+    async def issue_ticket(self, principal: Principal, robot: str) -> str:
+        """A ticket for one websocket to a robot.
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        for record, _ in await self._access.robots(principal):
+            if record.name == robot:
+                return self._auth.issue_ticket(principal, robot)
+        raise NotFound(NO_ROBOT)
+
+    async def robots(self, principal: Principal) -> list[dict[str, Any]]:
+        """What the principal may see of its robots."""
+        return [
+            self._view(record, str(rules.level)) for record, rules in await self._access.robots(principal)
+        ]
+
+    def _view(self, record: queries.RobotRecord, level: str) -> dict[str, Any]:
+        robot = self._registry.find(record.id) or Presence(record.id, record.name, record.realm)
+        return {
+            "name": record.name,
+            "description": record.description,
+            "state": robot.state.value,
+            "level": level,
+            "clients": [{"user": each.name, "since": each.since} for each in self.sessions_of(record.id)],
+            "battery": robot.health.battery,
+            "rtt_ms": milliseconds(robot.rtt),
+            "host": robot.description.host,
+            "platform": robot.description.platform,
+            "distro": robot.description.distro,
+            "last_seen": robot.last_seen,
+        }
+
+    async def healthy(self) -> bool:
+        """Whether the database answers."""
+        try:
+            await self._store.read(queries.revision)
+        except SwitchboardError:
+            return False
+        return True
+
+    def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call ``listener`` when something about robots may have changed; returns what ends that."""
+        return self._registry.on_change(listener)
+
+    def status(self) -> list[dict[str, Any]]:
+        """Every robot the relay knows and who works with it, for the administrator's own machine."""
+        return [
+            {
+                "name": robot.name,
+                "realm": robot.realm,
+                "state": robot.state.value,
+                "address": robot.address,
+                "agent": robot.description.agent,
+                "rtt_ms": milliseconds(robot.rtt),
+                "battery": robot.health.battery,
+                "last_seen": robot.last_seen,
+                "health": {name: getattr(robot.health, name) for name in robot.health.__struct_fields__},
+                "clients": [
+                    {
+                        "user": each.name,
+                        "address": each.address,
+                        "since": each.since,
+                        "rtt_ms": milliseconds(each.rtt),
+                        "drops": each.outbox.dropped,
+                        "waiting_bytes": each.outbox.waiting_bytes,
+                        "refusals": each.refusals,
+                        "stale_commands": each.stale_commands,
+                    }
+                    for each in self.sessions_of(robot.robot_id)
+                ],
+            }
+            for robot in self._registry
+        ]
+
+    def say_goodbye(self, reason: str) -> None:
+        """Refuse newcomers and close what is open: the relay is going down."""
+        self.accepting = False
+        for session in self:
+            session.close(closing.GOING_AWAY, reason)

@@ -1,0 +1,70 @@
+"""The relay as a node of every robot's graph: its own services and topics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+
+from relay_server.local import rosapi
+from relay_server.session import Session
+
+
+async def ping(session: Session, args: Any) -> dict[str, Any]:
+    """``/relay/ping``: answered at once, or with ``{"robot": true}`` after a round trip to the robot."""
+    robot_rtt = session.robot.rtt
+    if isinstance(args, dict) and args.get("robot"):
+        robot_rtt = await session.channel.round_trip()
+    return {"relay_time_ns": time.time_ns(), "robot_rtt_ms": milliseconds(robot_rtt)}
+
+
+def milliseconds(seconds: float | None) -> float | None:
+    """Seconds as milliseconds with two decimals; ``None`` stays."""
+    return None if seconds is None else round(seconds * 1000, 2)
+
+
+class RelayNode:
+    """Finds the relay's own services and topics by name.
+
+    :param sessions: all sessions of a robot, by its id
+    """
+
+    def __init__(self, sessions: Callable[[int], list[Session]]) -> None:
+        self._sessions = sessions
+        self._services: dict[str, Callable[[Session, Any], Awaitable[Any]]] = {
+            "/relay/ping": ping,
+            **rosapi.SERVICES,
+        }
+        self._topics: dict[str, Callable[[Session], dict[str, Any]]] = {"/relay/status": self.status}
+
+    def service(self, name: str) -> Callable[[Session, Any], Awaitable[Any]] | None:
+        """The handler of a service the relay itself offers."""
+        return self._services.get(name)
+
+    def topic(self, name: str) -> Callable[[Session], dict[str, Any]] | None:
+        """What makes the messages of a topic the relay itself publishes."""
+        return self._topics.get(name)
+
+    def status(self, session: Session) -> dict[str, Any]:
+        """``/relay/status``: who is here, how well the links do, what was dropped, for the one who asks."""
+        robot = session.robot
+        rules = session.permit.rules
+        return {
+            "robot": robot.name,
+            "state": robot.state.value,
+            "level": str(rules.level) if rules.level else None,
+            "clients": [{"user": each.name, "since": each.since} for each in self._sessions(robot.robot_id)],
+            "rtt_ms": {"client_relay": milliseconds(session.rtt), "relay_robot": milliseconds(robot.rtt)},
+            "drops": session.outbox.dropped,
+            "refusals": session.refusals,
+            "stale_commands": session.stale_commands,
+            "motion": _whole(robot.description.motion),
+            "health": _whole(robot.health),
+        }
+
+
+def _whole(struct: msgspec.Struct) -> dict[str, Any]:
+    """All fields of a message, also those at their default."""
+    return {name: getattr(struct, name) for name in struct.__struct_fields__}

@@ -1,0 +1,63 @@
+"""The relay's log: one line an event on standard error, as text or JSON, inert whatever robots and clients sent."""
+
+from __future__ import annotations
+
+import sys
+from datetime import UTC, datetime
+from typing import TextIO, cast
+
+from twisted.logger import ILogObserver, LogEvent, LogLevel, formatEvent, globalLogBeginner
+
+from relay_protocol import jsontext
+
+_QUIET = (
+    "autobahn",
+    "txaio",
+    "twisted.web",
+    "twisted.internet",
+    "twisted.python",
+    "log_legacy",
+    "relay_server.edges.site",
+)
+
+
+def begin(as_json: bool, debug: bool = False, out: TextIO = sys.stderr) -> None:
+    """Send all logging to ``out``; warnings of Python and stray prints are left alone."""
+    least = LogLevel.debug if debug else LogLevel.info
+
+    def observe(event: LogEvent) -> None:
+        level = event.get("log_level", LogLevel.info)
+        namespace = str(event.get("log_namespace", ""))
+        floor = LogLevel.warn if namespace.startswith(_QUIET) and not debug else least
+        if level < floor:
+            return
+        text = formatEvent(event)
+        failure = event.get("log_failure")
+        if failure is not None:
+            text += f": {failure.getErrorMessage()}"
+            if level >= LogLevel.critical:
+                text += "\n" + failure.getTraceback()
+        out.write(_line(event, level.name, namespace, text, as_json))
+        out.flush()
+
+    globalLogBeginner.beginLoggingTo(
+        [cast(ILogObserver, observe)], redirectStandardIO=False, discardBuffer=True
+    )
+
+
+def _line(event: LogEvent, level: str, namespace: str, text: str, as_json: bool) -> str:
+    when = datetime.fromtimestamp(event.get("log_time", 0.0), UTC)
+    stamp = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    if as_json:
+        entry = {"time": stamp, "level": level, "logger": namespace, "message": text}
+        return jsontext.encode(entry).decode(errors="replace") + "\n"
+    return f"{stamp} {level:<8} {inert(text)}\n"
+
+
+def inert(text: str) -> str:
+    """Text with its control characters spelled out, so that it can't drive a terminal. Line breaks are indented."""
+    safe = "".join(
+        each if each.isprintable() or each == "\n" else each.encode("unicode_escape").decode()
+        for each in text
+    )
+    return safe.replace("\n", "\n    ")

@@ -1,0 +1,133 @@
+"""What waits for a slow receiver: bounded, newest data first to survive, control never dropped.
+
+Used towards clients and towards robots. While the transport takes bytes, everything passes straight through.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Hashable
+
+from relay_protocol.limits import MIB
+
+DATA_BYTES = 2 * MIB
+DATA_PER_TOPIC = 128
+DATA_AGE = 1.0
+CONTROL_MESSAGES = 1024
+CONTROL_BYTES = 2 * MIB
+
+
+class Outbox:
+    """A queue in front of one transport.
+
+    :param write: puts one message on the transport; only called while it is not paused
+    :param seconds: a monotonic clock
+    :param overflow: called once when control messages exceed their bound; the receiver must be cut
+    """
+
+    def __init__(
+        self, write: Callable[[bytes], None], seconds: Callable[[], float], overflow: Callable[[], None]
+    ) -> None:
+        self._write = write
+        self._seconds = seconds
+        self._overflow = overflow
+        self._control: deque[bytes] = deque()
+        self._control_bytes = 0
+        self._data: dict[Hashable, deque[tuple[float, bytes]]] = {}
+        self._data_bytes = 0
+        self._closed = False
+        self.paused_since: float | None = None
+        self.dropped = 0
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes held back, data and control."""
+        return self._data_bytes + self._control_bytes
+
+    def pause(self) -> None:
+        """The transport's buffer is full."""
+        if self.paused_since is None:
+            self.paused_since = self._seconds()
+
+    def resume(self) -> None:
+        """The transport takes bytes again: control first, then one message a topic in turn."""
+        self.paused_since = None
+        while self._control and self.paused_since is None and not self._closed:
+            message = self._control.popleft()
+            self._control_bytes -= len(message)
+            self._write(message)
+        while self._data and self.paused_since is None and not self._closed:
+            key = next(iter(self._data))
+            queue = self._data.pop(key)
+            self._forget_stale(queue)
+            _, message = queue.popleft()
+            self._data_bytes -= len(message)
+            if queue:
+                self._data[key] = queue
+            self._write(message)
+
+    def close(self) -> None:
+        """Nothing is written any more; what waited is let go."""
+        self._closed = True
+        self._control.clear()
+        self._data.clear()
+        self._control_bytes = self._data_bytes = 0
+
+    def control(self, message: bytes) -> None:
+        """Send a message that must not be lost."""
+        if self._closed:
+            return
+        if self.paused_since is None:
+            self._write(message)
+            return
+        self._control.append(message)
+        self._control_bytes += len(message)
+        if len(self._control) > CONTROL_MESSAGES or self._control_bytes > CONTROL_BYTES:
+            self.close()
+            self._overflow()
+
+    def data(self, key: Hashable, message: bytes, depth: int = DATA_PER_TOPIC) -> None:
+        """Send a sample of a topic; the oldest give way when they pile up.
+
+        :param key: the topic
+        :param depth: most samples of this topic that may wait
+        """
+        if self._closed:
+            return
+        if self.paused_since is None:
+            self._write(message)
+            return
+        queue = self._data.setdefault(key, deque())
+        queue.append((self._seconds(), message))
+        self._data_bytes += len(message)
+        while len(queue) > depth:
+            self._drop_oldest(queue)
+        while self._data_bytes > DATA_BYTES:
+            fullest = max(self._data.values(), key=_size)
+            if len(fullest) == 1:
+                break
+            self._drop_oldest(fullest)
+        if self._data_bytes > 2 * DATA_BYTES:
+            # Single samples of many topics: even the newest can't all be kept.
+            self._drop_oldest(queue)
+            if not queue:
+                del self._data[key]
+
+    def forget(self, key: Hashable) -> None:
+        """Let go of what waits of this topic."""
+        for _, message in self._data.pop(key, ()):
+            self._data_bytes -= len(message)
+
+    def _forget_stale(self, queue: deque[tuple[float, bytes]]) -> None:
+        oldest = self._seconds() - DATA_AGE
+        while len(queue) > 1 and queue[0][0] < oldest:
+            self._drop_oldest(queue)
+
+    def _drop_oldest(self, queue: deque[tuple[float, bytes]]) -> None:
+        _, message = queue.popleft()
+        self._data_bytes -= len(message)
+        self.dropped += 1
+
+
+def _size(queue: deque[tuple[float, bytes]]) -> int:
+    return sum(len(message) for _, message in queue)

@@ -1,0 +1,163 @@
+"""Who is there: every robot the relay knows, whether it is online, and what it last told about itself."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from relay_protocol import link
+from relay_protocol.ros_types import TypeRegistry
+from relay_server.graph import GraphMirror
+
+
+class ControlLink(Protocol):
+    """A robot's control link, as the registry and channels use it."""
+
+    def send(self, message: link.Message) -> None:
+        """Queue a message."""
+
+    def close(self, reason: str) -> None:
+        """Say ``bye`` and end the connection."""
+
+
+class State(str, enum.Enum):
+    """What a user sees of a robot."""
+
+    OFFLINE = "offline"
+    ONLINE = "online"
+    IN_USE = "in_use"
+
+
+class Watcher(Protocol):
+    """Something that follows one robot: its channel."""
+
+    def robot_online(self) -> None:
+        """The robot has registered (again)."""
+
+    def robot_offline(self) -> None:
+        """The control link is gone."""
+
+    def graph_changed(self) -> None:
+        """The mirror of its graph has changed."""
+
+
+@dataclass
+class Presence:
+    """One robot as the relay sees it now.
+
+    :param registered_at: monotonic seconds of the latest registration
+    :param rtt: round trip relay–robot of the latest ping, seconds
+    :param last_seen: Unix time of the latest byte, ``None`` when never seen since the start
+    """
+
+    robot_id: int
+    name: str
+    realm: str
+    control: ControlLink | None = None
+    registered_at: float = 0.0
+    session: str = ""
+    key: str = ""
+    address: str = ""
+    encodings: tuple[str, ...] = ()
+    description: link.Describe = field(default_factory=link.Describe)
+    health: link.Health = field(default_factory=link.Health)
+    graph: GraphMirror = field(default_factory=GraphMirror)
+    types: TypeRegistry = field(default_factory=TypeRegistry)
+    rtt: float | None = None
+    last_seen: float | None = None
+    users: int = 0
+    watchers: list[Watcher] = field(default_factory=list)
+
+    @property
+    def state(self) -> State:
+        """Offline, online, or online with somebody working with it."""
+        if self.control is None:
+            return State.OFFLINE
+        return State.IN_USE if self.users else State.ONLINE
+
+    def is_motion(self, topic: str, type_name: str) -> bool:
+        """Whether the robot's own safety counts this topic as motion."""
+        motion = self.description.motion
+        return type_name in motion.types or topic in motion.topics
+
+
+class Registry:
+    """All robots that have shown up or were asked for since the start.
+
+    :param wall: Unix time in seconds
+    """
+
+    def __init__(self, wall: Callable[[], float]) -> None:
+        self._wall = wall
+        self._robots: dict[int, Presence] = {}
+        self._listeners: list[Callable[[], None]] = []
+
+    def __iter__(self) -> Iterator[Presence]:
+        return iter(list(self._robots.values()))
+
+    def presence(self, robot_id: int, name: str, realm: str) -> Presence:
+        """The entry of a robot, made when it is the first time."""
+        found = self._robots.get(robot_id)
+        if found is None:
+            found = self._robots[robot_id] = Presence(robot_id, name, realm)
+        return found
+
+    def find(self, robot_id: int) -> Presence | None:
+        """The entry of a robot, if there is one."""
+        return self._robots.get(robot_id)
+
+    def registered(self, robot: Presence, control: ControlLink) -> None:
+        """A robot has proved itself on this link. An older link of it gives way."""
+        older = robot.control
+        robot.control = control
+        robot.types = TypeRegistry()
+        robot.graph.clear()
+        robot.health = link.Health()
+        robot.rtt = None
+        self.seen(robot)
+        if older is not None:
+            for watcher in list(robot.watchers):
+                watcher.robot_offline()
+            older.close("the robot has connected anew")
+        for watcher in list(robot.watchers):
+            watcher.robot_online()
+        self.changed()
+
+    def lost(self, robot: Presence, control: ControlLink) -> None:
+        """A control link has ended. One that was replaced already changes nothing."""
+        if robot.control is not control:
+            return
+        robot.control = None
+        robot.rtt = None
+        robot.graph.clear()
+        for watcher in list(robot.watchers):
+            watcher.robot_offline()
+        self.changed()
+
+    def seen(self, robot: Presence) -> None:
+        """Bytes came from it."""
+        robot.last_seen = self._wall()
+
+    def graph(self, robot: Presence, graph: link.Graph) -> None:
+        """The robot told of its graph, or of changes in it."""
+        robot.graph.apply(graph)
+        for watcher in list(robot.watchers):
+            watcher.graph_changed()
+
+    def forget(self, robot_id: int) -> None:
+        """The robot was removed; its links are closed."""
+        robot = self._robots.pop(robot_id, None)
+        if robot is not None and robot.control is not None:
+            robot.control.close("this robot was removed from the relay")
+
+    def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call ``listener`` after any change users can see; returns what ends that."""
+        self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
+
+    def changed(self) -> None:
+        """Something users can see has changed."""
+        for listener in list(self._listeners):
+            listener()

@@ -1,0 +1,74 @@
+"""Runs a relay in this process until a signal ends it."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.error import CannotListenError
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_protocol.errors import SwitchboardError
+from relay_server.config import Settings
+from relay_server.service import Relay
+
+STOP_SECONDS = 8.0
+log = Logger()
+
+
+def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
+    """Serve until SIGTERM or SIGINT.
+
+    :param ready: called once everything listens, with the first login link if nobody can log in yet
+    :returns: exit code; 1 when it could not start, said on stderr in words
+    """
+    reactor = monotonic_reactor()
+    relay = Relay(reactor, settings)
+    failed: list[int] = []
+
+    async def begin() -> None:
+        await relay.start()
+        ready(relay, await relay.first_login())
+
+    def wrong(failure: Failure) -> None:
+        sys.stderr.write(f"switchboard: {_sentence(failure)}\n")
+        failed.append(1)
+        reactor.stop()
+
+    def stopping() -> Deferred[Any]:
+        done = Deferred.fromCoroutine(relay.stop())
+        done.addErrback(lambda failure: log.failure("stopping failed", failure))
+        return done.addTimeout(STOP_SECONDS, reactor).addErrback(lambda _: None)
+
+    def start() -> None:
+        Deferred.fromCoroutine(begin()).addErrback(wrong)
+
+    reactor.callWhenRunning(start)
+    reactor.addSystemEventTrigger("before", "shutdown", stopping)
+    signal.signal(signal.SIGHUP, lambda *_: reactor.callFromThread(relay.reload_tls))
+    reactor.run()
+    return failed[0] if failed else 0
+
+
+def monotonic_reactor() -> Any:
+    """Twisted's reactor on the monotonic clock: its own, the wall clock, jumps when NTP sets it."""
+    from twisted.internet import reactor
+
+    monotonic: Any = reactor
+    monotonic.seconds = time.monotonic
+    return monotonic
+
+
+def _sentence(failure: Failure) -> str:
+    error = failure.value
+    if isinstance(error, CannotListenError):
+        reason = getattr(error.socketError, "strerror", None) or str(error.socketError)
+        return f"can't listen on {error.interface or 'any address'} port {error.port}: {reason}"
+    if isinstance(error, SwitchboardError):
+        return str(error)
+    return f"it failed to start: {failure.getTraceback()}"

@@ -1,0 +1,303 @@
+"""The one composition root: builds a relay from its settings, starts and stops it. Only this module knows all."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from typing import Any
+
+from autobahn.twisted.resource import WebSocketResource
+from twisted.internet.defer import Deferred, DeferredList
+from twisted.internet.endpoints import (
+    SSL4ServerEndpoint,
+    TCP4ServerEndpoint,
+    TCP6ServerEndpoint,
+    UNIXServerEndpoint,
+)
+from twisted.internet.task import LoopingCall, deferLater
+from twisted.logger import Logger
+from twisted.web.server import Site
+
+import relay_server
+from relay_db import queries
+from relay_db.engine import Database
+from relay_protocol.errors import Invalid, SwitchboardError
+from relay_server import passwords
+from relay_server.access import Access
+from relay_server.auth import Authenticator
+from relay_server.channel import Channels
+from relay_server.config import Endpoint, Settings
+from relay_server.edges.admin import AdminSocket
+from relay_server.edges.api import Api
+from relay_server.edges.caps import AddressCap
+from relay_server.edges.origins import Origins
+from relay_server.edges.robot_roles import Opening, RobotHall
+from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
+from relay_server.edges.site import Portal, RelaySite, Robots, Root
+from relay_server.edges.websocket import ClientFactory
+from relay_server.frontdesk import FrontDesk
+from relay_server.journal import Journal
+from relay_server.metrics import RelayCollector, registry_of
+from relay_server.registry import Registry
+from relay_server.session import Timing
+from relay_server.store import Store
+from relay_server.tls import ServerTls
+
+FIRST_LINK_SECONDS = 3600.0
+PURGE_SECONDS = 3600.0
+
+
+class Relay:
+    """One relay.
+
+    :param reactor: Twisted's
+    """
+
+    log = Logger()
+
+    def __init__(self, reactor: Any, settings: Settings) -> None:
+        self._reactor = reactor
+        self.settings = settings
+        self._database = Database(settings.database)
+        self._store = Store(reactor, self._database)
+        self._tls = (
+            ServerTls(settings.tls_cert, settings.tls_key) if settings.tls_cert and settings.tls_key else None
+        )
+        self._auth = Authenticator(reactor, self._store, time.monotonic, time.time)
+        self._access = Access(self._store, time.time)
+        self._registry = Registry(time.time)
+        self._channels = Channels(
+            reactor, linger=settings.linger, new_ticket=passwords.new_token, wall_ns=time.time_ns
+        )
+        self._journal = Journal(self._store, time.time)
+        self._ports: list[Any] = []
+        self._revision = -1
+        self._polling = LoopingCall(self._poll)
+        self._purging = LoopingCall(self._purge)
+        self._database_fine = True
+        self._desk: FrontDesk | None = None
+        self.http_port = 0
+        self.robots_port = 0
+        self._started = time.monotonic()
+
+    # --- starting -----------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Upgrade the database, listen on everything.
+
+        :raises SwitchboardError: in words, when the database or the certificate can't be used
+        :raises CannotListenError: an address is taken
+        """
+        self._database.upgrade()
+        self._store.start()
+        self._auth.start()
+        self._revision = await self._store.read(queries.revision)
+        name = self._relay_name()
+        http = await self._listen(self.settings.http, self._site())
+        self.http_port = http.getHost().port
+        hall = RobotHall(
+            name, self._store, self._registry, self._channels, self._journal, time.monotonic, time.time
+        )
+        robots = await self._listen(self.settings.robots, self._robot_factory(hall))
+        self.robots_port = robots.getHost().port
+        await self._listen_locally()
+        self._polling.start(self.settings.refresh, now=False)
+        self._purging.start(PURGE_SECONDS, now=True)
+
+    def _site(self) -> RelaySite:
+        settings = self.settings
+        origins = Origins(settings.scheme, settings.origins)
+        # Cookies know no ports: relays side by side on one host must not overwrite each other's.
+        cookie = (
+            f"switchboard_{secrets.token_hex(4)}"
+            if not settings.http.port
+            else f"switchboard_{settings.http.port}"
+        )
+        self._desk = FrontDesk(
+            self._reactor,
+            self._store,
+            self._auth,
+            self._access,
+            self._registry,
+            self._channels,
+            self._journal,
+            origins,
+            Timing(settings.client_ping, settings.driving_ping, settings.stall_limit),
+            cookie=cookie,
+            clock_ns=time.monotonic_ns,
+            wall=time.time,
+        )
+        desk = self._desk
+        metrics = registry_of(RelayCollector(self._registry, self._channels, lambda: desk))
+        api = Api(self._reactor, desk, origins, metrics, cookie=cookie, secure=settings.tls)
+        websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk))
+        root = Root(Robots(websocket, relay_server.VERSION), api.app.resource(), Portal(relay_server.PORTAL))
+        cap = AddressCap(settings.connections_per_address)
+        return RelaySite(root, self._reactor, cap, settings.tls)
+
+    def _robot_factory(self, hall: RobotHall) -> RobotFactory:
+        cap = AddressCap(self.settings.connections_per_address)
+        timing = LinkTiming(self.settings.heartbeat)
+
+        def build() -> RobotConnection:
+            return RobotConnection(
+                self._reactor, time.monotonic_ns, timing, lambda connection: Opening(hall, connection), cap
+            )
+
+        return RobotFactory(build)
+
+    async def _listen(self, where: Endpoint, factory: Any) -> Any:
+        kind: Any = TCP6ServerEndpoint if ":" in where.host else TCP4ServerEndpoint
+        endpoint: Any = kind(self._reactor, where.port, interface=where.host)
+        if self._tls is not None:
+            endpoint = SSL4ServerEndpoint(self._reactor, where.port, self._tls, interface=where.host)
+        port = await endpoint.listen(factory)
+        self._ports.append(port)
+        return port
+
+    async def _listen_locally(self) -> None:
+        admin = AdminSocket(self.status, self.refresh)
+        site = Site(admin.app.resource(), reactor=self._reactor)
+        site.log = lambda request: None
+        endpoint = UNIXServerEndpoint(self._reactor, str(self.settings.socket_path), mode=0o600, wantPID=True)
+        self._ports.append(await endpoint.listen(site))
+
+    def _relay_name(self) -> str:
+        """What robots sign for: given, or made up once and kept beside the database."""
+        if self.settings.name:
+            return self.settings.name
+        path = self.settings.data / "relay.name"
+        try:
+            return path.read_text().strip()
+        except FileNotFoundError:
+            name = f"relay-{secrets.token_hex(8)}"
+            path.write_text(name + "\n")
+            return name
+        except OSError as error:
+            raise Invalid(f"the relay's name can't be read from {path.name}: {error.strerror}") from None
+
+    async def first_login(self) -> str | None:
+        """A one-time login link for the administrator of a relay nobody can log in to yet."""
+        users = await self._store.read(queries.list_users)
+        if any(user.password_hash is not None or user.name != "admin" for user in users):
+            return None
+        return await self.login_link("admin", create=True)
+
+    async def login_link(self, user: str, create: bool = False) -> str:
+        """A one-time login link for a user.
+
+        :param create: make the user, an administrator, when there is none
+        :raises Invalid: no such user
+        """
+        record = await self._store.read(queries.find_user, user)
+        if record is None:
+            if not create:
+                raise Invalid(f"there is no user '{user}'")
+            record = await self._store.write(queries.add_user, user, None, admin=True)
+        code = passwords.new_token()
+        now = time.time()
+        await self._store.write(
+            queries.create_token,
+            record.id,
+            passwords.token_hash(code),
+            kind="login",
+            label="login link",
+            expires=now + FIRST_LINK_SECONDS,
+            now=now,
+        )
+        return f"{self.url}/login#code={code}"
+
+    @property
+    def url(self) -> str:
+        """Where people go."""
+        host = self.settings.http.host
+        shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104
+        return f"{self.settings.scheme}://{shown}:{self.http_port}"
+
+    # --- running ------------------------------------------------------------------------------------------
+
+    async def refresh(self) -> None:
+        """Take up changes somebody made in the database."""
+        revision = await self._store.read(queries.revision)
+        if revision == self._revision:
+            return
+        await self._access.refresh()
+        for robot in self._registry:
+            if robot.control is not None:
+                record = await self._store.read(queries.robot_key, robot.name, robot.key)
+                if record is None or record.robot_id != robot.robot_id:
+                    self.log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
+                    robot.control.close("the robot's key is not accepted any more")
+        # Only now: had anything above failed, the next look would have to do it again.
+        self._revision = revision
+        self._registry.changed()
+
+    async def _poll_once(self) -> None:
+        self._access.expire()
+        try:
+            await self.refresh()
+        except SwitchboardError as error:
+            if self._database_fine:
+                self.log.error("{reason}; what is open goes on, new asks are refused", reason=str(error))
+            self._database_fine = False
+        else:
+            if not self._database_fine:
+                self.log.info("the database answers again")
+            self._database_fine = True
+
+    def _poll(self) -> Deferred[None]:
+        return Deferred.fromCoroutine(self._poll_once()).addErrback(
+            lambda failure: self.log.failure("taking up changes failed", failure)
+        )
+
+    def _purge(self) -> Deferred[Any]:
+        return Deferred.fromCoroutine(self._store.write(queries.purge_expired, time.time())).addErrback(
+            lambda failure: self.log.error("expired tokens stay for now: {reason}", reason=failure.value)
+        )
+
+    def reload_tls(self) -> None:
+        """Read the certificate again (SIGHUP)."""
+        if self._tls is None:
+            return
+        try:
+            self._tls.reload()
+        except Invalid as error:
+            self.log.error("{reason}; the old certificate stays in use", reason=str(error))
+        else:
+            self.log.info("the TLS certificate was read again")
+
+    def status(self) -> dict[str, Any]:
+        """What ``switchboard status`` shows."""
+        return {
+            "relay": relay_server.VERSION,
+            "uptime_s": round(time.monotonic() - self._started, 1),
+            "http_port": self.http_port,
+            "robots_port": self.robots_port,
+            "robots": self._desk.status() if self._desk else [],
+        }
+
+    # --- stopping -----------------------------------------------------------------------------------------
+
+    async def stop(self) -> None:
+        """Refuse newcomers, tell clients and robots, finish what is being written."""
+        if self._desk is not None:
+            self._desk.say_goodbye("the relay is going down")
+        for robot in self._registry:
+            if robot.control is not None:
+                robot.control.close("the relay is going down")
+        for loop in (self._polling, self._purging):
+            if loop.running:
+                loop.stop()
+        for channel in self._channels:
+            channel.shut()
+        await DeferredList(
+            [Deferred.fromCoroutine(_stopped(port)) for port in self._ports], consumeErrors=True
+        )
+        # The farewells are on their way; a moment lets slow networks take them.
+        await deferLater(self._reactor, 0.2)
+        self._auth.stop()
+        self._store.stop()
+
+
+async def _stopped(port: Any) -> None:
+    await port.stopListening()
