@@ -5,10 +5,12 @@ export const STALE_MS = 1000
 /** Counts events in a sliding window. */
 export class RateMeter {
   private times: number[] = []
+  private sinceMs: number | null = null
 
   constructor(private readonly windowMs = 2000) {}
 
   mark(nowMs: number): void {
+    this.sinceMs ??= nowMs
     this.times.push(nowMs)
     this.trim(nowMs)
   }
@@ -16,19 +18,20 @@ export class RateMeter {
   /** Events per second over the window, 0 when nothing came. */
   hz(nowMs: number): number {
     this.trim(nowMs)
-    const first = this.times[0]
-    if (first === undefined || this.times.length < 2) return 0
-    // Over the time since the first mark, so the rate falls when nothing more comes.
-    const span = Math.max(nowMs - first, 1)
-    return ((this.times.length - 1) * 1000) / Math.max(span, this.times[this.times.length - 1]! - first)
+    if (this.sinceMs === null) return 0
+    const span = nowMs - this.sinceMs
+    if (span >= this.windowMs) return (this.times.length * 1000) / this.windowMs
+    // Before the window is full the first mark opens it and is not counted.
+    return this.times.length < 2 ? 0 : ((this.times.length - 1) * 1000) / Math.max(span, 1)
   }
 
   reset(): void {
     this.times = []
+    this.sinceMs = null
   }
 
   private trim(nowMs: number): void {
-    while (this.times.length > 0 && this.times[0]! < nowMs - this.windowMs) this.times.shift()
+    while (this.times.length > 0 && this.times[0]! <= nowMs - this.windowMs) this.times.shift()
   }
 }
 

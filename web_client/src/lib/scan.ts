@@ -30,7 +30,7 @@ export function radius(scan: LaserScan, present: number | null): number {
   const valid = scan.ranges.filter((r): r is number => r !== null && r >= scan.range_min && r <= scan.range_max)
   if (valid.length === 0) return present ?? 5
   valid.sort((a, b) => a - b)
-  const far = valid[Math.floor((valid.length - 1) * 0.95)]!
+  const far = valid[Math.ceil((valid.length - 1) * 0.95)]!
   if (present !== null && far <= present && far > present * 0.45) return present
   return SCALES.find((scale) => scale >= far) ?? SCALES.at(-1)!
 }

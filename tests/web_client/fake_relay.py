@@ -1,0 +1,451 @@
+"""A small stand-in for the relay: enough HTTP and rosbridge for the portal's own tests, with robots made of sums.
+
+Run as a script it prints ``READY <port>``. ``POST /fake/do`` changes its behaviour, ``GET /fake/log`` tells what the
+page sent. It is no relay: rights are a table, nothing is judged but publishing and calling.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import base64
+import contextlib
+import json
+import math
+import mimetypes
+import secrets
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from websockets.frames import Opcode
+from websockets.server import ServerProtocol
+
+Json = dict[str, Any]
+
+PASSWORD = "correct horse"
+RIGHTS: dict[str, dict[str, str]] = {
+    "admin": {"rover-1": "owner", "rover-2": "owner", "arm-3": "owner"},
+    "driver": {"rover-1": "operator", "rover-2": "viewer"},
+    "viewer": {"rover-1": "viewer"},
+    "newcomer": {},
+}
+ROBOTS: dict[str, Json] = {
+    "rover-1": {
+        "description": "Differential drive, laser and camera, in the hall",
+        "state": "online",
+        "host": "rover-1.lab",
+        "platform": "ros2",
+        "distro": "jazzy",
+    },
+    "rover-2": {
+        "description": "<img src=x onerror=alert(1)> a robot that sends markup, and a rather long description besides",
+        "state": "in_use",
+        "host": "<b>bold</b>",
+        "platform": "ros2",
+        "distro": "kilted",
+    },
+    "arm-3": {"description": "", "state": "offline", "host": "arm", "platform": "mqtt", "distro": ""},
+}
+TOPICS = {
+    "/battery_state": "sensor_msgs/msg/BatteryState",
+    "/camera/image_raw": "sensor_msgs/msg/Image",
+    "/camera/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
+    "/cmd_vel": "geometry_msgs/msg/Twist",
+    "/cmd_vel_nav": "geometry_msgs/msg/Twist",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/relay/status": "switchboard_msgs/msg/Status",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/tf": "tf2_msgs/msg/TFMessage",
+}
+CSP = (
+    "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; connect-src 'self' ws: wss:; "
+    "object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+PILLARS = [(2.5, 1.0, 0.35), (-1.5, -2.0, 0.5), (1.0, -2.5, 0.3)]
+HALL = (4.5, 3.5)
+HALF_TURN = np.linspace(-math.pi, math.pi, 360, endpoint=False)
+
+
+class World:
+    """One robot that obeys its last command for half a second."""
+
+    def __init__(self) -> None:
+        self.x, self.y, self.heading = -1.0, 0.0, 0.0
+        self.speed, self.turn = 0.0, 0.0
+        self.commanded = -math.inf
+        self.clock = time.monotonic()
+
+    def command(self, twist: Json) -> None:
+        self.speed, self.turn = twist["linear"]["x"], twist["angular"]["z"]
+        self.commanded = time.monotonic()
+
+    def step(self) -> None:
+        now = time.monotonic()
+        span, self.clock = min(now - self.clock, 0.2), now
+        if now - self.commanded > 0.5:
+            self.speed = self.turn = 0.0
+        self.heading += self.turn * span
+        self.x = float(np.clip(self.x + self.speed * math.cos(self.heading) * span, -HALL[0] + 0.3, HALL[0] - 0.3))
+        self.y = float(np.clip(self.y + self.speed * math.sin(self.heading) * span, -HALL[1] + 0.3, HALL[1] - 0.3))
+
+    def ranges(self, angles: np.ndarray) -> np.ndarray:
+        c, s = np.cos(angles + self.heading), np.sin(angles + self.heading)
+        with np.errstate(divide="ignore"):
+            walls_x = np.where(c > 0, (HALL[0] - self.x) / c, (-HALL[0] - self.x) / c)
+            walls_y = np.where(s > 0, (HALL[1] - self.y) / s, (-HALL[1] - self.y) / s)
+        best = np.minimum(walls_x, walls_y)
+        for px, py, radius in PILLARS:
+            along = (px - self.x) * c + (py - self.y) * s
+            root = radius**2 - ((px - self.x) ** 2 + (py - self.y) ** 2 - along**2)
+            hit = np.where((root > 0) & (along > 0), along - np.sqrt(np.maximum(root, 0)), np.inf)
+            best = np.minimum(best, hit)
+        return best
+
+    def odom(self) -> Json:
+        spin = {"x": 0.0, "y": 0.0, "z": math.sin(self.heading / 2), "w": math.cos(self.heading / 2)}
+        none = [0.0] * 36
+        return {
+            "header": header("odom"),
+            "child_frame_id": "base_link",
+            "pose": {"pose": {"position": {"x": self.x, "y": self.y, "z": 0.0}, "orientation": spin}, "covariance": none},
+            "twist": {
+                "twist": {
+                    "linear": {"x": self.speed, "y": 0.0, "z": 0.0},
+                    "angular": {"x": 0.0, "y": 0.0, "z": self.turn},
+                },
+                "covariance": none,
+            },
+        }
+
+    def scan(self) -> Json:
+        ranges: list[float | None] = [round(float(r), 3) for r in self.ranges(HALF_TURN)]
+        ranges[10:14] = [None] * 4
+        return {
+            "header": header("laser"),
+            "angle_min": -math.pi,
+            "angle_max": math.pi,
+            "angle_increment": 2 * math.pi / 360,
+            "range_min": 0.1,
+            "range_max": 12.0,
+            "ranges": ranges,
+            "intensities": [],
+        }
+
+    def picture(self) -> Json:
+        angles = np.linspace(0.55, -0.55, 160)
+        heights = np.clip(190 / (self.ranges(angles) * np.cos(angles)), 4, 239)
+        image = np.zeros((480, 640, 3), np.uint8)
+        image[:240] = (74, 62, 52)
+        image[240:] = (58, 66, 70)
+        for i, height in enumerate(heights):
+            shade = int(np.clip(60 + height, 60, 235))
+            image[240 - int(height) : 240 + int(height), i * 4 : i * 4 + 4] = (shade, int(shade * 0.9), int(shade * 0.75))
+        clock = time.strftime("%H:%M:%S") + f".{int(time.time() * 10) % 10}"
+        cv2.putText(image, clock, (16, 36), cv2.FONT_HERSHEY_SIMPLEX, 0.9, (235, 235, 235), 2, cv2.LINE_AA)
+        jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
+        return {"header": header("camera"), "format": "jpeg", "data": base64.b64encode(jpeg).decode()}
+
+
+def header(frame: str) -> Json:
+    now = time.time_ns()
+    return {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": frame}
+
+
+class Relay:
+    """State shared by all connections, and what the tests may change."""
+
+    def __init__(self, portal: Path) -> None:
+        self.portal = portal
+        self.sessions: dict[str, str] = {}
+        self.codes = {"ONCE-ONLY": "admin"}
+        self.log: list[Json] = []
+        self.channels: set[Channel] = set()
+        self.worlds = {name: World() for name in ROBOTS}
+        self.rights = {user: dict(levels) for user, levels in RIGHTS.items()}
+        self.robots = {name: dict(robot) for name, robot in ROBOTS.items()}
+        self.silent = False
+        self.frozen = False
+        self.last_seen = time.time() - 7200
+
+    def robot(self, user: str, name: str) -> Json:
+        facts = self.robots[name]
+        clients = [{"user": c.user, "since": int(c.since)} for c in self.channels if c.robot == name]
+        if facts["state"] == "in_use":
+            clients.append({"user": "ann", "since": int(time.time()) - 300})
+        state = facts["state"] if facts["state"] == "offline" or not clients else "in_use"
+        there = state != "offline"
+        return {
+            **facts,
+            "name": name,
+            "state": state,
+            "level": self.rights[user][name],
+            "clients": clients,
+            "battery": 0.76 if there else None,
+            "rtt_ms": 4.2 if there else None,
+            "last_seen": int(time.time() if there else self.last_seen),
+        }
+
+    def robot_list(self, user: str) -> Json:
+        return {"robots": [self.robot(user, name) for name in self.rights[user]]}
+
+    def do(self, order: Json) -> None:
+        """One order of a test: close, level, silent (no data), frozen (no answers), say, offline."""
+        self.silent = order.get("silent", self.silent)
+        self.frozen = order.get("frozen", self.frozen)
+        if "level" in order:
+            self.rights[order["user"]][order["robot"]] = order["level"]
+        if "state" in order:
+            self.robots[order["robot"]]["state"] = order["state"]
+        if order.get("clear_log"):
+            self.log.clear()
+        for channel in list(self.channels):
+            if "say" in order:
+                channel.send({"op": "status", "level": "error", "msg": order["say"], "id": "any"})
+            if "close" in order:
+                channel.close(order["close"], order.get("reason", ""))
+
+
+class Channel:
+    """One rosbridge websocket."""
+
+    def __init__(self, relay: Relay, user: str, robot: str, protocol: ServerProtocol, flush: Callable[[], None]) -> None:
+        self.relay, self.user, self.robot = relay, user, robot
+        self.protocol, self.flush = protocol, flush
+        self.since = time.time()
+        self.subscribed: dict[str, set[str]] = {}
+        self.due: dict[str, float] = {}
+        relay.channels.add(self)
+
+    @property
+    def level(self) -> str:
+        return self.relay.rights[self.user].get(self.robot, "viewer")
+
+    def send(self, message: Json) -> None:
+        self.protocol.send_text(json.dumps(message).encode())
+        self.flush()
+
+    def close(self, code: int, reason: str) -> None:
+        self.protocol.send_close(code, reason)
+        self.flush()
+
+    def take(self, message: Json) -> None:
+        op = message["op"]
+        self.relay.log.append({"at": time.monotonic(), "user": self.user, "robot": self.robot, **message})
+        if op == "subscribe":
+            self.subscribed.setdefault(message["topic"], set()).add(message["id"])
+        elif op == "unsubscribe":
+            ids = self.subscribed.get(message["topic"], set())
+            ids.discard(message["id"])
+            if not ids:
+                self.subscribed.pop(message["topic"], None)
+        elif op == "publish" and self.level == "viewer":
+            words = f"{self.user} may not publish to {message['topic']}: the level viewer does not allow it"
+            self.send({"op": "status", "level": "error", "msg": words, "id": message.get("id")})
+        elif op == "publish" and message["topic"] == "/cmd_vel":
+            self.relay.worlds[self.robot].command(message["msg"])
+        elif op == "call_service":
+            self.call(message)
+
+    def call(self, message: Json) -> None:
+        if self.relay.frozen:
+            return
+        values: Json = {}
+        if message["service"] == "/rosapi/topics":
+            values = {"topics": list(TOPICS), "types": list(TOPICS.values())}
+        elif message["service"] == "/relay/ping":
+            values = {"relay_time_ns": time.monotonic_ns(), "robot_rtt_ms": 4.2 if message["args"]["robot"] else None}
+        answer = {"op": "service_response", "service": message["service"], "result": True, "values": values}
+        self.send({**answer, "id": message["id"]})
+
+    def stream(self, now: float) -> None:
+        world = self.relay.worlds[self.robot]
+        makers: dict[str, tuple[float, Callable[[], Json]]] = {
+            "/odom": (20, world.odom),
+            "/scan": (10, world.scan),
+            "/camera/image_raw/compressed": (12, world.picture),
+            "/battery_state": (1, lambda: {"header": header(""), "percentage": 0.76, "voltage": 24.1}),
+            "/relay/status": (1, self.status),
+        }
+        for topic in self.subscribed:
+            rate, make = makers.get(topic, (0, dict))
+            quiet = self.relay.silent and topic != "/relay/status"
+            if rate and not quiet and now >= self.due.get(topic, 0):
+                self.due[topic] = now + 1 / rate
+                self.send({"op": "publish", "topic": topic, "msg": make()})
+
+    def status(self) -> Json:
+        facts = self.relay.robot(self.user, self.robot)
+        return {
+            "robot": self.robot,
+            "state": facts["state"],
+            "level": facts["level"],
+            "clients": facts["clients"],
+            "rtt_ms": {"relay_robot": facts["rtt_ms"]},
+            "drops": 0,
+            "motion": {"topics": ["/cmd_vel"], "types": [], "deadline_ms": 500, "stop_within_ms": 500},
+            "health": {"battery": 0.76, "cpu": 0.23, "memory": 0.41, "rtt_ms": 4.2, "stale_commands": 0},
+        }
+
+
+class Connection:
+    """One TCP connection: one HTTP request, or a websocket."""
+
+    def __init__(self, relay: Relay, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.relay, self.reader, self.writer = relay, reader, writer
+        self.cookies: dict[str, str] = {}
+
+    async def run(self) -> None:
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            head = await self.reader.readuntil(b"\r\n\r\n")
+            lines = head.decode("latin-1").split("\r\n")
+            method, target, _ = lines[0].split(" ")
+            self.headers = {k.lower(): v.strip() for k, _, v in (line.partition(":") for line in lines[1:] if line)}
+            for part in self.headers.get("cookie", "").split(";"):
+                name, _, value = part.strip().partition("=")
+                self.cookies[name] = value
+            body = await self.reader.readexactly(int(self.headers.get("content-length", 0)))
+            if self.headers.get("upgrade", "").lower() == "websocket":
+                await self.websocket(head, target)
+            else:
+                await self.answer(method, target.partition("?")[0], body)
+        self.writer.close()
+
+    @property
+    def user(self) -> str | None:
+        return self.relay.sessions.get(self.cookies.get("session", ""))
+
+    def reply(self, status: int, body: Any = None, kind: str = "application/json", **headers: str) -> None:
+        data = body if isinstance(body, bytes) else b"" if body is None else json.dumps(body).encode()
+        lines = [f"HTTP/1.1 {status} X", f"Content-Length: {len(data)}", f"Content-Type: {kind}", "Connection: close"]
+        lines += [f"Content-Security-Policy: {CSP}", *(f"{k.replace('_', '-')}: {v}" for k, v in headers.items())]
+        self.writer.write("\r\n".join(lines).encode() + b"\r\n\r\n" + data)
+
+    def problem(self, status: int, detail: str, **headers: str) -> None:
+        body = {"type": "about:blank", "title": "Refused", "status": status, "detail": detail}
+        self.reply(status, body, "application/problem+json", **headers)
+
+    async def answer(self, method: str, path: str, body: bytes) -> None:
+        if path == "/fake/log":
+            self.reply(200, self.relay.log)
+        elif path == "/fake/do":
+            self.relay.do(json.loads(body))
+            self.reply(204)
+        elif path == "/api/v1/session":
+            self.session(method, body)
+        elif path.startswith("/api/v1/"):
+            await self.robots(path)
+        else:
+            self.page(path)
+
+    def session(self, method: str, body: bytes) -> None:
+        if method != "GET" and self.headers.get("x-requested-with") != "switchboard":
+            self.problem(403, "The header X-Requested-With is missing.")
+        elif method == "POST":
+            self.login(json.loads(body))
+        elif method == "DELETE":
+            self.relay.sessions.pop(self.cookies.get("session", ""), None)
+            self.reply(204)
+        elif self.user is None:
+            self.problem(401, "You are not logged in.")
+        else:
+            self.reply(200, {"user": self.user, "admin": self.user == "admin", "realm": "lab"})
+
+    def login(self, given: Json) -> None:
+        user = self.relay.codes.pop(given["code"], None) if "code" in given else given["user"]
+        if user == "hasty":
+            self.problem(429, "Too many attempts. Wait a little.", Retry_After="30")
+        elif user not in self.relay.rights or ("code" not in given and given["password"] != PASSWORD):
+            words = "This login link is used up or too old." if "code" in given else "User or password is wrong."
+            self.problem(401, words)
+        else:
+            token = secrets.token_hex(8)
+            self.relay.sessions[token] = user
+            facts = {"user": user, "admin": user == "admin", "realm": "lab"}
+            self.reply(200, facts, Set_Cookie=f"session={token}; HttpOnly; SameSite=Strict; Path=/")
+
+    async def robots(self, path: str) -> None:
+        user, name = self.user, path.removeprefix("/api/v1/robots").strip("/")
+        if user is None:
+            self.problem(401, "You are not logged in.")
+        elif name == "stream":
+            await self.events(user)
+        elif name == "":
+            self.reply(200, self.relay.robot_list(user))
+        elif name in self.relay.rights[user]:
+            self.reply(200, self.relay.robot(user, name))
+        else:
+            self.problem(404, f"There is no robot '{name}' for you.")
+
+    async def events(self, user: str) -> None:
+        self.writer.write(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n")
+        while not self.writer.is_closing():
+            self.writer.write(f"event: robots\ndata: {json.dumps(self.relay.robot_list(user))}\n\n".encode())
+            await self.writer.drain()
+            await asyncio.sleep(0.5)
+
+    def page(self, path: str) -> None:
+        file = (self.relay.portal / path.lstrip("/")).resolve()
+        if not file.is_file() or self.relay.portal.resolve() not in file.parents:
+            file = self.relay.portal / "index.html"
+        self.reply(200, file.read_bytes(), mimetypes.guess_type(file.name)[0] or "application/octet-stream")
+
+    async def websocket(self, head: bytes, target: str) -> None:
+        protocol = ServerProtocol()
+        protocol.receive_data(head)
+        protocol.send_response(protocol.accept(protocol.events_received()[0]))  # type: ignore[arg-type]
+        self.flush(protocol)
+        robot = target.removeprefix("/robots/")
+        user = self.user
+        if user is None or robot not in self.relay.rights[user]:
+            protocol.send_close(4401 if user is None else 4404, "")
+            self.flush(protocol)
+            return
+        channel = Channel(self.relay, user, robot, protocol, lambda: self.flush(protocol))
+        try:
+            while data := await self.reader.read(65536):
+                protocol.receive_data(data)
+                self.flush(protocol)
+                for frame in protocol.events_received():
+                    if getattr(frame, "opcode", None) is Opcode.TEXT:
+                        channel.take(json.loads(frame.data))  # type: ignore[union-attr]
+        finally:
+            self.relay.channels.discard(channel)
+
+    def flush(self, protocol: ServerProtocol) -> None:
+        for data in protocol.data_to_send():
+            if data:
+                self.writer.write(data)
+            else:
+                self.writer.close()
+
+
+async def stream(relay: Relay) -> None:
+    while True:
+        await asyncio.sleep(0.02)
+        for world in relay.worlds.values():
+            world.step()
+        for channel in list(relay.channels):
+            if channel.protocol.close_code is None and not relay.frozen:
+                with contextlib.suppress(Exception):
+                    channel.stream(time.monotonic())
+
+
+async def main(portal: Path, port: int) -> None:
+    relay = Relay(portal)
+    server = await asyncio.start_server(lambda r, w: Connection(relay, r, w).run(), "127.0.0.1", port)
+    print(f"READY {server.sockets[0].getsockname()[1]}", flush=True)
+    await stream(relay)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--portal", type=Path, required=True, help="folder of the built portal")
+    parser.add_argument("--port", type=int, default=0)
+    options = parser.parse_args()
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(main(options.portal, options.port))

@@ -1,0 +1,66 @@
+import { expect, it } from 'vitest'
+import { grade, PingTracker, PONG_TIMEOUT_MS } from './latency'
+
+it('measures a round trip', () => {
+  const pings = new PingTracker()
+  const ping = pings.sent(1000)
+  expect(pings.answered(ping, 1040)).toBe(40)
+  expect(pings.rtt).toBe(40)
+})
+
+it('smooths, so that one late answer does not jump', () => {
+  const pings = new PingTracker()
+  pings.answered(pings.sent(0), 40)
+  pings.answered(pings.sent(1000), 1140)
+  expect(pings.rtt).toBeGreaterThan(40)
+  expect(pings.rtt).toBeLessThan(140)
+})
+
+it('is late once a ping has been out for longer than the timeout, and no more when it is answered', () => {
+  const pings = new PingTracker()
+  const ping = pings.sent(0)
+  expect(pings.isLate(PONG_TIMEOUT_MS)).toBe(false)
+  expect(pings.isLate(PONG_TIMEOUT_MS + 1)).toBe(true)
+  pings.answered(ping, 800)
+  expect(pings.isLate(801)).toBe(false)
+})
+
+it('is late by the oldest ping, even when newer ones left since', () => {
+  const pings = new PingTracker()
+  for (let t = 0; t <= 600; t += 200) pings.sent(t)
+  expect(pings.isLate(601)).toBe(true)
+  expect(pings.silentFor(601)).toBe(601)
+})
+
+it('forgets older pings when a newer one is answered', () => {
+  const pings = new PingTracker()
+  const first = pings.sent(0)
+  pings.answered(pings.sent(100), 150)
+  expect(pings.isLate(2000)).toBe(false)
+  expect(pings.answered(first, 2000)).toBeNull()
+})
+
+it('is not late without pings, nor after a reset', () => {
+  const pings = new PingTracker()
+  expect(pings.isLate(1e6)).toBe(false)
+  pings.sent(0)
+  pings.reset()
+  expect(pings.isLate(1e6)).toBe(false)
+  expect(pings.rtt).toBeNull()
+})
+
+it('takes a ping that failed for nothing', () => {
+  const pings = new PingTracker()
+  pings.dropped(pings.sent(0))
+  expect(pings.isLate(1e6)).toBe(false)
+})
+
+it('keeps a bounded number of unanswered pings', () => {
+  const pings = new PingTracker()
+  for (let t = 0; t < 100_000; t += 1000) pings.sent(t)
+  expect(pings.silentFor(100_000)).toBeLessThanOrEqual(31_000)
+})
+
+it('grades round trips', () => {
+  expect([20, 150, 400].map(grade)).toEqual(['good', 'fair', 'poor'])
+})

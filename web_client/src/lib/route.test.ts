@@ -1,0 +1,30 @@
+import { expect, it } from 'vitest'
+import { afterLogin, cockpitPath, loginCode, parse } from './route'
+
+it('reads the pages out of the address', () => {
+  expect(parse('/')).toEqual({ page: 'fleet' })
+  expect(parse('/fleet')).toEqual({ page: 'fleet' })
+  expect(parse('/login')).toEqual({ page: 'login' })
+  expect(parse('/cockpit/rover-1')).toEqual({ page: 'cockpit', robot: 'rover-1' })
+  expect(parse('/cockpit/%E0%A4%A')).toEqual({ page: 'unknown' })
+  expect(parse('/elsewhere')).toEqual({ page: 'unknown' })
+})
+
+it('writes robot names so that they can be read back', () => {
+  for (const name of ['rover-1', 'a b', 'ä/ö', '%41']) {
+    expect(parse(cockpitPath(name))).toEqual({ page: 'cockpit', robot: name })
+  }
+})
+
+it('goes to a page of the portal after the login, nowhere else', () => {
+  expect(afterLogin('?next=%2Fcockpit%2Frover-1')).toBe('/cockpit/rover-1')
+  for (const next of ['https://evil.example/', '//evil.example/x', 'javascript:alert(1)', '/api/v1/session', '']) {
+    expect(afterLogin(`?next=${encodeURIComponent(next)}`)).toBe('/fleet')
+  }
+})
+
+it('finds the code of a login link', () => {
+  expect(loginCode('#code=ABC-123')).toBe('ABC-123')
+  expect(loginCode('#code=')).toBeNull()
+  expect(loginCode('')).toBeNull()
+})

@@ -1,0 +1,79 @@
+import { expect, it } from 'vitest'
+import { refusal, robotSocket } from './api'
+import { pause } from './backoff'
+import { ending } from './closing'
+import { counts, select } from './fleet'
+import { direction, isDriveKey, takesKeys, takesSpace } from './keys'
+import type { Robot } from './types'
+
+it('waits longer after each attempt, within bounds', () => {
+  expect(pause(0, 0.5)).toBe(500)
+  expect(pause(3, 0.5)).toBe(4000)
+  for (const attempt of [5, 50, 5000]) expect(pause(attempt, 1)).toBeLessThanOrEqual(18_750)
+  expect(pause(2, 0)).toBeLessThan(pause(2, 1))
+})
+
+it('tells what a close code means and whether to try again', () => {
+  expect(ending(4401, '').after).toBe('login')
+  expect(ending(4403, 'revoked by admin')).toEqual({
+    after: 'give_up',
+    words: 'You no longer have a right to this robot. Revoked by admin.',
+  })
+  expect(ending(4404, '').after).toBe('give_up')
+  for (const code of [1001, 1006, 1011, 4408, 4999]) expect(ending(code, '').after).toBe('retry')
+})
+
+it('adds up the keys held', () => {
+  expect(direction(new Set(['KeyW', 'ArrowLeft']))).toEqual({ turn: 1, ahead: 1 })
+  expect(direction(new Set(['KeyW', 'KeyS', 'KeyD']))).toEqual({ turn: -1, ahead: 0 })
+  expect(direction(new Set(['KeyW', 'ArrowUp']))).toEqual({ turn: 0, ahead: 1 })
+  expect(isDriveKey('KeyQ')).toBe(false)
+})
+
+it('leaves keys to the controls that need them', () => {
+  expect(takesKeys({ tagName: 'INPUT' })).toBe(true)
+  expect(takesKeys({ tagName: 'DIV', isContentEditable: true })).toBe(true)
+  expect(takesKeys({ tagName: 'BUTTON' })).toBe(false)
+  expect(takesSpace({ tagName: 'BUTTON' })).toBe(true)
+  expect(takesSpace(null)).toBe(false)
+})
+
+it('builds the address of a robot’s websocket', () => {
+  expect(robotSocket('r 1', { protocol: 'https:', host: 'relay:9090' })).toBe('wss://relay:9090/robots/r%201')
+  expect(robotSocket('r1', { protocol: 'http:', host: 'h' })).toBe('ws://h/robots/r1')
+})
+
+it('hands on the relay’s own words of refusal', async () => {
+  const problem = { type: 'about:blank', title: 'Too many', status: 429, detail: 'Wait a little.' }
+  const told = await refusal(new Response(JSON.stringify(problem), { status: 429, headers: { 'Retry-After': '7' } }))
+  expect(told).toMatchObject({ status: 429, message: 'Wait a little.', retryAfter: 7 })
+  const dumb = await refusal(new Response('<html>', { status: 502 }))
+  expect(dumb).toMatchObject({ status: 502, message: 'The relay answered with error 502.', retryAfter: null })
+})
+
+const robot = (name: string, state: Robot['state'], description = ''): Robot => ({
+  name,
+  description,
+  state,
+  level: 'viewer',
+  clients: state === 'in_use' ? [{ user: 'ann', since: 0 }] : [],
+  battery: null,
+  rtt_ms: null,
+  host: '',
+  platform: 'ros2',
+  distro: 'jazzy',
+  last_seen: null,
+})
+
+it('lists reachable robots first, then by name as people count', () => {
+  const fleet = [robot('r10', 'online'), robot('r1', 'offline'), robot('r2', 'in_use')]
+  expect(select(fleet, '', 'all').map((r) => r.name)).toEqual(['r2', 'r10', 'r1'])
+  expect(counts(fleet)).toEqual({ all: 3, online: 1, in_use: 1, offline: 1 })
+})
+
+it('searches names, descriptions and users', () => {
+  const fleet = [robot('r1', 'online', 'Lawn mower'), robot('r2', 'in_use')]
+  expect(select(fleet, 'MOWER jazzy', 'all').map((r) => r.name)).toEqual(['r1'])
+  expect(select(fleet, 'ann', 'all').map((r) => r.name)).toEqual(['r2'])
+  expect(select(fleet, '', 'offline')).toEqual([])
+})
