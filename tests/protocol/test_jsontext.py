@@ -18,7 +18,7 @@ SCALARS = (
     st.none()
     | st.booleans()
     | st.integers(-(2**63), 2**63)
-    | st.floats(allow_nan=False)
+    | st.floats(allow_nan=False, allow_infinity=False)
     | st.text('ab"\\[]{}ß')
 )
 KEYS = st.text('k"\\[{', max_size=3)
