@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 
 from relay_db.models import LABEL, NAME
 from relay_protocol.errors import Invalid
+
+_HEX = re.compile(r"[0-9a-f]{1,64}\Z")
 
 
 def normal_name(text: str, what: str = "name") -> str:
@@ -22,6 +25,22 @@ def normal_name(text: str, what: str = "name") -> str:
     if name[0] in "@-":
         raise Invalid(f"the {what} must not begin with '{name[0]}'")
     return name
+
+
+def findable(text: str) -> str:
+    """A name to look for. One that can't be is looked for as the empty one, which nobody has.
+
+    Text from anywhere must not reach the database as it is: PostgreSQL fails on NUL and on half characters.
+    """
+    try:
+        return normal_name(text)
+    except Invalid:
+        return ""
+
+
+def findable_hex(text: str) -> str:
+    """A fingerprint or hash to look for; what can't be one is looked for as the empty one."""
+    return text if _HEX.match(text) else ""
 
 
 def label(text: str, what: str) -> str:

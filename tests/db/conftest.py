@@ -22,7 +22,7 @@ def postgres() -> Iterator[str]:
     Not in pytest's folder: the next run that starts closes that to other users, and under root the server is
     another user's.
     """
-    folder = Path(tempfile.mkdtemp(prefix="switchboard-pg-"))
+    folder = Path(tempfile.mkdtemp(prefix="pg-of-tests-"))
     server = pgserver.get_server(folder / "data", cleanup_mode="stop")
     try:
         with psycopg.connect(server.get_uri(), autocommit=True) as connection:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -107,16 +108,10 @@ def test_a_failing_migration_leaves_nothing(url: str, monkeypatch: pytest.Monkey
 
 def test_processes_that_start_at_once_upgrade_once(url: str) -> None:
     """Three processes find an empty database; all of them end well, with one set of tables."""
-    program = (
-        "import sys; from relay_db.engine import Database; d = Database(sys.argv[1]); d.upgrade(); d.close()"
-    )
-    paths = [path for path in sys.path if path]
+    program = "import os; from relay_db.engine import Database; d = Database(os.environ['URL']); d.upgrade(); d.close()"
+    environment = {**os.environ, "URL": url, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     started = [
-        subprocess.Popen(
-            [sys.executable, "-c", f"import sys; sys.path[:0] = {paths!r}; {program}", url],
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        subprocess.Popen([sys.executable, "-c", program], env=environment, stderr=subprocess.PIPE, text=True)
         for _ in range(3)
     ]
     errors = [process.communicate(timeout=60)[1] for process in started]

@@ -8,7 +8,7 @@ from sqlalchemy import Select, delete, insert, select, update
 from sqlalchemy.orm import Session
 
 from relay_db.models import EnrolmentCode, Realm, Robot, RobotKey
-from relay_db.names import label, recorded
+from relay_db.names import findable, findable_hex, label, recorded
 from relay_db.queries.records import KeyRecord, RobotKeyRecord, RobotRecord
 from relay_db.queries.state import bump
 from relay_db.queries.users import DEFAULT_REALM, realm_id
@@ -27,7 +27,7 @@ def find_robot(s: Session, name: str, realm: str = DEFAULT_REALM) -> RobotRecord
     """The robot of that name."""
     if not _possible(name):
         return None
-    row = s.execute(_robots().where(Robot.name == name, Realm.name == realm)).one_or_none()
+    row = s.execute(_robots().where(Robot.name == name, Realm.name == findable(realm))).one_or_none()
     return None if row is None else RobotRecord(*row)
 
 
@@ -35,7 +35,7 @@ def list_robots(s: Session, realm: str | None = None) -> list[RobotRecord]:
     """All robots, of one realm or of all, by name."""
     query = _robots().order_by(Robot.name)
     if realm is not None:
-        query = query.where(Realm.name == realm)
+        query = query.where(Realm.name == findable(realm))
     return [RobotRecord(*row) for row in s.execute(query)]
 
 
@@ -108,7 +108,7 @@ def redeem_enrolment_code(
         update(EnrolmentCode)
         .where(
             EnrolmentCode.robot_id == (-1 if robot is None else robot.id),
-            EnrolmentCode.code_hash == code_hash,
+            EnrolmentCode.code_hash == findable_hex(code_hash),
             EnrolmentCode.used.is_(None),
             EnrolmentCode.expires > now,
         )
@@ -126,7 +126,7 @@ def robot_key(
     s: Session, robot_name: str, fingerprint: str, realm: str = DEFAULT_REALM
 ) -> RobotKeyRecord | None:
     """The live key of that fingerprint, if the robot has it."""
-    if not _possible(robot_name) or not _hex(fingerprint):
+    if not _possible(robot_name):
         return None
     row = s.execute(
         select(Robot.id, Robot.name, Realm.name, RobotKey.public_key)
@@ -134,8 +134,8 @@ def robot_key(
         .join(RobotKey, RobotKey.robot_id == Robot.id)
         .where(
             Robot.name == robot_name,
-            Realm.name == realm,
-            RobotKey.fingerprint == fingerprint,
+            Realm.name == findable(realm),
+            RobotKey.fingerprint == findable_hex(fingerprint),
             RobotKey.retired.is_(None),
         )
     ).one_or_none()
@@ -160,7 +160,7 @@ def revoke_key(s: Session, robot_id: int, fingerprint: str, now: float) -> None:
     bump(s)
     live = (
         RobotKey.robot_id == robot_id,
-        RobotKey.fingerprint == (fingerprint if _hex(fingerprint) else ""),
+        RobotKey.fingerprint == findable_hex(fingerprint),
         RobotKey.retired.is_(None),
     )
     if s.scalar(update(RobotKey).where(*live).values(retired=now).returning(RobotKey.id)) is None:
@@ -199,7 +199,3 @@ def _possible(name: str) -> bool:
     except Invalid:
         return False
     return True
-
-
-def _hex(text: str) -> bool:
-    return text.isascii() and text.isalnum()

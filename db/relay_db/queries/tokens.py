@@ -9,6 +9,7 @@ from sqlalchemy import ColumnElement, delete, insert, or_, select
 from sqlalchemy.orm import Session
 
 from relay_db.models import AccessToken, EnrolmentCode, Realm, User
+from relay_db.names import findable_hex
 from relay_db.names import label as checked_label
 from relay_db.queries.records import PrincipalRecord, TokenRecord
 from relay_db.queries.state import bump
@@ -60,7 +61,7 @@ def principal_by_token(
         .join(User, User.id == AccessToken.user_id)
         .join(Realm, Realm.id == User.realm_id)
         .where(
-            AccessToken.token_hash == token_hash,
+            AccessToken.token_hash == findable_hex(token_hash),
             AccessToken.kind.in_(tuple(kinds)),
             User.disabled.is_(False),
             _unexpired(now),

@@ -6,7 +6,7 @@ from sqlalchemy import ColumnElement, Row, Select, delete, exists, func, insert,
 from sqlalchemy.orm import Session
 
 from relay_db.models import AccessToken, Group, Membership, Realm, User
-from relay_db.names import normal_name
+from relay_db.names import findable, normal_name
 from relay_db.queries.records import GroupRecord, RealmRecord, UserRecord
 from relay_db.queries.state import bump
 from relay_protocol.errors import Invalid, NotFound
@@ -30,7 +30,7 @@ def list_realms(s: Session) -> list[RealmRecord]:
 
 def realm_id(s: Session, name: str) -> int:
     """:raises NotFound: no such realm"""
-    found = s.scalar(select(Realm.id).where(Realm.name == _plain(name)))
+    found = s.scalar(select(Realm.id).where(Realm.name == findable(name)))
     if found is None:
         raise NotFound("there is no such realm")
     return found
@@ -38,7 +38,7 @@ def realm_id(s: Session, name: str) -> int:
 
 def find_user(s: Session, name: str, realm: str = DEFAULT_REALM) -> UserRecord | None:
     """The user of that name, in whatever case it is written; also a disabled one."""
-    row = s.execute(_users().where(User.name == _plain(name), Realm.name == _plain(realm))).one_or_none()
+    row = s.execute(_users().where(User.name == findable(name), Realm.name == findable(realm))).one_or_none()
     return None if row is None else UserRecord(*row)
 
 
@@ -52,7 +52,7 @@ def list_users(s: Session, realm: str | None = None) -> list[UserRecord]:
     """All users, of one realm or of all, by name."""
     query = _users().order_by(User.name)
     if realm is not None:
-        query = query.where(Realm.name == _plain(realm))
+        query = query.where(Realm.name == findable(realm))
     return [UserRecord(*row) for row in s.execute(query)]
 
 
@@ -136,7 +136,7 @@ def find_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord
     row = s.execute(
         select(Group.id, Group.name, Realm.name)
         .join(Realm, Realm.id == Group.realm_id)
-        .where(Group.name == _plain(name), Realm.name == _plain(realm))
+        .where(Group.name == findable(name), Realm.name == findable(realm))
     ).one_or_none()
     return None if row is None else _with_members(s, row)
 
@@ -147,7 +147,7 @@ def list_groups(s: Session, realm: str | None = None) -> list[GroupRecord]:
         select(Group.id, Group.name, Realm.name).join(Realm, Realm.id == Group.realm_id).order_by(Group.name)
     )
     if realm is not None:
-        query = query.where(Realm.name == _plain(realm))
+        query = query.where(Realm.name == findable(realm))
     return [_with_members(s, row) for row in s.execute(query).all()]
 
 
@@ -222,11 +222,3 @@ def _with_members(s: Session, group: Row[int, str, str]) -> GroupRecord:
 
 def _holds(s: Session, condition: ColumnElement[bool]) -> bool:
     return bool(s.scalar(select(exists().where(condition))))
-
-
-def _plain(name: str) -> str:
-    """A name to look for. One that can't be is looked for as the empty one, which nobody has."""
-    try:
-        return normal_name(name)
-    except Invalid:
-        return ""

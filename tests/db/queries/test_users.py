@@ -1,0 +1,195 @@
+"""Users and groups, on both databases."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.rights import Level
+
+TOKEN = "b" * 64
+
+
+def test_a_user_is_found_in_any_case(database: Database) -> None:
+    """Ann is ann."""
+    with database.begin() as s:
+        added = queries.add_user(s, "Ann", "hash", admin=True)
+        assert queries.find_user(s, "ANN") == added
+        assert queries.get_user(s, added.id) == added
+    assert added == queries.UserRecord(added.id, "ann", "default", True, False, "hash")
+
+
+def test_an_unknown_user_is_none(database: Database) -> None:
+    """Neither a name nor a realm nor a number that isn't there is an error."""
+    with database.reading() as s:
+        assert queries.find_user(s, "ann") is None
+        assert queries.find_user(s, "ann", realm="elsewhere") is None
+        assert queries.get_user(s, 1) is None
+        assert not queries.user_is_live(s, 1)
+
+
+def test_any_text_can_be_looked_for(database: Database) -> None:
+    """What comes from the network, NUL and half characters too, finds nothing instead of failing."""
+
+    @settings(deadline=None, max_examples=50)
+    @given(st.text())
+    @example("\x00")
+    @example("\ud800")
+    def look_for(text: str) -> None:
+        with database.reading() as s:
+            assert queries.find_user(s, text) is None
+            assert queries.find_user(s, "ann", realm=text) is None
+            assert queries.find_group(s, text) is None
+            assert queries.find_robot(s, text) is None
+            assert queries.find_robot(s, "rover", realm=text) is None
+            assert queries.robot_key(s, text, text) is None
+            assert queries.robot_key(s, "rover", text) is None
+            assert queries.principal_by_token(s, text, 1.0) is None
+
+    look_for()
+
+
+def test_a_name_is_taken_once_per_realm(database: Database) -> None:
+    """The same name in another realm is another user."""
+    with database.begin() as s:
+        queries.add_user(s, "ann", None)
+        with pytest.raises(Invalid, match="already"):
+            queries.add_user(s, "ANN", None)
+        queries.add_realm(s, "plant")
+        other = queries.add_user(s, "ann", None, realm="plant")
+        assert queries.find_user(s, "ann", "plant") == other
+        assert [user.realm for user in queries.list_users(s)] == ["default", "plant"]
+        assert queries.list_users(s, "plant") == [other]
+        assert queries.count_users(s) == 2
+
+
+def test_a_realm_must_be_there(database: Database) -> None:
+    """A user, group or robot of an unknown realm is refused."""
+    with database.begin() as s:
+        for add in (
+            lambda: queries.add_user(s, "ann", None, realm="nowhere"),
+            lambda: queries.add_group(s, "lab", realm="nowhere"),
+            lambda: queries.add_robot(s, "rover", realm="nowhere"),
+        ):
+            with pytest.raises(NotFound, match="realm"):
+                add()
+        with pytest.raises(Invalid, match="already"):
+            queries.add_realm(s, "Default")
+
+
+def test_a_new_password_ends_browser_sessions_but_not_access_tokens(database: Database) -> None:
+    """Whoever knew the old password is out; the session that asked may stay; programs go on."""
+    with database.begin() as s:
+        ann = queries.add_user(s, "ann", "old")
+        make = {"expires": None, "now": 1.0}
+        program = queries.create_token(s, ann.id, "1" * 64, kind="access", **make)
+        here = queries.create_token(s, ann.id, "2" * 64, kind="session", **make)
+        elsewhere = queries.create_token(s, ann.id, "3" * 64, kind="session", **make)
+        link = queries.create_token(s, ann.id, "4" * 64, kind="login", **make)
+        queries.set_password(s, ann.id, "new", keep_token=here)
+        found = queries.find_user(s, "ann")
+        assert found is not None
+        assert found.password_hash == "new"
+        live = {each for each in (program, here, elsewhere, link) if queries.token_is_live(s, each, 2.0)}
+        assert live == {program, here}
+        queries.set_password(s, ann.id, "newer")
+        assert not queries.token_is_live(s, here, 2.0)
+
+
+def test_a_disabled_user_is_out_until_enabled(database: Database) -> None:
+    """Tokens and rights of a disabled user are worth nothing, and are back afterwards."""
+    with database.begin() as s:
+        ann, rover = queries.add_user(s, "ann", None, admin=True), queries.add_robot(s, "rover")
+        queries.grant_right(s, rover.id, "viewer", user_id=ann.id)
+        token = queries.create_token(s, ann.id, TOKEN, kind="access", expires=None, now=1.0)
+
+        def live() -> tuple[bool, bool, bool, int, int]:
+            return (
+                queries.user_is_live(s, ann.id),
+                queries.token_is_live(s, token, 2.0),
+                queries.principal_by_token(s, TOKEN, 2.0) is not None,
+                len(queries.grants_for(s, ann.id, rover.id)),
+                len(queries.robots_with_grants(s, ann.id)),
+            )
+
+        assert live() == (True, True, True, 2, 1)
+        queries.set_disabled(s, ann.id, True)
+        assert live() == (False, False, False, 0, 0)
+        queries.set_disabled(s, ann.id, False)
+        assert live() == (True, True, True, 2, 1)
+
+
+def test_a_removed_user_leaves_nothing(database: Database) -> None:
+    """Rights, memberships and tokens go with the user; events stay, without it."""
+    with database.begin() as s:
+        ann, rover = queries.add_user(s, "ann", None), queries.add_robot(s, "rover")
+        lab = queries.add_group(s, "lab")
+        queries.add_member(s, lab.id, ann.id)
+        queries.grant_right(s, rover.id, "owner", user_id=ann.id)
+        queries.create_token(s, ann.id, TOKEN, kind="access", expires=None, now=1.0)
+        queries.record_event(s, at=1.0, kind="login", source="relay", user_id=ann.id, data={})
+        queries.remove_user(s, ann.id)
+        assert queries.find_user(s, "ann") is None
+        assert queries.list_rights(s) == []
+        assert queries.list_tokens(s) == []
+        assert queries.list_groups(s) == [lab]
+        assert [event.user_id for event in queries.list_events(s)] == [None]
+
+
+def test_changes_to_nobody_are_refused(database: Database) -> None:
+    """Every change of a user or group that isn't there says so."""
+    with database.begin() as s:
+        lab, ann = queries.add_group(s, "lab"), queries.add_user(s, "ann", None)
+        for change in (
+            lambda: queries.set_password(s, 99, "x"),
+            lambda: queries.set_disabled(s, 99, True),
+            lambda: queries.set_admin(s, 99, True),
+            lambda: queries.remove_user(s, 99),
+            lambda: queries.remove_group(s, 99),
+            lambda: queries.add_member(s, 99, ann.id),
+            lambda: queries.add_member(s, lab.id, 99),
+        ):
+            with pytest.raises(NotFound):
+                change()
+
+
+def test_a_group_lists_its_members(database: Database) -> None:
+    """Joining twice is joining; leaving says whether one was in."""
+    with database.begin() as s:
+        bob, ann = queries.add_user(s, "bob", None), queries.add_user(s, "ann", None)
+        lab = queries.add_group(s, "Lab")
+        for user in (bob, ann, ann):
+            queries.add_member(s, lab.id, user.id)
+        assert queries.find_group(s, "LAB") == lab._replace(members=("ann", "bob"))
+        assert queries.remove_member(s, lab.id, bob.id)
+        assert not queries.remove_member(s, lab.id, bob.id)
+        assert queries.list_groups(s) == [lab._replace(members=("ann",))]
+        with pytest.raises(Invalid, match="already"):
+            queries.add_group(s, "lab")
+
+
+def test_a_group_takes_only_users_of_its_realm(database: Database) -> None:
+    """Realms don't mix."""
+    with database.begin() as s:
+        queries.add_realm(s, "plant")
+        stranger = queries.add_user(s, "eve", None, realm="plant")
+        lab = queries.add_group(s, "lab")
+        with pytest.raises(Invalid, match="different realms"):
+            queries.add_member(s, lab.id, stranger.id)
+        assert queries.list_groups(s, "plant") == []
+
+
+def test_a_removed_group_takes_its_rights_along(database: Database) -> None:
+    """Members stay users, without what the group gave them."""
+    with database.begin() as s:
+        ann, rover = queries.add_user(s, "ann", None), queries.add_robot(s, "rover")
+        lab = queries.add_group(s, "lab")
+        queries.add_member(s, lab.id, ann.id)
+        queries.grant_right(s, rover.id, Level.OWNER, group_id=lab.id)
+        queries.remove_group(s, lab.id)
+        assert queries.user_is_live(s, ann.id)
+        assert queries.grants_for(s, ann.id, rover.id) == []
