@@ -137,7 +137,7 @@ class Opening:
             key=identity.fingerprint(public_key),
         )
         self._connection.send(link.Enrolled(robot=record.name, relay=hall.relay))
-        self._connection.close("enrolled; dial again with hello")
+        self._connection.finish("enrolled")
 
     def _join(self, message: link.Join) -> None:
         try:

@@ -139,6 +139,11 @@ class RobotConnection(TwistedProtocol):
             self.send(link.Bye(reason=reason))
             self._hang_up(reason)
 
+    def finish(self, reason: str) -> None:
+        """All is said; end the connection."""
+        if self._role is not None:
+            self._hang_up(reason)
+
     def refuse(self, refusal: link.Refused) -> None:
         """Say no in words and end the connection."""
         if self._role is not None:
