@@ -160,7 +160,7 @@ class TypeRegistry:
         :raises Invalid: see :meth:`from_json`
         """
         name, compiled = self._find(self._request_of(type_name))
-        value = _decoded(name, body) if body else None
+        value = None if body == b"" else _decoded(name, body)
         if isinstance(value, list):
             fields = compiled.definitions[name].fields
             if len(value) > len(fields):

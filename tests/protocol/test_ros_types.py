@@ -343,6 +343,9 @@ def test_service_arguments_come_by_name_by_order_or_not_at_all() -> None:
         )
     with pytest.raises(Invalid, match="a/srv/Add_Request has 2 arguments, not 3"):
         types.args_from_json("a/srv/Add", b"[1,2,3]", 0)
+    for body in (b"0", b'""', b"false"):
+        with pytest.raises(Invalid, match="a/srv/Add_Request must be an object"):
+            types.args_from_json("a/srv/Add", body, 0)
     with pytest.raises(Invalid, match="b must be an integer"):
         types.args_from_json("a/srv/Add", b'[1,"2"]', 0)
 
