@@ -86,7 +86,9 @@ def enroll(
     if not tls and (ca or server_name):
         raise Invalid("--ca and --server-name mean TLS; leave out --no-tls")
     _warn_if_plain(host, tls)
-    code = (click.get_text_stream("stdin").readline() if code == "-" else code).strip()
+    if code == "-":
+        code = sys.stdin.readline()
+    code = code.strip()
     ca_path = str(Path(ca).resolve()) if ca else ""
     reactor = monotonic_reactor()
     where = endpoint(reactor, host, port, tls, ca_path, server_name)
@@ -142,7 +144,7 @@ def monotonic_reactor() -> Any:
 def _warn_if_plain(host: str, tls: bool) -> None:
     if not tls and not is_loopback(host):
         click.echo(
-            f"warning: the link to {inert(host)} is not encrypted: who is between can read and drive; use --tls",
+            f"warning: the link to {inert(host)} is not encrypted; who is between can read and drive: use --tls",
             err=True,
         )
 

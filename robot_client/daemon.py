@@ -29,6 +29,7 @@ from robot_client.tls import explain
 from robot_client.transport import LinkLost, LinkProtocol
 
 ALERTS_KEPT = 32
+MAX_CHANNELS = 64
 
 
 class ChannelEnd(Wire):
@@ -171,6 +172,11 @@ class Daemon:
 
     def _open(self, message: link.OpenChannel) -> None:
         self._close(message.channel, "it is opened anew")
+        if len(self._ends) + len(self._opening) >= MAX_CHANNELS:
+            self._log.warn(
+                "channel {name} is not opened: there are {count}", name=message.channel, count=MAX_CHANNELS
+            )
+            return
         factory = Factory.forProtocol(lambda: self._make_channel(message))
         factory.noisy = False
         try:
@@ -277,7 +283,8 @@ class Daemon:
                 rtt_ms=round(round_trip * 1000, 3) if round_trip is not None else None,
                 stale_commands=self.motion.stale_commands,
                 watchdog_stops=self.motion.watchdog_stops,
-                dropped_samples=self._dropped
+                dropped_samples=self._platform.dropped
+                + self._dropped
                 + sum(each.channel.uplink.dropped for each in self._ends.values()),
             )
         )

@@ -240,7 +240,7 @@ class ControlLink(Link):
         if message.relay != self._me.relay:
             raise WrongRelay(
                 f"the relay calls itself '{message.relay}', but this robot was enrolled at '{self._me.relay}'; "
-                "nothing was signed. Check the address; enrol again if the relay is a new one"
+                "nothing was signed. Check the address; enrol again if the relay is new"
             )
         nonce = link.from_base64(message.nonce, "nonce")
         if len(nonce) != identity.NONCE_BYTES:

@@ -7,12 +7,16 @@ from pathlib import Path
 from typing import Any, cast
 
 from OpenSSL import SSL
-from service_identity import VerificationError
+from service_identity import CertificateError, VerificationError
+from service_identity.hazmat import DNS_ID, IPAddress_ID, verify_service_identity
+from service_identity.pyopenssl import extract_patterns
 from twisted.internet import error, ssl
 from twisted.internet.endpoints import HostnameEndpoint, wrapClientTLS
+from twisted.internet.interfaces import IOpenSSLClientConnectionCreator
 from twisted.python.failure import Failure
+from zope.interface import implementer  # type: ignore[import-untyped]
 
-from relay_protocol.errors import Invalid
+from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from robot_client.reactors import Endpoint
 
 CONNECT_SECONDS = 10.0
@@ -44,7 +48,7 @@ def trust_root(ca: str) -> Any:
         raise Invalid(f"the CA file {ca} holds something that is no certificate in PEM form") from None
     if not certificates:
         raise Invalid(f"the CA file {ca} holds no certificate in PEM form")
-    return ssl.trustRootFromCertificates(certificates)  # type: ignore[no-untyped-call]
+    return ssl.trustRootFromCertificates(certificates)
 
 
 def endpoint(reactor: Any, host: str, port: int, tls: bool, ca: str = "", server_name: str = "") -> Endpoint:
@@ -57,19 +61,82 @@ def endpoint(reactor: Any, host: str, port: int, tls: bool, ca: str = "", server
     plain: Any = HostnameEndpoint(reactor, host, port, timeout=CONNECT_SECONDS)
     if not tls:
         return cast(Endpoint, plain)
+    name = server_name or host
     options = ssl.optionsForClientTLS(
-        server_name or host,
+        name,
         trustRoot=trust_root(ca) if ca else None,
         extraCertificateOptions={"raiseMinimumTo": ssl.TLSVersion.TLSv1_2},
     )
-    return cast(Endpoint, wrapClientTLS(options, plain))
+    return cast(Endpoint, wrapClientTLS(cast(Any, _InWords(options, name)), plain))
+
+
+class CertificateRefused(Refused):
+    """The relay's certificate is not good; nothing was said to it."""
+
+
+@implementer(IOpenSSLClientConnectionCreator)
+class _InWords:
+    """Twisted's TLS client, whose checks are made with the reason kept: OpenSSL's error only says *failed*.
+
+    :param inner: makes the connections
+    :param name: what the certificate must be for
+    """
+
+    def __init__(self, inner: Any, name: str) -> None:
+        self._inner = inner
+        self._name = name
+        try:
+            self._id: Any = IPAddress_ID(name)
+        except ValueError:
+            self._id = DNS_ID(name)
+
+    def clientConnectionForTLS(self, protocol: Any) -> SSL.Connection:
+        """A connection that checks chain and name."""
+        connection: SSL.Connection = self._inner.clientConnectionForTLS(protocol)
+
+        def check(_: SSL.Connection, certificate: Any, code: int, depth: int, good: int) -> bool:
+            reason = self._fault(certificate, code, depth, bool(good))
+            if reason:
+                protocol.failVerification(Failure(CertificateRefused(reason)))
+            return not reason
+
+        connection.set_verify(SSL.VERIFY_PEER | SSL.VERIFY_FAIL_IF_NO_PEER_CERT, check)
+        return connection
+
+    def _fault(self, certificate: Any, code: int, depth: int, good: bool) -> str:
+        """What is wrong with one certificate of the chain; empty if nothing is."""
+        if not good:
+            return _CHAIN_WORDS.get(
+                code, f"the relay's certificate can't be verified (OpenSSL's reason {code})"
+            )
+        if depth > 0:
+            return ""
+        try:
+            verify_service_identity(extract_patterns(certificate), [self._id], [])
+        except (VerificationError, CertificateError):
+            return f"the relay's certificate is for another name than {self._name}; see --server-name"
+        except Exception:  # an exception in OpenSSL's callback would be lost, and the certificate taken
+            return "the relay's certificate can't be read"
+        return ""
+
+
+_UNTRUSTED = "the relay's certificate is of nobody this robot trusts; give its CA as --ca"
+_CODES = SSL.X509VerificationCodes
+_CHAIN_WORDS = {
+    _CODES.ERR_CERT_HAS_EXPIRED: "the relay's certificate has expired; it must be renewed there",
+    _CODES.ERR_CERT_NOT_YET_VALID: "the relay's certificate is not valid yet; compare the clocks of both machines",
+    _CODES.ERR_DEPTH_ZERO_SELF_SIGNED_CERT: _UNTRUSTED,
+    _CODES.ERR_SELF_SIGNED_CERT_IN_CHAIN: _UNTRUSTED,
+    _CODES.ERR_UNABLE_TO_GET_ISSUER_CERT_LOCALLY: _UNTRUSTED,
+    _CODES.ERR_UNABLE_TO_VERIFY_LEAF_SIGNATURE: _UNTRUSTED,
+}
 
 
 def explain(failure: Failure) -> str:
     """Why a connection failed or ended, for a person."""
     problem = failure.value
-    if isinstance(problem, VerificationError):
-        return "the relay's certificate is for another name; nothing was said to it"
+    if isinstance(problem, SwitchboardError):
+        return str(problem)
     if isinstance(problem, SSL.Error):
         return _explain_tls(problem)
     for kind, words in _WORDS.items():
@@ -89,11 +156,6 @@ _WORDS: dict[type[BaseException], str] = {
 }
 
 _TLS_WORDS = {
-    "certificate has expired": "the relay's certificate has expired; it must be renewed there",
-    "not yet valid": "the relay's certificate is not valid yet; compare the clocks of both machines",
-    "self-signed certificate": "the relay's certificate is of nobody this robot trusts; give its CA as --ca",
-    "unable to get local issuer": "the relay's certificate is of a CA not trusted here; give it as --ca",
-    "certificate verify failed": "the relay's certificate can't be verified; give its CA by --ca",
     "wrong version number": "the relay does not speak TLS on this port; for a trusted network say --no-tls",
     "unexpected eof": "the relay ended the TLS connection early; does it speak TLS on this port?",
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 from twisted.internet.interfaces import IPushProducer
 from twisted.internet.protocol import Protocol as TwistedProtocol
@@ -18,6 +18,9 @@ from relay_protocol.limits import UNPROVEN_SECONDS
 from robot_client.link import Event, Link, State
 from robot_client.reactors import Clock, Timer
 from robot_client.tls import explain
+
+GOODBYE_SECONDS = 2.0
+"""How long the last words may take to leave; a relay that takes nothing would hold the connection for ever."""
 
 _UNSENT = 128 * 1024
 """Bytes the kernel may hold unsent; more would be delay nobody sees."""
@@ -63,6 +66,7 @@ class LinkProtocol(TwistedProtocol):
         self._clock = clock
         self._ping: Timer | None = None
         self._deadline: Timer | None = None
+        self._patience: Timer | None = None
         self._reason: SwitchboardError | None = None
 
     def connectionMade(self) -> None:
@@ -92,10 +96,10 @@ class LinkProtocol(TwistedProtocol):
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """The connection is gone."""
-        for timer in (self._ping, self._deadline):
+        for timer in (self._ping, self._deadline, self._patience):
             if timer is not None and timer.active():
                 timer.cancel()
-        lost = self._reason or LinkLost(explain(reason))
+        lost = self._reason or _as_ours(reason)
         self._reason = lost
         self.owner.on_lost(lost)
 
@@ -119,6 +123,7 @@ class LinkProtocol(TwistedProtocol):
         if gently:
             self.flush()
             self.transport.loseConnection()
+            self._patience = self._clock.callLater(GOODBYE_SECONDS, self.transport.abortConnection)
         else:
             self.transport.abortConnection()
 
@@ -147,6 +152,10 @@ class LinkProtocol(TwistedProtocol):
     def stopProducing(self) -> None:
         """The transport wants no more."""
         self.owner.on_pause()
+
+
+def _as_ours(failure: Failure) -> SwitchboardError:
+    return failure.value if isinstance(failure.value, SwitchboardError) else LinkLost(explain(failure))
 
 
 def tune(transport: object, patience: float) -> None:

@@ -77,6 +77,10 @@ class Platform(Protocol):
 
     encoding: str
 
+    @property
+    def dropped(self) -> int:
+        """Samples that never reached the reactor, since start."""
+
     def start(self) -> None:
         """Connect to the middleware.
 

@@ -75,6 +75,11 @@ class MemoryPlatform(Platform):
         self.charge: float | None = None
         self.running = False
 
+    @property
+    def dropped(self) -> int:
+        """Never any."""
+        return 0
+
     def start(self) -> None:
         """Be there."""
         self.running = True

@@ -23,10 +23,19 @@ from robot_client.platforms import ros2_graph, ros2_qos
 from robot_client.platforms.base import Facts, GraphView, Motion, OnSample, Platform
 from robot_client.platforms.ros2_calls import Calls
 from robot_client.platforms.ros2_executor import Hop, Spinner, make_executor
-from robot_client.platforms.ros2_topics import RosSink, RosSource, check_name, service_type, topic_type
+from robot_client.platforms.ros2_topics import (
+    Lingering,
+    RosSink,
+    RosSource,
+    check_name,
+    service_type,
+    topic_type,
+)
 from robot_client.platforms.ros2_types import Types
 
 BATTERY = "sensor_msgs/msg/BatteryState"
+FAREWELL = 0.3
+"""Seconds the last messages have to arrive when the daemon leaves; a stop is among them."""
 
 
 class Ros2Platform(Platform):
@@ -60,6 +69,12 @@ class Ros2Platform(Platform):
         self._node: Any = None
         self._spinner: Any = None
         self._calls: Any = None
+        self._lingering: Any = None
+
+    @property
+    def dropped(self) -> int:
+        """Samples that the reactor was too slow for."""
+        return self._hop.dropped
 
     def start(self) -> None:
         """Enter the graph."""
@@ -72,6 +87,7 @@ class Ros2Platform(Platform):
             self._spinner = Spinner(make_executor(self._kind, self._context), self._node)
         except Exception as error:
             raise Unavailable(f"ROS 2 does not start: {error}") from error
+        self._lingering = Lingering(self._node, self._reactor)
         self._calls = Calls(self._node, self._hop, self._types, self._reactor)
         self._spinner.start()
 
@@ -85,6 +101,7 @@ class Ros2Platform(Platform):
         for sink in list(self._sinks):
             sink.close()
         self._spinner.stop()
+        self._lingering.end(FAREWELL)
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
         self._spinner = None
@@ -153,9 +170,13 @@ class Ros2Platform(Platform):
             publisher = self._node.create_publisher(kind, topic, profile)
         except Exception as error:
             raise Invalid(f"ROS 2 refuses to publish {topic} as {full}: {error}") from None
-        sink = RosSink(self._node, publisher, self._sinks.remove)
+        sink = RosSink(publisher, self._sunk)
         self._sinks.append(sink)
         return sink
+
+    def _sunk(self, sink: RosSink) -> None:
+        self._sinks.remove(sink)
+        self._lingering.take(sink.publisher)
 
     def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
         """Call a service once."""

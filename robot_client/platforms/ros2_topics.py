@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable
 from typing import Any
+
+from rclpy.duration import Duration
 
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.link import QoS
@@ -12,6 +15,9 @@ from robot_client.platforms.base import OnSample
 from robot_client.platforms.definitions import normalise
 from robot_client.platforms.ros2_executor import Hop
 from robot_client.platforms.ros2_types import Types
+from robot_client.reactors import Clock, Timer
+
+LINGER = 0.5
 
 
 def check_name(resolve: Callable[[str], str], name: str, what: str) -> None:
@@ -155,20 +161,48 @@ class RosSource:
 
 
 class RosSink:
-    """A publisher of CDR bytes."""
+    """A publisher of CDR bytes.
 
-    def __init__(self, node: Any, publisher: Any, on_close: Callable[[RosSink], None]) -> None:
-        self._node = node
-        self._publisher = publisher
-        self._on_close = on_close
+    :param on_close: takes the publisher over
+    """
+
+    def __init__(self, publisher: Any, on_close: Callable[[RosSink], None]) -> None:
+        self.publisher = publisher
+        self._on_close: Callable[[RosSink], None] | None = on_close
 
     def publish(self, body: bytes) -> None:
         """Publish one message."""
-        self._publisher.publish(body)
+        self.publisher.publish(body)
 
     def close(self) -> None:
         """Take the publisher away."""
-        if self._publisher is not None:
-            self._node.destroy_publisher(self._publisher)
-            self._publisher = None
-            self._on_close(self)
+        if self._on_close is not None:
+            on_close, self._on_close = self._on_close, None
+            on_close(self)
+
+
+class Lingering:
+    """Publishers on their way out: a publisher that goes at once takes its last message with it, often a stop."""
+
+    def __init__(self, node: Any, clock: Clock) -> None:
+        self._node = node
+        self._clock = clock
+        self._timers: dict[Any, Timer] = {}
+
+    def take(self, publisher: Any) -> None:
+        """Destroy this one in a while."""
+        self._timers[publisher] = self._clock.callLater(LINGER, self._destroy, publisher)
+
+    def end(self, seconds: float) -> None:
+        """Destroy all, once what they said has arrived, or after ``seconds``."""
+        deadline = self._clock.seconds() + seconds
+        for publisher, timer in list(self._timers.items()):
+            timer.cancel()
+            left = max(0.0, deadline - self._clock.seconds())
+            with contextlib.suppress(Exception):  # not every middleware can tell
+                publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
+            self._destroy(publisher)
+
+    def _destroy(self, publisher: Any) -> None:
+        del self._timers[publisher]
+        self._node.destroy_publisher(publisher)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import secrets
 import socket
@@ -57,10 +58,8 @@ class Peer:
         self.raw(frames.encode_sample(number, time.monotonic_ns() - int(age * 1e9), body))
 
     def raw(self, data: bytes) -> None:
-        try:
+        with contextlib.suppress(OSError):
             self._connection.sendall(data)
-        except OSError:
-            pass
 
     def expect(self, kind: type[T], timeout: float = PATIENCE) -> T:
         """The next message of a kind; others are passed over."""
@@ -84,10 +83,8 @@ class Peer:
         return said
 
     def cut(self) -> None:
-        try:
+        with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            pass
         self._connection.close()
 
 
@@ -164,10 +161,8 @@ class FakeRelay:
 
     def close(self) -> None:
         # Wakes the thread in accept(), which close() alone would not.
-        try:
+        with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            pass
         self._listener.close()
         for peer in self._all:
             peer.cut()

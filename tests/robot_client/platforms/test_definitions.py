@@ -1,0 +1,103 @@
+"""Type texts with all they contain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from relay_protocol.errors import Invalid, NotFound
+from robot_client.platforms.definitions import (
+    RULE,
+    contained,
+    full_text,
+    installed,
+    normalise,
+    prefixes,
+    type_hash,
+)
+
+TEXTS = {
+    "a/msg/Outer": "# made of others\nInner one\nb/Far[] many\nHeader header\nfloat64[9] k\nstring<=5 s\nint8 C=3\n",
+    "a/msg/Inner": "Deep deep\nbool[<=3] flags\n",
+    "a/msg/Deep": "uint8 X=1  # Inner not here\nuint8 x\n",
+    "b/msg/Far": "a/Deep near\n",
+    "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
+    "a/srv/Do": "Inner what\n---\nbool ok\nb/Far far\n",
+}
+
+
+def test_each_type_comes_once_after_a_rule() -> None:
+    """A text is followed by every type it contains, at any depth, once."""
+    parts = full_text("a/msg/Outer", TEXTS.get).split(RULE + "\n")
+    assert parts[0] == TEXTS["a/msg/Outer"]
+    assert [part.split("\n")[0] for part in parts[1:]] == [
+        "MSG: a/Inner",
+        "MSG: b/Far",
+        "MSG: std_msgs/Header",
+        "MSG: a/Deep",
+        "MSG: builtin_interfaces/Time",
+    ]
+
+
+def test_service_has_both_halves() -> None:
+    """A service's text keeps its dividing line, and what both halves contain follows."""
+    text = full_text("a/srv/Do", TEXTS.get)
+    assert text.startswith("Inner what\n---\nbool ok\n")
+    assert "MSG: a/Inner" in text
+    assert "MSG: b/Far" in text
+
+
+def test_comments_and_constants_contain_nothing() -> None:
+    """Words in comments and constants are no types."""
+    assert contained(TEXTS["a/msg/Deep"], "a") == []
+
+
+def test_missing_part_is_named() -> None:
+    """A type that contains one that is not installed says which."""
+    with pytest.raises(NotFound, match="b/msg/Far"):
+        full_text("a/msg/Outer", {key: text for key, text in TEXTS.items() if key != "b/msg/Far"}.get)
+
+
+def test_endless_definition_is_refused() -> None:
+    """A definition over the limit is not sent."""
+    with pytest.raises(Invalid, match="larger"):
+        full_text("a/msg/Big", lambda name: "# " + "x" * 300_000)
+
+
+@pytest.mark.parametrize(
+    ("name", "full"),
+    [("std_msgs/String", "std_msgs/msg/String"), ("a/srv/B", "a/srv/B"), ("a/msg/B", "a/msg/B")],
+)
+def test_short_names_are_completed(name: str, full: str) -> None:
+    """A name without its kind means a message."""
+    assert normalise(name) == full
+
+
+@pytest.mark.parametrize(
+    "name", ["", "String", "../../etc/passwd", "a/msg/../x", "a/msg/b/c", "a/lib/B", "a/msg/B\n"]
+)
+def test_paths_are_no_types(name: str) -> None:
+    """What is no type name never becomes a path."""
+    with pytest.raises(Invalid):
+        normalise(name)
+
+
+def test_files_and_hashes_are_found_under_share(tmp_path: Path) -> None:
+    """Texts and hashes come from the first prefix that has them."""
+    folder = tmp_path / "share" / "a" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "B.msg").write_text("int8 x\n")
+    (folder / "B.json").write_text('{"type_hashes":[{"type_name":"a/msg/B","hash_string":"RIHS01_ab"}]}')
+    where = [tmp_path / "none", tmp_path]
+    assert installed("a/msg/B", where) == "int8 x\n"
+    assert type_hash("a/msg/B", where) == "RIHS01_ab"
+    assert installed("a/msg/C", where) is None
+    assert type_hash("a/msg/C", where) == ""
+
+
+def test_ament_prefixes_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot's own ROS is asked before the Python environment."""
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/ws/install")
+    assert [str(each) for each in prefixes()[:2]] == ["/opt/ros/jazzy", "/ws/install"]

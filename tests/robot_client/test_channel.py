@@ -1,0 +1,232 @@
+"""A channel's requests, samples and end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock
+
+from relay_protocol import link
+from relay_protocol.frames import FrameDecoder, SampleFrame
+from relay_protocol.link import MotionPolicy
+from robot_client.channel import Channel, Wire
+from robot_client.motion import MotionDesk, NoGuard
+from robot_client.offset import Offset
+from robot_client.platforms.base import GraphView
+from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
+
+STRING = "std_msgs/msg/String"
+
+
+class Recorder(Wire):
+    def __init__(self) -> None:
+        self.said: list[Any] = []
+        self.writes: list[list[bytes]] = []
+
+    def say(self, message: link.Message) -> None:
+        self.said.append(message)
+
+    def write(self, frames: list[bytes]) -> None:
+        self.writes.append(frames)
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.clock.advance(100)
+        self.platform = MemoryPlatform(GraphView(topics={"/chat": link.Topic(types=[STRING])}))
+        self.wire = Recorder()
+        self.offset = Offset()
+        self.offset.add(self.now(), self.now(), self.now())
+        policy = MotionPolicy(types=[TWIST])
+        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, NoGuard())
+        self.channel = Channel(
+            "c1", self.wire, self.offset, self.platform, self.desk, self.clock, 2**24, wall=lambda: 777
+        )
+
+    def now(self) -> int:
+        return round(self.clock.seconds() * 1e9)
+
+    def ask(self, message: link.Message) -> Any:
+        self.channel.handle(message)
+        return self.wire.said[-1] if self.wire.said else None
+
+    def frames(self) -> list[SampleFrame]:
+        data = b"".join(piece for write in self.wire.writes for piece in write)
+        return FrameDecoder(2**25).feed(data)  # type: ignore[return-value]
+
+    def drive(self, body: bytes) -> None:
+        self.channel.sample(SampleFrame(5, self.now(), body))
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+def test_subscribe_is_confirmed_with_type_and_encoding(scene: Scene) -> None:
+    """A subscription without a type takes it from the graph and says so."""
+    answer = scene.ask(link.Subscribe(number=1, topic="/chat"))
+    assert answer == link.Subscribed(number=1, topic="/chat", type=STRING, encoding="cdr", publishers=1)
+
+
+def test_samples_carry_number_and_wall_clock(scene: Scene) -> None:
+    """A sample goes out as a frame of its subscription with the robot's wall clock."""
+    scene.ask(link.Subscribe(number=9, topic="/chat"))
+    scene.platform.emit("/chat", b"hello")
+    scene.clock.advance(0)
+    assert scene.frames() == [SampleFrame(9, 777, b"hello")]
+
+
+def test_samples_of_one_turn_share_a_write(scene: Scene) -> None:
+    """A burst within one turn of the reactor is one write."""
+    scene.ask(link.Subscribe(number=1, topic="/chat"))
+    for number in range(50):
+        scene.platform.emit("/chat", b"%d" % number)
+    scene.clock.advance(0)
+    assert len(scene.wire.writes) == 1
+    assert len(scene.frames()) == 50
+
+
+def test_unknown_topic_fails_in_words(scene: Scene) -> None:
+    """A topic without a type that the graph does not know fails with its number."""
+    answer = scene.ask(link.Subscribe(number=3, topic="/nope"))
+    assert isinstance(answer, link.Failed)
+    assert (answer.what, answer.ref) == ("subscribe", "3")
+    assert "/nope" in answer.reason
+
+
+def test_second_subscribe_changes_the_throttle(scene: Scene) -> None:
+    """The same number again changes the throttle and makes no second subscription."""
+    scene.ask(link.Subscribe(number=1, topic="/chat"))
+    scene.ask(link.Subscribe(number=1, topic="/chat", throttle_ms=1000))
+    assert len(scene.platform.sources) == 1
+    scene.platform.emit("/chat", b"a")
+    scene.platform.emit("/chat", b"b")
+    scene.clock.advance(0)
+    assert [each.body for each in scene.frames()] == [b"a"] or scene.frames() == []
+    scene.clock.advance(1.0)
+    assert scene.frames()[-1].body == b"b"
+
+
+def test_full_transport_keeps_the_newest(scene: Scene) -> None:
+    """While the transport is full nothing is written; with room again the newest comes."""
+    scene.ask(link.Subscribe(number=1, topic="/chat"))
+    scene.channel.pause()
+    for number in range(4):
+        scene.platform.emit("/chat", bytes([number]) * 300_000)
+        scene.clock.advance(0.01)
+    assert scene.wire.writes == []
+    scene.channel.resume()
+    assert [each.body[0] for each in scene.frames()] == [3]
+    assert scene.channel.uplink.dropped == 3
+
+
+def test_answers_pass_a_full_transport(scene: Scene) -> None:
+    """What the relay asked is answered however full the transport is."""
+    scene.channel.pause()
+    assert isinstance(scene.ask(link.Subscribe(number=1, topic="/chat")), link.Subscribed)
+
+
+def test_change_of_publishers_is_told(scene: Scene) -> None:
+    """When publishers become latching, the relay hears of it by another confirmation."""
+    scene.ask(link.Subscribe(number=1, topic="/chat"))
+    source = scene.platform.sources[0]
+    source.latched = True
+    source.on_change()
+    assert scene.wire.said[-1].latched is True
+
+
+def test_advertise_says_what_is_motion(scene: Scene) -> None:
+    """The relay learns which publications the robot counts as motion."""
+    assert scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST)).motion is True
+    assert scene.ask(link.Advertise(number=6, topic="/chat", type=STRING)).motion is False
+
+
+def test_plain_topics_are_not_judged_by_age(scene: Scene) -> None:
+    """A message on a topic that moves nothing is published however old it is."""
+    scene.ask(link.Advertise(number=6, topic="/chat", type=STRING))
+    scene.channel.sample(SampleFrame(6, 0, b"old"))
+    assert scene.platform.published == [("/chat", b"old")]
+
+
+def test_samples_of_unknown_numbers_go_nowhere(scene: Scene) -> None:
+    """A sample for a publication that is not there is passed over."""
+    scene.channel.sample(SampleFrame(6, scene.now(), b"x"))
+    assert scene.platform.published == []
+
+
+def test_unadvertise_stops_the_robot(scene: Scene) -> None:
+    """A driver that unadvertises leaves the robot standing, at once."""
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    scene.drive(twist(1.0))
+    scene.channel.handle(link.Unadvertise(number=5))
+    assert scene.platform.published == [("/cmd_vel", twist(1.0)), ("/cmd_vel", twist())]
+    assert scene.platform.sinks == []
+
+
+def test_end_of_the_channel_stops_and_releases_all(scene: Scene) -> None:
+    """A channel that ends stops the robot, ends its subscriptions and publications, gives up its calls."""
+    scene.platform.services["/slow"] = lambda request: Deferred()
+    scene.ask(link.Subscribe(number=1, topic="/chat", throttle_ms=1000))
+    scene.platform.emit("/chat", b"a")
+    scene.platform.emit("/chat", b"b")
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    scene.ask(link.CallService(id="x", service="/slow", type="t", timeout=5, cdr=""))
+    scene.drive(twist(1.0))
+    told = len(scene.wire.said)
+    scene.channel.close()
+    assert scene.platform.published[-1] == ("/cmd_vel", twist())
+    assert (scene.platform.sources, scene.platform.sinks) == ([], [])
+    assert scene.clock.getDelayedCalls() == []
+    assert len(scene.wire.said) == told
+
+
+def test_call_is_answered(scene: Scene) -> None:
+    """A service's answer comes back with the id of its call."""
+    scene.platform.services["/echo"] = lambda request: request
+    answer = scene.ask(
+        link.CallService(id="7", service="/echo", type="t", timeout=5, cdr=link.to_base64(b"abc"))
+    )
+    assert answer == link.ServiceResponse(id="7", result=True, cdr=link.to_base64(b"abc"))
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (link.CallService(id="7", service="/none", type="t", timeout=5, cdr=""), "no service /none"),
+        (link.CallService(id="7", service="/echo", type="t", timeout=5), "CDR"),
+        (link.CallService(id="7", service="/echo", type="t", timeout=5, cdr="%%"), "base64"),
+    ],
+)
+def test_call_that_can_not_be_made_is_answered_in_words(
+    scene: Scene, message: link.CallService, words: str
+) -> None:
+    """A call that fails is answered with false and the reason."""
+    scene.platform.services["/echo"] = lambda request: request
+    answer = scene.ask(message)
+    assert isinstance(answer, link.ServiceResponse)
+    assert answer.result is False
+    assert words in answer.reason
+
+
+def test_middleware_that_throws_costs_one_answer(scene: Scene) -> None:
+    """An unforeseen fault of the platform is answered without its internals, and the channel lives."""
+
+    def broken(*args: object) -> None:
+        raise RuntimeError("secret internals")
+
+    scene.platform.subscribe = broken  # type: ignore[method-assign,assignment]
+    answer = scene.ask(link.Subscribe(number=1, topic="/chat"))
+    assert isinstance(answer, link.Failed)
+    assert "secret" not in answer.reason
+
+
+def test_type_definition_or_words(scene: Scene) -> None:
+    """A known type is sent, an unknown one fails by its name."""
+    scene.platform.definitions[STRING] = "string data\n"
+    assert scene.ask(link.GetType(type=STRING)) == link.TypeDefinition(type=STRING, text="string data\n")
+    answer = scene.ask(link.GetType(type="a/msg/B"))
+    assert (answer.what, answer.ref) == ("get_type", "a/msg/B")

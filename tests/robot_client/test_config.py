@@ -1,0 +1,65 @@
+"""Settings from file and environment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from relay_protocol.errors import Invalid
+from robot_client.config import Settings, load
+
+
+def test_without_anything_the_defaults_hold() -> None:
+    """No file and no variables give the defaults: stop within 500 ms, Twist and TwistStamped are motion."""
+    settings = load(None, {})
+    assert settings == Settings()
+    assert settings.safety.policy.stop_within_ms == 500
+    assert settings.safety.policy.types == ["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
+
+
+def test_environment_beats_file(tmp_path: Path) -> None:
+    """A variable overrides the same key of the file, other keys stay."""
+    file = tmp_path / "robot.toml"
+    file.write_text('[safety]\nstop_within_ms = 300\nmotion_topics = ["/arm"]\n[ros]\nexecutor = "single"\n')
+    settings = load(file, {"SWITCHBOARD_ROBOT_SAFETY_STOP_WITHIN_MS": "200", "PATH": "/bin"})
+    assert settings.safety.stop_within_ms == 200
+    assert settings.safety.motion_topics == ["/arm"]
+    assert settings.ros.executor == "single"
+
+
+def test_lists_in_variables_have_commas() -> None:
+    """A list in a variable is divided by commas."""
+    settings = load(None, {"SWITCHBOARD_ROBOT_SAFETY_MOTION_TOPICS": "/a, /b"})
+    assert settings.safety.motion_topics == ["/a", "/b"]
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("[safety]\nstop_within = 3\n", "stop_within"),
+        ("[safty]\n", "safty"),
+        ("guard = false\n", "guard"),
+        ("[safety]\nstop_within_ms = 1\n", "stop_within_ms"),
+        ('[ros]\nexecutor = "fast"\n', "executor"),
+        ("[safety\n", "not TOML"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
+    """An unknown key, a value out of range, or a text that is no TOML is named in the error."""
+    file = tmp_path / "robot.toml"
+    file.write_text(text)
+    with pytest.raises(Invalid, match=named):
+        load(file, {})
+
+
+def test_unknown_variable_is_named() -> None:
+    """A variable of ours that is no setting is an error, with those that are."""
+    with pytest.raises(Invalid, match=r"SWITCHBOARD_ROBOT_SAFTY_GUARD.*SWITCHBOARD_ROBOT_SAFETY_GUARD"):
+        load(None, {"SWITCHBOARD_ROBOT_SAFTY_GUARD": "1"})
+
+
+def test_missing_file_is_said(tmp_path: Path) -> None:
+    """A settings file that is not there is an error in words."""
+    with pytest.raises(Invalid, match="can't be read"):
+        load(tmp_path / "none.toml", {})

@@ -1,0 +1,305 @@
+"""Connection and daemon together, in memory, on a clock of ours."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from twisted.internet.address import IPv4Address
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.error import ConnectionLost, ConnectionRefusedError
+from twisted.internet.protocol import Factory
+from twisted.internet.task import Clock
+from twisted.internet.testing import StringTransportWithDisconnection
+from twisted.python.failure import Failure
+
+from relay_protocol import frames, identity, link
+from robot_client.backoff import Backoff
+from robot_client.config import Settings
+from robot_client.connection import Connection
+from robot_client.daemon import Daemon
+from robot_client.link import ControlLink, Identity
+from robot_client.motion import NoGuard
+from robot_client.platforms.base import GraphView
+from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
+
+ME = Identity("r1", "relay-1", identity.generate_key())
+
+
+class Line:
+    """The relay's end of one connection in memory."""
+
+    def __init__(self, protocol: Any, address: str) -> None:
+        self.address = address
+        self.protocol = protocol
+        self.transport = StringTransportWithDisconnection(peerAddress=IPv4Address("TCP", "127.0.0.1", 1))
+        self.transport.protocol = protocol
+        self.transport.abortConnection = self.transport.loseConnection
+        self.closed = False
+        protocol.makeConnection(self.transport)
+
+    def say(self, *messages: link.Message) -> None:
+        self.protocol.dataReceived(b"".join(map(link.frame, messages)))
+
+    def heard(self) -> list[Any]:
+        data = self.transport.value()
+        self.transport.clear()
+        return [
+            json.loads(each.body) if isinstance(each, frames.JsonFrame) else each
+            for each in frames.FrameDecoder(2**25).feed(data)
+        ]
+
+    def ops(self) -> list[str]:
+        return [each["op"] for each in self.heard() if isinstance(each, dict)]
+
+    def lose(self) -> None:
+        self.transport.connected = False
+        self.protocol.connectionLost(Failure(ConnectionLost()))
+
+
+class Endpoint:
+    def __init__(self, scene: Scene, address: str) -> None:
+        self.scene = scene
+        self.address = address
+
+    def connect(self, factory: Factory[Any]) -> Deferred[Any]:
+        self.scene.dialled.append((self.scene.clock.seconds(), self.address))
+        if not self.scene.listening:
+            return fail(ConnectionRefusedError())
+        protocol = factory.buildProtocol(IPv4Address("TCP", "127.0.0.1", 1))
+        self.scene.lines.append(Line(protocol, self.address))
+        return succeed(protocol)
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.clock.advance(1000)
+        self.listening = True
+        self.dialled: list[tuple[float, str]] = []
+        self.lines: list[Line] = []
+        self.platform = MemoryPlatform(GraphView(nodes=frozenset({"/talker"})))
+        self.connection = Connection(
+            self.dial,
+            lambda: ControlLink(ME, "test", self.now),
+            self.clock,
+            Backoff(lambda: 0.5),
+            "r1",
+            "relay:1",
+        )
+        self.daemon = Daemon(
+            Settings(), self.connection, self.platform, NoGuard(), self.clock, self.dial, "test", self.now
+        )
+        self.daemon.start()
+
+    def now(self) -> int:
+        return round(self.clock.seconds() * 1e9)
+
+    def dial(self, address: str) -> Endpoint:
+        return Endpoint(self, address)
+
+    def register(self) -> Line:
+        line = self.lines[-1]
+        line.say(link.Challenge(nonce=link.to_base64(bytes(32)), relay="relay-1"))
+        line.say(link.Welcome(session="s", heartbeat=2.0, frame_limit=2**24))
+        return line
+
+    def channel(self, control: Line, name: str = "c1", address: str = "") -> Line:
+        control.say(link.OpenChannel(channel=name, ticket="t-" + name, address=address))
+        line = self.lines[-1]
+        line.say(link.Joined(channel=name, at=self.now()))
+        return line
+
+    def driving(self, control: Line) -> Line:
+        line = self.channel(control)
+        line.say(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+        line.protocol.dataReceived(frames.encode_sample(5, self.now(), twist(1.0)))
+        assert self.platform.published[-1] == ("/cmd_vel", twist(1.0))
+        return line
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds * 10)):
+            self.clock.advance(0.1)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+def test_registered_robot_describes_itself(scene: Scene) -> None:
+    """After the welcome come description, the whole graph and health, in this order."""
+    heard = scene.register().heard()
+    by_op = {each["op"]: each for each in heard}
+    ops = [each["op"] for each in heard if each["op"] in ("describe", "graph", "health")]
+    assert ops == ["describe", "graph", "health"]
+    assert by_op["graph"]["full"] is True
+    assert "/talker" in by_op["graph"]["nodes"]
+    assert by_op["describe"]["platform"] == "memory"
+
+
+def test_graph_is_told_in_differences(scene: Scene) -> None:
+    """A change of the graph is told within half a second, as a difference; no change, nothing."""
+    line = scene.register()
+    line.heard()
+    scene.run(1.0)
+    assert "graph" not in line.ops()
+    scene.platform.view = GraphView(nodes=frozenset({"/listener"}))
+    scene.run(0.5)
+    (told,) = [each for each in line.heard() if each["op"] == "graph"]
+    assert told["nodes"] == {"/listener": {}, "/talker": None}
+    assert "full" not in told
+
+
+def test_lost_link_is_dialled_again_and_told_all(scene: Scene) -> None:
+    """After a loss the robot is back within half a second, and tells the whole graph anew."""
+    scene.register().lose()
+    scene.run(0.5)
+    assert len(scene.lines) == 2
+    heard = scene.register().heard()
+    assert any(each["op"] == "graph" and each.get("full") for each in heard)
+
+
+def test_robot_dials_for_ever(scene: Scene) -> None:
+    """A relay that is away for an hour is asked all the time, and the robot is back 15 s after it is."""
+    scene.listening = False
+    scene.lines[-1].lose()
+    scene.run(3600)
+    waits = [
+        later - earlier for (earlier, _), (later, _) in zip(scene.dialled, scene.dialled[1:], strict=False)
+    ]
+    assert max(waits) <= 15.1
+    scene.listening = True
+    scene.run(15.1)
+    assert len(scene.lines) == 2
+
+
+def test_relay_that_restarts_has_its_robots_back_within_3_s(scene: Scene) -> None:
+    """After an outage of 20 s the robot dials within 3 s."""
+    scene.register()
+    scene.run(0.1)
+    scene.listening = False
+    scene.lines[-1].lose()
+    scene.run(20)
+    scene.listening = True
+    scene.run(3)
+    assert len(scene.lines) == 2
+
+
+def test_retry_after_is_honoured(scene: Scene) -> None:
+    """A relay that refuses with a time is not dialled before it."""
+    scene.lines[-1].say(link.Refused(reason="full", retry_after=20))
+    scene.run(19.9)
+    assert len(scene.dialled) == 1
+    scene.run(3)
+    assert len(scene.dialled) == 2
+
+
+def test_other_relay_is_refused_and_asked_slowly(scene: Scene) -> None:
+    """A relay of another name gets no proof, and is asked again after 30 s at the earliest."""
+    line = scene.lines[-1]
+    line.heard()
+    line.say(link.Challenge(nonce=link.to_base64(bytes(32)), relay="evil"))
+    assert line.ops() == []
+    assert not line.transport.connected
+    scene.run(29)
+    assert len(scene.dialled) == 1
+    scene.run(32)
+    assert len(scene.dialled) > 1
+
+
+def test_silent_relay_is_left(scene: Scene) -> None:
+    """A relay that is silent for three heartbeats counts as lost, and is dialled anew."""
+    scene.register()
+    scene.run(9)
+    assert len(scene.lines) >= 2
+
+
+def test_relay_that_never_answers_is_left(scene: Scene) -> None:
+    """A connection on which nothing is said is given up after ten seconds."""
+    scene.run(10.1)
+    assert not scene.lines[0].transport.connected
+
+
+def test_channel_is_joined_by_ticket(scene: Scene) -> None:
+    """An order to open a channel is followed by a connection to the address given, with the ticket."""
+    control = scene.register()
+    control.say(link.OpenChannel(channel="c", ticket="tick", address="host:99"))
+    assert scene.dialled[-1][1] == "host:99"
+    assert [each["ticket"] for each in scene.lines[-1].heard() if each["op"] == "join"] == ["tick"]
+
+
+def test_several_channels_live_side_by_side(scene: Scene) -> None:
+    """Two channels have their own subscriptions; the end of one leaves the other."""
+    control = scene.register()
+    first, second = scene.channel(control, "a"), scene.channel(control, "b")
+    for line in (first, second):
+        line.say(link.Subscribe(number=1, topic="/t", type="x/msg/Y"))
+    control.say(link.CloseChannel(channel="a"))
+    assert len(scene.platform.sources) == 1
+    scene.platform.emit("/t", b"z")
+    scene.clock.advance(0)
+    assert [each.body for each in second.heard() if isinstance(each, frames.SampleFrame)] == [b"z"]
+
+
+@pytest.mark.parametrize("how", ["channel lost", "control lost", "closed", "daemon leaves", "hostile frame"])
+def test_every_loss_stops_the_robot_at_once(scene: Scene, how: str) -> None:
+    """Whatever link is lost or closed, zero goes out in the same moment, and publishers end."""
+    control = scene.register()
+    line = scene.driving(control)
+    {
+        "channel lost": line.lose,
+        "control lost": control.lose,
+        "closed": lambda: control.say(link.CloseChannel(channel="c1")),
+        "daemon leaves": scene.daemon.stop,
+        "hostile frame": lambda: line.protocol.dataReceived(b"\xff\xff\xff\xff\x00"),
+    }[how]()
+    assert scene.platform.published[-1] == ("/cmd_vel", twist())
+    assert scene.platform.sinks == []
+
+
+def test_reconnecting_resumes_nothing(scene: Scene) -> None:
+    """After a loss nothing is published until a client advertises and commands anew."""
+    control = scene.register()
+    scene.driving(control)
+    control.lose()
+    sent = len(scene.platform.published)
+    scene.run(1)
+    control = scene.register()
+    line = scene.channel(control)
+    line.protocol.dataReceived(frames.encode_sample(5, scene.now(), twist(1.0)))
+    scene.run(1)
+    assert len(scene.platform.published) == sent
+
+
+def test_alert_waits_for_the_relay(scene: Scene) -> None:
+    """What a person should know while no relay is there is told when one is."""
+    scene.daemon.alert("error", "look here")
+    (told,) = [each for each in scene.register().heard() if each["op"] == "alert"]
+    assert told["text"] == "look here"
+
+
+def test_stop_says_goodbye(scene: Scene) -> None:
+    """A daemon that leaves says so on the control link and dials no more."""
+    control = scene.register()
+    control.heard()
+    stopped: list[Any] = []
+    scene.daemon.stop().addCallback(stopped.append)
+    assert control.ops() == ["bye"]
+    scene.run(60)
+    assert stopped == [None]
+    assert len(scene.dialled) == 1
+
+
+def test_stuck_middleware_is_told_once(scene: Scene) -> None:
+    """A middleware that is stuck is an alert, once, and its recovery another."""
+    control = scene.register()
+    control.heard()
+    trouble: list[str | None] = ["the executor is stuck"]
+    scene.platform.trouble = lambda: trouble[0]  # type: ignore[method-assign]
+    scene.run(1)
+    trouble[0] = None
+    scene.run(1)
+    alerts = [each["level"] for each in control.heard() if each["op"] == "alert"]
+    assert alerts == ["error", "info"]

@@ -1,0 +1,83 @@
+"""The watchdog and the age of commands, as functions of time."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_protocol.link import MotionPolicy
+from robot_client.offset import Offset
+from robot_client.safety import DAEMON_SHARE, GUARD_SHARE, Freshness, Watchdog, freshness, is_motion
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def offset() -> Offset:
+    made = Offset()
+    made.add(0, 7000 * MS + 5 * MS, 10 * MS)  # the relay's clock is 7 s ahead, known to 5 ms
+    return made
+
+
+@pytest.mark.parametrize(
+    ("age", "verdict"),
+    [
+        (0, Freshness.FRESH),
+        (499, Freshness.FRESH),
+        (501, Freshness.STALE),
+        (60_000, Freshness.STALE),
+        (-54, Freshness.FRESH),
+        (-56, Freshness.AHEAD),
+    ],
+)
+def test_age_decides(offset: Offset, age: int, verdict: Freshness) -> None:
+    """A command older than 500 ms is stale; one ahead of what the clocks can explain is refused too."""
+    now = 1000 * MS
+    assert freshness(now + 7000 * MS - age * MS, now, offset, 500) is verdict
+
+
+def test_without_an_offset_nothing_is_fresh() -> None:
+    """A link whose clock is not known yet passes no motion command."""
+    assert freshness(0, 0, Offset(), 500) is Freshness.STALE
+
+
+def test_motion_is_by_type_or_by_name() -> None:
+    """A topic moves the robot if its type or its name is in the policy."""
+    policy = MotionPolicy(types=["geometry_msgs/msg/Twist"], topics=["/arm"])
+    assert is_motion(policy, "/any", "geometry_msgs/msg/Twist")
+    assert is_motion(policy, "/arm", "x/msg/Y")
+    assert not is_motion(policy, "/other", "x/msg/Y")
+
+
+def test_silence_stops_once() -> None:
+    """A moving topic is named when its time is over, once."""
+    dog = Watchdog(500, DAEMON_SHARE)
+    dog.command("/cmd_vel", "a", True, 100 * MS)
+    assert dog.due() == 500 * MS
+    assert dog.expired(499 * MS) == []
+    assert dog.expired(500 * MS) == ["/cmd_vel"]
+    assert dog.expired(900 * MS) == []
+    assert dog.due() is None
+
+
+def test_standing_topic_needs_no_stop() -> None:
+    """After a command of zero nothing is due."""
+    dog = Watchdog(500, DAEMON_SHARE)
+    dog.command("/cmd_vel", "a", True, 0)
+    dog.command("/cmd_vel", "a", False, 10 * MS)
+    assert dog.due() is None
+    assert dog.everything() == []
+
+
+def test_only_the_driver_leaving_stops() -> None:
+    """A publication that leaves stops its topic only if the last command was its own."""
+    dog = Watchdog(500, DAEMON_SHARE)
+    dog.command("/cmd_vel", "a", True, 0)
+    dog.command("/cmd_vel", "b", True, 10 * MS)
+    assert not dog.release("/cmd_vel", "a")
+    assert dog.release("/cmd_vel", "b")
+    assert not dog.release("/cmd_vel", "b")
+
+
+def test_guard_is_later_than_the_daemon_and_in_time() -> None:
+    """The guard acts after the daemon had its chance, and before the robot must stand."""
+    assert DAEMON_SHARE < GUARD_SHARE < 1
