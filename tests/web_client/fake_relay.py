@@ -98,7 +98,8 @@ class World:
         with np.errstate(divide="ignore"):
             walls_x = np.where(c > 0, (HALL[0] - self.x) / c, (-HALL[0] - self.x) / c)
             walls_y = np.where(s > 0, (HALL[1] - self.y) / s, (-HALL[1] - self.y) / s)
-        best = np.minimum(walls_x, walls_y)
+        # A ray along a wall meets it nowhere; JSON has no infinity.
+        best = np.minimum(np.where(c == 0, 99, walls_x), np.where(s == 0, 99, walls_y))
         for px, py, radius in PILLARS:
             along = (px - self.x) * c + (py - self.y) * s
             root = radius**2 - ((px - self.x) ** 2 + (py - self.y) ** 2 - along**2)
@@ -226,7 +227,7 @@ class Channel:
         return self.relay.rights[self.user].get(self.robot, "viewer")
 
     def send(self, message: Json) -> None:
-        self.protocol.send_text(json.dumps(message).encode())
+        self.protocol.send_text(json.dumps(message, allow_nan=False).encode())
         self.flush()
 
     def close(self, code: int, reason: str) -> None:
@@ -431,8 +432,7 @@ async def stream(relay: Relay) -> None:
             world.step()
         for channel in list(relay.channels):
             if channel.protocol.close_code is None and not relay.frozen:
-                with contextlib.suppress(Exception):
-                    channel.stream(time.monotonic())
+                channel.stream(time.monotonic())
 
 
 async def main(portal: Path, port: int) -> None:

@@ -106,6 +106,10 @@ export class Link {
     const connection: Connection = { ros, socket, publishers: new Map(), calls: new Set() }
     this.connection = connection
     ros.on('connection', () => this.opened(connection))
+    // roslib swallows what goes wrong while a message is handled; it is a fault and has to be seen.
+    ros.on('error', (error) => {
+      if (error instanceof Error) reportError(error)
+    })
     ros.on('close', (event) => this.closed(connection, event as CloseEvent))
     void ros.connect(this.url)
     transport.on('message', (message) => this.listen(message))

@@ -1,0 +1,122 @@
+"""A browser and a fake relay for the portal's tests."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+HERE = Path(__file__).parent
+PORTAL = HERE.parents[1] / "relay_server" / "portal"
+PASSWORD = "correct horse"
+CHROMIUM_ARGS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--disable-background-networking"]
+WAIT_SECONDS = 20.0
+
+Json = dict[str, Any]
+
+
+class FakeRelay:
+    """The fake relay as a test sees it."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+
+    def do(self, **order: Any) -> None:
+        """Changes what the relay does, see ``Relay.do`` in ``fake_relay.py``."""
+        data = json.dumps(order).encode()
+        urllib.request.urlopen(urllib.request.Request(self.url + "/fake/do", data, method="POST")).close()
+
+    def log(self, **wanted: Any) -> list[Json]:
+        """What pages sent so far, in order, narrowed to messages with these values."""
+        with urllib.request.urlopen(self.url + "/fake/log") as answer:
+            entries: list[Json] = json.load(answer)
+        return [entry for entry in entries if all(entry.get(key) == value for key, value in wanted.items())]
+
+    def until(self, ready: Callable[[], Any], what: str) -> Any:
+        """Polls until something is true, and fails with ``what`` if it never is."""
+        deadline = time.monotonic() + WAIT_SECONDS
+        while not (found := ready()):
+            if time.monotonic() > deadline:
+                pytest.fail(f"waited {WAIT_SECONDS:.0f} s in vain: {what}")
+            time.sleep(0.05)
+        return found
+
+    def commands(self, topic: str = "/cmd_vel") -> list[tuple[float, float]]:
+        """The motion commands received, as (ahead, turn)."""
+        return [
+            (entry["msg"]["linear"]["x"], entry["msg"]["angular"]["z"]) for entry in self.log(op="publish", topic=topic)
+        ]
+
+
+@pytest.fixture
+def relay() -> Iterator[FakeRelay]:
+    if not (PORTAL / "index.html").is_file():
+        pytest.fail("The portal is not built. Run 'make web', then the tests again.")
+    process = subprocess.Popen(
+        [sys.executable, str(HERE / "fake_relay.py"), "--portal", str(PORTAL)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        words = process.stdout.readline().split()
+        assert words[:1] == ["READY"], f"the fake relay did not start: {words}"
+        yield FakeRelay(f"http://127.0.0.1:{words[1]}")
+    finally:
+        process.terminate()
+        process.wait(10)
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.fail("There is no Chromium. Install the package 'chromium', then run the tests again.")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=CHROMIUM_ARGS)
+        yield browser
+        browser.close()
+
+
+OpenPage = Callable[..., Page]
+
+
+@pytest.fixture
+def open_page(browser: Browser, relay: FakeRelay) -> Iterator[OpenPage]:
+    """Opens pages of the portal; fails the test if any of them had an uncaught error or broke the CSP."""
+    faults: list[str] = []
+    contexts = []
+
+    def open_page(path: str = "/", width: int = 1280, height: int = 800, user: str | None = None, **options: Any) -> Page:
+        context = browser.new_context(viewport={"width": width, "height": height}, base_url=relay.url, **options)
+        context.set_default_timeout(WAIT_SECONDS * 1000)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: faults.append(f"uncaught: {error}"))
+        page.on(
+            "console",
+            lambda message: faults.append(message.text) if "Content Security Policy" in message.text else None,
+        )
+        if user is not None:
+            answer = context.request.post(
+                "/api/v1/session",
+                data={"user": user, "password": PASSWORD},
+                headers={"X-Requested-With": "switchboard"},
+            )
+            assert answer.ok, answer.text()
+        page.goto(path)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert faults == []

@@ -1,0 +1,494 @@
+"""The built portal in a real browser, against a fake relay."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    OpenPage = Callable[..., Page]
+    FakeRelay = Any
+
+PASSWORD = "correct horse"
+ZERO = (0, 0)
+COCKPIT = "/cockpit/rover-1"
+
+
+def seen(page: Page, testid: str) -> Any:
+    return page.get_by_test_id(testid)
+
+
+def ready_to_drive(page: Page) -> None:
+    expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+    expect(seen(page, "limit-linear")).to_be_visible()
+    expect(seen(page, "joystick").locator(".back")).to_be_visible()
+
+
+def hold_joystick(page: Page, dx: float = 0, dy: float = -60) -> None:
+    """Presses the joystick with the mouse and pulls it away from its middle (pixels)."""
+    # At rest nothing moves below the pointer any more.
+    box = seen(page, "joystick").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + dx, y + dy, steps=4)
+
+
+def driving(relay: FakeRelay, at_least: int = 3) -> None:
+    relay.until(lambda: len([c for c in relay.commands() if c != ZERO]) >= at_least, "no commands came")
+
+
+def assert_one_zero_then_silence(page: Page, relay: FakeRelay) -> None:
+    relay.until(lambda: relay.commands()[-1:] == [ZERO], "no zero came")
+    before = relay.commands()
+    # Absence can only be shown by waiting.
+    page.wait_for_timeout(700)
+    after = relay.commands()
+    assert after == before, f"commands after the zero: {after[len(before) :]}"
+    moving = max(i for i, command in enumerate(after) if command != ZERO)
+    assert after[moving + 1 :] == [ZERO]
+
+
+class TestLogin:
+    def test_wrong_password_is_said(self, open_page: OpenPage) -> None:
+        """A refused login shows the relay's own words and stays on the page."""
+        page = open_page("/")
+        seen(page, "login-user").fill("driver")
+        seen(page, "login-password").fill("guess")
+        seen(page, "login-submit").click()
+        expect(seen(page, "login-error")).to_have_text("User or password is wrong.")
+        expect(seen(page, "login-password")).to_have_value("")
+
+    def test_right_password_leads_to_the_robots(self, open_page: OpenPage) -> None:
+        """A login shows the fleet, and a reload keeps one logged in."""
+        page = open_page("/")
+        seen(page, "login-user").fill("driver")
+        seen(page, "login-password").fill(PASSWORD)
+        seen(page, "login-submit").click()
+        expect(seen(page, "robot-card")).to_have_count(2)
+        page.reload()
+        expect(seen(page, "robot-card")).to_have_count(2)
+
+    def test_too_many_attempts_wait(self, open_page: OpenPage) -> None:
+        """After 429 the button counts down the time the relay named."""
+        page = open_page("/login")
+        seen(page, "login-user").fill("hasty")
+        seen(page, "login-password").fill("x")
+        seen(page, "login-submit").click()
+        expect(seen(page, "login-submit")).to_have_text(re.compile(r"Try again in \d+ s"))
+        expect(seen(page, "login-submit")).to_be_disabled()
+
+    def test_login_link_works_once_and_leaves_no_code(self, open_page: OpenPage) -> None:
+        """A one-time link logs in, its code vanishes from the address, and the second use is refused in words."""
+        page = open_page("/login#code=ONCE-ONLY")
+        expect(seen(page, "robot-card")).to_have_count(3)
+        assert "ONCE-ONLY" not in page.url
+        other = open_page("/login#code=ONCE-ONLY")
+        expect(seen(other, "login-error")).to_contain_text("used up")
+        assert "ONCE-ONLY" not in other.url
+
+    def test_the_page_asked_for_comes_after_the_login(self, open_page: OpenPage) -> None:
+        """Who opens a cockpit without a session logs in and lands in that cockpit."""
+        page = open_page(COCKPIT)
+        seen(page, "login-user").fill("driver")
+        seen(page, "login-password").fill(PASSWORD)
+        seen(page, "login-submit").click()
+        expect(seen(page, "camera-canvas")).to_be_visible()
+
+    def test_logout(self, open_page: OpenPage) -> None:
+        """Logging out ends the session and shows the login page."""
+        page = open_page("/fleet", user="driver")
+        seen(page, "user-menu").click()
+        seen(page, "logout").click()
+        expect(seen(page, "login-user")).to_be_visible()
+        page.goto("/fleet")
+        expect(seen(page, "login-user")).to_be_visible()
+
+
+class TestFleet:
+    def test_cards_show_state_and_level(self, open_page: OpenPage) -> None:
+        """Each robot of the user has a card with state, battery and level."""
+        page = open_page("/", user="admin")
+        card = page.locator("[data-testid=robot-card][data-robot=rover-1]")
+        expect(card.get_by_test_id("robot-state")).to_have_attribute("data-state", "online")
+        expect(card).to_contain_text("76 %")
+        expect(card).to_contain_text("owner")
+
+    def test_changes_appear_by_themselves(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A robot that goes offline is shown so without a reload."""
+        page = open_page("/", user="admin")
+        state = page.locator("[data-robot=rover-1]").get_by_test_id("robot-state")
+        expect(state).to_have_attribute("data-state", "online")
+        relay.do(robot="rover-1", state="offline")
+        expect(state).to_have_attribute("data-state", "offline")
+
+    def test_search_and_filter(self, open_page: OpenPage) -> None:
+        """Words narrow the list; a search without result says so and offers the way back."""
+        page = open_page("/", user="admin")
+        seen(page, "robot-search").fill("kilted")
+        expect(seen(page, "robot-card")).to_have_count(1)
+        seen(page, "robot-search").fill("nothing like this")
+        page.get_by_role("button", name="Show all robots").click()
+        page.get_by_role("button", name="Offline").click()
+        expect(seen(page, "robot-card")).to_have_attribute("data-robot", "arm-3")
+
+    def test_empty_fleet_tells_what_to_do(self, open_page: OpenPage) -> None:
+        """Without a robot the page names the command that adds one."""
+        page = open_page("/", user="newcomer")
+        expect(seen(page, "fleet-empty")).to_contain_text("switchboard robot add NAME")
+
+    def test_text_from_robots_is_inert(self, open_page: OpenPage) -> None:
+        """Markup in a robot's description is shown as text and makes no elements."""
+        page = open_page("/", user="admin")
+        card = page.locator("[data-robot=rover-2]")
+        expect(card).to_contain_text("<img src=x onerror=alert(1)>")
+        assert card.locator("img, b").count() == 0
+
+
+class TestCockpit:
+    def test_everything_arrives(self, open_page: OpenPage) -> None:
+        """Picture, scan, odometry, latency and topics show live data."""
+        page = open_page(COCKPIT, user="driver")
+        expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+        expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
+        expect(seen(page, "odom-x")).to_have_text("−1.00")
+        expect(seen(page, "latency-badge")).to_contain_text(re.compile(r"\d+ ms"))
+        expect(seen(page, "leg-client-robot")).to_contain_text(re.compile(r"\d+ ms"))
+        expect(seen(page, "leg-relay-robot")).to_have_text("4 ms")
+        expect(seen(page, "topic-row")).to_have_count(10)
+        for canvas in ("camera-canvas", "scan-canvas"):
+            colours = seen(page, canvas).evaluate(
+                """canvas => {
+                    const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
+                    const seen = new Set()
+                    for (let i = 0; i < data.length; i += 4) seen.add(data[i] + ',' + data[i + 1] + ',' + data[i + 3])
+                    return seen.size
+                }"""
+            )
+            assert colours > 10, f"{canvas} shows {colours} colours"
+
+    def test_echo_shows_shortened_messages(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A chosen topic is shown live with its rate, long arrays cut, and stays as it is while paused."""
+        page = open_page(COCKPIT, user="driver")
+        seen(page, "topic-filter").fill("laser")
+        page.locator("[data-testid=topic-row][data-topic='/scan']").click()
+        expect(seen(page, "topic-echo")).to_contain_text("… 354 more")
+        expect(seen(page, "topic-rate")).to_have_text(re.compile(r"\d+(\.\d)? Hz"))
+        seen(page, "topic-pause").click()
+        before = seen(page, "topic-echo").inner_text()
+        page.wait_for_timeout(500)
+        assert seen(page, "topic-echo").inner_text() == before
+
+    def test_only_what_is_on_screen_is_subscribed(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The page asks for four topics, and one more while its echo is open."""
+        page = open_page(COCKPIT, user="driver")
+        expect(seen(page, "odom-x")).to_have_text("−1.00")
+        shown = {"/relay/status", "/camera/image_raw/compressed", "/scan", "/odom"}
+        assert {entry["topic"] for entry in relay.log(op="subscribe")} == shown
+        row = page.locator("[data-testid=topic-row][data-topic='/battery_state']")
+        row.click()
+        expect(seen(page, "topic-echo")).to_contain_text("percentage")
+        row.click()
+        relay.until(lambda: relay.log(op="unsubscribe", topic="/battery_state"), "the echo was not unsubscribed")
+
+    def test_data_that_stops_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """When a robot falls silent its picture and values are marked as old."""
+        page = open_page(COCKPIT, user="driver")
+        expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
+        relay.do(silent=True)
+        expect(seen(page, "camera-stale")).to_have_text(re.compile(r"No picture since \d+ s"))
+        expect(page.get_by_text(re.compile(r"stale, \d+ s old"))).to_have_count(2)
+        relay.do(silent=False)
+        expect(seen(page, "camera-stale")).to_have_count(0)
+
+    def test_refusals_are_told(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A status message of the relay appears in its own words."""
+        page = open_page(COCKPIT, user="driver")
+        expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+        relay.until(lambda: relay.log(op="set_level", level="warning"), "the page did not ask for warnings")
+        relay.do(say="driver may not call /reset: no right covers it")
+        expect(seen(page, "toast")).to_contain_text("no right covers it")
+
+    def test_robot_goes_offline(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """An offline robot is said to be so, and can't be driven until it is back."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        relay.do(robot="rover-1", state="offline")
+        expect(seen(page, "drive-blocked")).to_have_text("The robot is offline.")
+        relay.do(robot="rover-1", state="online")
+        ready_to_drive(page)
+
+
+class TestDriving:
+    def test_joystick(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Holding the joystick drives at the chosen speed; letting go sends one zero, then nothing."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page, dy=-120)
+        driving(relay, 10)
+        expect(seen(page, "odom-speed")).to_have_text("0.50")
+        page.mouse.up()
+        assert_one_zero_then_silence(page, relay)
+        expect(seen(page, "odom-speed")).to_have_text("0.00")
+
+    def test_joystick_turns_left_for_left(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Pulled to the left the robot turns left, which ROS counts as positive."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page, dx=-60, dy=0)
+        driving(relay)
+        page.mouse.up()
+        ahead, turn = next(command for command in reversed(relay.commands()) if command != ZERO)
+        assert abs(ahead) < 0.1
+        assert turn > 0.3
+
+    def test_commands_keep_to_the_rate(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """However the stick is shaken, commands leave no faster than twenty times a second."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        box = seen(page, "joystick").bounding_box()
+        for i in range(120):
+            page.mouse.move(box["x"] + 60 + i % 40, box["y"] + 40)
+        driving(relay, 5)
+        page.mouse.up()
+        sent = [entry["at"] for entry in relay.log(op="publish", topic="/cmd_vel")]
+        assert (len(sent) - 1) / (sent[-1] - sent[0]) < 20
+
+    def test_keys(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """W drives ahead, and lifting it stops with one zero."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        page.keyboard.down("w")
+        driving(relay)
+        page.keyboard.up("w")
+        assert_one_zero_then_silence(page, relay)
+        assert relay.commands()[0] == (0.5, 0)
+
+    def test_keys_in_a_text_field_do_not_drive(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Typing into the filter is typing."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        seen(page, "topic-filter").press_sequentially("wasd ")
+        expect(seen(page, "topic-filter")).to_have_value("wasd ")
+        page.wait_for_timeout(300)
+        assert relay.commands() == []
+
+    def test_space_stops_whatever_has_the_focus(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """While driving, space stops, even when a button has the focus; the held key drives no further."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        page.locator("[data-topic='/odom']").focus()
+        page.keyboard.down("ArrowUp")
+        driving(relay)
+        page.keyboard.press("Space")
+        assert_one_zero_then_silence(page, relay)
+        page.keyboard.up("ArrowUp")
+        expect(seen(page, "topic-echo")).to_have_count(0)
+
+    @pytest.mark.parametrize(
+        ("event", "script"),
+        [
+            ("blur", "window.dispatchEvent(new Event('blur'))"),
+            ("pagehide", "window.dispatchEvent(new Event('pagehide'))"),
+            ("pointercancel", "window.dispatchEvent(new PointerEvent('pointercancel', { bubbles: true }))"),
+            (
+                "visibilitychange",
+                "Object.defineProperty(document, 'hidden', { value: true, configurable: true });"
+                "document.dispatchEvent(new Event('visibilitychange'))",
+            ),
+        ],
+    )
+    def test_leaving_stops(self, open_page: OpenPage, relay: FakeRelay, event: str, script: str) -> None:
+        """When the browser takes the control away, one zero goes out, and the hand still there drives no further."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        page.evaluate(script)
+        page.mouse.move(640, 300, steps=5)
+        assert_one_zero_then_silence(page, relay)
+        page.mouse.up()
+
+    def test_stop_button(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """STOP sends a zero at once, without anything being held."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        seen(page, "stop").click()
+        relay.until(relay.commands, "no zero came")
+        page.wait_for_timeout(300)
+        assert relay.commands() == [ZERO]
+
+    def test_stop_by_keyboard(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """STOP can be reached and pressed by keyboard."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        seen(page, "stop").focus()
+        page.keyboard.press("Enter")
+        relay.until(lambda: relay.commands() == [ZERO], "no zero came")
+
+    def test_late_link_stops(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """When pongs stay out, driving ends, the page says so, and nothing is sent until it is taken hold of anew."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        relay.do(frozen=True)
+        expect(seen(page, "link-late")).to_be_visible()
+        expect(seen(page, "latency-badge")).to_contain_text("link late")
+        assert_one_zero_then_silence(page, relay)
+        relay.do(frozen=False)
+        expect(seen(page, "link-late")).to_have_count(0)
+        assert relay.commands()[-1] == ZERO
+        page.mouse.up()
+
+    def test_nothing_old_is_sent_after_a_reconnect(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A link cut while driving comes back by itself, and no command of before comes with it."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        page.keyboard.down("w")
+        driving(relay)
+        relay.do(close=1001, clear_log=True)
+        relay.until(lambda: relay.log(op="set_level"), "the page did not come back")
+        ready_to_drive(page)
+        page.wait_for_timeout(300)
+        assert [command for command in relay.commands() if command != ZERO] == []
+        page.keyboard.up("w")
+
+    def test_another_command_topic(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The user chooses among the topics of the type, and the choice outlasts a reload."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        page.get_by_label("Command topic").select_option("/cmd_vel_nav")
+        page.reload()
+        ready_to_drive(page)
+        expect(page.get_by_label("Command topic")).to_have_value("/cmd_vel_nav")
+        seen(page, "stop").click()
+        relay.until(lambda: relay.commands("/cmd_vel_nav"), "no zero came on the chosen topic")
+        assert relay.commands("/cmd_vel") == []
+
+    def test_touch(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A finger drives on a phone, and lifting it stops."""
+        page = open_page(COCKPIT, user="driver", width=390, height=844, has_touch=True, is_mobile=True)
+        ready_to_drive(page)
+        box = seen(page, "joystick").bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        session = page.context.new_cdp_session(page)
+
+        def touch(kind: str, *points: dict[str, float]) -> None:
+            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": list(points)})
+
+        touch("touchStart", {"x": x, "y": y})
+        touch("touchMove", {"x": x, "y": y - 50})
+        driving(relay)
+        touch("touchEnd")
+        assert_one_zero_then_silence(page, relay)
+
+
+class TestRights:
+    def test_viewer_watches_but_does_not_drive(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A viewer sees the data and the reason why the controls are off; nothing is published or advertised."""
+        page = open_page(COCKPIT, user="viewer")
+        expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
+        expect(seen(page, "drive-blocked")).to_contain_text("viewer")
+        expect(seen(page, "stop")).to_be_disabled()
+        hold_joystick(page)
+        page.mouse.up()
+        page.keyboard.press("w")
+        page.keyboard.press("Space")
+        page.wait_for_timeout(300)
+        assert relay.log(op="publish") == []
+        assert relay.log(op="advertise") == []
+
+    def test_lowered_right_stops_driving(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Who becomes a viewer while driving is stopped and told why."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        relay.do(user="driver", robot="rover-1", level="viewer")
+        expect(seen(page, "drive-blocked")).to_contain_text("viewer")
+        page.mouse.up()
+
+    def test_revoked_right_is_said(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A channel cut for a revoked right shows the reason and does not dial again."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        relay.do(close=4403, reason="revoked by admin", clear_log=True)
+        expect(seen(page, "link-banner")).to_have_text("You no longer have a right to this robot. Revoked by admin.")
+        expect(seen(page, "link-state")).to_have_attribute("data-state", "closed")
+        page.wait_for_timeout(1500)
+        assert relay.log() == []
+
+    def test_unknown_robot_is_said(self, open_page: OpenPage) -> None:
+        """A robot one has no right to looks like one that does not exist."""
+        page = open_page("/cockpit/arm-3", user="driver")
+        expect(seen(page, "link-banner")).to_have_text("There is no robot of this name for you.")
+        page.get_by_role("button", name="To the robots").click()
+        expect(seen(page, "robot-card")).to_have_count(2)
+
+    def test_ended_session_leads_to_the_login(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """When the session ends in the cockpit, one logs in again and is back in it."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        relay.do(close=4401)
+        expect(seen(page, "login-notice")).to_contain_text("session has ended")
+        seen(page, "login-user").fill("driver")
+        seen(page, "login-password").fill(PASSWORD)
+        seen(page, "login-submit").click()
+        ready_to_drive(page)
+
+
+@pytest.mark.parametrize("width", [390, 768, 1280])
+class TestWidths:
+    @pytest.mark.parametrize("path", ["/login", "/fleet", COCKPIT, "/nowhere"])
+    def test_no_sideways_scrolling(self, open_page: OpenPage, width: int, path: str) -> None:
+        """No page is wider than its window."""
+        page = open_page(path, width=width, user=None if path == "/login" else "admin")
+        expect(page.locator("main")).to_be_visible()
+        if path == COCKPIT:
+            ready_to_drive(page)
+            page.locator("[data-topic='/scan']").click()
+            expect(seen(page, "topic-echo")).to_contain_text("angle_min")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+    def test_stop_is_always_on_top(self, open_page: OpenPage, width: int) -> None:
+        """STOP stays visible and uncovered however far the cockpit is scrolled."""
+        page = open_page(COCKPIT, width=width, user="driver")
+        ready_to_drive(page)
+        for y in (0, 350, 700, 5000):
+            page.evaluate(f"window.scrollTo(0, {y})")
+            assert seen(page, "stop").evaluate(
+                """stop => {
+                    const { left, top, width, height } = stop.getBoundingClientRect()
+                    const within = top >= 0 && left >= 0 && left + width <= innerWidth
+                    return within && document.elementFromPoint(left + width / 2, top + height / 2) === stop
+                }"""
+            )
+
+
+def test_joystick_is_under_the_video_on_a_phone(open_page: OpenPage) -> None:
+    """On a phone the video is on top, the joystick below it, and both on one screen."""
+    page = open_page(COCKPIT, user="driver", width=390, height=844)
+    ready_to_drive(page)
+    camera, joystick = (seen(page, name).bounding_box() for name in ("camera-canvas", "joystick"))
+    assert camera["y"] + camera["height"] <= joystick["y"]
+    assert joystick["y"] + joystick["height"] <= 844
+
+
+def test_first_load_is_small(open_page: OpenPage) -> None:
+    """All scripts and styles up to the cockpit stay below 150 kB, compressed."""
+    import gzip
+
+    page = open_page("/fleet", user="driver")
+    bodies: list[bytes] = []
+    page.on("response", lambda answer: bodies.append(answer.body()) if "/assets/" in answer.url else None)
+    page.goto(COCKPIT)
+    ready_to_drive(page)
+    assert bodies
+    assert sum(len(gzip.compress(body)) for body in bodies) < 150_000
