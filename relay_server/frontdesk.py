@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
 from relay_db import queries
 from relay_protocol.errors import NotFound, SwitchboardError
 from relay_server import closing
-from relay_server.access import Access, Principal
+from relay_server.access import Access, Permit, Principal
 from relay_server.auth import Authenticator, BadCredentials
 from relay_server.channel import Channels
 from relay_server.clock import Clock
@@ -24,6 +25,15 @@ from relay_server.session import ClientTransport, Session, Timing
 from relay_server.store import Store
 
 NO_ROBOT = "there is no such robot, or you have no right on it"
+
+
+@dataclass(frozen=True)
+class Admission:
+    """Somebody who may come in to a robot."""
+
+    permit: Permit
+    robot: Presence
+    address: str
 
 
 class FrontDesk:
@@ -127,12 +137,9 @@ class FrontDesk:
 
     # --- robots -------------------------------------------------------------------------------------------
 
-    async def session(
-        self, principal: Principal, robot: str, transport: ClientTransport, address: str, opened_ns: int
-    ) -> Session:
-        """A session on a robot.
+    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
+        """Let a principal in to a robot it has a right on; :meth:`open` or :meth:`turn_away` must follow.
 
-        :param opened_ns: when the websocket's handshake was answered, monotonic nanoseconds
         :raises NotFound: no such robot, or no right on it: one and the same answer
         """
         record = await self._store.read(queries.find_robot, robot, principal.realm)
@@ -142,28 +149,40 @@ class FrontDesk:
                 "client.refused", "relay", user_id=principal.user_id, robot=robot[:64], address=address
             )
             raise NotFound(NO_ROBOT)
-        presence = self._registry.presence(record.id, record.name, record.realm)
+        return Admission(permit, self._registry.presence(record.id, record.name, record.realm), address)
+
+    def turn_away(self, admission: Admission) -> None:
+        """Somebody who was admitted left before a session began."""
+        self._access.release(admission.permit)
+
+    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> Session:
+        """Begin a session that was admitted.
+
+        :param opened_ns: when the websocket's handshake was answered, monotonic nanoseconds
+        """
+        robot = admission.robot
         session = Session(
             self._clock,
             transport,
-            permit,
-            presence,
-            self._channels.of(presence),
+            admission.permit,
+            robot,
+            self._channels.of(robot),
             self._local,
             Freshness(self._clock_ns, opened_ns, lambda: secrets.token_bytes(8)),
             self._timing,
-            address=address,
+            address=admission.address,
             since=self._wall(),
             ended=self._ended,
         )
-        self._sessions.setdefault(record.id, {})[session.number] = session
-        presence.users = len(self._sessions[record.id])
+        self._sessions.setdefault(robot.robot_id, {})[session.number] = session
+        robot.users = len(self._sessions[robot.robot_id])
+        principal = admission.permit.principal
         self._journal.event(
             "client.joined",
             f"user:{principal.name}",
-            robot_id=record.id,
+            robot_id=robot.robot_id,
             user_id=principal.user_id,
-            address=address,
+            address=admission.address,
         )
         self._registry.changed()
         return session

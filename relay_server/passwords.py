@@ -46,9 +46,13 @@ def verify_password(text: str, hashed: str | None) -> bool:
     :param hashed: what :func:`hash_password` returned; None for a user that is unknown or has no password
     """
     normal = _normal(text)
-    comparable = hashed is not None and _argon2().identify(hashed)
-    matches = bool(_argon2().verify(normal or "", hashed if comparable else _nobody()))
-    return matches and comparable and normal is not None
+    if hashed is not None and normal is not None:
+        try:
+            return bool(_argon2().verify(normal, hashed))
+        except ValueError:
+            pass  # a damaged hash is like none
+    _argon2().verify(normal or "", _nobody())
+    return False
 
 
 def prepare() -> None:

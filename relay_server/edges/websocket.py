@@ -22,6 +22,7 @@ from relay_server import closing
 from relay_server.access import Principal
 from relay_server.auth import BadCredentials
 from relay_server.clock import Clock, Timer, cancel
+from relay_server.frontdesk import Admission
 from relay_server.session import ClientTransport, Session
 
 HANDSHAKE_STATUS = {
@@ -48,10 +49,17 @@ class Gate(Protocol):
     async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
         """The principal of a session cookie, ``None`` when there is no such cookie."""
 
-    async def session(
-        self, principal: Principal, robot: str, transport: ClientTransport, address: str, opened_ns: int
-    ) -> Session:
-        """A session on a robot the principal has a right on."""
+    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
+        """Find out whether the principal has any right on the robot.
+
+        :raises NotFound: it has none, or there is no such robot
+        """
+
+    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> Session:
+        """Begin a session that was admitted."""
+
+    def turn_away(self, admission: Admission) -> None:
+        """Somebody who was admitted left before a session began."""
 
 
 class ClientProtocol(WebSocketServerProtocol):
@@ -63,10 +71,10 @@ class ClientProtocol(WebSocketServerProtocol):
     def __init__(self) -> None:
         super().__init__()
         self._robot = ""
-        self._principal: Principal | None = None
+        self._admission: Admission | None = None
         self._failure: tuple[int, str] | None = None
         self._session: Session | None = None
-        self._opening = False
+        self._proving = False
         self._early: list[bytes] = []
         self._early_bytes = 0
         self._deadline: Timer | None = None
@@ -85,31 +93,33 @@ class ClientProtocol(WebSocketServerProtocol):
         try:
             if not self.factory.gate.accepting:
                 raise Unavailable("the relay is going down; connect again in a moment")
-            chosen = await self._identify(request)
+            principal, chosen = await self._identify(request)
+            if principal is not None:
+                self._admission = await self.factory.gate.admit(principal, self._robot, self._address())
         except SwitchboardError as error:
             self._failure = (_code_of(error), str(error))
-        if self._failure is not None and request.origin is None:
+        if self._failure is not None and not request.origin:
             # Programs read the status; browsers can't, so they get a close code after the handshake.
             code, reason = self._failure
             raise ConnectionDeny(HANDSHAKE_STATUS.get(code, 403), reason)
         return chosen
 
-    async def _identify(self, request: ConnectionRequest) -> str | None:
+    async def _identify(self, request: ConnectionRequest) -> tuple[Principal | None, str | None]:
+        """The principal, if the handshake names one, and the subprotocol to answer with."""
         gate = self.factory.gate
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         bearer = next((each for each in request.protocols if each.startswith("bearer.")), None)
         ticket = request.params.get("ticket")
+        chosen = bearer or next((each for each in request.protocols if each.startswith("rosbridge")), None)
         if scheme.lower() == "bearer" and token:
-            self._principal = await gate.bearer(token.strip())
-        elif bearer is not None:
-            self._principal = await gate.bearer(bearer.removeprefix("bearer."))
-        elif ticket:
-            self._principal = await gate.ticket(ticket[0], self._robot)
-        else:
-            self._principal = await gate.cookie(
-                request.headers.get("cookie", ""), request.origin, request.headers.get("host", "")
-            )
-        return bearer or next((each for each in request.protocols if each.startswith("rosbridge")), None)
+            return await gate.bearer(token.strip()), chosen
+        if bearer is not None:
+            return await gate.bearer(bearer.removeprefix("bearer.")), chosen
+        if ticket:
+            return await gate.ticket(ticket[0], self._robot), chosen
+        headers = request.headers
+        origin = request.origin or None
+        return await gate.cookie(headers.get("cookie", ""), origin, headers.get("host", "")), chosen
 
     def onOpen(self) -> None:
         """The handshake is done."""
@@ -120,7 +130,7 @@ class ClientProtocol(WebSocketServerProtocol):
         self.transport.registerProducer(_Flow(self), True)
         if self._failure is not None:
             self.close(*self._failure)
-        elif self._principal is not None:
+        elif self._admission is not None:
             self._begin()
         else:
             self._deadline = self.factory.clock.callLater(limits.UNPROVEN_SECONDS, self._nobody)
@@ -132,27 +142,16 @@ class ClientProtocol(WebSocketServerProtocol):
         )
 
     def _begin(self) -> None:
-        self._opening = True
-        Deferred.fromCoroutine(self._start()).addErrback(self._failed)
-
-    async def _start(self) -> None:
-        assert self._principal is not None
-        session = await self.factory.gate.session(
-            self._principal, self._robot, self, self._address(), self._opened_ns
-        )
+        assert self._admission is not None
+        admission, self._admission = self._admission, None
         self._stop_deadline()
-        self._opening = False
-        if not self._open:
-            session.end()
-            return
-        self._session = session
-        session.start()
+        self._session = self.factory.gate.open(admission, self, self._opened_ns)
+        self._session.start()
         early, self._early = self._early, []
         for message in early:
-            session.message(message)
+            self._session.message(message)
 
     def _failed(self, failure: Any) -> None:
-        self._opening = False
         error = failure.value
         if isinstance(error, SwitchboardError):
             self.close(_code_of(error), str(error))
@@ -178,7 +177,7 @@ class ClientProtocol(WebSocketServerProtocol):
         self._early_bytes += len(payload)
         if self._early_bytes > limits.UNPROVEN_BYTES:
             self.close(closing.TOO_BIG, f"more than {limits.UNPROVEN_BYTES} bytes before the session began")
-        elif self._principal is not None or self._opening:
+        elif self._proving:
             self._early.append(payload)
         else:
             self._authenticate(payload)
@@ -192,12 +191,21 @@ class ClientProtocol(WebSocketServerProtocol):
         if not isinstance(message, rosbridge.Auth):
             self.close(closing.UNAUTHENTICATED, "log in first: send op 'auth' with the access token in 'mac'")
             return
-        self._opening = True
+        self._proving = True
         Deferred.fromCoroutine(self._authenticated(message.mac)).addErrback(self._failed)
 
     async def _authenticated(self, token: str) -> None:
-        self._principal = await self.factory.gate.bearer(token)
-        await self._start()
+        principal = await self.factory.gate.bearer(token)
+        self._admission = await self.factory.gate.admit(principal, self._robot, self._address())
+        if self._open:
+            self._begin()
+        else:
+            self._turn_away()
+
+    def _turn_away(self) -> None:
+        admission, self._admission = self._admission, None
+        if admission is not None:
+            self.factory.gate.turn_away(admission)
 
     def onPong(self, payload: bytes) -> None:
         """The answer to a ping."""
@@ -209,6 +217,7 @@ class ClientProtocol(WebSocketServerProtocol):
         self._open = False
         self._stop_deadline()
         self._early.clear()
+        self._turn_away()
         session, self._session = self._session, None
         if session is not None:
             session.end()

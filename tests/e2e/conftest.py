@@ -1,0 +1,37 @@
+"""One relay and one robot for the tests that break nothing; those that do start their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+from switchboard_harness import Relay, Robot
+
+
+@dataclass
+class World:
+    """A relay with the robot ``rover`` and three users."""
+
+    relay: Relay
+    robot: Robot
+    operator: str
+    viewer: str
+    stranger: str
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """The world most end-to-end tests share."""
+    relay = Relay(tmp_path_factory.mktemp("world"))
+    try:
+        robot = Robot(relay, "rover", camera=True)
+        try:
+            operator, viewer, stranger = (relay.user(name) for name in ("operator", "viewer", "stranger"))
+            relay.cli("right", "grant", "operator", "rover", "operator")
+            relay.cli("right", "grant", "viewer", "rover", "viewer")
+            yield World(relay, robot, operator, viewer, stranger)
+        finally:
+            robot.stop()
+    finally:
+        relay.stop()

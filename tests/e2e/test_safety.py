@@ -1,0 +1,192 @@
+"""Whatever breaks while a robot is driven, it stands still within half a second, by its own record.
+
+The simulator keeps its last command for ever, as many bases do: what stops it is the daemon's watchdog or its guard.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from switchboard_harness import ChaosProxy, Driver, Relay, Robot, wait_for
+
+LIMIT_MS = 500
+SIM_STEP_MS = 20
+
+
+class Drive:
+    """A relay, a robot and somebody driving, each behind a proxy that can be broken."""
+
+    def __init__(self, folder: Path) -> None:
+        self.relay = Relay(folder, "--heartbeat", "0.5")
+        self.robot_side = ChaosProxy(self.relay.robots_port)
+        self.client_side = ChaosProxy(self.relay.http_port)
+        self.robot = Robot(self.relay, "rover", port=self.robot_side.port)
+        self.token = self.relay.user("driver")
+        self.relay.cli("right", "grant", "driver", "rover", "operator")
+        self._drivers: list[Driver] = []
+
+    def start_driving(self) -> Driver:
+        """Drive in circles until the robot moves by its own record."""
+        driver = Driver(self.relay.connect_by(self.client_side.port, "rover", self.token))
+        driver.start()
+        self._drivers.append(driver)
+        wait_for("the robot moves", self.robot.moving)
+        # Some commands more, so that all links are in the state they are in for hours.
+        enough = len(self.robot.events("command")) + 5
+        wait_for("it is driven", lambda: len(self.robot.events("command")) >= enough)
+        return driver
+
+    def stands_within_limit(self, since: int) -> None:
+        """The robot came to a standstill soon enough after a fault at ``since`` (monotonic ns)."""
+        wait_for("the robot stands", lambda: not self.robot.moving(), 10)
+        stood = self.robot.events("standstill")[-1]["t"]
+        took_ms = (stood - since) / 1e6
+        assert took_ms <= LIMIT_MS + SIM_STEP_MS, f"it took {took_ms:.0f} ms"
+
+    def stop(self) -> None:
+        """End everything."""
+        self.robot_side.heal()
+        self.client_side.heal()
+        for driver in self._drivers:
+            driver.stop()
+        self.robot.stop()
+        self.relay.stop()
+        self.robot_side.close()
+        self.client_side.close()
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
+    """One drive for all faults: each test leaves it whole again."""
+    drive = Drive(tmp_path_factory.mktemp("drive"))
+    try:
+        yield drive
+    finally:
+        drive.stop()
+
+
+def drives_again(drive: Drive) -> None:
+    """All is back by itself: somebody new can drive, and lets go."""
+    drive.robot.wait_online()
+    driver = drive.start_driving()
+    driver.stop()
+    wait_for("the robot stands", lambda: not drive.robot.moving(), 5)
+
+
+@pytest.mark.parametrize("fault", ["client vanishes", "client link black hole", "client link reset"])
+def test_the_robot_stands_when_its_driver_is_lost(drive: Drive, fault: str) -> None:
+    """A client that goes away, with or without a word, leaves the robot standing."""
+    driver = drive.start_driving()
+    act: dict[str, Callable[[], None]] = {
+        "client vanishes": driver.stop,
+        "client link black hole": drive.client_side.black_hole,
+        "client link reset": drive.client_side.reset,
+    }
+    since = time.monotonic_ns()
+    act[fault]()
+    drive.stands_within_limit(since)
+    driver.stop()
+    drive.client_side.heal()
+    drives_again(drive)
+
+
+@pytest.mark.parametrize("fault", ["robot link black hole", "robot link reset", "relay to robot only"])
+def test_the_robot_stands_when_its_link_is_lost(drive: Drive, fault: str) -> None:
+    """A robot that hears nothing more stands, also when nobody told it that the link is dead."""
+    driver = drive.start_driving()
+    act: dict[str, Callable[[], None]] = {
+        "robot link black hole": drive.robot_side.black_hole,
+        "robot link reset": drive.robot_side.reset,
+        "relay to robot only": drive.robot_side.forward_down.clear,
+    }
+    since = time.monotonic_ns()
+    act[fault]()
+    drive.stands_within_limit(since)
+    driver.stop()
+    drive.robot_side.heal()
+    drives_again(drive)
+
+
+def test_no_command_from_before_a_partition_is_executed_after_it(drive: Drive) -> None:
+    """Commands that a network held back for two seconds arrive and are dropped."""
+    driver = drive.start_driving()
+    drive.robot_side.forward_down.clear()
+    time.sleep(1.5)  # commands pile up on their way to the robot
+    driver.stop()
+    time.sleep(0.6)  # the last of them grows older than its deadline
+    healed = time.monotonic_ns()
+    drive.robot_side.heal()
+    with drive.relay.connect("rover", drive.token) as client:
+        # The answer comes behind everything that was held back.
+        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
+    late = [each for each in drive.robot.events("command", healed) if each["v"] or each["w"]]
+    assert late == []
+    assert not drive.robot.moving()
+    drives_again(drive)
+
+
+def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_when_it_wakes(drive: Drive) -> None:
+    """Commands that waited in a frozen relay's sockets are older than their deadline, and the relay knows."""
+    driver = drive.start_driving()
+    since = time.monotonic_ns()
+    drive.relay.freeze()
+    try:
+        drive.stands_within_limit(since)
+        time.sleep(1.0)  # the client goes on sending into the frozen relay's socket
+        driver.stop()
+        time.sleep(0.6)
+    finally:
+        woken = time.monotonic_ns()
+        drive.relay.thaw()
+    drive.robot.wait_online()
+    with drive.relay.connect("rover", drive.token) as client:
+        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
+    late = [each for each in drive.robot.events("command", woken) if each["v"] or each["w"]]
+    assert late == []
+    drives_again(drive)
+
+
+def test_the_robot_stands_when_the_relay_is_killed_and_all_is_back_after_its_restart(drive: Drive) -> None:
+    """kill -9 of the relay: the robot stands; a new relay on the same data finds its robot again."""
+    driver = drive.start_driving()
+    since = time.monotonic_ns()
+    drive.relay.kill()
+    drive.stands_within_limit(since)
+    driver.stop()
+    drive.relay.start()
+    drives_again(drive)
+
+
+def test_the_robot_stands_when_its_daemon_is_killed(drive: Drive) -> None:
+    """kill -9 of the daemon: the guard outlives it and stops the robot."""
+    driver = drive.start_driving()
+    since = time.monotonic_ns()
+    drive.robot.daemon.kill()
+    drive.stands_within_limit(since)
+    driver.stop()
+    drive.robot.start_daemon()
+    drives_again(drive)
+
+
+def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
+    """A daemon that hangs with its links open is stopped by the guard, and is itself again when it wakes."""
+    driver = drive.start_driving()
+    since = time.monotonic_ns()
+    drive.robot.daemon.signal(signal.SIGSTOP)
+    try:
+        drive.stands_within_limit(since)
+        driver.stop()
+        time.sleep(0.6)
+    finally:
+        woken = time.monotonic_ns()
+        drive.robot.daemon.signal(signal.SIGCONT)
+    drive.robot.wait_online()
+    with drive.relay.connect("rover", drive.token) as client:
+        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
+    late = [each for each in drive.robot.events("command", woken) if each["v"] or each["w"]]
+    assert late == []
+    drives_again(drive)
