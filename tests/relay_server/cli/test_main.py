@@ -1,0 +1,234 @@
+"""What all commands have in common: where the data is, the audit log, the knock, exit codes, help."""
+
+from __future__ import annotations
+
+import json
+import os
+import pwd
+import re
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from sqlalchemy import create_engine, text
+
+from relay_server.cli import main
+from relay_server.cli.relaysocket import SOCKET_NAME
+
+CHANGES = [
+    ("user.add", ("user", "add", "bob", "--no-password")),
+    ("user.password", ("user", "passwd", "ann", "--password-stdin")),
+    ("user.disable", ("user", "disable", "ann")),
+    ("user.enable", ("user", "enable", "ann")),
+    ("user.remove", ("user", "remove", "ann", "--yes")),
+    ("group.add", ("group", "add", "ops")),
+    ("group.remove", ("group", "remove", "lab", "--yes")),
+    ("group.join", ("group", "join", "lab", "ann")),
+    ("group.leave", ("group", "leave", "lab", "cat")),
+    ("robot.add", ("robot", "add", "arm")),
+    ("robot.code", ("robot", "code", "rover")),
+    ("robot.remove", ("robot", "remove", "rover", "--yes")),
+    ("right.grant", ("right", "grant", "ann", "rover", "owner", "--allow", "call:/x")),
+    ("right.revoke", ("right", "revoke", "cat", "rover")),
+    ("token.create", ("token", "create", "ann")),
+    ("token.revoke", ("token", "revoke", "1")),
+]
+LOOKS = [
+    ("user", "list"),
+    ("group", "list"),
+    ("robot", "list"),
+    ("robot", "keys", "rover"),
+    ("right", "list"),
+    ("token", "list"),
+    ("audit", "list"),
+    ("audit", "verify"),
+]
+
+
+def _fill(cli: Any) -> None:
+    for arguments in (
+        ("user", "add", "ann", "--no-password"),
+        ("user", "add", "cat", "--no-password"),
+        ("group", "add", "lab"),
+        ("group", "join", "lab", "cat"),
+        ("robot", "add", "rover"),
+        ("right", "grant", "cat", "rover", "viewer"),
+        ("token", "create", "cat", "--json"),
+    ):
+        cli.ok(*arguments)
+
+
+@pytest.mark.parametrize(("action", "arguments"), CHANGES, ids=[action for action, _ in CHANGES])
+def test_each_change_is_audited_and_knocks(
+    live: Any, relay: Any, action: str, arguments: tuple[str, ...]
+) -> None:
+    """One entry that says who by the system's own account, and the relay is told to look."""
+    _fill(live)
+    before = len(live.json("audit", "list"))
+    relay.asked.clear()
+    result = live(*arguments, stdin="correct horse\n", LOGNAME="someone-else", USER="someone-else")
+    assert result.exit_code == 0, result.output
+    assert relay.asked[0] == "POST /refresh"
+    *_, entry = entries = live.json("audit", "list")
+    assert len(entries) == before + 1
+    assert (entry["action"], entry["actor"]) == (action, f"cli:{pwd.getpwuid(os.getuid()).pw_name}")
+    assert live.json("audit", "verify") == {"whole": True, "first_broken": None}
+
+
+@pytest.mark.parametrize("arguments", LOOKS, ids=" ".join)
+def test_a_look_changes_nothing(live: Any, relay: Any, arguments: tuple[str, ...]) -> None:
+    """No audit entry and no knock; --json prints one line of JSON and nothing else."""
+    _fill(live)
+    before = live.json("audit", "list")
+    relay.asked.clear()
+    answer = live.ok(*arguments, "--json")
+    assert answer.count("\n") == 1
+    json.loads(answer)
+    assert live.ok(*arguments)
+    assert relay.asked == []
+    assert live.json("audit", "list") == before
+
+
+def test_a_refused_change_is_not_audited_and_does_not_knock(live: Any, relay: Any) -> None:
+    """Nothing changed, nothing to tell."""
+    _fill(live)
+    before = live.json("audit", "list")
+    relay.asked.clear()
+    live.fails("user", "add", "ann", "--no-password")
+    live.fails("right", "grant", "ann", "rover", "owner", "--allow", "nonsense")
+    assert relay.asked == []
+    assert live.json("audit", "list") == before
+
+
+def test_a_broken_chain_is_told(cli: Any) -> None:
+    """With the number of the entry, as exit code 1, also in JSON."""
+    for name in ("ann", "bob"):
+        cli.ok("user", "add", name, "--no-password")
+    engine = create_engine(f"sqlite:///{cli.data}/switchboard.db")
+    with engine.begin() as connection:
+        connection.execute(text("DROP TRIGGER audit_entry_no_update"))
+        connection.execute(text("UPDATE audit_entry SET target = 'bab' WHERE id = 2"))
+    engine.dispose()
+    assert "first broken entry is number 2" in cli.fails("audit", "verify")
+    result = cli("audit", "verify", "--json")
+    assert (result.exit_code, json.loads(result.stdout)) == (1, {"whole": False, "first_broken": 2})
+
+
+def test_the_audit_log_is_listed_oldest_first_and_cut_to_the_latest(cli: Any) -> None:
+    """As people read a log."""
+    for name in ("ann", "bob", "cat"):
+        cli.ok("user", "add", name, "--no-password")
+    assert [entry["target"] for entry in cli.json("audit", "list", "--limit", "2")] == ["bob", "cat"]
+    assert [line.split()[0] for line in cli.ok("audit", "list").splitlines()[2:]] == ["1", "2", "3"]
+
+
+def test_the_data_folder_is_made_for_its_owner_only(cli: Any) -> None:
+    """Also by a command that only looks."""
+    cli.ok("user", "list")
+    assert stat.S_IMODE(cli.data.stat().st_mode) == 0o700
+    assert stat.S_IMODE((cli.data / "switchboard.db").stat().st_mode) == 0o600
+
+
+def test_the_option_beats_the_variable(cli: Any, tmp_path: Path) -> None:
+    """--data before the command, else SWITCHBOARD_DATA."""
+    cli.ok("--data", str(tmp_path / "other"), "user", "add", "ann", "--no-password")
+    assert (tmp_path / "other" / "switchboard.db").exists()
+    assert not cli.data.exists()
+
+
+def test_odd_folders_work(cli: Any, tmp_path: Path) -> None:
+    """Blanks, percent signs and hashes in the path."""
+    folder = tmp_path / "a b%41#c"
+    cli.ok("--data", str(folder), "user", "list")
+    assert (folder / "switchboard.db").exists()
+
+
+def test_another_database_is_taken_by_url(cli: Any, tmp_path: Path) -> None:
+    """--db or SWITCHBOARD_DB; the data folder is not needed then."""
+    url = f"sqlite:///{tmp_path}/elsewhere/x.db"
+    cli.ok("--db", url, "user", "add", "ann", "--no-password")
+    result = cli("user", "list", "--json", SWITCHBOARD_DB=url)
+    assert [each["user"] for each in json.loads(result.stdout)] == ["ann"]
+    assert not cli.data.exists()
+    assert cli.json("--db", url, "db", "upgrade") == {"database": url, "schema": "0001"}
+
+
+def test_a_database_that_is_not_there_is_exit_code_3(cli: Any, tmp_path: Path) -> None:
+    """A sentence, without a traceback and without the password of the URL."""
+    result = cli("user", "list", SWITCHBOARD_DB="postgresql://me:hunter22@127.0.0.1:1/x")
+    assert (result.exit_code, result.stdout) == (3, "")
+    assert result.stderr == "Error: the database server can't be reached\n"
+    (tmp_path / "file").write_text("")
+    assert "can't be used" in cli.fails("--data", str(tmp_path / "file" / "x"), "user", "list", code=3)
+
+
+def test_a_database_url_that_cannot_be_is_refused(cli: Any) -> None:
+    """As exit code 1."""
+    assert "no database URL" in cli.fails("--db", "nonsense", "user", "list")
+
+
+def test_a_relay_that_hangs_does_not_hold_a_change_up(
+    cli: Any, short_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The knock is given up; the change is made."""
+    import socket
+
+    from relay_server.cli import relaysocket
+
+    monkeypatch.setattr(relaysocket, "_KNOCK_SECONDS", 0.05)
+    monkeypatch.setattr(relaysocket, "_ASK_SECONDS", 0.05)
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.bind(str(short_folder / SOCKET_NAME))
+        silent.listen()
+        cli.ok("--data", str(short_folder), "user", "add", "ann", "--no-password")
+        told = cli.fails("--data", str(short_folder), "status", code=3)
+    assert "does not answer" in told
+    assert len(cli.json("--data", str(short_folder), "user", "list")) == 1
+
+
+def _commands(
+    command: click.Command, path: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    yield path, command
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            child = command.get_command(context, name)
+            assert child is not None
+            yield from _commands(child, (*path, name))
+
+
+ADMIN = [
+    (path, command)
+    for path, command in _commands(main, ())
+    if not isinstance(command, click.Group) and path not in {("serve",), ("demo",)}
+]
+
+
+@pytest.mark.parametrize(("path", "command"), ADMIN, ids=[" ".join(path) for path, _ in ADMIN])
+def test_each_command_has_help_examples_and_json(path: tuple[str, ...], command: click.Command) -> None:
+    """The help says what it does, shows an example of itself, and what exit codes mean."""
+    assert command.help
+    assert command.epilog is not None
+    assert re.search(rf"switchboard( --data \S+)? {' '.join(path)}\b", command.epilog)
+    assert "Exit codes: 0 done, 1 refused" in command.epilog
+    assert any("--json" in parameter.opts for parameter in command.params)
+    if "remove" in path:
+        assert any("--yes" in parameter.opts for parameter in command.params)
+
+
+def test_the_help_names_all_commands(cli: Any) -> None:
+    """Without importing them."""
+    shown = cli.ok("--help")
+    for name in ("user", "group", "robot", "right", "token", "audit", "db", "status"):
+        assert re.search(rf"^  {name} ", shown, re.MULTILINE)
+
+
+@pytest.mark.parametrize("arguments", [("fly",), ("user", "fly"), ("user", "add"), ("user", "list", "--fly")])
+def test_wrong_usage_is_exit_code_2(cli: Any, arguments: tuple[str, ...]) -> None:
+    """And makes no database."""
+    cli.fails(*arguments, code=2)
+    assert not cli.data.exists()
