@@ -13,13 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 HERE = Path(__file__).parent
 PORTAL = HERE.parents[1] / "relay_server" / "portal"
 PASSWORD = "correct horse"
-CHROMIUM_ARGS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--disable-background-networking"]
+CHROMIUM_ARGS = [
+    "--no-sandbox",
+    "--disable-dev-shm-usage",
+    "--disable-gpu",
+    "--disable-background-networking",
+]
 WAIT_SECONDS = 20.0
+
+expect.set_options(timeout=WAIT_SECONDS * 1000)
 
 Json = dict[str, Any]
 
@@ -53,7 +60,8 @@ class FakeRelay:
     def commands(self, topic: str = "/cmd_vel") -> list[tuple[float, float]]:
         """The motion commands received, as (ahead, turn)."""
         return [
-            (entry["msg"]["linear"]["x"], entry["msg"]["angular"]["z"]) for entry in self.log(op="publish", topic=topic)
+            (entry["msg"]["linear"]["x"], entry["msg"]["angular"]["z"])
+            for entry in self.log(op="publish", topic=topic)
         ]
 
 
@@ -62,7 +70,9 @@ def relay() -> Iterator[FakeRelay]:
     if not (PORTAL / "index.html").is_file():
         pytest.fail("The portal is not built. Run 'make web', then the tests again.")
     process = subprocess.Popen(
-        [sys.executable, str(HERE / "fake_relay.py"), "--portal", str(PORTAL)], stdout=subprocess.PIPE, text=True
+        [sys.executable, str(HERE / "fake_relay.py"), "--portal", str(PORTAL)],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     try:
         assert process.stdout is not None
@@ -96,15 +106,21 @@ def open_page(browser: Browser, relay: FakeRelay) -> Iterator[OpenPage]:
     faults: list[str] = []
     contexts = []
 
-    def open_page(path: str = "/", width: int = 1280, height: int = 800, user: str | None = None, **options: Any) -> Page:
-        context = browser.new_context(viewport={"width": width, "height": height}, base_url=relay.url, **options)
+    def open_page(
+        path: str = "/", width: int = 1280, height: int = 800, user: str | None = None, **options: Any
+    ) -> Page:
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, base_url=relay.url, **options
+        )
         context.set_default_timeout(WAIT_SECONDS * 1000)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: faults.append(f"uncaught: {error}"))
         page.on(
             "console",
-            lambda message: faults.append(message.text) if "Content Security Policy" in message.text else None,
+            lambda message: (
+                faults.append(message.text) if "Content Security Policy" in message.text else None
+            ),
         )
         if user is not None:
             answer = context.request.post(

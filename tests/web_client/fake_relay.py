@@ -90,8 +90,12 @@ class World:
         if now - self.commanded > 0.5:
             self.speed = self.turn = 0.0
         self.heading += self.turn * span
-        self.x = float(np.clip(self.x + self.speed * math.cos(self.heading) * span, -HALL[0] + 0.3, HALL[0] - 0.3))
-        self.y = float(np.clip(self.y + self.speed * math.sin(self.heading) * span, -HALL[1] + 0.3, HALL[1] - 0.3))
+        self.x = float(
+            np.clip(self.x + self.speed * math.cos(self.heading) * span, -HALL[0] + 0.3, HALL[0] - 0.3)
+        )
+        self.y = float(
+            np.clip(self.y + self.speed * math.sin(self.heading) * span, -HALL[1] + 0.3, HALL[1] - 0.3)
+        )
 
     def ranges(self, angles: np.ndarray) -> np.ndarray:
         c, s = np.cos(angles + self.heading), np.sin(angles + self.heading)
@@ -113,7 +117,10 @@ class World:
         return {
             "header": header("odom"),
             "child_frame_id": "base_link",
-            "pose": {"pose": {"position": {"x": self.x, "y": self.y, "z": 0.0}, "orientation": spin}, "covariance": none},
+            "pose": {
+                "pose": {"position": {"x": self.x, "y": self.y, "z": 0.0}, "orientation": spin},
+                "covariance": none,
+            },
             "twist": {
                 "twist": {
                     "linear": {"x": self.speed, "y": 0.0, "z": 0.0},
@@ -145,7 +152,11 @@ class World:
         image[240:] = (58, 66, 70)
         for i, height in enumerate(heights):
             shade = int(np.clip(60 + height, 60, 235))
-            image[240 - int(height) : 240 + int(height), i * 4 : i * 4 + 4] = (shade, int(shade * 0.9), int(shade * 0.75))
+            image[240 - int(height) : 240 + int(height), i * 4 : i * 4 + 4] = (
+                shade,
+                int(shade * 0.9),
+                int(shade * 0.75),
+            )
         clock = time.strftime("%H:%M:%S") + f".{int(time.time() * 10) % 10}"
         cv2.putText(image, clock, (16, 36), cv2.FONT_HERSHEY_SIMPLEX, 0.9, (235, 235, 235), 2, cv2.LINE_AA)
         jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
@@ -214,7 +225,9 @@ class Relay:
 class Channel:
     """One rosbridge websocket."""
 
-    def __init__(self, relay: Relay, user: str, robot: str, protocol: ServerProtocol, flush: Callable[[], None]) -> None:
+    def __init__(
+        self, relay: Relay, user: str, robot: str, protocol: ServerProtocol, flush: Callable[[], None]
+    ) -> None:
         self.relay, self.user, self.robot = relay, user, robot
         self.protocol, self.flush = protocol, flush
         self.since = time.time()
@@ -259,7 +272,10 @@ class Channel:
         if message["service"] == "/rosapi/topics":
             values = {"topics": list(TOPICS), "types": list(TOPICS.values())}
         elif message["service"] == "/relay/ping":
-            values = {"relay_time_ns": time.monotonic_ns(), "robot_rtt_ms": 4.2 if message["args"]["robot"] else None}
+            values = {
+                "relay_time_ns": time.monotonic_ns(),
+                "robot_rtt_ms": 4.2 if message["args"]["robot"] else None,
+            }
         answer = {"op": "service_response", "service": message["service"], "result": True, "values": values}
         self.send({**answer, "id": message["id"]})
 
@@ -305,7 +321,9 @@ class Connection:
             head = await self.reader.readuntil(b"\r\n\r\n")
             lines = head.decode("latin-1").split("\r\n")
             method, target, _ = lines[0].split(" ")
-            self.headers = {k.lower(): v.strip() for k, _, v in (line.partition(":") for line in lines[1:] if line)}
+            self.headers = {
+                k.lower(): v.strip() for k, _, v in (line.partition(":") for line in lines[1:] if line)
+            }
             for part in self.headers.get("cookie", "").split(";"):
                 name, _, value = part.strip().partition("=")
                 self.cookies[name] = value
@@ -322,8 +340,16 @@ class Connection:
 
     def reply(self, status: int, body: Any = None, kind: str = "application/json", **headers: str) -> None:
         data = body if isinstance(body, bytes) else b"" if body is None else json.dumps(body).encode()
-        lines = [f"HTTP/1.1 {status} X", f"Content-Length: {len(data)}", f"Content-Type: {kind}", "Connection: close"]
-        lines += [f"Content-Security-Policy: {CSP}", *(f"{k.replace('_', '-')}: {v}" for k, v in headers.items())]
+        lines = [
+            f"HTTP/1.1 {status} X",
+            f"Content-Length: {len(data)}",
+            f"Content-Type: {kind}",
+            "Connection: close",
+        ]
+        lines += [
+            f"Content-Security-Policy: {CSP}",
+            *(f"{k.replace('_', '-')}: {v}" for k, v in headers.items()),
+        ]
         self.writer.write("\r\n".join(lines).encode() + b"\r\n\r\n" + data)
 
     def problem(self, status: int, detail: str, **headers: str) -> None:
@@ -361,7 +387,9 @@ class Connection:
         if user == "hasty":
             self.problem(429, "Too many attempts. Wait a little.", Retry_After="30")
         elif user not in self.relay.rights or ("code" not in given and given["password"] != PASSWORD):
-            words = "This login link is used up or too old." if "code" in given else "User or password is wrong."
+            words = (
+                "This login link is used up or too old." if "code" in given else "User or password is wrong."
+            )
             self.problem(401, words)
         else:
             token = secrets.token_hex(8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -194,7 +195,9 @@ class TestCockpit:
         row.click()
         expect(seen(page, "topic-echo")).to_contain_text("percentage")
         row.click()
-        relay.until(lambda: relay.log(op="unsubscribe", topic="/battery_state"), "the echo was not unsubscribed")
+        relay.until(
+            lambda: relay.log(op="unsubscribe", topic="/battery_state"), "the echo was not unsubscribed"
+        )
 
     def test_data_that_stops_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """When a robot falls silent its picture and values are marked as old."""
@@ -251,14 +254,17 @@ class TestDriving:
         """However the stick is shaken, commands leave no faster than twenty times a second."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
+        # By the page's clock and around everything: a slow machine only makes the time longer.
+        began = page.evaluate("performance.now()")
         hold_joystick(page)
         box = seen(page, "joystick").bounding_box()
         for i in range(120):
             page.mouse.move(box["x"] + 60 + i % 40, box["y"] + 40)
         driving(relay, 5)
         page.mouse.up()
-        sent = [entry["at"] for entry in relay.log(op="publish", topic="/cmd_vel")]
-        assert (len(sent) - 1) / (sent[-1] - sent[0]) < 20
+        seconds = (page.evaluate("performance.now()") - began) / 1000
+        relay.until(lambda: relay.commands()[-1] == ZERO, "no zero came")
+        assert len(relay.commands()) <= seconds * 20 + 2
 
     def test_keys(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """W drives ahead, and lifting it stops with one zero."""
@@ -420,7 +426,9 @@ class TestRights:
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         relay.do(close=4403, reason="revoked by admin", clear_log=True)
-        expect(seen(page, "link-banner")).to_have_text("You no longer have a right to this robot. Revoked by admin.")
+        expect(seen(page, "link-banner")).to_have_text(
+            "You no longer have a right to this robot. Revoked by admin."
+        )
         expect(seen(page, "link-state")).to_have_attribute("data-state", "closed")
         page.wait_for_timeout(1500)
         assert relay.log() == []
@@ -483,8 +491,6 @@ def test_joystick_is_under_the_video_on_a_phone(open_page: OpenPage) -> None:
 
 def test_first_load_is_small(open_page: OpenPage) -> None:
     """All scripts and styles up to the cockpit stay below 150 kB, compressed."""
-    import gzip
-
     page = open_page("/fleet", user="driver")
     bodies: list[bytes] = []
     page.on("response", lambda answer: bodies.append(answer.body()) if "/assets/" in answer.url else None)
