@@ -122,7 +122,9 @@ def _judge(value: Any) -> Motion:
 
 def _judge_value(value: Any) -> Motion:
     if isinstance(value, (bool, int, float)):
-        return Motion.MOVING if value else Motion.STILL if math.isfinite(value) else Motion.INVALID
+        if not math.isfinite(value):
+            return Motion.INVALID
+        return Motion.MOVING if value else Motion.STILL
     if hasattr(value, "get_fields_and_field_types"):
         return _judge(value)
     if isinstance(value, (str, bytes)):

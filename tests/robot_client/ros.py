@@ -1,0 +1,86 @@
+"""What the tests with real ROS share: a domain of their own, a peer process."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+PATIENCE = 20.0
+
+
+@contextmanager
+def domain() -> Iterator[dict[str, str]]:
+    """An environment with a ROS domain nobody else has, set for this process too."""
+    ours = {"ROS_DOMAIN_ID": str(random.randint(20, 200)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    before = {name: os.environ.get(name) for name in ours}
+    os.environ.update(ours)
+    try:
+        yield dict(os.environ)
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+class Peer:
+    """A node in another process."""
+
+    def __init__(self, environment: dict[str, str]) -> None:
+        self.record: list[dict[str, Any]] = []
+        self._process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("ros_peer.py"))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.until(lambda: any("ready" in each for each in self.record))
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.record.append(json.loads(line))
+
+    def do(self, *what: Any) -> None:
+        """Have something done, and wait until it is."""
+        assert self._process.stdin is not None
+        done = len([each for each in self.record if "done" in each])
+        self._process.stdin.write(json.dumps(what) + "\n")
+        self._process.stdin.flush()
+        self.until(lambda: len([each for each in self.record if "done" in each]) > done)
+
+    def heard(self, topic: str) -> list[dict[str, Any]]:
+        """What came on a topic so far."""
+        return [each for each in list(self.record) if each.get("topic") == topic]
+
+    def until(self, true: Callable[[], Any], timeout: float = PATIENCE) -> None:
+        deadline = time.monotonic() + timeout
+        while not true():
+            assert self._process.poll() is None, "the peer ended"
+            assert time.monotonic() < deadline, f"waited {timeout} s in vain"
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(5)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
