@@ -6,7 +6,6 @@ robot passes CDR on unread.
 
 from __future__ import annotations
 
-import struct
 from collections import OrderedDict
 from typing import Any
 
@@ -14,15 +13,17 @@ import orjson
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
-from relay_protocol.limits import MIB
+from relay_protocol.limits import COMMAND_FRAME, MIB
 from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
-from relay_protocol.ros.reader import Reader, ReaderFactory
+from relay_protocol.ros.reader import ReaderFactory
 from relay_protocol.ros.typedefs import typedef
 from relay_protocol.ros.writer import Mismatch, Write, WriterFactory, as_invalid
 
 _LITTLE = b"\x00\x01"
 _BIG = b"\x00\x00"
 _WRITTEN_HEAD = b"\x00\x01\x00\x00"
+_LARGEST_BODY = COMMAND_FRAME - 17
+"""What is left of a frame after kind, number, stamp and encapsulation header."""
 _SHARED_CHARACTERS = 8 * MIB
 _TYPES_OF_A_ROBOT = 4096
 
@@ -40,11 +41,11 @@ class _Compiled:
             _BIG: ReaderFactory(self.definitions, ">"),
         }
 
-    def reader(self, type_name: str, encapsulation: bytes) -> Reader:
+    def reader(self, encapsulation: bytes) -> ReaderFactory:
         factory = self._readers.get(encapsulation)
         if factory is None:
-            raise Invalid(f"{type_name}: bytes 0 and 1 are {encapsulation.hex()}; plain CDR has 0001 or 0000")
-        return factory.reader(type_name)
+            raise Invalid(f"bytes 0 and 1 are {encapsulation.hex()}; plain CDR has 0001 or 0000")
+        return factory
 
     def writer(self, type_name: str) -> Write:
         return self._writers.writer(type_name)
@@ -129,13 +130,10 @@ class TypeRegistry:
         name, compiled = self._find(type_name)
         if len(cdr) < 4:
             raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
-        body = cdr[4:]
         try:
-            value, _ = compiled.reader(name, cdr[:2]).read(body, 0)
+            value = compiled.reader(cdr[:2]).read(name, cdr[4:])
         except Invalid as error:
             raise Invalid(f"{name}: {error}") from None
-        except struct.error:
-            raise Invalid(f"{name}: the message ends too early, after {len(body)} bytes") from None
         # Bytes left over are no error: rclpy's serialize_message counts gaps before empty sequences that it
         # does not write, and pads the end.
         return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
@@ -209,6 +207,8 @@ class TypeRegistry:
             compiled.writer(name)(out, value, now_ns)
         except Mismatch as error:
             raise as_invalid(name, error) from None
+        if len(out) > _LARGEST_BODY:
+            raise Invalid(f"{name}: the message has {len(out)} bytes; a robot takes at most {_LARGEST_BODY}")
         return _WRITTEN_HEAD + out
 
 

@@ -175,6 +175,34 @@ def test_a_huge_length_costs_nothing(text: str, head: bytes) -> None:
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("text", ["E[] x", "string[] x", "F[] x"])
+def test_small_bytes_can_not_become_a_million_objects(text: str) -> None:
+    """A robot that sends 16 MiB of tiny messages does not cost the relay gigabytes, nested or not."""
+    contained = f"{LINE}\nMSG: a/E\n{LINE}\nMSG: a/F\nE[] e"
+    types = registry(B=f"{text}\n{contained}")
+    one = {"E": struct.pack("<I", 0), "s": struct.pack("<I", 0), "F": struct.pack("<I", 60) + bytes(60)}[
+        text[0]
+    ]
+    cdr = b"\0\1\0\0" + struct.pack("<I", 300_000 if text[0] != "F" else 10_000) + one * 300_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(Invalid, match="more than 250000 messages and strings"):
+            types.to_json("a/msg/B", cdr)
+        assert tracemalloc.get_traced_memory()[1] < 100_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_few_bytes_of_json_can_not_become_a_huge_message() -> None:
+    """A list of empty objects stands for defaults, whose size is bounded."""
+    types = registry(B=f"E[] x\n{LINE}\nMSG: a/E\nfloat64[100000] e", C="float64[] x")
+    with pytest.raises(Invalid, match="x makes a message of more than 4194304 bytes"):
+        types.from_json("a/msg/B", {"x": [{}] * 300_000}, 0)
+    with pytest.raises(Invalid, match="a robot takes at most 4194287"):
+        types.from_json("a/msg/C", {"x": [0] * 524_288}, 0)
+    assert len(types.from_json("a/msg/C", {"x": [0] * 524_284}, 0)) < 4 * 1024 * 1024
+
+
 def test_big_endian_is_read() -> None:
     """Robots of the other byte order are understood, numbers, arrays and lengths alike."""
     types = registry(B="int16 a\nfloat64[] b\nwstring c\nuint8[] d\nint64[2] e")

@@ -20,6 +20,9 @@ import pybase64
 from relay_protocol.errors import Invalid
 from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, Primitive, Shape
 
+MAX_ELEMENTS = 250_000
+"""Most messages and strings in the sequences of one message. An object takes far more memory than its bytes."""
+
 Read = Callable[[bytes, int], "tuple[Any, int]"]
 """Takes the body and a position; gives the value and the position after it."""
 
@@ -63,6 +66,19 @@ class ReaderFactory:
         self._order = order
         self._u32 = struct.Struct(order + "I").unpack_from
         self._readers: dict[str, Reader] = {}
+        self._room = 0
+
+    def read(self, name: str, body: bytes) -> Any:
+        """One message as values for JSON.
+
+        :param body: CDR without its encapsulation header
+        :raises Invalid: it is no message of this type
+        """
+        self._room = MAX_ELEMENTS
+        try:
+            return self.reader(name).read(body, 0)[0]
+        except struct.error:
+            raise Invalid(f"the message ends too early, after {len(body)} bytes") from None
 
     def reader(self, name: str) -> Reader:
         """The reader of one message type."""
@@ -144,6 +160,9 @@ class ReaderFactory:
             position += 4
             if count * least > len(data) - position:
                 raise Invalid(f"a sequence of {count} at byte {position} is longer than the message")
+            self._room -= count
+            if self._room < 0:
+                raise Invalid(f"its sequences hold more than {MAX_ELEMENTS} messages and strings")
             values = []
             for _ in range(count):
                 value, position = one(data, position)

@@ -1,0 +1,23 @@
+"""What the robot imports of the protocol package."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROBOT_NEEDS = "frames identity jsontext limits link rights rosbridge errors"
+PROTOCOL = Path(__file__).parents[2] / "protocol"
+
+
+def test_the_robot_needs_nothing_of_the_servers() -> None:
+    """All modules but the ROS types work without numpy, orjson, pybase64 and rosbags."""
+    program = f"""
+import importlib, sys
+sys.path.insert(0, {str(PROTOCOL)!r})
+for name in ("numpy", "orjson", "pybase64", "rosbags"):
+    sys.modules[name] = None
+for name in {ROBOT_NEEDS!r}.split():
+    importlib.import_module("relay_protocol." + name)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
