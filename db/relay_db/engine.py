@@ -87,7 +87,9 @@ def _view(engine: Engine, *, write: bool) -> Engine:
     """The same pool with another kind of transaction."""
     if engine.dialect.name == "sqlite":
         return engine.execution_options(**{sqlite.WRITE: write})
-    return engine.execution_options(postgresql_readonly=not write)
+    if write:
+        return engine
+    return engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
 
 
 def _parse(url: str) -> URL:

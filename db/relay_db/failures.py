@@ -53,7 +53,7 @@ def in_words() -> Iterator[None]:
         raise Unavailable("the change contradicts another one made at the same time; try again") from error
     except exc.TimeoutError as error:
         raise Unavailable("all connections to the database are busy; try again") from error
-    except exc.DBAPIError as error:
+    except (exc.DBAPIError, sqlite3.Error) as error:
         sentence = _sentence(error)
         if sentence is None:
             raise
@@ -62,15 +62,15 @@ def in_words() -> Iterator[None]:
         raise Unavailable(f"the database file can't be used: {error.strerror}") from error
 
 
-def _sentence(error: exc.DBAPIError) -> str | None:
-    original = error.orig
+def _sentence(error: exc.DBAPIError | sqlite3.Error) -> str | None:
+    original = error if isinstance(error, sqlite3.Error) else error.orig
     if isinstance(original, sqlite3.Error):
         code = getattr(original, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
         return _SQLITE.get(code & _PRIMARY)
     state = getattr(original, "sqlstate", None)
-    if state is None:
+    if state is None and isinstance(error, exc.DBAPIError):
         return _unconnected(error)
-    return _POSTGRES.get(state[:2])
+    return _POSTGRES.get(str(state)[:2])
 
 
 def _unconnected(error: exc.DBAPIError) -> str | None:

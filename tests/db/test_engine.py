@@ -39,11 +39,11 @@ def test_a_reading_session_cannot_write(database: Database) -> None:
         queries.add_robot(s, "rover")
 
 
-def test_a_reading_session_sees_one_state(sqlite: Database) -> None:
-    """On SQLite a change made meanwhile is not seen by a session that has begun to read."""
-    with sqlite.reading() as reader:
+def test_a_reading_session_sees_one_state(database: Database) -> None:
+    """A change made meanwhile is not seen by a session that has begun to read."""
+    with database.reading() as reader:
         before = queries.revision(reader)
-        with sqlite.begin() as s:
+        with database.begin() as s:
             queries.add_robot(s, "rover")
         assert queries.revision(reader) == before
 

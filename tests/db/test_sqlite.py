@@ -66,6 +66,20 @@ def test_odd_paths_work(tmp_path: Path) -> None:
     assert path.exists()
 
 
+def test_a_restored_dump_gets_a_write_ahead_log(sqlite_url: str, tmp_path: Path) -> None:
+    """A database that came with a rollback journal is switched when it is opened."""
+    Database(sqlite_url).close()
+    path = tmp_path / "data" / "switchboard.db"
+    raw = sqlite3.connect(path)
+    assert raw.execute("PRAGMA journal_mode = DELETE").fetchone() == ("delete",)
+    raw.execute("CREATE TABLE something (x)")
+    raw.close()
+    database = Database(sqlite_url)
+    with database.reading() as s:
+        assert s.connection().exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
+    database.close()
+
+
 def test_a_locked_database_is_told_in_words(
     sqlite_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from relay_db.base import canonical_json
-from relay_db.models import NAME, AuditEntry, Event, Revision
+from relay_db.models import NAME, AuditEntry, Event, Revision, Robot, User
 from relay_db.names import recorded
 from relay_db.queries.records import AuditRecord, EventRecord
 
@@ -33,7 +33,7 @@ def record_event(
     user_id: int | None = None,
     data: Mapping[str, Any],
 ) -> int:
-    """Remember something that happened.
+    """Remember something that happened, also to a robot or user that was removed meanwhile.
 
     :param at: Unix seconds
     :param source: who tells it, e.g. ``relay``
@@ -43,8 +43,8 @@ def record_event(
         "at": at,
         "kind": recorded(kind, NAME),
         "source": recorded(source),
-        "robot_id": robot_id,
-        "user_id": user_id,
+        "robot_id": select(Robot.id).where(Robot.id == robot_id).scalar_subquery(),
+        "user_id": select(User.id).where(User.id == user_id).scalar_subquery(),
         "data": dict(data),
     }
     return s.scalars(insert(Event).values(**values).returning(Event.id)).one()

@@ -45,6 +45,7 @@ def add_robot(s: Session, name: str, description: str = "", realm: str = DEFAULT
     """
     check_robot_name(name)
     label(description, "description of a robot")
+    realm = findable(realm)
     if find_robot(s, name, realm) is not None:
         raise Invalid(f"there is a robot '{name}' already")
     bump(s)

@@ -68,7 +68,7 @@ def add_user(
     :raises Invalid: the name can't be, or is taken
     :raises NotFound: no such realm
     """
-    name = normal_name(name, "name of a user")
+    name, realm = normal_name(name, "name of a user"), findable(realm)
     if find_user(s, name, realm) is not None:
         raise Invalid(f"there is a user '{name}' already")
     bump(s)
@@ -155,7 +155,7 @@ def add_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord:
     """:raises Invalid: the name can't be, or is taken
     :raises NotFound: no such realm
     """
-    name = normal_name(name, "name of a group")
+    name, realm = normal_name(name, "name of a group"), findable(realm)
     if find_group(s, name, realm) is not None:
         raise Invalid(f"there is a group '{name}' already")
     bump(s)

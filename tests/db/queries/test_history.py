@@ -178,6 +178,26 @@ def test_data_that_is_no_json_is_refused(database: Database) -> None:
         queries.append_audit(s, at=1.0, actor="a", action="b", target="c", data={"x": float("nan")})
 
 
+def test_an_event_of_what_was_removed_is_kept(database: Database) -> None:
+    """A link that is cut because its robot was removed still leaves its event."""
+    with database.begin() as s:
+        queries.record_event(
+            s, at=1.0, kind="offline", source="relay", robot_id=99, user_id=99, data={"n": 1}
+        )
+        [event] = queries.list_events(s)
+    assert (event.robot_id, event.user_id, event.data) == (None, None, {"n": 1})
+
+
+def test_a_log_that_grows_meanwhile_is_whole(audited: Database) -> None:
+    """Entries appended while the chain is being verified are not taken for insertions."""
+    with audited.reading() as reader:
+        assert queries.verify_audit(reader) is None
+        with audited.begin() as s:
+            _append(s, 77)
+        assert queries.verify_audit(reader) is None
+    assert _verify(audited) is None
+
+
 def test_events_are_listed_latest_first(database: Database) -> None:
     """All, of one robot, or of one kind, up to a limit."""
     with database.begin() as s:
