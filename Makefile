@@ -1,6 +1,8 @@
 # The commands people and CI use. Everything lives in .venv; nothing is installed outside, except what apt brings
 # when run as root (python3-venv, chromium).
 BIN := .venv/bin
+# ROS 2 would write its logs into the home directory, and not start without one.
+export ROS_LOG_DIR ?= $(CURDIR)/build/ros-log
 NPM := scripts/with-node.sh npm --silent --prefix web_client
 
 .DEFAULT_GOAL := help

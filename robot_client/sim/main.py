@@ -11,6 +11,7 @@ from typing import IO, Any
 
 import click
 
+from robot_client.ros_log import ensure_log_folder
 from robot_client.sim.worlds import WORLDS
 
 _LONGEST_SPIN = 0.1
@@ -64,6 +65,7 @@ def _run(
     cv2.setNumThreads(1)  # pictures are small: threads would cost more than they give
     place = WORLDS[world]()
     robot = Robot(place, Recorder(stream), seed, time.monotonic)
+    ensure_log_folder()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = SimNode(robot, Camera(place) if camera else None, namespace)
