@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from itertools import count
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import psycopg
 import pytest
 
 from relay_db.engine import Database
+
+EMPTY = "template0"
 
 
 @pytest.fixture(scope="session")
@@ -26,6 +29,7 @@ def postgres() -> Iterator[str]:
     server = pgserver.get_server(folder / "data", cleanup_mode="stop")
     try:
         with psycopg.connect(server.get_uri(), autocommit=True) as connection:
+            # nothing here needs to outlive a power cut
             connection.execute("ALTER SYSTEM SET fsync = off")
             connection.execute("SELECT pg_reload_conf()")
         yield server.get_uri()
@@ -34,19 +38,35 @@ def postgres() -> Iterator[str]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+Copies = Callable[[str], AbstractContextManager[str]]
+"""Makes the URL of a PostgreSQL database copied from a template, and drops the database at the end."""
+
+
 @pytest.fixture(scope="session")
-def new_postgres_url(postgres: str) -> Iterator[Callable[[], str]]:
-    """Makes URLs of empty PostgreSQL databases."""
+def copies(postgres: str) -> Iterator[Copies]:
+    """Databases for as long as they are needed."""
     numbers = count(1)
     assert "/postgres?" in postgres
     with psycopg.connect(postgres, autocommit=True) as connection:
 
-        def make() -> str:
+        @contextmanager
+        def copy(template: str) -> Iterator[str]:
             name = f"test_{next(numbers)}"
-            connection.execute(f'CREATE DATABASE "{name}"')
-            return postgres.replace("/postgres?", f"/{name}?")
+            connection.execute(f'CREATE DATABASE "{name}" TEMPLATE "{template}"')
+            yield postgres.replace("/postgres?", f"/{name}?")
+            connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)')
 
-        yield make
+        yield copy
+
+
+@pytest.fixture(scope="session")
+def with_tables(copies: Copies) -> Iterator[str]:
+    """Name of a PostgreSQL database that was brought up from empty, to be copied."""
+    with copies(EMPTY) as url:
+        upgraded = Database(url)
+        upgraded.upgrade()
+        upgraded.close()
+        yield url.partition("?")[0].rpartition("/")[2]
 
 
 @pytest.fixture
@@ -56,16 +76,30 @@ def sqlite_url(tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def postgres_url(new_postgres_url: Callable[[], str]) -> str:
+def postgres_url(copies: Copies, with_tables: str) -> Iterator[str]:
+    """URL of a PostgreSQL database with all tables."""
+    with copies(with_tables) as url:
+        yield url
+
+
+@pytest.fixture
+def empty_postgres_url(copies: Copies) -> Iterator[str]:
     """URL of an empty PostgreSQL database."""
-    return new_postgres_url()
+    with copies(EMPTY) as url:
+        yield url
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest) -> str:
+@pytest.fixture(params=["sqlite_url", "empty_postgres_url"], ids=["sqlite", "postgresql"])
+def empty_url(request: pytest.FixtureRequest) -> str:
     """URL of an empty database, of each kind in turn."""
-    name = "sqlite_url" if request.param == "sqlite" else "postgres_url"
-    made: str = request.getfixturevalue(name)
+    made: str = request.getfixturevalue(request.param)
+    return made
+
+
+@pytest.fixture(params=["sqlite_url", "postgres_url"], ids=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest) -> str:
+    """URL of the database of :func:`database`, of each kind in turn."""
+    made: str = request.getfixturevalue(request.param)
     return made
 
 

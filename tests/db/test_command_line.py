@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from relay_server.cli import main
 
 
-def test_the_command_line_works_on_postgresql(postgres_url: str, tmp_path: Path) -> None:
+def test_the_command_line_works_on_postgresql(empty_postgres_url: str, tmp_path: Path) -> None:
     """From an empty database to a verified audit log; no file is made for it."""
-    runner = CliRunner(env={"SWITCHBOARD_DB": postgres_url, "SWITCHBOARD_DATA": str(tmp_path / "data")})
+    runner = CliRunner(env={"SWITCHBOARD_DB": empty_postgres_url, "SWITCHBOARD_DATA": str(tmp_path / "data")})
 
     def run(*arguments: str, stdin: str | None = None) -> Any:
         result = runner.invoke(main, [*arguments, "--json"], input=stdin)

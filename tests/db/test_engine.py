@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 
 import psycopg
 import pytest
@@ -129,9 +128,9 @@ def test_a_missing_database_is_told_in_words(postgres_url: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["postgresql", "postgres", "postgresql+psycopg"])
-def test_the_usual_ways_to_name_postgresql_work(new_postgres_url: Callable[[], str], scheme: str) -> None:
+def test_the_usual_ways_to_name_postgresql_work(empty_postgres_url: str, scheme: str) -> None:
     """The driver need not be named."""
-    database = Database(new_postgres_url().replace("postgresql:", f"{scheme}:"))
+    database = Database(empty_postgres_url.replace("postgresql:", f"{scheme}:"))
     database.upgrade()
     with database.reading() as s:
         assert queries.revision(s) == 1

@@ -85,7 +85,7 @@ def test_a_newer_schema_is_refused_in_words(database: Database) -> None:
         database.upgrade()
 
 
-def test_a_failing_migration_leaves_nothing(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_migration_leaves_nothing(empty_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Migrations run in one transaction on both databases: half a schema is never seen."""
     from alembic import command
 
@@ -96,7 +96,7 @@ def test_a_failing_migration_leaves_nothing(url: str, monkeypatch: pytest.Monkey
         raise RuntimeError("power cut")
 
     monkeypatch.setattr(command, "upgrade", run_and_fail)
-    database = Database(url)
+    database = Database(empty_url)
     with pytest.raises(RuntimeError, match="power cut"):
         database.upgrade()
     with database.connection() as connection:
@@ -106,10 +106,10 @@ def test_a_failing_migration_leaves_nothing(url: str, monkeypatch: pytest.Monkey
     database.close()
 
 
-def test_processes_that_start_at_once_upgrade_once(url: str) -> None:
+def test_processes_that_start_at_once_upgrade_once(empty_url: str) -> None:
     """Three processes find an empty database; all of them end well, with one set of tables."""
     program = "import os; from relay_db.engine import Database; d = Database(os.environ['URL']); d.upgrade(); d.close()"
-    environment = {**os.environ, "URL": url, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment = {**os.environ, "URL": empty_url, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     started = [
         subprocess.Popen([sys.executable, "-c", program], env=environment, stderr=subprocess.PIPE, text=True)
         for _ in range(3)
@@ -118,7 +118,7 @@ def test_processes_that_start_at_once_upgrade_once(url: str) -> None:
     assert [(process.returncode, error) for process, error in zip(started, errors, strict=True)] == [
         (0, "")
     ] * 3
-    database = Database(url)
+    database = Database(empty_url)
     with database.reading() as s:
         assert [realm.name for realm in queries.list_realms(s)] == ["default"]
     database.close()
