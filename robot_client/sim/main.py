@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import signal
 import time
 from collections.abc import Iterator
@@ -40,6 +41,7 @@ def main(namespace: str, record: Path | None, seed: int | None, world: str, came
             f"there is no ROS 2 for this Python ({error}): "
             "source your ROS installation, or install 'robot-switchboard[robot,sim,ros]'"
         ) from None
+    faulthandler.enable()  # a crash in the middleware's C++ leaves a trace instead of silence
     with _opened(record) as stream, _stop_requested() as stop:
         _run(namespace, stream, seed, world, camera, stop)
 
