@@ -179,7 +179,10 @@ class Session:
             return
         self._malformed = 0
         try:
-            _HANDLERS[type(operation)](self, operation)
+            handler = _HANDLERS.get(type(operation))
+            if handler is None:
+                raise Refused("services offered by clients are not carried to robots by this relay")
+            handler(self, operation)
         except SwitchboardError as error:
             self._refuse(operation, error)
 

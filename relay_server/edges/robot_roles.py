@@ -231,6 +231,8 @@ class Control:
                 level=message.level[:20],
                 text=message.text[:500],
             )
+        elif isinstance(message, (link.Ping, link.Pong)):
+            self._connection.heartbeat(message)
         elif isinstance(message, link.Bye):
             self._connection.close("bye")
 
@@ -262,7 +264,9 @@ class ChannelEnd:
     def message(self, body: bytes) -> None:
         """An answer, or a definition."""
         message = jsontext.decode(link.robot_channel_decoder, body)
-        if isinstance(message, link.Bye):
+        if isinstance(message, (link.Ping, link.Pong)):
+            self._connection.heartbeat(message)
+        elif isinstance(message, link.Bye):
             self._connection.close("bye")
         else:
             self._channel.message(message)

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import msgspec
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IAddress
 from twisted.internet.protocol import Factory, connectionDone
@@ -20,7 +19,7 @@ from twisted.internet.protocol import Protocol as TwistedProtocol
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from relay_protocol import jsontext, limits, link
+from relay_protocol import limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
 from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, encode_sample
 from relay_server.clock import Clock, Timer, cancel, looping
@@ -181,16 +180,12 @@ class RobotConnection(TwistedProtocol):
             if isinstance(frame, SampleFrame):
                 self._role.sample(frame)
             elif isinstance(frame, JsonFrame):
-                if not self._heartbeat(frame.body):
-                    self._role.message(frame.body)
+                self._role.message(frame.body)
             else:
                 raise MalformedMessage("pictures have a link of their own")
 
-    def _heartbeat(self, body: bytes) -> bool:
-        """Ping and pong are the same in every role; the first is answered before anything else is looked at."""
-        if self._deadline is not None or not body.startswith((b'{"op":"ping"', b'{"op":"pong"')):
-            return False
-        message = jsontext.decode(_heartbeats, body)
+    def heartbeat(self, message: link.Ping | link.Pong) -> None:
+        """Ping and pong are the same in every role."""
         if isinstance(message, link.Ping):
             self.send(link.Pong(t=message.t, at=self.clock_ns()))
         elif message.t in self._pings:
@@ -199,7 +194,6 @@ class RobotConnection(TwistedProtocol):
             self.on_round_trip(seconds)
             if waiting is not None:
                 waiting.callback(seconds)
-        return True
 
     def _ping(self, waiting: Deferred[float] | None) -> None:
         now = self.clock_ns()
@@ -283,9 +277,6 @@ class RobotConnection(TwistedProtocol):
         self.log.warn("the robot at {address} takes nothing; it is cut", address=self.address)
         self._end("the robot takes nothing")
         self.transport.abortConnection()
-
-
-_heartbeats: msgspec.json.Decoder[link.Ping | link.Pong] = msgspec.json.Decoder(link.Ping | link.Pong)
 
 
 class _Flow:

@@ -126,7 +126,15 @@ def test_patterns_narrow_and_widen_a_level(world: Any) -> None:
     """A viewer allowed one service may call it; one denied a topic may not see it."""
     token = world.relay.user("patterned")
     world.relay.cli(
-        "right", "grant", "patterned", "rover", "viewer", "--allow", "call:/reset", "--deny", "subscribe:/scan"
+        "right",
+        "grant",
+        "patterned",
+        "rover",
+        "viewer",
+        "--allow",
+        "call:/reset",
+        "--deny",
+        "subscribe:/scan",
     )
     with world.relay.connect("rover", token) as client:
         client.send(op="set_level", level="error")

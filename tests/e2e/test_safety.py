@@ -129,7 +129,9 @@ def test_no_command_from_before_a_partition_is_executed_after_it(drive: Drive) -
     drives_again(drive)
 
 
-def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_when_it_wakes(drive: Drive) -> None:
+def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_when_it_wakes(
+    drive: Drive,
+) -> None:
     """Commands that waited in a frozen relay's sockets are older than their deadline, and the relay knows."""
     driver = drive.start_driving()
     since = time.monotonic_ns()

@@ -58,7 +58,9 @@ def ros_environment(domain: int) -> dict[str, str]:
 class Process:
     """One child process with its output in files."""
 
-    def __init__(self, command: list[str], folder: Path, name: str, env: dict[str, str] | None = None) -> None:
+    def __init__(
+        self, command: list[str], folder: Path, name: str, env: dict[str, str] | None = None
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.name = name
         self.out = folder / f"{name}.out"
@@ -78,7 +80,9 @@ class Process:
 
         def line() -> str | None:
             if self.popen.poll() is not None:
-                raise AssertionError(f"{self.name} ended with {self.popen.returncode}: {self.log.read_text()[-2000:]}")
+                raise AssertionError(
+                    f"{self.name} ended with {self.popen.returncode}: {self.log.read_text()[-2000:]}"
+                )
             return next((each for each in self.said().splitlines() if each.startswith(start)), None)
 
         return str(wait_for(f"{self.name} prints {start}", line, START_SECONDS))
@@ -152,7 +156,9 @@ class Relay:
 
     def user(self, name: str, password: str = "correct horse", *, admin: bool = False) -> str:  # noqa: S107
         """Add a user and return an access token."""
-        self.cli("user", "add", name, "--password-stdin", *(["--admin"] if admin else []), stdin=password + "\n")
+        self.cli(
+            "user", "add", name, "--password-stdin", *(["--admin"] if admin else []), stdin=password + "\n"
+        )
         return self.token(name)
 
     def token(self, user: str, ttl: str = "1h") -> str:
@@ -241,7 +247,14 @@ class Robot:
 
     def enroll(self, code: str, port: int, *options: str) -> subprocess.CompletedProcess[str]:
         """``switchboard-robot enroll``."""
-        command = [str(BIN / "switchboard-robot"), "enroll", "--relay", f"127.0.0.1:{port}", "--robot", self.name]
+        command = [
+            str(BIN / "switchboard-robot"),
+            "enroll",
+            "--relay",
+            f"127.0.0.1:{port}",
+            "--robot",
+            self.name,
+        ]
         command += ["--code", "-", "--state", str(self.state), *options]
         return subprocess.run(command, input=code, capture_output=True, text=True, timeout=60, check=False)
 

@@ -1,0 +1,61 @@
+// An unmodified roslib.js user in Node: lists, subscribes, drives, calls. Prints what it saw as JSON.
+// Arguments: path of roslib's module, websocket URL, access token ("" when the URL carries a ticket).
+
+const [module, url, token] = process.argv.slice(2);
+const ROSLIB = await import(module);
+
+const late = setTimeout(() => {
+  console.error("not done within 60 s");
+  process.exit(1);
+}, 60000);
+
+const ros = new ROSLIB.Ros();
+await new Promise((resolve, reject) => {
+  ros.on("connection", resolve);
+  ros.on("error", reject);
+  ros.connect(url);
+});
+if (token) {
+  ros.authenticate(token, "test", "relay", "random", 0, "any", 0);
+}
+
+const seen = {};
+const topics = await new Promise((resolve, reject) => ros.getTopics(resolve, reject));
+seen.topics = topics.topics;
+seen.services = await new Promise((resolve, reject) => ros.getServices(resolve, reject));
+seen.scan_type = await new Promise((resolve, reject) => ros.getTopicType("/scan", resolve, reject));
+
+const scan = new ROSLIB.Topic({ ros, name: "/scan", messageType: "sensor_msgs/msg/LaserScan" });
+const odom = new ROSLIB.Topic({ ros, name: "/odom", messageType: "nav_msgs/msg/Odometry" });
+seen.rays = await new Promise((resolve) => scan.subscribe((message) => resolve(message.ranges.length)));
+seen.scanned = true;
+
+let first;
+let moved = false;
+await new Promise((resolve) => {
+  const command = new ROSLIB.Topic({ ros, name: "/cmd_vel", messageType: "geometry_msgs/msg/Twist" });
+  let driving;
+  odom.subscribe((message) => {
+    const x = message.pose.pose.position.x;
+    first ??= x;
+    driving ??= setInterval(() => command.publish({ linear: { x: 0.3 } }), 100);
+    if (!moved && Math.abs(x - first) > 0.05) {
+      moved = true;
+      clearInterval(driving);
+      command.publish({});
+      command.unadvertise();
+      resolve();
+    }
+  });
+});
+seen.odom = first !== undefined;
+seen.moved = moved;
+
+const reset = new ROSLIB.Service({ ros, name: "/reset", serviceType: "std_srvs/srv/Trigger" });
+seen.reset = await new Promise((resolve, reject) => reset.callService({}, resolve, reject));
+scan.unsubscribe();
+odom.unsubscribe();
+ros.close();
+clearTimeout(late);
+console.log(JSON.stringify(seen));
+process.exit(0);
