@@ -19,6 +19,7 @@ import click
 import msgspec
 
 from robot_client.guard_protocol import ALIVE, Command, Leave, Line, Probe, Topic, decoder
+from robot_client.ros_log import ensure_log_folder
 from robot_client.safety import GUARD_SHARE, Watchdog
 
 MILLI = 1_000_000
@@ -121,6 +122,7 @@ class RosOutlets:
 
         from robot_client.platforms.ros2_types import Types
 
+        ensure_log_folder()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._node: Any = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
         self._types = Types()

@@ -66,6 +66,7 @@ class LinkProtocol(TwistedProtocol):
         self._clock = clock
         self._ping: Timer | None = None
         self._deadline: Timer | None = None
+        self._heard = False
         self._patience: Timer | None = None
         self._reason: SwitchboardError | None = None
 
@@ -79,6 +80,7 @@ class LinkProtocol(TwistedProtocol):
 
     def dataReceived(self, data: bytes) -> None:
         """Bytes from the relay."""
+        self._heard = True
         if self._reason is not None:
             return
         try:
@@ -99,7 +101,7 @@ class LinkProtocol(TwistedProtocol):
         for timer in (self._ping, self._deadline, self._patience):
             if timer is not None and timer.active():
                 timer.cancel()
-        lost = self._reason or _as_ours(reason)
+        lost = self._reason or self._as_ours(reason)
         self._reason = lost
         self.owner.on_lost(lost)
 
@@ -127,6 +129,12 @@ class LinkProtocol(TwistedProtocol):
         else:
             self.transport.abortConnection()
 
+    def _as_ours(self, failure: Failure) -> SwitchboardError:
+        if isinstance(failure.value, SwitchboardError):
+            return failure.value
+        silent = "" if self._heard else " before it said a word; is it a relay, with TLS as it is set here?"
+        return LinkLost(explain(failure) + silent)
+
     def _beat(self) -> None:
         try:
             self.link.check_silence()
@@ -152,10 +160,6 @@ class LinkProtocol(TwistedProtocol):
     def stopProducing(self) -> None:
         """The transport wants no more."""
         self.owner.on_pause()
-
-
-def _as_ours(failure: Failure) -> SwitchboardError:
-    return failure.value if isinstance(failure.value, SwitchboardError) else LinkLost(explain(failure))
 
 
 def tune(transport: object, patience: float) -> None:

@@ -32,6 +32,7 @@ from robot_client.platforms.ros2_topics import (
     topic_type,
 )
 from robot_client.platforms.ros2_types import Types
+from robot_client.ros_log import ensure_log_folder
 
 BATTERY = "sensor_msgs/msg/BatteryState"
 FAREWELL = 0.3
@@ -78,6 +79,7 @@ class Ros2Platform(Platform):
 
     def start(self) -> None:
         """Enter the graph."""
+        ensure_log_folder()
         self._context = rclpy.Context()
         try:
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)

@@ -11,7 +11,10 @@ import threading
 import time
 from typing import Any, TypeVar
 
+import msgspec
+
 from relay_protocol import frames, identity, link
+from relay_protocol.errors import PeerError
 
 T = TypeVar("T", bound=link.Message)
 PATIENCE = 20.0
@@ -33,8 +36,8 @@ class Peer:
             while data := self._connection.recv(65536):
                 for frame in self._decoder.feed(data):
                     self._take(frame)
-        except OSError:
-            pass
+        except (OSError, PeerError, msgspec.DecodeError):
+            self.cut()
         self._inbox.put(None)
 
     def _take(self, frame: frames.Frame) -> None:

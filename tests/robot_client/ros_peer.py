@@ -10,15 +10,16 @@ import time
 
 import rclpy
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.executors import MultiThreadedExecutor
-from rclpy.qos import QoSProfile
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+)
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 node = None
@@ -73,8 +74,16 @@ def listen(topic: str, kind: str) -> None:
     def string(message: String) -> None:
         tell(topic=topic, text=message.data)
 
-    type, function = {"twist": (Twist, twist), "stamped": (TwistStamped, stamped), "string": (String, string)}[kind]
+    type, function = {
+        "twist": (Twist, twist),
+        "stamped": (TwistStamped, stamped),
+        "string": (String, string),
+    }[kind]
     ends["<" + topic] = node.create_subscription(type, topic, function, 10)
+
+
+def publishers(topic: str) -> None:
+    tell(publishers=[each.node_name for each in node.get_publishers_info_by_topic(topic)])
 
 
 def battery(topic: str, charge: float) -> None:

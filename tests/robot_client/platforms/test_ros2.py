@@ -183,7 +183,9 @@ async def test_latching_publisher_is_heard_late(ros: Ros2Platform, peer: Peer) -
     sink.publish(bytes(serialize_message(String(data="kept"))))
     peer.do("advertise", "/marker")
     await seen(ros, lambda graph: "/marker" in graph.topics)
-    listener = Listener(ros, "/from_client", STRING, link.QoS(durability="transient_local", reliability="reliable"))
+    listener = Listener(
+        ros, "/from_client", STRING, link.QoS(durability="transient_local", reliability="reliable")
+    )
     await until(lambda: listener.texts)
     assert listener.texts == ["kept"]
 
@@ -290,7 +292,12 @@ async def test_battery_is_found(ros: Ros2Platform, peer: Peer) -> None:
 def test_definition_has_all_parts_and_hash(ros: Ros2Platform) -> None:
     """A definition from the installed files holds every contained type, and the distribution's hash."""
     found = ros.definition(STAMPED)
-    for part in ("std_msgs/Header", "builtin_interfaces/Time", "geometry_msgs/Twist", "geometry_msgs/Vector3"):
+    for part in (
+        "std_msgs/Header",
+        "builtin_interfaces/Time",
+        "geometry_msgs/Twist",
+        "geometry_msgs/Vector3",
+    ):
         assert f"MSG: {part}\n" in found.text
     assert found.hash.startswith("RIHS01_")
     assert ros.definition(TRIGGER).text.startswith("---\nbool success")
@@ -304,7 +311,9 @@ def test_introspection_says_the_same_as_the_file(ros: Ros2Platform) -> None:
     assert introspected(Twist, "msg") == "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
     assert "uint8[] data\n" in introspected(Image, "msg")
     assert "POWER_SUPPLY_STATUS_FULL=4\n" in introspected(BatteryState, "msg")
-    assert "rcl_interfaces/FloatingPointRange[<=1] floating_point_range\n" in introspected(ParameterDescriptor, "msg")
+    assert "rcl_interfaces/FloatingPointRange[<=1] floating_point_range\n" in introspected(
+        ParameterDescriptor, "msg"
+    )
     assert introspected(Trigger, "srv") == "---\nbool success\nstring message\n"
 
 

@@ -1,0 +1,361 @@
+"""The daemon as a process: real TCP, real ROS, real signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import psutil
+import pytest
+from geometry_msgs.msg import Twist
+from rclpy.serialization import serialize_message
+
+from relay_protocol import link
+from tests.robot_client.fake_relay import FakeRelay, Peer
+from tests.robot_client.ros import PATIENCE, domain
+from tests.robot_client.ros import Peer as Node
+
+TWIST = "geometry_msgs/msg/Twist"
+MS = 1_000_000
+
+
+def command(x: float) -> bytes:
+    twist = Twist()
+    twist.linear.x = x
+    return bytes(serialize_message(twist))
+
+
+GO = command(1.0)
+
+
+def until(true: Callable[[], object], timeout: float = PATIENCE) -> None:
+    deadline = time.monotonic() + timeout
+    while not true():
+        assert time.monotonic() < deadline, f"waited {timeout} s in vain"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def environment() -> Iterator[dict[str, str]]:
+    with domain() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def node(environment: dict[str, str]) -> Iterator[Node]:
+    with closing(Node(environment)) as made:
+        made.do("listen", "/cmd_vel", "twist")
+        yield made
+
+
+@pytest.fixture
+def relay() -> Iterator[FakeRelay]:
+    with closing(FakeRelay()) as made:
+        yield made
+
+
+class Robot:
+    """A state folder and the processes that use it."""
+
+    def __init__(self, relay: FakeRelay, state: Path, environment: dict[str, str]) -> None:
+        self.relay = relay
+        self.state = state
+        self.log = state.with_suffix(".log")
+        self._environment = environment
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def start(self, *arguments: str, stdin: str | None = None) -> subprocess.Popen[str]:
+        with self.log.open("a") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "robot_client.cli", *arguments, "--state", str(self.state)],
+                env=self._environment,
+                stdin=subprocess.PIPE if stdin is not None else subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                text=True,
+            )
+        self._processes.append(process)
+        if stdin is not None:
+            assert process.stdin is not None
+            process.stdin.write(stdin)
+            process.stdin.close()
+        return process
+
+    def enroll(self) -> None:
+        process = self.start(
+            "enroll", "--relay", self.relay.address, "--robot", "r1", "--code", "-", stdin="code-1\n"
+        )
+        self.asked = self.relay.enroll()
+        assert process.wait(PATIENCE) == 0, self.log.read_text()
+
+    def run(self, *arguments: str) -> subprocess.Popen[str]:
+        return self.start("run", *arguments)
+
+    def guards(self, process: subprocess.Popen[str]) -> list[psutil.Process]:
+        return [
+            each for each in psutil.Process(process.pid).children() if "robot_client.guard" in each.cmdline()
+        ]
+
+    def close(self) -> None:
+        for process in self._processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+            process.wait(10)
+
+
+@pytest.fixture
+def robot(relay: FakeRelay, tmp_path: Path, environment: dict[str, str]) -> Iterator[Robot]:
+    with closing(Robot(relay, tmp_path / "state", environment)) as made:
+        yield made
+
+
+@pytest.fixture
+def enrolled(robot: Robot) -> Robot:
+    robot.enroll()
+    return robot
+
+
+class Drive:
+    """A daemon on a channel, with its guard up and a node that listens."""
+
+    def __init__(self, robot: Robot, node: Node) -> None:
+        self.robot = robot
+        self.node = node
+        self.process = robot.run()
+        self.control = robot.relay.register()
+        self.channel = self.open()
+        self.guard = robot.guards(self.process)[0]
+        self.heard_by_node()
+
+    def open(self) -> Peer:
+        channel = self.robot.relay.channel(self.control)
+        channel.say(link.Advertise(number=5, topic="/cmd_vel", type=TWIST, source="test"))
+        assert channel.expect(link.Advertised).motion
+        return channel
+
+    def heard_by_node(self) -> None:
+        """Drive until both the node and the guard have found each other."""
+        start = len(self.node.heard("/cmd_vel"))
+        until(lambda: self.channel.sample(5, GO) or len(self.node.heard("/cmd_vel")) > start)
+        self.channel.sample(5, command(0.0))
+        until(self._guard_is_known)
+
+    def _guard_is_known(self) -> bool:
+        cmdline = self.guard.cmdline()
+        self.node.do("publishers", "/cmd_vel")
+        known = [each["publishers"] for each in self.node.record if "publishers" in each]
+        return cmdline[cmdline.index("--node") + 1] in known[-1]
+
+    def drive(self) -> int:
+        """Drive for half a second; when the last command was heard, nanoseconds."""
+        for _ in range(10):
+            self.channel.sample(5, GO)
+            time.sleep(0.05)
+        return int(self.node.heard("/cmd_vel")[-1]["at"])
+
+    def zero_after(self, since: int) -> float:
+        """Wait for the first zero after a moment; how long after it, milliseconds."""
+
+        def zeros() -> list[int]:
+            return [
+                each["at"] for each in self.node.heard("/cmd_vel") if each["at"] > since and each["x"] == 0.0
+            ]
+
+        until(zeros)
+        return (zeros()[0] - since) / MS
+
+
+@pytest.fixture
+def drive(enrolled: Robot, node: Node) -> Drive:
+    return Drive(enrolled, node)
+
+
+STOP_MS = 500
+"""What is promised: the robot has its zero this long after the last valid command."""
+
+
+def test_enrolment_sends_the_code_and_keeps_the_key(robot: Robot) -> None:
+    """Enrolling sends code and public key, and leaves a private key for its owner alone."""
+    robot.enroll()
+    assert (robot.asked.robot, robot.asked.code) == ("r1", "code-1")
+    assert len(robot.relay.public_key) == 32
+    assert stat.S_IMODE((robot.state / "robot.key").stat().st_mode) == 0o600
+    assert robot.relay.public_key not in (robot.state / "robot.key").read_bytes()
+
+
+def test_refused_enrolment_says_why_and_leaves_nothing(robot: Robot) -> None:
+    """A refused code ends with exit code 1, the relay's words made harmless, and no state."""
+    process = robot.start("enroll", "--relay", robot.relay.address, "--robot", "r1", "--code", "old")
+    peer = robot.relay.accept()
+    peer.expect(link.Enroll)
+    peer.say(link.Refused(reason="this code was used \x1b[31malready"))
+    assert process.wait(PATIENCE) == 1
+    assert r"this code was used \x1b[31malready" in robot.log.read_text()
+    assert not robot.state.exists()
+
+
+def test_second_enrolment_needs_a_word(enrolled: Robot) -> None:
+    """An enrolled folder is not overwritten by accident."""
+    process = enrolled.start("enroll", "--relay", enrolled.relay.address, "--robot", "r2", "--code", "x")
+    assert process.wait(PATIENCE) == 1
+    assert "--replace" in enrolled.log.read_text()
+
+
+def test_unreachable_relay_is_said(robot: Robot) -> None:
+    """Enrolling where nobody listens ends in words."""
+    robot.relay.close()
+    process = robot.start("enroll", "--relay", robot.relay.address, "--robot", "r1", "--code", "x")
+    assert process.wait(PATIENCE) == 1
+    assert "nobody listens" in robot.log.read_text()
+    assert not robot.state.exists()
+
+
+def test_run_without_enrolment_says_what_to_do(robot: Robot) -> None:
+    """A robot that is not enrolled is told how to be."""
+    assert robot.run().wait(PATIENCE) == 1
+    assert "switchboard-robot enroll" in robot.log.read_text()
+
+
+def test_wrong_settings_are_named(enrolled: Robot, tmp_path: Path) -> None:
+    """An unknown key in the settings file ends the run with its name."""
+    (tmp_path / "c.toml").write_text("[safety]\nstop_after = 3\n")
+    assert enrolled.run("--config", str(tmp_path / "c.toml")).wait(PATIENCE) == 1
+    assert "stop_after" in enrolled.log.read_text()
+
+
+def test_daemon_registers_and_tells(enrolled: Robot) -> None:
+    """A daemon that runs proves its key, describes a ROS 2 robot, and says so in its log."""
+    enrolled.run("--log-json")
+    control = enrolled.relay.register()
+    assert control.expect(link.Describe).platform == "ros2"
+    assert control.expect(link.Graph).full
+    assert control.expect(link.Health).memory is not None
+    until(lambda: "registered as" in enrolled.log.read_text())
+    lines = [json.loads(each) for each in enrolled.log.read_text().splitlines() if each.startswith("{")]
+    assert "registered as r1 at relay-1" in [each["text"] for each in lines]
+
+
+def test_relay_that_restarts_has_its_robot_back(enrolled: Robot) -> None:
+    """A relay that is killed and comes back on its port has the robot registered again within 3 s."""
+    enrolled.run()
+    enrolled.relay.register()
+    enrolled.relay.close()
+    time.sleep(1.0)
+    enrolled.relay.open()
+    back = time.monotonic()
+    enrolled.relay.register()
+    assert time.monotonic() - back < 3.0
+
+
+def test_other_relay_is_refused(enrolled: Robot) -> None:
+    """A relay with another name at the same address gets no proof, and the log says why."""
+    enrolled.relay.name = "relay-2"
+    enrolled.run()
+    peer = enrolled.relay.accept()
+    enrolled.relay.challenge(peer)
+    assert peer.expect_end() == []
+    until(lambda: "enrolled at 'relay-1'" in enrolled.log.read_text())
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"\xff\xff\xff\xff", "frame of 4294967295 bytes"),
+        (b"\0\0\0\x05\0\xff\xfe\xfd\xfc", "UTF-8"),
+        (b"\0\0\0\x06\x09hello", "frame kind 9"),
+    ],
+)
+def test_hostile_relay_is_cut(enrolled: Robot, data: bytes, words: str) -> None:
+    """A frame over the limit, no UTF-8, an unknown kind: the link ends in words, the daemon goes on."""
+    enrolled.run()
+    control = enrolled.relay.register()
+    control.raw(data)
+    control.expect_end()
+    until(lambda: words in enrolled.log.read_text())
+    assert "Traceback" not in enrolled.log.read_text()
+    enrolled.relay.register()
+
+
+def test_silence_of_the_client_stops(drive: Drive) -> None:
+    """When commands cease on a living link the robot has its zero in time."""
+    assert drive.zero_after(drive.drive()) < STOP_MS
+
+
+def test_lost_channel_stops(drive: Drive) -> None:
+    """When the channel's connection is cut the robot has its zero in time."""
+    last = drive.drive()
+    drive.channel.cut()
+    assert drive.zero_after(last) < STOP_MS
+
+
+def test_killed_daemon_stops(drive: Drive) -> None:
+    """kill -9 of the daemon: its guard sends zero in time, then leaves."""
+    last = drive.drive()
+    drive.process.kill()
+    assert drive.zero_after(last) < STOP_MS
+    until(lambda: not drive.guard.is_running())
+
+
+def test_frozen_daemon_stops(drive: Drive) -> None:
+    """SIGSTOP of the daemon: its guard sends zero in time; what waited in the frozen daemon is not executed."""
+    last = drive.drive()
+    drive.process.send_signal(signal.SIGSTOP)
+    for _ in range(5):
+        drive.channel.sample(5, GO)
+    assert drive.zero_after(last) < STOP_MS
+    time.sleep(1.0)
+    thawed = time.monotonic_ns()
+    drive.process.send_signal(signal.SIGCONT)
+    drive.control.expect(link.Health)
+    time.sleep(0.5)
+    assert [each for each in drive.node.heard("/cmd_vel") if each["at"] > thawed and each["x"] != 0.0] == []
+
+
+def test_sigterm_stops_and_leaves(drive: Drive) -> None:
+    """SIGTERM while driving: zero, goodbye, exit 0 within seconds, no guard left."""
+    last = drive.drive()
+    drive.process.terminate()
+    assert drive.process.wait(5) == 0
+    assert drive.zero_after(last) < STOP_MS
+    assert any(isinstance(each, link.Bye) for each in drive.control.expect_end())
+    until(lambda: not drive.guard.is_running())
+
+
+def test_old_commands_are_not_executed(drive: Drive) -> None:
+    """A command over its deadline, or stamped in the future, moves nothing and is counted."""
+    before = len(drive.node.heard("/cmd_vel"))
+    drive.channel.sample(5, GO, age=0.6)
+    drive.channel.sample(5, GO, age=-0.6)
+    until(lambda: drive.control.expect(link.Health).stale_commands >= 2)
+    assert len(drive.node.heard("/cmd_vel")) == before
+
+
+def test_dead_guard_is_replaced_and_told(drive: Drive) -> None:
+    """A guard that is killed is an alert, and another one takes its place and does its work."""
+    drive.guard.kill()
+    alert = drive.control.expect(link.Alert)
+    assert "guard" in alert.text
+    until(lambda: [each for each in drive.robot.guards(drive.process) if each.pid != drive.guard.pid])
+    drive.guard = drive.robot.guards(drive.process)[0]
+    drive.heard_by_node()
+    last = drive.drive()
+    drive.process.kill()
+    assert drive.zero_after(last) < STOP_MS
+    until(lambda: not drive.guard.is_running())
+
+
+def test_idle_guard_costs_nothing(drive: Drive) -> None:
+    """A guard with nothing to guard uses no measurable processor time of its own code."""
+    before = sum(drive.guard.cpu_times()[:2])
+    time.sleep(2.0)
+    assert sum(drive.guard.cpu_times()[:2]) - before < 0.2
+    assert os.getsid(drive.guard.pid) != os.getsid(drive.process.pid)
