@@ -27,7 +27,7 @@ def status(app: App, as_json: bool) -> None:
     say(f"Relay {answer.get('relay', '?')}{since}")
     robots = [each for each in answer.get("robots") or [] if isinstance(each, dict)]
     if not robots:
-        say("No robots yet; add one with 'switchboard robot add NAME'.")
+        say("No robot has dialled in yet; 'switchboard robot list' shows which may.")
         return
     table(("robot", "state", "with", "round trip"), [_row(each, time.time()) for each in robots])
 

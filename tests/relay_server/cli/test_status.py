@@ -30,10 +30,10 @@ def test_status_shows_who_is_online_and_with_whom(live: Any, relay: Any) -> None
     assert relay.asked == ["GET /status", "GET /status"]
 
 
-def test_status_without_robots_says_how_to_add_one(live: Any, relay: Any) -> None:
+def test_status_without_robots_says_where_to_look(live: Any, relay: Any) -> None:
     """Rather than an empty table."""
     relay.answer = (200, json.dumps(_answer()).encode())
-    assert "switchboard robot add" in live.ok("status")
+    assert "switchboard robot list" in live.ok("status")
 
 
 def test_hostile_text_is_inert(live: Any, relay: Any) -> None:
