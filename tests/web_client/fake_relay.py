@@ -22,6 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 from websockets.frames import Opcode
+from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 Json = dict[str, Any]
@@ -459,7 +460,7 @@ async def stream(relay: Relay) -> None:
         for world in relay.worlds.values():
             world.step()
         for channel in list(relay.channels):
-            if channel.protocol.close_code is None and not relay.frozen:
+            if channel.protocol.state is State.OPEN and not relay.frozen:
                 channel.stream(time.monotonic())
 
 

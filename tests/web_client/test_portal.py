@@ -466,10 +466,11 @@ class TestWidths:
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
     def test_stop_is_always_on_top(self, open_page: OpenPage, width: int) -> None:
-        """STOP stays visible and uncovered however far the cockpit is scrolled."""
+        """STOP stays visible and the top bar uncovered however far the cockpit is scrolled."""
         page = open_page(COCKPIT, width=width, user="driver")
         ready_to_drive(page)
-        for y in (0, 350, 700, 5000):
+        joystick = seen(page, "joystick").bounding_box()
+        for y in (0, joystick["y"] + joystick["height"] / 2 - 28, 5000):
             page.evaluate(f"window.scrollTo(0, {y})")
             assert seen(page, "stop").evaluate(
                 """stop => {
@@ -478,6 +479,8 @@ class TestWidths:
                     return within && document.elementFromPoint(left + width / 2, top + height / 2) === stop
                 }"""
             )
+            x = joystick["x"] + joystick["width"] / 2
+            assert page.evaluate(f"document.elementFromPoint({x}, 28).closest('header') !== null")
 
 
 def test_joystick_is_under_the_video_on_a_phone(open_page: OpenPage) -> None:

@@ -3,7 +3,7 @@ import { currentSession, robot as fetchRobot, robotSocket } from './api'
 import { app } from './app.svelte'
 import type { Ending } from './closing'
 import { Drive, type Limits, type Source, stopWords, type StopReason } from './drive'
-import { type Legs, PING_DRIVING_MS, PING_IDLE_MS, PingTracker } from './latency'
+import { type Legs, Median, PING_DRIVING_MS, PING_IDLE_MS, PingTracker } from './latency'
 import { Gate } from './meter'
 import { Link, type LinkState } from './ros'
 import { recall, remember } from './storage'
@@ -15,6 +15,8 @@ const ROBOT_PING_MS = 1000
 const TOPICS_MS = 5000
 /** A link without an answer for so long is dialled anew. */
 const SILENT_MS = 6000
+/** Longer than the silence above, so that a silent link is seen as one. Seconds. */
+const PING_TIMEOUT_S = 10
 /** A loss shorter than this is not spoken of. */
 const LOSS_SHOWN_MS = 1000
 
@@ -72,6 +74,7 @@ export class Cockpit {
   private readonly nowGate = new Gate(200)
   private readonly idleGate = new Gate(PING_IDLE_MS)
   private readonly drivingGate = new Gate(PING_DRIVING_MS)
+  private readonly robotTrips = new Median()
   private robotPingOut = false
   private timer: ReturnType<typeof setInterval> | undefined
 
@@ -296,9 +299,10 @@ export class Cockpit {
     this.robotPingOut = true
     try {
       const answer = await this.ping(true)
-      this.legs.clientRobot = performance.now() - now
+      this.legs.clientRobot = this.robotTrips.add(performance.now() - now)
       this.legs.relayRobot = answer.robot_rtt_ms
     } catch {
+      this.robotTrips.reset()
       this.legs.clientRobot = null
     } finally {
       this.robotPingOut = false
@@ -306,6 +310,6 @@ export class Cockpit {
   }
 
   private ping(robot: boolean): Promise<{ robot_rtt_ms: number | null }> {
-    return this.link.call('/relay/ping', 'switchboard_msgs/srv/Ping', { robot })
+    return this.link.call('/relay/ping', 'switchboard_msgs/srv/Ping', { robot }, PING_TIMEOUT_S)
   }
 }

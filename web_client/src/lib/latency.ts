@@ -14,11 +14,32 @@ export interface Legs {
   clientRobot: number | null
 }
 
+/** The median of the last few values: one outlier does not move it, and it holds no old ones for long. */
+export class Median {
+  private values: number[] = []
+
+  constructor(private readonly size = 5) {}
+
+  add(value: number): number {
+    this.values = [...this.values, value].slice(-this.size)
+    return this.value!
+  }
+
+  get value(): number | null {
+    const sorted = [...this.values].sort((a, b) => a - b)
+    return sorted[Math.floor(sorted.length / 2)] ?? null
+  }
+
+  reset(): void {
+    this.values = []
+  }
+}
+
 /** Remembers pings that are out and how long the last ones took. */
 export class PingTracker {
   private out = new Map<number, number>()
   private next = 1
-  private smooth: number | null = null
+  private trips = new Median()
 
   /** A ping leaves; the number names it. */
   sent(nowMs: number): number {
@@ -35,7 +56,7 @@ export class PingTracker {
     // Answers keep their order, so what left earlier and is still out won't be answered any more.
     for (const other of this.out.keys()) if (other <= number) this.out.delete(other)
     const rtt = nowMs - atMs
-    this.smooth = this.smooth === null ? rtt : this.smooth + 0.3 * (rtt - this.smooth)
+    this.trips.add(rtt)
     return rtt
   }
 
@@ -56,14 +77,14 @@ export class PingTracker {
     return longest
   }
 
-  /** Smoothed round trip, or null before the first answer. */
+  /** The usual round trip of late, or null before the first answer. */
   get rtt(): number | null {
-    return this.smooth
+    return this.trips.value
   }
 
   reset(): void {
     this.out.clear()
-    this.smooth = null
+    this.trips.reset()
   }
 }
 

@@ -160,6 +160,13 @@ it('fails calls that are out when the connection closes, and calls without one',
   await expect(link.call('/relay/ping', 't', {})).rejects.toThrow('no connection')
 })
 
+it('fails a call that is never answered', async () => {
+  await opened()
+  const call = expect(link.call('/slow', 't', {}, 2)).rejects.toThrow('did not answer')
+  await vi.advanceTimersByTimeAsync(3000)
+  await call
+})
+
 it.each([4401, 4403, 4404])('does not dial again after the close code %i', async (code) => {
   const socket = await opened()
   socket.end(code, 'because')

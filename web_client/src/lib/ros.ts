@@ -168,21 +168,24 @@ export class Link {
   /** Calls a service.
    *
    * @param timeoutS seconds until the relay gives up
-   * @throws Error in the relay's words, or when the connection closes first
+   * @throws Error in the relay's words, when the connection closes first, or a second after the relay should have given up
    */
   call<Q, A>(name: string, type: string, args: Q, timeoutS = 5): Promise<A> {
     const connection = this.connection
     if (!this.isOpen || connection === null) return Promise.reject(new Error('There is no connection.'))
     return new Promise<A>((resolve, reject) => {
       const done = <V>(settle: (value: V) => void) => (value: V) => {
-        connection.calls.delete(reject)
+        clearTimeout(timer)
+        connection.calls.delete(fail)
         settle(value)
       }
-      connection.calls.add(reject)
+      const fail: (error: Error) => void = done(reject)
+      const timer = setTimeout(() => fail(new Error(`${name} did not answer.`)), (timeoutS + 1) * 1000)
+      connection.calls.add(fail)
       new Service<Q, A>({ ros: connection.ros, name, serviceType: type }).callService(
         args,
         done(resolve),
-        done((words: string) => reject(new Error(words || `The call of ${name} failed.`))),
+        (words) => fail(new Error(words || `The call of ${name} failed.`)),
         timeoutS,
       )
     })
