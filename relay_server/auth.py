@@ -68,8 +68,9 @@ class Authenticator:
         self._tickets: dict[str, _Ticket] = {}
 
     def start(self) -> None:
-        """Start the threads that hash passwords."""
+        """Start the threads that hash passwords, and make ready for the first unknown user."""
         self._hashing.start()
+        self._hashing.callInThread(passwords.prepare)
 
     def stop(self) -> None:
         """Wait for the hashing under way and end its threads."""
