@@ -1,4 +1,5 @@
 /** The relay's HTTP API, as far as the portal uses it. */
+import { sentence } from './format'
 import type { Robot, Session } from './types'
 
 /** A request the relay refused, in its own words. */
@@ -54,7 +55,7 @@ export async function refusal(response: Response): Promise<Refusal> {
   } catch {
     // Not JSON: a proxy in between, for example. The status has to do.
   }
-  return new Refusal(response.status, words || `The relay answered with error ${response.status}.`, retryAfter)
+  return new Refusal(response.status, sentence(words) || `The relay answered with error ${response.status}.`, retryAfter)
 }
 
 /** Who is logged in, or null. */

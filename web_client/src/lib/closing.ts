@@ -1,4 +1,5 @@
 /** What the close codes of a robot's websocket mean, and what to do about them. */
+import { sentence } from './format'
 
 export type After = 'login' | 'give_up' | 'retry'
 
@@ -25,9 +26,4 @@ export function ending(code: number, reason: string): Ending {
   const added = reason.trim()
   if (code !== 4403 || added === '') return known
   return { ...known, words: `${known.words} ${sentence(added)}` }
-}
-
-function sentence(text: string): string {
-  const begun = text.charAt(0).toUpperCase() + text.slice(1)
-  return /[.!?]$/.test(begun) ? begun : `${begun}.`
 }

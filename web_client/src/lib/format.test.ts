@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest'
-import { ago, hertz, milliseconds, number, people, percent, pretty } from './format'
+import { ago, hertz, milliseconds, number, people, percent, pretty, sentence } from './format'
 
 it('writes numbers with a real minus and without a negative zero', () => {
   expect(number(-1.234, 2)).toBe('−1.23')
@@ -31,6 +31,10 @@ it('names people once, and few of them', () => {
   expect(people([])).toBe('nobody')
   expect(people(['ann', 'ann'])).toBe('ann')
   expect(people(['ann', 'bob', 'cid', 'dot'])).toBe('ann, bob and 2 more')
+})
+
+it('makes sentences of remarks', () => {
+  expect(['no such robot', 'Wait.', '  ', 'why?'].map(sentence)).toEqual(['No such robot.', 'Wait.', '', 'Why?'])
 })
 
 describe('pretty', () => {

@@ -43,6 +43,13 @@ export function people(names: string[], shown = 2): string {
   return `${once.slice(0, shown).join(', ')} and ${once.length - shown} more`
 }
 
+/** A remark of the relay as a sentence: it begins with a capital and ends with a full stop. */
+export function sentence(text: string): string {
+  const trimmed = text.trim()
+  const begun = trimmed.charAt(0).toUpperCase() + trimmed.slice(1)
+  return begun === '' || /[.!?…]$/.test(begun) ? begun : `${begun}.`
+}
+
 const ARRAY_SHOWN = 6
 const STRING_SHOWN = 120
 const LINES_SHOWN = 400
