@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.protocol import Factory
 from twisted.internet.task import LoopingCall
 from twisted.logger import Logger
@@ -193,7 +193,8 @@ class Daemon:
             del self._opening[name]
 
     def _unreachable(self, failure: Failure, name: str) -> None:
-        self._log.warn("channel {name} can't be opened: {why}", name=name, why=explain(failure))
+        if not isinstance(failure.value, CancelledError):
+            self._log.warn("channel {name} can't be opened: {why}", name=name, why=explain(failure))
 
     def _make_channel(self, message: link.OpenChannel) -> LinkProtocol:
         channel_link = ChannelLink(message.ticket, self._now, self._heartbeat)

@@ -81,7 +81,7 @@ class LinkProtocol(TwistedProtocol):
     def dataReceived(self, data: bytes) -> None:
         """Bytes from the relay."""
         self._heard = True
-        if self._reason is not None:
+        if self._over():
             return
         try:
             events = self.link.receive(data)
@@ -93,6 +93,8 @@ class LinkProtocol(TwistedProtocol):
             self._deadline = None
             self._beat()
         for event in events:
+            if self._over():
+                return  # what came behind the end of the link must not be done any more
             self.owner.on_event(event)
         self.flush()
 
@@ -128,6 +130,9 @@ class LinkProtocol(TwistedProtocol):
             self._patience = self._clock.callLater(GOODBYE_SECONDS, self.transport.abortConnection)
         else:
             self.transport.abortConnection()
+
+    def _over(self) -> bool:
+        return self._reason is not None
 
     def _as_ours(self, failure: Failure) -> SwitchboardError:
         if isinstance(failure.value, SwitchboardError):

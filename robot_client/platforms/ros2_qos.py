@@ -11,7 +11,10 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from relay_protocol.errors import Invalid
 from relay_protocol.link import QoS
 
-DEPTH = 64
+DEPTH = 512
+"""Messages the middleware keeps for us: half a second at 1000 a second, while other processes have the processor."""
+
+PUBLISHED = 64
 MAX_DEPTH = 1000
 
 
@@ -55,7 +58,7 @@ def for_publisher(subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | N
         bool(subscribers) and all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in subscribers)
     )
     profile = QoSProfile(
-        depth=1 if latch else DEPTH,
+        depth=1 if latch else PUBLISHED,
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,

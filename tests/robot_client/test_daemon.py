@@ -259,6 +259,15 @@ def test_every_loss_stops_the_robot_at_once(scene: Scene, how: str) -> None:
     assert scene.platform.sinks == []
 
 
+def test_nothing_behind_a_goodbye_is_done(scene: Scene) -> None:
+    """A command that follows the relay's goodbye in the same bytes is not executed."""
+    line = scene.driving(scene.register())
+    late = frames.encode_sample(5, scene.now(), twist(0.5))
+    line.protocol.dataReceived(link.frame(link.Bye(reason="done")) + late)
+    assert ("/cmd_vel", twist(0.5)) not in scene.platform.published
+    assert scene.platform.published[-1] == ("/cmd_vel", twist())
+
+
 def test_reconnecting_resumes_nothing(scene: Scene) -> None:
     """After a loss nothing is published until a client advertises and commands anew."""
     control = scene.register()

@@ -1,0 +1,130 @@
+"""The daemon's side of its guard, with processes in memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from twisted.internet.error import ProcessTerminated
+from twisted.internet.task import Clock
+from twisted.python.failure import Failure
+
+from robot_client.guard_protocol import Command, Leave, Probe, Topic, decoder
+from robot_client.guarding import PROBE_EVERY, SILENT, GuardKeeper
+
+
+class Process:
+    """The transport of a process that does nothing."""
+
+    def __init__(self, protocol: Any) -> None:
+        self.pid = 1
+        self.protocol = protocol
+        self.lines: list[Any] = []
+        self.closed = False
+        self.signals: list[str] = []
+
+    def write(self, data: bytes) -> None:
+        self.lines += [decoder.decode(line) for line in data.splitlines()]
+
+    def closeStdin(self) -> None:
+        self.closed = True
+
+    def signalProcess(self, name: str) -> None:
+        self.signals.append(name)
+        self.end()
+
+    def end(self) -> None:
+        self.protocol.processEnded(Failure(ProcessTerminated(signal=9)))
+
+
+class Reactor(Clock):
+    def __init__(self) -> None:
+        super().__init__()
+        self.processes: list[Process] = []
+
+    def spawnProcess(self, protocol: Any, executable: str, args: list[str], **options: Any) -> None:
+        protocol.transport = Process(protocol)
+        self.processes.append(protocol.transport)
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.reactor = Reactor()
+        self.alerts: list[str] = []
+        self.keeper = GuardKeeper(self.reactor, "guard", 500)
+        self.keeper.on_alert = lambda level, text: self.alerts.append(text)
+        self.keeper.start()
+
+    @property
+    def process(self) -> Process:
+        return self.reactor.processes[-1]
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+def test_guard_is_told_of_topics_and_commands(scene: Scene) -> None:
+    """Each topic is told once, each command as it goes."""
+    scene.keeper.topic("/cmd_vel", "T")
+    scene.keeper.topic("/cmd_vel", "T")
+    scene.keeper.command("/cmd_vel", True, 5)
+    assert scene.process.lines == [Topic("/cmd_vel", "T"), Command("/cmd_vel", True, 5)]
+
+
+def test_dead_guard_is_replaced_and_brought_up_to_date(scene: Scene) -> None:
+    """A second later there is another guard that knows the topics and who moves; a person is told."""
+    scene.keeper.topic("/cmd_vel", "T")
+    scene.keeper.command("/cmd_vel", True, 5)
+    scene.process.end()
+    assert len(scene.alerts) == 1
+    scene.reactor.advance(1.0)
+    assert len(scene.reactor.processes) == 2
+    assert scene.process.lines == [Topic("/cmd_vel", "T"), Command("/cmd_vel", True, 5)]
+
+
+def test_guard_that_can_not_live_is_not_started_all_the_time(scene: Scene) -> None:
+    """A guard that dies at once each time is started ever more seldom, but at least every 30 s."""
+    for _ in range(300):
+        if scene.keeper.pid is not None:
+            scene.process.end()
+        scene.reactor.advance(1.0)
+    assert 10 <= len(scene.reactor.processes) <= 16
+
+
+def test_guard_that_answers_is_left_alone(scene: Scene) -> None:
+    """A guard that answers its probes is not touched."""
+    for _ in range(20):
+        scene.reactor.advance(PROBE_EVERY)
+        assert scene.process.lines[-1] == Probe()
+        scene.process.protocol.outReceived(b"alive\n")
+    assert scene.process.signals == []
+
+
+def test_frozen_guard_is_ended_and_replaced(scene: Scene) -> None:
+    """A guard that does not answer is killed, and another one started."""
+    for _ in range(int(SILENT / PROBE_EVERY) + 1):
+        scene.reactor.advance(PROBE_EVERY)
+    assert scene.process.signals == ["KILL"]
+    scene.reactor.advance(1.0)
+    assert len(scene.reactor.processes) == 2
+
+
+def test_daemon_that_leaves_lets_its_guard_go(scene: Scene) -> None:
+    """On leaving, the guard is told to, its pipe ends, and nobody is alarmed."""
+    left: list[Any] = []
+    scene.keeper.stop().addCallback(left.append)
+    assert scene.process.lines == [Leave()]
+    assert scene.process.closed
+    scene.process.end()
+    assert left == [None]
+    assert scene.alerts == []
+    assert scene.reactor.getDelayedCalls() == []
+
+
+def test_guard_that_stays_is_ended(scene: Scene) -> None:
+    """A guard that does not leave within two seconds is killed."""
+    scene.keeper.stop()
+    scene.reactor.advance(2.0)
+    assert scene.process.signals == ["KILL"]
