@@ -37,7 +37,7 @@ export function radius(scan: LaserScan, present: number | null): number {
 
 /** Distances in metres at which to draw rings. */
 export function rings(radiusM: number): number[] {
-  const step = [0.25, 0.5, 1, 2, 5, 10, 20, 50].find((s) => radiusM / s <= 4.5) ?? 100
+  const step = [0.25, 0.5, 1, 2, 3, 5, 10, 20, 30, 50].find((s) => radiusM / s <= 4.5) ?? 100
   const found: number[] = []
   for (let r = step; r <= radiusM * 1.001; r += step) found.push(r)
   return found
