@@ -28,7 +28,7 @@ REPEATS = 5
 REPEAT_EVERY = 40 * MILLI
 """A stop is said five times within 200 ms: the first ones may find a network that is just breaking."""
 
-UNHEARD = 2 * NANO
+UNHEARD = 10 * NANO
 """How much longer to repeat while nobody who listens to the topic was found yet, after the daemon's end."""
 
 

@@ -28,14 +28,16 @@ class GuardKeeper:
     """Feeds a guard that is always there; a :class:`~robot_client.motion.GuardFeed`.
 
     :param reactor: for processes and timers
-    :param node: name of the guard's node
+    :param node: name of the guard's node; those of later guards begin with it
     :param within_ms: time to stop, milliseconds
     """
 
     def __init__(self, reactor: Any, node: str, within_ms: int) -> None:
         self.on_alert: Callable[[str, str], None] = lambda level, text: None
         self._reactor = reactor
-        self._arguments = ["-m", "robot_client.guard", "--node", node, "--within-ms", str(within_ms)]
+        self._node = node
+        self._within_ms = str(within_ms)
+        self._started = 0
         self._process: _Process | None = None
         self._topics: dict[str, Topic] = {}
         self._commands: dict[str, Command] = {}
@@ -52,7 +54,7 @@ class GuardKeeper:
             self._reactor.spawnProcess(
                 process,
                 sys.executable,
-                [sys.executable, *self._arguments],
+                [sys.executable, *self._arguments()],
                 # Whole: the wheels of ROS keep their library path in it, and the domain must be the same.
                 env=dict(os.environ),
                 childFDs={0: "w", 1: "r", 2: 2},
@@ -114,6 +116,12 @@ class GuardKeeper:
         self._failures += 1
         self.on_alert("error", f"the motion guard is gone ({why}); another one is started in {delay:.0f} s")
         self._timer = self._reactor.callLater(delay, self.start)
+
+    def _arguments(self) -> list[str]:
+        # The network remembers a dead node for a while; one of the same name would be mistaken for it.
+        node = f"{self._node}_{self._started}" if self._started else self._node
+        self._started += 1
+        return ["-m", "robot_client.guard", "--node", node, "--within-ms", self._within_ms]
 
     def _tell(self, line: Line) -> None:
         if self._process is not None:

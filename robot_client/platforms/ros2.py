@@ -44,7 +44,7 @@ class Ros2Platform(Platform):
 
     :param reactor: for timers, and for the way back from the executor's thread
     :param name: of the node
-    :param guard: name of the guard's node, left out of the graph like our own
+    :param guard: how the names of guards' nodes begin; they are left out of the graph like our own
     :param executor: ``events`` or ``single``
     :param battery: whether to listen to the first battery topic there is
     """
@@ -59,7 +59,7 @@ class Ros2Platform(Platform):
         self._guard = guard
         self._kind = executor
         self._want_battery = battery
-        self._own = frozenset("/" + each for each in (name, guard) if each)
+        self._own = tuple("/" + each for each in (name, guard) if each)
         self._types = Types()
         self._hop = Hop(reactor.callFromThread)
         self._sources: list[RosSource] = []

@@ -19,18 +19,18 @@ class _Found(NamedTuple):
     subscribers: dict[str, set[str]]
 
 
-def read(node: Any, own: frozenset[str]) -> GraphView:
+def read(node: Any, own: tuple[str, ...]) -> GraphView:
     """Ask the middleware's cache for everything.
 
     :param node: an rclpy node
-    :param own: full names of nodes to leave out, with all that is theirs alone
+    :param own: how the full names of nodes begin that are left out, with all that is theirs alone
     """
     topics = _Found(defaultdict(set), defaultdict(set), defaultdict(set))
     services: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     nodes = set()
     for name, namespace in node.get_node_names_and_namespaces():
         full = f"{namespace.rstrip('/')}/{name}"
-        if full in own or name == _UNKNOWN:
+        if full.startswith(own) or name == _UNKNOWN:
             continue
         if not hidden(full):
             nodes.add(full)

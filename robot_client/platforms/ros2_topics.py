@@ -71,7 +71,7 @@ def _one_of(types: list[str], asked: str, what: str, kind: str) -> str:
 class RosSource:
     """A raw subscription that follows its publishers' quality of service.
 
-    :param ignore: name of a node whose publishers don't count
+    :param ignore: how the names of nodes begin whose publishers don't count
     """
 
     def __init__(
@@ -136,7 +136,10 @@ class RosSource:
 
     def _look(self) -> ros2_qos.Match:
         infos = self._node.get_publishers_info_by_topic(self._topic)
-        return ros2_qos.match([each.qos_profile for each in infos if each.node_name != self._ignore])
+        ignored = self._ignore or None
+        return ros2_qos.match(
+            [each.qos_profile for each in infos if not (ignored and each.node_name.startswith(ignored))]
+        )
 
     def _build(self) -> None:
         self._generation += 1

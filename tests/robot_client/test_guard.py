@@ -94,11 +94,11 @@ def test_idle_guard_sleeps(scene: Scene) -> None:
 
 
 def test_orphan_does_not_stay(scene: Scene) -> None:
-    """A guard whose stop nobody hears goes on for two seconds, no longer."""
+    """A guard whose stop nobody hears goes on for ten seconds, no longer."""
     scene.outlets.heard = False
     scene.move()
     scene.guard.orphaned()
-    scene.run(1900)
+    scene.run(9900)
     assert not scene.guard.done
     scene.run(300)
     assert scene.guard.done
