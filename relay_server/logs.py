@@ -17,7 +17,6 @@ _QUIET = (
     "twisted.internet",
     "twisted.python",
     "log_legacy",
-    "relay_server.edges.site",
 )
 
 

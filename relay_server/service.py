@@ -130,9 +130,9 @@ class Relay:
         desk = self._desk
         metrics = registry_of(RelayCollector(self._registry, self._channels, lambda: desk))
         api = Api(self._reactor, desk, origins, metrics, cookie=cookie, secure=settings.tls)
-        websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk))
-        root = Root(Robots(websocket, relay_server.VERSION), api.app.resource(), Portal(relay_server.PORTAL))
         cap = AddressCap(settings.connections_per_address)
+        websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk, cap))
+        root = Root(Robots(websocket, relay_server.VERSION), api.app.resource(), Portal(relay_server.PORTAL))
         return RelaySite(root, self._reactor, cap, settings.tls)
 
     def _robot_factory(self, hall: RobotHall) -> RobotFactory:

@@ -170,6 +170,12 @@ class Session:
             operation = rosbridge.decode(data)
         except PeerError as error:
             self._malformed += 1
+            if self._malformed == 1:
+                self.log.info(
+                    "client {number} sent what is not rosbridge: {reason}",
+                    number=self.number,
+                    reason=str(error),
+                )
             self.tell("error", str(error))
             if self._malformed >= MALFORMED:
                 self.close(

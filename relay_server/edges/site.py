@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import mimetypes
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from twisted.logger import Logger
 from twisted.web.http import HTTPChannel
 from twisted.web.resource import IResource, Resource
 from twisted.web.server import NOT_DONE_YET, Request, Site
@@ -16,6 +18,8 @@ from relay_server.edges.caps import AddressCap
 
 BODY_BYTES = limits.UNPROVEN_BYTES
 IDLE_SECONDS = 60.0
+CLOSE_SECONDS = 2.0
+"""What a refused client has to take the answer."""
 
 SECURITY_HEADERS = {
     b"content-security-policy": (
@@ -37,6 +41,7 @@ class DeadlineChannel(HTTPChannel):
     Twisted's own timeout starts anew with each byte, so a slow trickle would hold a connection for ever.
     """
 
+    log = Logger()
     _deadline: Timer | None = None
     _address = ""
 
@@ -44,12 +49,11 @@ class DeadlineChannel(HTTPChannel):
         super().connectionMade()
         self._address = getattr(self.transport.getPeer(), "host", "local")
         if not self.site.cap.enter(self._address):
-            self.transport.write(
-                b"HTTP/1.1 429 Too Many Requests\r\nRetry-After: 10\r\nConnection: close\r\n\r\n"
+            self.refuse(
+                b"429 Too Many Requests", "too many connections from your address", b"Retry-After: 10\r\n"
             )
-            self.transport.loseConnection()
             return
-        self._start_deadline()
+        self._start_deadline(limits.UNPROVEN_SECONDS, self._too_late)
 
     def allContentReceived(self) -> None:
         self._stop_deadline()
@@ -58,21 +62,41 @@ class DeadlineChannel(HTTPChannel):
     def requestDone(self, request: Request) -> None:
         super().requestDone(request)
         # The next request on this connection gets the same: its time begins when the last answer is out.
-        self._start_deadline(IDLE_SECONDS)
+        self._start_deadline(IDLE_SECONDS, self._idle)
 
     def connectionLost(self, reason: Any) -> None:
+        # Not called for a websocket, which takes the transport away: its protocol counts itself out.
+        self.site.cap.leave(self._address)
         self._stop_deadline()
         super().connectionLost(reason)
 
-    def _start_deadline(self, seconds: float = limits.UNPROVEN_SECONDS) -> None:
+    def refuse(self, status: bytes, reason: str, headers: bytes = b"") -> None:
+        """Answer whatever is being sent here with a status and words, and end the connection."""
         self._stop_deadline()
-        self._deadline = self.site.reactor.callLater(seconds, self._too_late)
+        self.log.info("a request from {address} is refused: {reason}", address=self._address, reason=reason)
+        body = reason.encode() + b"\n"
+        self.transport.write(
+            b"HTTP/1.1 %b\r\n%bContent-Type: text/plain; charset=utf-8\r\nContent-Length: %d\r\n"
+            b"Connection: close\r\n\r\n%b" % (status, headers, len(body), body)
+        )
+        self.transport.loseConnection()
+        self._deadline = self.site.reactor.callLater(CLOSE_SECONDS, self._idle)
+
+    def _start_deadline(self, seconds: float, late: Callable[[], None]) -> None:
+        self._stop_deadline()
+        self._deadline = self.site.reactor.callLater(seconds, late)
 
     def _stop_deadline(self) -> None:
         cancel(self._deadline)
         self._deadline = None
 
     def _too_late(self) -> None:
+        self._deadline = None
+        seconds = limits.UNPROVEN_SECONDS
+        self.refuse(b"408 Request Timeout", f"the whole request must be here within {seconds:g} s")
+
+    def _idle(self) -> None:
+        self._deadline = None
         if self.transport is not None:
             self.transport.abortConnection()
 
@@ -93,7 +117,7 @@ class BoundedRequest(Request):
         super().handleContentChunk(data)
 
     def _too_big(self) -> None:
-        self.channel._respondToBadRequestAndDisconnect()
+        self.channel.refuse(b"413 Content Too Large", f"a request may carry at most {BODY_BYTES} bytes")
 
 
 class RelaySite(Site):

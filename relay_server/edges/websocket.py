@@ -14,6 +14,7 @@ from urllib.parse import unquote
 from autobahn.twisted.websocket import WebSocketServerFactory, WebSocketServerProtocol
 from autobahn.websocket.types import ConnectionDeny, ConnectionRequest
 from twisted.internet.defer import Deferred
+from twisted.internet.protocol import connectionDone
 from twisted.logger import Logger
 
 from relay_protocol import limits, rosbridge
@@ -22,6 +23,7 @@ from relay_server import closing
 from relay_server.access import Principal
 from relay_server.auth import BadCredentials
 from relay_server.clock import Clock, Timer, cancel
+from relay_server.edges.caps import AddressCap
 from relay_server.frontdesk import Admission
 from relay_server.session import ClientTransport, Session
 
@@ -101,6 +103,9 @@ class ClientProtocol(WebSocketServerProtocol):
         if self._failure is not None and not request.origin:
             # Programs read the status; browsers can't, so they get a close code after the handshake.
             code, reason = self._failure
+            self.log.info(
+                "a client at {address} is refused: {reason}", address=self._address(), reason=reason
+            )
             raise ConnectionDeny(HANDSHAKE_STATUS.get(code, 403), reason)
         return chosen
 
@@ -167,7 +172,9 @@ class ClientProtocol(WebSocketServerProtocol):
     def onMessage(self, payload: bytes, isBinary: bool) -> None:
         """One whole message."""
         if isBinary:
-            self.close(closing.FORBIDDEN, "binary messages are not taken; send rosbridge JSON as text")
+            (self._session or self).close(
+                closing.FORBIDDEN, "binary messages are not taken; send rosbridge JSON as text"
+            )
         elif self._session is not None:
             self._session.message(payload)
         elif self._open:
@@ -212,6 +219,11 @@ class ClientProtocol(WebSocketServerProtocol):
         if self._session is not None:
             self._session.pong(payload)
 
+    def connectionLost(self, reason: Any = connectionDone) -> None:
+        """The connection that began as an HTTP request is gone."""
+        self.factory.cap.leave(self._address())
+        super().connectionLost(reason)
+
     def onClose(self, wasClean: bool, code: int | None, reason: str | None) -> None:
         """The websocket is gone."""
         self._open = False
@@ -237,6 +249,10 @@ class ClientProtocol(WebSocketServerProtocol):
         self._stop_deadline()
         if self._open:
             self._open = False
+            if self._session is None:
+                self.log.info(
+                    "a client at {address} is refused: {reason}", address=self._address(), reason=reason
+                )
             text = reason.encode()[:REASON_BYTES].decode(errors="ignore")
             self.sendClose(code, text)
 
@@ -282,12 +298,16 @@ def _code_of(error: SwitchboardError) -> int:
 
 
 class ClientFactory(WebSocketServerFactory):
-    """Builds a :class:`ClientProtocol` for each websocket. Autobahn's open defaults are all closed here."""
+    """Builds a :class:`ClientProtocol` for each websocket. Autobahn's open defaults are all closed here.
+
+    :param cap: where the site has counted the connections that become websockets
+    """
 
     protocol = ClientProtocol
 
-    def __init__(self, clock: Clock, clock_ns: Callable[[], int], gate: Gate) -> None:
+    def __init__(self, clock: Clock, clock_ns: Callable[[], int], gate: Gate, cap: AddressCap) -> None:
         super().__init__(reactor=clock)
+        self.cap = cap
         self.clock = clock
         self.clock_ns = clock_ns
         self.gate = gate

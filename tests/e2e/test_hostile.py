@@ -1,0 +1,499 @@
+"""Peers that lie, babble or say nothing: refused in words, logged in words, and nobody else notices."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import random
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import psutil
+import pytest
+from switchboard_harness import Client, FakeRobot, wait_for
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_protocol import identity, limits, link
+from relay_protocol.frames import encode_json
+from relay_server import passwords
+
+STAMP_GAP = 1.0
+"""Seconds between two odometry stamps that a busy machine can explain; the simulator sends 20 a second or more."""
+
+
+class Watcher(threading.Thread):
+    """Somebody who watches odometry all the time and keeps the stamps."""
+
+    def __init__(self, client: Client) -> None:
+        super().__init__(daemon=True)
+        self.client = client
+        self.stamps: list[float] = []
+        self.broken = ""
+        self._end = threading.Event()
+        client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
+
+    def run(self) -> None:
+        """Until told to stop, or until the connection breaks."""
+        while not self._end.is_set():
+            try:
+                message = self.client.receive(0.5)
+            except TimeoutError:
+                continue
+            except Exception as error:
+                self.broken = repr(error)
+                return
+            stamp = message["msg"]["header"]["stamp"]
+            self.stamps.append(stamp["sec"] + stamp["nanosec"] / 1e9)
+
+    def stop(self) -> None:
+        """Leave."""
+        self._end.set()
+        self.join(10)
+        self.client.close()
+
+
+@pytest.fixture(scope="module")
+def watchers(world: Any) -> Iterator[list[Watcher]]:
+    """Two bystanders for all tests: the same connections from the first attack to the last."""
+    watchers = [Watcher(world.relay.connect("rover", token)) for token in (world.viewer, world.operator)]
+    for each in watchers:
+        each.start()
+    yield watchers
+    for each in watchers:
+        each.stop()
+
+
+@pytest.fixture(autouse=True)
+def undisturbed(world: Any, watchers: list[Watcher]) -> Iterator[None]:
+    """Whatever a test does, the bystanders go on, the process is the same, and the log shows no traceback."""
+    for each in watchers:
+        wait_for("odometry comes", lambda each=each: each.stamps)
+    begun = [len(each.stamps) for each in watchers]
+    logged = len(world.relay.log)
+    process = world.relay.process.popen
+    yield
+    for each in watchers:
+        seen = len(each.stamps)
+        wait_for("odometry still comes", lambda each=each, seen=seen: len(each.stamps) > seen + 3)
+    for each, start in zip(watchers, begun, strict=True):
+        assert each.broken == ""
+        stamps = each.stamps[start - 1 :]
+        gaps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
+        assert min(gaps) > 0
+        assert max(gaps) < STAMP_GAP
+    assert world.relay.process.popen is process
+    assert process.poll() is None
+    assert "Traceback" not in world.relay.log[logged:]
+
+
+def logs(world: Any, words: str, since: int) -> None:
+    """These words come into the relay's log."""
+    wait_for(f"the log says '{words}'", lambda: words in world.relay.log[since:], 5)
+
+
+def robot_of_our_own(world: Any) -> tuple[str, bytes]:
+    """A robot enrolled with a key of the test's; its name and private key."""
+    name = f"fake-{random.randrange(10**9)}"
+    key = identity.generate_key()
+    code = world.relay.cli("robot", "add", name)["enrolment_code"]
+    with FakeRobot(world.relay.robots_port) as robot:
+        assert robot.enroll(name, code, key)["op"] == "enrolled"
+    return name, key
+
+
+# --- identity ---------------------------------------------------------------------------------------------
+
+
+def test_a_robot_with_a_key_nobody_enrolled_is_refused(world: Any) -> None:
+    """A key made up on the spot opens nothing, and the robot whose name was used stays online."""
+    since = len(world.relay.log)
+    with FakeRobot(world.relay.robots_port) as robot:
+        answer = robot.register("rover", identity.generate_key())
+        assert answer["op"] == "refused"
+        assert "key is not accepted" in answer["reason"]
+        assert robot.ended()
+    logs(world, "is refused: this key is not accepted", since)
+    assert world.relay.state_of("rover") != "offline"
+
+
+def test_a_robot_that_claims_the_right_key_but_signs_with_another_is_refused(world: Any) -> None:
+    """The fingerprint is public; only the signature counts."""
+    known = world.relay.cli("robot", "keys", "rover")[0]["fingerprint"]
+    with FakeRobot(world.relay.robots_port) as robot:
+        challenge = robot.hello("rover", known)
+        nonce = link.from_base64(challenge["nonce"], "the nonce")
+        forged = identity.sign(identity.generate_key(), challenge["relay"], "rover", nonce)
+        robot.send(link.Prove(signature=link.to_base64(forged)))
+        assert "key is not accepted" in robot.until("refused")["reason"]
+        assert robot.ended()
+
+
+def test_a_recorded_proof_is_worth_nothing_on_another_connection(world: Any) -> None:
+    """A real proof, replayed against a new challenge, is refused; whom it was stolen from stays registered."""
+    name, key = robot_of_our_own(world)
+    with FakeRobot(world.relay.robots_port) as robot, FakeRobot(world.relay.robots_port) as thief:
+        assert robot.register(name, key)["op"] == "welcome"
+        thief.hello(name, identity.fingerprint(identity.public_half(key)))
+        thief.send(robot.proof)
+        assert "key is not accepted" in thief.until("refused")["reason"]
+        assert thief.ended()
+        assert world.relay.state_of(name) == "online"
+
+
+def test_used_expired_and_unknown_codes_get_the_same_words(world: Any) -> None:
+    """Nobody learns from the answer what was wrong with a code, nor whether there is such a robot."""
+    used = world.relay.cli("robot", "add", "codes")["enrolment_code"]
+    with FakeRobot(world.relay.robots_port) as robot:
+        assert robot.enroll("codes", used, identity.generate_key())["op"] == "enrolled"
+    expired = passwords.new_enrolment_code()
+    database = Database(f"sqlite:///{world.relay.data / 'switchboard.db'}")
+    with database.begin() as session:
+        found = queries.find_robot(session, "codes")
+        assert found is not None
+        queries.issue_enrolment_code(session, found.id, passwords.code_hash(expired), time.time() - 1)
+    database.close()
+    since = len(world.relay.log)
+    unknown = passwords.new_enrolment_code()
+    tries = [("codes", used), ("codes", expired), ("codes", unknown), ("no-such-robot", unknown)]
+    answers = []
+    for name, code in tries:
+        with FakeRobot(world.relay.robots_port) as robot:
+            answers.append(robot.enroll(name, code, identity.generate_key()))
+            assert robot.ended()
+    assert answers[0]["op"] == "refused"
+    assert "ask for a new one" in answers[0]["reason"]
+    assert all(answer == answers[0] for answer in answers)
+    logs(world, "enrolment code is wrong", since)
+    assert not any(code in world.relay.log for _, code in tries)
+
+
+def test_the_robots_own_command_says_why_a_code_was_refused(world: Any) -> None:
+    """``switchboard-robot enroll`` with a wrong code ends with the relay's sentence and a failure code."""
+    done = world.robot.enroll(passwords.new_enrolment_code(), world.relay.robots_port, "--replace")
+    assert done.returncode != 0
+    assert "ask for a new one" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+# --- bytes from robots ------------------------------------------------------------------------------------
+
+DEEP = b"[" * 100_000
+BAD_JSON = {
+    "invalid UTF-8": (b'{"op":"bye","reason":"\xff\xfe"}', "UTF-8"),
+    "invalid UTF-8 in a field nobody reads": (b'{"op":"bye","reason":"x","y":"\xc3("}', "UTF-8"),
+    "100,000 deep": (b'{"op":"bye","reason":' + DEEP, "deeper than 64"),
+    "100,000 deep in a field nobody reads": (
+        b'{"op":"bye","reason":"","x":' + DEEP + b"]" * 100_000 + b"}",
+        "deeper",
+    ),
+    "NaN": (b'{"op":"bye","reason":"","t":NaN}', ""),
+    "a huge number": (b'{"op":"ping","t":' + b"9" * 5000 + b"}", ""),
+    "a number beyond doubles": (b'{"op":"health","cpu":1e999}', ""),
+    "no object": (b"[1,2,3]", "object"),
+    "an unknown op": (b'{"op":"rm -rf"}', "unknown op"),
+    "nothing": (b"", ""),
+    "binary": (bytes(range(256)), ""),
+}
+
+
+@pytest.mark.parametrize("proved", [False, True], ids=["before the proof", "after the proof"])
+def test_a_frame_of_four_gigabytes_is_refused_before_it_is_awaited(world: Any, proved: bool) -> None:
+    """Four bytes of length are enough to say no; no memory is taken."""
+    name, key = robot_of_our_own(world)
+    since = len(world.relay.log)
+    relay = psutil.Process(world.relay.process.popen.pid)
+    with FakeRobot(world.relay.robots_port) as robot:
+        if proved:
+            assert robot.register(name, key)["op"] == "welcome"
+        before = relay.memory_info().rss
+        robot.send_bytes(b"\xff\xff\xff\xff\x00")
+        refused = robot.until("refused")
+        assert refused["code"] == "frame_too_large"
+        assert "4294967295" in refused["reason"]
+        assert robot.ended()
+        assert relay.memory_info().rss - before < 64 * limits.MIB
+    logs(world, "a frame of 4294967295 bytes was announced", since)
+
+
+@pytest.mark.parametrize("what", BAD_JSON)
+def test_bad_json_from_a_proved_robot_ends_its_link_in_words(
+    world: Any, proved_robot: Any, what: str
+) -> None:
+    """A robot that sends what is no message is told why, and cut."""
+    text, words = BAD_JSON[what]
+    since = len(world.relay.log)
+    with proved_robot() as robot:
+        robot.send_bytes(encode_json(text))
+        refused = robot.until("refused")
+        assert words in refused["reason"]
+        assert robot.ended()
+    logs(world, "broke the protocol", since)
+
+
+@pytest.mark.parametrize("what", [each for each in BAD_JSON if "100,000" not in each])
+def test_bad_json_before_the_proof_ends_the_connection_in_words(world: Any, what: str) -> None:
+    """Who has proved nothing is told the same."""
+    text, words = BAD_JSON[what]
+    with FakeRobot(world.relay.robots_port) as robot:
+        robot.send_bytes(encode_json(text))
+        assert words in robot.until("refused")["reason"]
+        assert robot.ended()
+
+
+@pytest.fixture(scope="module")
+def proved_robot(world: Any) -> Any:
+    """Opens registered links of a robot of the test's own, one after the other."""
+    name, key = robot_of_our_own(world)
+
+    @contextlib.contextmanager
+    def opened() -> Iterator[FakeRobot]:
+        wait_for("the former link is gone", lambda: world.relay.state_of(name) == "offline")
+        with FakeRobot(world.relay.robots_port) as robot:
+            assert robot.register(name, key)["op"] == "welcome"
+            yield robot
+
+    return opened
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"\x00\x00\x00\x00", "length 0"),
+        (b"\x00\x00\x00\x02\x09x", "frame kind 9"),
+        (b"\x00\x00\x00\x05\x01aaaa", "12 bytes"),
+        (b"\x00\x00\x00\x0d\x01" + bytes(12), "control link"),
+        (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", "announced"),
+    ],
+    ids=["empty", "unknown kind", "short sample", "sample on the control link", "HTTP"],
+)
+def test_bytes_that_are_no_frames_end_a_robots_link_in_words(
+    world: Any, proved_robot: Any, data: bytes, words: str
+) -> None:
+    """Framing that breaks the contract is named."""
+    with proved_robot() as robot:
+        robot.send_bytes(data)
+        assert words in robot.until("refused")["reason"]
+        assert robot.ended()
+
+
+# --- messages from clients --------------------------------------------------------------------------------
+
+BAD_ROSBRIDGE = {
+    "invalid UTF-8": (b'{"op":"unsubscribe","topic":"\xff"}', "UTF-8"),
+    "100,000 deep": (b'{"op":"publish","topic":"/cmd_vel","msg":' + DEEP, "deeper than 64"),
+    "NaN": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":NaN}}}', "not JSON"),
+    "Infinity": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":Infinity}}}', "not JSON"),
+    "no object": (b'"hello"', "object"),
+    "an unknown op": (b'{"op":"shutdown"}', "unknown op"),
+    "no op": (b"{}", "op"),
+    "a field of the wrong type": (b'{"op":"subscribe","topic":7}', "topic"),
+    "nothing": (b"", "not JSON"),
+}
+
+
+@pytest.mark.parametrize("what", BAD_ROSBRIDGE)
+def test_a_client_is_told_what_is_wrong_with_its_message(world: Any, what: str) -> None:
+    """One bad message costs a status in words and a line in the log; the connection goes on."""
+    text, words = BAD_ROSBRIDGE[what]
+    since = len(world.relay.log)
+    moved = time.monotonic_ns()
+    with world.relay.connect("rover", world.operator) as client:
+        client.send(op="set_level", level="error")
+        client.connection.send(text, text=True)
+        status = client.until(op="status")
+        assert status["level"] == "error"
+        assert words in status["msg"]
+        assert client.call("/relay/ping", {"robot": True})["result"]
+    logs(world, "not rosbridge", since)
+    assert world.robot.events("command", moved) == []
+
+
+@pytest.mark.parametrize("number", ["9" * 5000, "1e999", "-1e999"])
+def test_a_number_too_large_is_no_command(world: Any, number: str) -> None:
+    """Numbers beyond doubles are named as such and never reach the robot."""
+    moved = time.monotonic_ns()
+    with world.relay.connect("rover", world.operator) as client:
+        client.send(op="set_level", level="error")
+        client.send(op="advertise", topic="/cmd_vel", type="geometry_msgs/msg/Twist")
+        text = '{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":' + number + "}}}"
+        client.connection.send(text)
+        assert client.until(op="status")["level"] == "error"
+        assert client.call("/relay/ping", {"robot": True})["result"]
+    assert world.robot.events("command", moved) == []
+
+
+def close_of(client: Client) -> Any:
+    """Read until the relay closes; the close frame."""
+    with pytest.raises(ConnectionClosed) as closed:
+        while True:
+            client.receive(15)
+    assert closed.value.rcvd is not None
+    return closed.value.rcvd
+
+
+def test_a_flood_of_malformed_messages_ends_the_connection(world: Any) -> None:
+    """After a hundred messages in a row that are no rosbridge the connection is closed with 4429 and words."""
+    since = len(world.relay.log)
+    with world.relay.connect("rover", world.viewer) as client:
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(20_000):
+                client.connection.send("{]")
+        closed = close_of(client)
+        assert closed.code == 4429
+        assert "not rosbridge" in closed.reason
+    logs(world, "is cut", since)
+    assert world.relay.log[since:].count("\n") < 200
+
+
+def test_a_binary_message_ends_the_connection(world: Any) -> None:
+    """Binary websocket messages are not taken, and the close says so."""
+    since = len(world.relay.log)
+    with world.relay.connect("rover", world.viewer) as client:
+        client.connection.send(b"\x00\x01\x02")
+        closed = close_of(client)
+        assert closed.code == 4403
+        assert "text" in closed.reason
+    logs(world, "binary messages are not taken", since)
+
+
+@pytest.mark.parametrize("fragments", [1, 4], ids=["one frame", "fragments"])
+def test_a_message_over_a_mebibyte_ends_the_connection(world: Any, fragments: int) -> None:
+    """1009 and words for what is too big, whole or in pieces."""
+    since = len(world.relay.log)
+    text = '{"op":"publish","topic":"/x","msg":{"data":"' + "x" * limits.CLIENT_MESSAGE + '"}}'
+    size = len(text) // fragments + 1
+    with world.relay.connect("rover", world.operator) as client:
+        with contextlib.suppress(ConnectionClosed):
+            pieces = [text[start : start + size] for start in range(0, len(text), size)]
+            client.connection.send(text if fragments == 1 else iter(pieces))
+        closed = close_of(client)
+        assert closed.code == 1009
+        assert closed.reason
+    logs(world, str(limits.CLIENT_MESSAGE), since)
+
+
+# --- those who say little ---------------------------------------------------------------------------------
+
+
+class Trickle(threading.Thread):
+    """Opens a connection, sends some bytes a second, and keeps what comes until it is cut off."""
+
+    def __init__(self, port: int, data: bytes, at_once: bytes = b"") -> None:
+        super().__init__(daemon=True)
+        self._socket = socket.create_connection(("127.0.0.1", port))
+        self._data = data
+        self._socket.sendall(at_once)
+        self._begun = time.monotonic()
+        self.lasted = float("inf")
+        self.heard = b""
+        self.start()
+
+    def run(self) -> None:
+        """A byte a second, for half a minute at most."""
+        self._socket.settimeout(1.0)
+        for place in range(30):
+            try:
+                self._socket.sendall(self._data[place : place + 1])
+                heard = self._socket.recv(65536)
+            except TimeoutError:
+                continue
+            except OSError:
+                heard = b""
+            self.heard += heard
+            if not heard:
+                self.lasted = time.monotonic() - self._begun
+                break
+        self._socket.close()
+
+
+def test_who_does_not_get_to_the_point_is_cut_after_ten_seconds(world: Any) -> None:
+    """A byte a second resets no deadline: neither in HTTP's head nor its body, nor on the robots' port."""
+    relay = world.relay
+    since = len(relay.log)
+    head = b"GET /healthz HTTP/1.1\r\nHost: example.org\r\n"
+    post = b"POST /api/v1/session HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 500\r\n\r\n"
+    upgrade = (
+        b"GET /robots/rover HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+    )
+    attackers = {
+        "head": [Trickle(relay.http_port, head) for _ in range(20)],
+        "body": [Trickle(relay.http_port, b"x" * 100, post) for _ in range(5)],
+        "nothing to HTTP": [Trickle(relay.http_port, b"") for _ in range(5)],
+        "nothing to robots": [Trickle(relay.robots_port, b"") for _ in range(5)],
+        "a robot's frame": [Trickle(relay.robots_port, b"\x00\x00\x01\x00" + b"x" * 100) for _ in range(5)],
+        "a websocket without credentials": [Trickle(relay.http_port, b"", upgrade) for _ in range(5)],
+    }
+    for each in [each for kind in attackers.values() for each in kind]:
+        each.join(40)
+    for kind, those in attackers.items():
+        for each in those:
+            assert 8 < each.lasted < 20, f"{kind} lasted {each.lasted:.1f} s"
+    assert all(b"no proof of identity within 10 s" in each.heard for each in attackers["nothing to robots"])
+    assert all(b"no proof of identity within 10 s" in each.heard for each in attackers["a robot's frame"])
+    assert all(b"log in" in each.heard for each in attackers["a websocket without credentials"])
+    assert all(each.heard.startswith(b"HTTP/1.1 408") for each in attackers["head"] + attackers["body"])
+    logs(world, "no proof of identity within 10 s", since)
+    logs(world, "whole request", since)
+    logs(world, "no credentials came with the connection", since)
+
+
+@pytest.mark.parametrize("announced", [True, False], ids=["announced", "in chunks"])
+def test_a_request_that_is_too_big_is_refused_in_words(world: Any, announced: bool) -> None:
+    """A body over 64 KiB is answered with 413, before or while it comes."""
+    since = len(world.relay.log)
+    how = "Content-Length: 1000000" if announced else "Transfer-Encoding: chunked"
+    head = f"POST /api/v1/session HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n{how}\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", world.relay.http_port), timeout=10) as plain:
+        with contextlib.suppress(ConnectionError):
+            plain.sendall(head.encode())
+            for _ in range(5):
+                plain.sendall(b"8000\r\n" + b"x" * 0x8000 + b"\r\n")
+        answer = b""
+        with contextlib.suppress(ConnectionError):
+            while data := plain.recv(65536):
+                answer += data
+    assert answer.startswith(b"HTTP/1.1 413")
+    assert b"at most 65536 bytes" in answer
+    logs(world, "at most 65536 bytes", since)
+
+
+def test_connections_that_came_and_went_are_not_held_against_an_address(world: Any) -> None:
+    """More connections than one address may hold at a time, one after the other, are all served."""
+    for _ in range(600):
+        with socket.create_connection(("127.0.0.1", world.relay.http_port)) as plain:
+            plain.sendall(b"GET /robots/x HTTP/1.0\r\n\r\n")
+            assert plain.recv(100).startswith(b"HTTP/1.0 200")
+    for _ in range(200):
+        with connect(world.relay.url("rover"), origin=None) as websocket:
+            websocket.send(json.dumps({"op": "auth", "mac": "swb_wrong"}))
+            with pytest.raises(ConnectionClosed):
+                websocket.recv(10)
+    with world.relay.connect("rover", world.viewer) as client:
+        assert client.call("/relay/ping")["result"]
+
+
+def test_too_many_connections_of_one_address_are_refused_in_words(world: Any) -> None:
+    """One address can't take all the relay's descriptors; when it lets go, it is served again."""
+    held = [socket.create_connection(("127.0.0.1", world.relay.http_port)) for _ in range(520)]
+    try:
+        # The last ones are over the limit, whatever others hold.
+        held[-1].settimeout(10)
+        assert held[-1].recv(200).startswith(b"HTTP/1.1 429")
+    finally:
+        for each in held:
+            each.close()
+
+    def served() -> bool:
+        with socket.create_connection(("127.0.0.1", world.relay.http_port)) as plain:
+            plain.sendall(b"GET /robots/x HTTP/1.0\r\n\r\n")
+            return plain.recv(100).startswith(b"HTTP/1.0 200")
+
+    wait_for("the address is served again", served)
