@@ -6,12 +6,14 @@ Everything listens on loopback, ports come from the OS, every process is reaped 
 from __future__ import annotations
 
 import contextlib
+import http.client
 import json
 import os
 import random
 import selectors
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -293,6 +295,56 @@ class Robot:
         """End daemon and simulator."""
         self.daemon.stop()
         self.sim.stop()
+
+
+class Answer:
+    """What came back for an HTTP request."""
+
+    def __init__(self, response: http.client.HTTPResponse) -> None:
+        self.status = response.status
+        self.headers = response.headers
+        self.body = response.read()
+
+    @property
+    def json(self) -> Any:
+        """The body, decoded."""
+        return json.loads(self.body)
+
+    @property
+    def cookie(self) -> str:
+        """The cookie it sets, as the next request sends it."""
+        return str(self.headers["Set-Cookie"]).partition(";")[0]
+
+
+def ask(
+    port: int,
+    method: str,
+    path: str,
+    body: Any = None,
+    *,
+    headers: dict[str, str] | None = None,
+    token: str = "",
+    tls: ssl.SSLContext | None = None,
+) -> Answer:
+    """One HTTP request on a connection of its own.
+
+    :param body: sent as JSON
+    :param token: an access token, sent as Bearer
+    """
+    sent = dict(headers or {})
+    if body is not None:
+        sent.setdefault("Content-Type", "application/json")
+    if token:
+        sent["Authorization"] = f"Bearer {token}"
+    if tls is None:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    else:
+        connection = http.client.HTTPSConnection("127.0.0.1", port, timeout=30, context=tls)
+    try:
+        connection.request(method, path, None if body is None else json.dumps(body), sent)
+        return Answer(connection.getresponse())
+    finally:
+        connection.close()
 
 
 class Client:
