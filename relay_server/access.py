@@ -13,11 +13,18 @@ from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.queries import PrincipalRecord, RobotRecord
+from relay_protocol.errors import Refused
 from relay_protocol.rights import Grant, Operation, Rules, Verdict
 from relay_server.store import Store
 
 Changed = Callable[[], None]
 Revoked = Callable[[str], None]
+
+
+class BadCredentials(Refused):
+    """The credentials prove nobody."""
+
+    code = "bad_credentials"
 
 
 @dataclass(frozen=True)
@@ -75,13 +82,24 @@ class Access:
         self._wall = wall
         self._permits: set[Permit] = set()
         self._robots: dict[int, list[tuple[RobotRecord, Rules]]] = {}
+        self._refreshed = 0
 
     async def permit(self, principal: Principal, robot_id: int) -> Permit | None:
-        """A live permit, or ``None`` when the principal has no right at all on the robot."""
-        grants = await self._store.read(queries.grants_for, principal.user_id, robot_id)
-        if not grants:
+        """A live permit, or ``None`` when the principal has no right at all on the robot.
+
+        :raises BadCredentials: the token has ended or the account was disabled since it was proved
+        """
+        key = (principal.user_id, principal.token_id, robot_id)
+        # What was read while a refresh went by may be what the refresh was about.
+        seen = -1
+        while seen != self._refreshed:
+            seen = self._refreshed
+            now = (await self._store.read(_standing, {key}, self._wall()))[key]
+        if now.ended and now.credentials:
+            raise BadCredentials(now.ended)
+        if now.ended:
             return None
-        permit = Permit(principal, robot_id, Rules(grants))
+        permit = Permit(principal, robot_id, Rules(now.grants))
         self._permits.add(permit)
         return permit
 
@@ -89,8 +107,11 @@ class Access:
         """The robots a principal has any right on, kept until something changes in the database."""
         found = self._robots.get(principal.user_id)
         if found is None:
+            seen = self._refreshed
             rows = await self._store.read(queries.robots_with_grants, principal.user_id)
-            found = self._robots[principal.user_id] = [(record, Rules(grants)) for record, grants in rows]
+            found = [(record, Rules(grants)) for record, grants in rows]
+            if seen == self._refreshed:
+                self._robots[principal.user_id] = found
         return found
 
     def release(self, permit: Permit) -> None:
@@ -109,6 +130,7 @@ class Access:
 
         :raises Unavailable: the database can't be asked; what is open goes on under the rights last seen
         """
+        self._refreshed += 1
         self._robots.clear()
         asked = list(self._permits)
         if not asked:
@@ -136,6 +158,7 @@ class Access:
 class _Standing:
     ended: str
     grants: tuple[Grant, ...] = ()
+    credentials: bool = False
 
 
 def _standing(
@@ -145,9 +168,9 @@ def _standing(
     for key in keys:
         user_id, token_id, robot_id = key
         if not queries.token_is_live(session, token_id, now):
-            found[key] = _Standing("your session was ended; log in again")
+            found[key] = _Standing("your session was ended; log in again", credentials=True)
         elif not queries.user_is_live(session, user_id):
-            found[key] = _Standing("your account was disabled")
+            found[key] = _Standing("your account was disabled", credentials=True)
         else:
             grants = tuple(queries.grants_for(session, user_id, robot_id))
             found[key] = _Standing("" if grants else "your right on this robot was revoked", grants)

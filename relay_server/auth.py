@@ -5,27 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorThreads
-from twisted.internet.threads import deferToThreadPool
-from twisted.python.threadpool import ThreadPool
 
 from relay_db import queries
-from relay_protocol.errors import Refused, SwitchboardError
+from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
 from relay_server import passwords
-from relay_server.access import Principal
+from relay_server.access import BadCredentials, Principal
 from relay_server.limiter import LoginLimiter
-from relay_server.store import Store
+from relay_server.store import Store, Threads
+
+__all__ = ["Authenticator", "BadCredentials", "TooManyTries"]
 
 SESSION_SECONDS = 12 * 3600.0
 HASHING_THREADS = 2
 TICKETS = 10_000
+TICKETS_OF_ONE = 100
+"""Tickets one user may have open; a further one takes the place of the oldest."""
 
-
-class BadCredentials(Refused):
-    """The credentials prove nobody."""
-
-    code = "bad_credentials"
+LOGINS_WAITING = 64
+"""Logins that wait for their password to be hashed; further ones are asked to come back."""
 
 
 class TooManyTries(SwitchboardError):
@@ -59,18 +59,19 @@ class Authenticator:
         seconds: Callable[[], float],
         wall: Callable[[], float],
     ) -> None:
-        self._reactor = reactor
         self._store = store
         self._seconds = seconds
         self._wall = wall
         self._limiter = LoginLimiter(seconds)
-        self._hashing = ThreadPool(1, HASHING_THREADS, "passwords")
+        self._hashing = Threads(
+            reactor, "passwords", HASHING_THREADS, LOGINS_WAITING, "too many people log in now; try again"
+        )
         self._tickets: dict[str, _Ticket] = {}
 
     def start(self) -> None:
         """Start the threads that hash passwords, and make ready for the first unknown user."""
         self._hashing.start()
-        self._hashing.callInThread(passwords.prepare)
+        Deferred.fromCoroutine(self._hashing.run(passwords.prepare))
 
     def stop(self) -> None:
         """Wait for the hashing under way and end its threads."""
@@ -82,16 +83,23 @@ class Authenticator:
         :param address: where the ask comes from, for the limit on failures
         :raises BadCredentials: unknown user, wrong password or disabled account: one and the same answer
         :raises TooManyTries: judged before the password is hashed
+        :raises Unavailable: the database does not answer, or too many log in at once
         """
         wait = self._limiter.wait(user, address)
         if wait > 0:
             raise TooManyTries(wait)
         self._limiter.failed(user, address)
+        try:
+            return await self._password(user, password, address)
+        except Unavailable:
+            # Nothing was tried.
+            self._limiter.forgive(user, address)
+            raise
+
+    async def _password(self, user: str, password: str, address: str) -> Principal:
         record = await self._store.read(queries.find_user, user)
         stored = record.password_hash if record is not None and not record.disabled else None
-        right = await deferToThreadPool(
-            self._reactor, self._hashing, passwords.verify_password, password, stored
-        )
+        right = await self._hashing.run(passwords.verify_password, password, stored)
         if record is None or not right:
             raise BadCredentials("user or password is wrong")
         self._limiter.succeeded(user, address)
@@ -115,12 +123,12 @@ class Authenticator:
         :raises BadCredentials: unknown, expired or used
         :raises TooManyTries: as for passwords
         """
-        wait = self._limiter.wait("", address)
+        wait = self._limiter.wait(None, address)
         if wait > 0:
             raise TooManyTries(wait)
         record = await self._store.write(queries.consume_login, passwords.token_hash(code), self._wall())
         if record is None:
-            self._limiter.failed("", address)
+            self._limiter.failed(None, address)
             raise BadCredentials("the login link is unknown, expired or already used; ask for a new one")
         return Principal.of(record)
 
@@ -144,6 +152,9 @@ class Authenticator:
         now = self._seconds()
         for key in [key for key, ticket in self._tickets.items() if ticket.until <= now]:
             del self._tickets[key]
+        own = [key for key, ticket in self._tickets.items() if ticket.principal.user_id == principal.user_id]
+        if len(own) >= TICKETS_OF_ONE:
+            del self._tickets[own[0]]
         if len(self._tickets) >= TICKETS:
             raise Refused("too many tickets are open; use them or wait a minute")
         ticket = passwords.new_token()

@@ -12,7 +12,7 @@ from relay_db import queries
 from relay_protocol.errors import NotFound, SwitchboardError
 from relay_server import closing
 from relay_server.access import Access, Permit, Principal
-from relay_server.auth import Authenticator, BadCredentials
+from relay_server.auth import Authenticator, BadCredentials, TooManyTries
 from relay_server.channel import Channels
 from relay_server.clock import Clock
 from relay_server.edges.origins import Origins
@@ -90,7 +90,11 @@ class FrontDesk:
         try:
             principal = await self._auth.password(user, password, address)
         except SwitchboardError as error:
-            self._journal.event("login.refused", "relay", user=user[:64], address=address, reason=error.code)
+            # Who is over the limit was recorded while under it; a flood must not reach the database.
+            if not isinstance(error, TooManyTries):
+                self._journal.event(
+                    "login.refused", "relay", user=user[:64], address=address, reason=error.code
+                )
             raise
         return await self._logged_in(principal, address, "password")
 

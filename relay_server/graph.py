@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from relay_protocol import limits
 from relay_protocol.link import Graph, Service, Topic
+
+NAMES = 20_000
+"""Most topics, services, actions and nodes, each, that are kept of one robot; further ones are passed over."""
 
 
 class GraphMirror:
@@ -26,12 +30,12 @@ class GraphMirror:
             for name, value in changes.items():
                 if value is None:
                     target.pop(name, None)
-                else:
+                elif name in target or (len(target) < NAMES and len(name) <= limits.NAME):
                     target[name] = value  # type: ignore[assignment]
         for name, node in graph.nodes.items():
             if node is None:
                 self.nodes.discard(name)
-            else:
+            elif len(self.nodes) < NAMES and len(name) <= limits.NAME:
                 self.nodes.add(name)
 
     def clear(self) -> None:

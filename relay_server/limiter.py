@@ -6,10 +6,16 @@ import ipaddress
 from collections import OrderedDict, deque
 from collections.abc import Callable
 
+from relay_db.names import findable
+
 FAILURES = 10
 WINDOW = 15 * 60.0
 KEYS = 10_000
 """Pairs of account and network remembered; the longest unused are forgotten first."""
+
+
+FAILURES_OF_NETWORK = 100
+"""Failures of one network on all accounts together, so that guessing names is no way around :data:`FAILURES`."""
 
 
 def network_of(address: str) -> str:
@@ -26,38 +32,65 @@ def network_of(address: str) -> str:
 
 
 class LoginLimiter:
-    """At most :data:`FAILURES` failures per account and network in :data:`WINDOW` seconds.
+    """At most :data:`FAILURES` failures per account and network in :data:`WINDOW` seconds, and per network
+    :data:`FAILURES_OF_NETWORK`.
 
     The pair is what is limited, so nobody can lock an account from afar.
+
+    An account of ``None`` stands for tries that name nobody (login links): only the network is counted.
 
     :param seconds: a monotonic clock
     """
 
     def __init__(self, seconds: Callable[[], float]) -> None:
         self._seconds = seconds
-        self._failures: OrderedDict[tuple[str, str], deque[float]] = OrderedDict()
+        self._failures: OrderedDict[_Key, deque[float]] = OrderedDict()
 
-    def wait(self, account: str, address: str) -> float:
+    def wait(self, account: str | None, address: str) -> float:
         """Seconds until another try is allowed; 0 when it is allowed now."""
-        times = self._failures.get((account, network_of(address)))
+        return max(self._wait(key, most) for key, most in _keys(account, address))
+
+    def _wait(self, key: _Key, most: int) -> float:
+        times = self._failures.get(key)
         if times is None:
             return 0.0
         now = self._seconds()
         while times and times[0] <= now - WINDOW:
             times.popleft()
-        if len(times) < FAILURES:
+        if len(times) < most:
             return 0.0
         return times[0] + WINDOW - now
 
-    def failed(self, account: str, address: str) -> None:
+    def failed(self, account: str | None, address: str) -> None:
         """Count one failure. Call before hashing begins, and :meth:`succeeded` when it went well."""
-        key = (account, network_of(address))
-        times = self._failures.setdefault(key, deque(maxlen=FAILURES))
-        times.append(self._seconds())
-        self._failures.move_to_end(key)
+        for key, most in _keys(account, address):
+            times = self._failures.setdefault(key, deque(maxlen=most))
+            times.append(self._seconds())
+            self._failures.move_to_end(key)
         while len(self._failures) > KEYS:
             self._failures.popitem(last=False)
 
-    def succeeded(self, account: str, address: str) -> None:
-        """Forget the failures of this pair."""
-        self._failures.pop((account, network_of(address)), None)
+    def forgive(self, account: str | None, address: str) -> None:
+        """Take the latest failure back: nothing was tried."""
+        for key, _ in _keys(account, address):
+            times = self._failures.get(key)
+            if times:
+                times.pop()
+
+    def succeeded(self, account: str | None, address: str) -> None:
+        """Forget the failures of this account here; the network's other failures stay."""
+        self.forgive(account, address)
+        if account is not None:
+            self._failures.pop((findable(account), network_of(address)), None)
+
+
+_Key = tuple[str | None, str]
+
+
+def _keys(account: str | None, address: str) -> list[tuple[_Key, int]]:
+    """What a try counts for, with the most failures each. An account is one however its name is written."""
+    network = network_of(address)
+    keys: list[tuple[_Key, int]] = [((None, network), FAILURES_OF_NETWORK)]
+    if account is not None:
+        keys.append(((findable(account), network), FAILURES))
+    return keys

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from datetime import UTC, datetime
 from typing import TextIO, cast
 
 from twisted.logger import ILogObserver, LogEvent, LogLevel, formatEvent, globalLogBeginner
-
-from relay_protocol import jsontext
 
 _QUIET = (
     "autobahn",
@@ -49,7 +48,8 @@ def _line(event: LogEvent, level: str, namespace: str, text: str, as_json: bool)
     stamp = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
     if as_json:
         entry = {"time": stamp, "level": level, "logger": namespace, "message": text}
-        return jsontext.encode(entry).decode(errors="replace") + "\n"
+        # Pure ASCII: whatever shows the log, nothing in it drives a terminal.
+        return json.dumps(entry).replace("\x7f", "\\u007f") + "\n"
     return f"{stamp} {level:<8} {inert(text)}\n"
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Hashable
+from operator import attrgetter
 
 from relay_protocol.limits import MIB
 
@@ -15,6 +16,16 @@ DATA_PER_TOPIC = 128
 DATA_AGE = 1.0
 CONTROL_MESSAGES = 1024
 CONTROL_BYTES = 2 * MIB
+
+
+class _Queue:
+    """Samples of one topic that wait, each with the moment it came."""
+
+    __slots__ = ("bytes", "samples")
+
+    def __init__(self) -> None:
+        self.samples: deque[tuple[float, bytes]] = deque()
+        self.bytes = 0
 
 
 class Outbox:
@@ -33,7 +44,7 @@ class Outbox:
         self._overflow = overflow
         self._control: deque[bytes] = deque()
         self._control_bytes = 0
-        self._data: dict[Hashable, deque[tuple[float, bytes]]] = {}
+        self._data: dict[Hashable, _Queue] = {}
         self._data_bytes = 0
         self._closed = False
         self.paused_since: float | None = None
@@ -60,9 +71,8 @@ class Outbox:
             key = next(iter(self._data))
             queue = self._data.pop(key)
             self._forget_stale(queue)
-            _, message = queue.popleft()
-            self._data_bytes -= len(message)
-            if queue:
+            message = self._take(queue)
+            if queue.samples:
                 self._data[key] = queue
             self._write(message)
 
@@ -97,37 +107,48 @@ class Outbox:
         if self.paused_since is None:
             self._write(message)
             return
-        queue = self._data.setdefault(key, deque())
-        queue.append((self._seconds(), message))
+        queue = self._data.setdefault(key, _Queue())
+        queue.samples.append((self._seconds(), message))
+        queue.bytes += len(message)
         self._data_bytes += len(message)
-        while len(queue) > depth:
+        while len(queue.samples) > max(depth, 1):
             self._drop_oldest(queue)
-        while self._data_bytes > DATA_BYTES:
-            fullest = max(self._data.values(), key=_size)
-            if len(fullest) == 1:
-                break
-            self._drop_oldest(fullest)
-        if self._data_bytes > 2 * DATA_BYTES:
+        if self._data_bytes > DATA_BYTES:
+            self._make_room()
+        while self._data_bytes > 2 * DATA_BYTES and queue.samples:
             # Single samples of many topics: even the newest can't all be kept.
             self._drop_oldest(queue)
-            if not queue:
-                del self._data[key]
+        if not queue.samples:
+            del self._data[key]
 
     def forget(self, key: Hashable) -> None:
         """Let go of what waits of this topic."""
-        for _, message in self._data.pop(key, ()):
-            self._data_bytes -= len(message)
+        queue = self._data.pop(key, None)
+        if queue is not None:
+            self._data_bytes -= queue.bytes
 
-    def _forget_stale(self, queue: deque[tuple[float, bytes]]) -> None:
+    def _make_room(self) -> None:
+        """Drop from the fullest topic first; each keeps its newest sample."""
+        while self._data_bytes > DATA_BYTES:
+            several = [queue for queue in self._data.values() if len(queue.samples) > 1]
+            if not several:
+                return
+            fullest = max(several, key=attrgetter("bytes"))
+            # A quarter at once, or every further sample would cost a search.
+            for _ in range(max(1, len(fullest.samples) // 4)):
+                self._drop_oldest(fullest)
+
+    def _forget_stale(self, queue: _Queue) -> None:
         oldest = self._seconds() - DATA_AGE
-        while len(queue) > 1 and queue[0][0] < oldest:
+        while len(queue.samples) > 1 and queue.samples[0][0] < oldest:
             self._drop_oldest(queue)
 
-    def _drop_oldest(self, queue: deque[tuple[float, bytes]]) -> None:
-        _, message = queue.popleft()
-        self._data_bytes -= len(message)
+    def _drop_oldest(self, queue: _Queue) -> None:
+        self._take(queue)
         self.dropped += 1
 
-
-def _size(queue: deque[tuple[float, bytes]]) -> int:
-    return sum(len(message) for _, message in queue)
+    def _take(self, queue: _Queue) -> bytes:
+        _, message = queue.samples.popleft()
+        queue.bytes -= len(message)
+        self._data_bytes -= len(message)
+        return message

@@ -223,11 +223,12 @@ class Relay:
             return
         await self._access.refresh()
         for robot in self._registry:
-            if robot.control is not None:
+            control = robot.control
+            if control is not None:
                 record = await self._store.read(queries.robot_key, robot.name, robot.key)
-                if record is None or record.robot_id != robot.robot_id:
+                if robot.control is control and (record is None or record.robot_id != robot.robot_id):
                     self.log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
-                    robot.control.close("the robot's key is not accepted any more")
+                    control.close("the robot's key is not accepted any more")
         # Only now: had anything above failed, the next look would have to do it again.
         self._revision = revision
         self._registry.changed()

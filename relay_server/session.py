@@ -11,12 +11,13 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import PeerError, Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Level, Operation
+from relay_protocol.ros.definition import normalise
 from relay_server import closing
 from relay_server.access import Permit
 from relay_server.channel import Channel, resolve
@@ -108,7 +109,7 @@ class Session:
         self._ended = ended
         self._level = LEVELS["none"]
         self._listeners: dict[str, Listener] = {}
-        self._calls = 0
+        self._calls: set[Deferred[None]] = set()
         self._malformed = 0
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
@@ -150,6 +151,9 @@ class Session:
                 loop.stop()
         for listener in self._listeners.values():
             listener.close()
+        # Nobody is left to hear the answers, and their places are wanted by others.
+        for call in list(self._calls):
+            call.cancel()
         self.channel.detach(self)
         self._ended(self)
 
@@ -250,12 +254,14 @@ class Session:
             if len(self._listeners) >= SUBSCRIPTIONS:
                 raise Refused(f"at most {SUBSCRIPTIONS} topics can be subscribed on one connection")
             listener = Listener(self._clock, self, ask.topic)
-        listener.asks[ask.id] = ask
         if self._local.topic(topic) is not None:
+            listener.add(ask)
             self._listeners[topic] = listener
             if not self._telling.running:
                 self._telling.start(1.0, now=True)
             return
+        self.channel.subscriptions.check(topic, normal_type(ask.type))
+        listener.add(ask)
         self.channel.subscriptions.add(self, listener, normal_type(ask.type), ask.qos)
         self._listeners[topic] = listener
 
@@ -264,12 +270,10 @@ class Session:
         listener = self._listeners.get(topic)
         if listener is None:
             return
-        if ask.id is not None:
-            listener.asks.pop(ask.id, None)
-            if listener.asks:
-                if self._local.topic(topic) is None:
-                    self.channel.subscriptions.add(self, listener, "", None)
-                return
+        if ask.id is not None and listener.remove(ask.id):
+            if self._local.topic(topic) is None:
+                self.channel.subscriptions.add(self, listener, "", None)
+            return
         self._drop(topic)
 
     def _drop(self, topic: str) -> None:
@@ -325,7 +329,7 @@ class Session:
 
     def _call(self, ask: rosbridge.CallService) -> None:
         service = resolve(ask.service)
-        if self._calls >= CALLS:
+        if len(self._calls) >= CALLS:
             raise Refused(f"{CALLS} calls of this connection are waiting already")
         local = self._local.service(service)
         if local is None:
@@ -336,9 +340,10 @@ class Session:
         else:
             args = jsontext.decode_any(bytes(ask.args)) if ask.args else {}
             answer = self._call_local(local, args)
-        self._calls += 1
-        finished = Deferred.fromCoroutine(self._finish(ask, answer))
-        finished.addErrback(self._unexpected, ask)
+        running = Deferred.fromCoroutine(self._finish(ask, answer))
+        self._calls.add(running)
+        running.addErrback(self._unexpected, ask)
+        running.addBoth(lambda _: self._calls.discard(running))
 
     async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
         return jsontext.encode(await local(self, args))
@@ -348,10 +353,10 @@ class Session:
             self._answer(ask, True, await answer)
         except SwitchboardError as error:
             self._refuse(ask, error)
-        finally:
-            self._calls -= 1
 
     def _unexpected(self, failure: Any, ask: rosbridge.CallService) -> None:
+        if self._closed and failure.check(CancelledError):
+            return
         self.log.failure("a call of {service} failed", failure, service=ask.service)
         self._answer(ask, False, jsontext.encode("the relay failed on this call; its log tells more"))
 
@@ -401,11 +406,14 @@ class Session:
 
 
 def normal_type(name: str | None, kind: str = "msg") -> str:
-    """ROS 1 habit ``pkg/Name`` becomes ``pkg/msg/Name`` (or ``srv``); empty stays empty."""
+    """ROS 1 habit ``pkg/Name`` becomes ``pkg/msg/Name`` (or ``srv``); empty stays empty.
+
+    :raises Invalid: no type name
+    """
     if not name:
         return ""
     package, slash, rest = name.partition("/")
-    return f"{package}/{kind}/{rest}" if slash and "/" not in rest else name
+    return normalise(f"{package}/{kind}/{rest}" if slash and "/" not in rest else name)
 
 
 _HANDLERS: dict[type, Callable[[Session, Any], None]] = {

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from typing import Concatenate, ParamSpec, TypeVar
 
 from sqlalchemy.orm import Session
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorThreads
 from twisted.internet.threads import deferToThreadPool
+from twisted.python.failure import Failure
 from twisted.python.threadpool import ThreadPool
 
 from relay_db.engine import Database
@@ -21,7 +23,52 @@ T = TypeVar("T")
 
 READERS = 2
 WAITING = 256
-"""More asks than this queue up only when the database hangs; further ones are refused."""
+"""Reads, and writes, at a time. More queue up only when the database hangs; further ones are refused."""
+
+
+class Threads:
+    """A pool of threads with a bounded queue in front.
+
+    :param reactor: calls results back
+    :param most: pieces of work that may be under way or wait, also those whose asker has left
+    :param overload: what further askers are told
+    """
+
+    def __init__(self, reactor: IReactorThreads, name: str, size: int, most: int, overload: str) -> None:
+        self._reactor = reactor
+        self._pool = ThreadPool(1, size, name)
+        self._most = most
+        self._overload = overload
+        self._under_way = 0
+
+    def start(self) -> None:
+        """Start the first thread."""
+        self._pool.start()
+
+    def stop(self) -> None:
+        """Finish what is under way; blocks for as long as that takes."""
+        self._pool.stop()
+
+    async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Do this in a thread.
+
+        :raises Unavailable: too much waits already
+        """
+        if self._under_way >= self._most:
+            raise Unavailable(self._overload)
+        self._under_way += 1
+        # Not the thread's own Deferred: cancelling that would free the place while the work goes on.
+        waiting: Deferred[T] = Deferred()
+        done = deferToThreadPool(self._reactor, self._pool, work, *args, **kwargs)
+        done.addBoth(self._done, waiting)
+        return await waiting
+
+    def _done(self, result: T | Failure, waiting: Deferred[T]) -> None:
+        self._under_way -= 1
+        if isinstance(result, Failure):
+            waiting.errback(result)
+        else:
+            waiting.callback(result)
 
 
 class Store:
@@ -32,10 +79,9 @@ class Store:
 
     def __init__(self, reactor: IReactorThreads, database: Database) -> None:
         self.database = database
-        self._reactor = reactor
-        self._readers = ThreadPool(1, READERS, "db-read")
-        self._writers = ThreadPool(1, database.writers, "db-write")
-        self._waiting = 0
+        overload = "the database is overloaded; try again in a moment"
+        self._readers = Threads(reactor, "db-read", READERS, WAITING, overload)
+        self._writers = Threads(reactor, "db-write", database.writers, WAITING, overload)
 
     def start(self) -> None:
         """Start the pools. The database must be upgraded already."""
@@ -58,7 +104,7 @@ class Store:
             with self.database.reading() as session:
                 return query(session, *args, **kwargs)
 
-        return await self._run(self._readers, work)
+        return await self._readers.run(work)
 
     async def write(
         self, query: Callable[Concatenate[Session, P], T], *args: P.args, **kwargs: P.kwargs
@@ -72,14 +118,4 @@ class Store:
             with self.database.begin() as session:
                 return query(session, *args, **kwargs)
 
-        return await self._run(self._writers, work)
-
-    async def _run(self, pool: ThreadPool, work: Callable[[], T]) -> T:
-        if self._waiting >= WAITING:
-            raise Unavailable("the database is overloaded; try again in a moment")
-        self._waiting += 1
-        try:
-            result: T = await deferToThreadPool(self._reactor, pool, work)
-            return result
-        finally:
-            self._waiting -= 1
+        return await self._writers.run(work)

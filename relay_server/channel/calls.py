@@ -16,8 +16,20 @@ from relay_server.clock import Clock, cancel
 PENDING = 1024
 """Calls under way on one robot."""
 
+LONGEST_CALL = 3600.0
+"""Most seconds a client may give a service."""
+
 GRACE = 1.0
 """The robot gives up by itself at the timeout; this much later the relay does, seconds."""
+
+
+LARGEST_REQUEST = limits.COMMAND_FRAME // 4 * 3 - 4096
+"""Bytes of CDR that still fit a frame to a robot in base64, beside the names."""
+
+
+def call_seconds(timeout: float | None) -> float:
+    """How long a call may take, by what the client asked for."""
+    return min(timeout, LONGEST_CALL) if timeout and timeout > 0 else limits.CALL_SECONDS
 
 
 class Calls:
@@ -30,14 +42,12 @@ class Calls:
         self._ids = itertools.count(1)
         self._pending: dict[str, Deferred[link.ServiceResponse]] = {}
 
-    async def call(
-        self, service: str, type_name: str, args: bytes, timeout: float | None, now_ns: int
-    ) -> bytes:
+    async def call(self, service: str, type_name: str, args: bytes, seconds: float, now_ns: int) -> bytes:
         """Call a service of the robot.
 
         :param type_name: as the client gave it; the graph's type wins
         :param args: JSON, an object or a list of the fields in order; may be empty
-        :param timeout: seconds
+        :param seconds: the robot has for its answer
         :returns: the response as JSON
         :raises NotFound: no such service
         :raises Invalid: arguments that do not fit its type
@@ -46,7 +56,6 @@ class Calls:
         type_name = self._wire.robot.graph.service_type(service) or type_name
         if not type_name:
             raise NotFound(f"service {service} does not exist on robot {self._wire.robot.name}")
-        seconds = min(timeout, 3600.0) if timeout and timeout > 0 else limits.CALL_SECONDS
         await self._definitions.ready(type_name)
         message = self._message(service, type_name, args, seconds, now_ns)
         response = await self._exchange(message, seconds)
@@ -73,6 +82,8 @@ class Calls:
         call_id = str(next(self._ids))
         if self._wire.cdr:
             cdr = self._wire.robot.types.args_from_json(f"{type_name}_Request", value, now_ns)
+            if len(cdr) > LARGEST_REQUEST:
+                raise Invalid(f"the request has {len(cdr)} bytes; a robot takes at most {LARGEST_REQUEST}")
             return link.CallService(
                 id=call_id, service=service, type=type_name, timeout=seconds, cdr=link.to_base64(cdr)
             )
@@ -91,6 +102,7 @@ class Calls:
         try:
             return await waiting
         finally:
+            self._pending.pop(message.id, None)
             cancel(timer)
 
     def _late(self, message: link.CallService, seconds: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from twisted.internet.defer import Deferred, succeed
+from twisted.internet.defer import Deferred, fail, succeed
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
@@ -34,6 +34,9 @@ class Definitions:
         """Fires when the type is known; fails in words when the robot does not know it or is lost."""
         if self._wire.robot.types.knows(type_name) or not self._wire.cdr:
             return succeed(None)
+        if self._wire.link is None:
+            # Nobody would ask the robot, and this type would count as asked for.
+            return fail(Unavailable(f"robot {self._wire.robot.name} is not connected"))
         self.want(type_name)
         waiting: Deferred[None] = Deferred()
         self._asked.setdefault(type_name, []).append(waiting)

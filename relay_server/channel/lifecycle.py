@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
+from twisted.python.failure import Failure
 
-from relay_protocol import link
+from relay_protocol import limits, link
 from relay_protocol.errors import SwitchboardError, Unavailable
-from relay_server.channel.calls import Calls
+from relay_server.channel.calls import GRACE, Calls, call_seconds
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.publications import Publications
 from relay_server.channel.subscriptions import Subscriptions
 from relay_server.channel.wire import ChannelLink, Member, Wire
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.registry import Presence
+
+T = TypeVar("T")
 
 JOIN_SECONDS = 10.0
 """A robot that has not joined by then is asked again."""
@@ -101,7 +105,7 @@ class Channel:
         definitions = Definitions(self.wire, self._typed)
         self._definitions = definitions
         self.subscriptions = Subscriptions(self.wire, definitions)
-        self.publications = Publications(self.wire, definitions, wall_ns)
+        self.publications = Publications(clock, self.wire, definitions, wall_ns)
         self._calls = Calls(clock, self.wire, definitions)
         robot.watchers.append(self)
 
@@ -142,18 +146,28 @@ class Channel:
 
         :raises Unavailable: besides the cases there, the robot is offline
         """
-        await self._open()
-        return await self._calls.call(service, type_name, args, timeout, self._wall_ns())
+        seconds = call_seconds(timeout)
+
+        async def work() -> bytes:
+            await self._open()
+            return await self._calls.call(service, type_name, args, seconds, self._wall_ns())
+
+        # One second more than the call itself has: its own words are the better ones.
+        return await self._within(seconds + 2 * GRACE, work())
 
     async def round_trip(self) -> float:
         """Seconds for a ping to the robot over this channel's own link.
 
         :raises Unavailable: the robot is offline or lost before it answers
         """
-        await self._open()
-        if self.wire.link is None:
-            raise Unavailable(f"robot {self.robot.name} is not connected")
-        return await self.wire.link.round_trip()
+
+        async def work() -> float:
+            await self._open()
+            if self.wire.link is None:
+                raise Unavailable(f"robot {self.robot.name} is not connected")
+            return await self.wire.link.round_trip()
+
+        return await self._within(limits.CALL_SECONDS, work())
 
     async def definition(self, type_name: str) -> None:
         """Wait until the robot's definition of a type is known.
@@ -161,8 +175,26 @@ class Channel:
         :raises Invalid: the robot does not have it
         :raises Unavailable: the robot is offline
         """
-        await self._open()
-        await self._definitions.ready(type_name)
+
+        async def work() -> None:
+            await self._open()
+            await self._definitions.ready(type_name)
+
+        await self._within(limits.CALL_SECONDS, work())
+
+    async def _within(self, seconds: float, work: Coroutine[Deferred[Any], Any, T]) -> T:
+        """Whatever the robot leaves out, nobody waits longer than this for it."""
+        running = Deferred.fromCoroutine(work)
+        late = Unavailable(f"robot {self.robot.name} did not answer within {seconds:g} s")
+
+        def too_late(result: Any, timeout: float) -> Any:
+            if isinstance(result, Failure):
+                result.trap(CancelledError)
+                raise late
+            return result
+
+        running.addTimeout(seconds, self._clock, too_late)  # type: ignore[arg-type]
+        return await running
 
     async def _open(self) -> None:
         if self.state is State.WAITING:
@@ -240,6 +272,8 @@ class Channel:
             pause = REOPEN_SECONDS if event is Event.LINK_LOST else 0.0
             self._timer = self._clock.callLater(pause, self._ask_to_open)
         elif following is State.WAITING:
+            # Also when the link had not opened yet: what was held must not be done when the robot is back.
+            self.publications.lost()
             self._tell_waiting(Unavailable(f"robot {self.robot.name} is offline"))
         elif following is State.OPEN:
             self._enter_open()

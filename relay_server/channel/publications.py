@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from relay_protocol import jsontext, link, rosbridge
-from relay_protocol.errors import Invalid, SwitchboardError
+from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.rights import Operation
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
-from relay_server.channel.topics import Phase, Publication
+from relay_server.channel.topics import Held, Phase, Publication
 from relay_server.channel.wire import Member, Wire, resolve
+from relay_server.clock import Clock
+
+ADVERTISEMENTS = 1024
+"""Advertisements of one client, by topic and id."""
+
+QUEUE_SIZE = 10_000
+"""Deepest queue of a publisher on the robot; who asks for more gets this."""
+
+HELD_SECONDS = 3.0
+"""A message that could not go out by then is dropped: nobody wants it done that late."""
 
 Failed = Callable[[str], None]
 
@@ -21,7 +31,10 @@ class Publications:
     :param wall_ns: Unix time in nanoseconds, for header stamps a client leaves out
     """
 
-    def __init__(self, wire: Wire, definitions: Definitions, wall_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, clock: Clock, wire: Wire, definitions: Definitions, wall_ns: Callable[[], int]
+    ) -> None:
+        self._clock = clock
         self._wire = wire
         self._definitions = definitions
         self._wall_ns = wall_ns
@@ -33,11 +46,11 @@ class Publications:
 
         :raises Invalid: the topic has another type; too many topics
         """
-        publication = self._get(resolve(ask.topic), type_name)
+        publication = self._get(member, resolve(ask.topic), type_name)
         publication.holders.setdefault(member, set()).add(ask.id)
         if publication.phase is Phase.WAITING:
             publication.latch = publication.latch or ask.latch
-            publication.queue_size = max(publication.queue_size, ask.queue_size)
+            publication.queue_size = min(max(publication.queue_size, ask.queue_size), QUEUE_SIZE)
             publication.qos = ask.qos or publication.qos
         if publication.phase in (Phase.WAITING, Phase.FAILED):
             self._ask(publication)
@@ -76,7 +89,7 @@ class Publications:
             wanted = type_name or self._known(topic)
             if not wanted:
                 raise Invalid(f"topic {topic} does not exist and no type was given; advertise it first")
-            publication = self._get(topic, wanted)
+            publication = self._get(member, topic, wanted)
             publication.holders.setdefault(member, set()).add(None)
             if publication.phase is Phase.WAITING:
                 self._ask(publication)
@@ -92,7 +105,7 @@ class Publications:
         if publication.phase is Phase.FAILED:
             failed(f"the robot could not advertise {publication.topic}; the message was dropped")
         elif self._wire.link is None or self._untyped(publication):
-            publication.held.append((body, stamp, failed))
+            publication.held.append(Held(body, stamp, failed, self._clock.seconds()))
         else:
             self._convert(publication, body, stamp, failed)
 
@@ -142,10 +155,14 @@ class Publications:
     def _untyped(self, publication: Publication) -> bool:
         return self._wire.cdr and not self._wire.robot.types.knows(publication.type)
 
-    def _get(self, topic: str, type_name: str) -> Publication:
+    def _get(self, member: Member, topic: str, type_name: str) -> Publication:
         known = self._known(topic)
         if known and known != type_name:
-            raise Invalid(f"topic {topic} has the type {known}, not {type_name}")
+            raise Invalid(f"topic {topic} has the type {known}, not {type_name or 'none'}")
+        if not type_name:
+            raise Invalid(f"topic {topic} does not exist; advertise it with its type")
+        if sum(len(each.holders.get(member, ())) for each in self._topics.values()) >= ADVERTISEMENTS:
+            raise Refused(f"at most {ADVERTISEMENTS} advertisements can be held on one connection")
         publication = self._topics.get(topic)
         if publication is None:
             publication = Publication(self._wire.number(), topic, type_name)
@@ -174,8 +191,12 @@ class Publications:
     def _flush(self, publication: Publication) -> None:
         held = list(publication.held)
         publication.held.clear()
-        for body, stamp, failed in held:
-            self._convert(publication, body, stamp, failed)
+        oldest = self._clock.seconds() - HELD_SECONDS
+        for each in held:
+            if each.since < oldest:
+                each.failed(f"publish {publication.topic}: the robot could not be reached in time; dropped")
+            else:
+                self._convert(publication, each.body, each.stamp, each.failed)
 
     def _convert(self, publication: Publication, body: bytes, stamp: int, failed: Failed) -> None:
         try:

@@ -29,14 +29,9 @@ class Subscriptions:
         :raises Invalid: the topic has another type; nobody knows its type; too many topics
         """
         topic = resolve(listener.name)
-        known = self._wire.robot.graph.topic_type(topic)
+        has = self.check(topic, type_name)
         uplink = self._topics.get(topic)
-        has = (uplink.type if uplink else "") or known or ""
-        if has and type_name and type_name != has:
-            raise Invalid(f"topic {topic} has the type {has}, not {type_name}")
         if uplink is None:
-            if not has and not type_name and self._wire.link is not None:
-                raise Invalid(f"topic {topic} does not exist; give its type to wait for it")
             uplink = TopicUplink(self._wire.number(), topic, has or type_name, qos)
             self._topics[topic] = self._numbers[uplink.number] = uplink
         newcomer = member not in uplink.listeners
@@ -49,6 +44,16 @@ class Subscriptions:
             self._send(uplink)
         if newcomer:
             uplink.replay(listener)
+
+    def check(self, topic: str, type_name: str) -> str:
+        """The type a topic has already, or none; see :meth:`add` for what is refused."""
+        uplink = self._topics.get(topic)
+        has = (uplink.type if uplink else "") or self._wire.robot.graph.topic_type(topic) or ""
+        if has and type_name and type_name != has:
+            raise Invalid(f"topic {topic} has the type {has}, not {type_name}")
+        if uplink is None and not has and not type_name and self._wire.link is not None:
+            raise Invalid(f"topic {topic} does not exist; give its type to wait for it")
+        return has
 
     def remove(self, member: Member, topic: str) -> None:
         """A client wants a topic no more; the robot stops sending it after the last."""

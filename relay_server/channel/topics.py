@@ -5,10 +5,10 @@ from __future__ import annotations
 import enum
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from relay_protocol import jsontext, rosbridge
-from relay_protocol.errors import SwitchboardError
+from relay_protocol import jsontext, limits, rosbridge
+from relay_protocol.errors import Refused, SwitchboardError
 from relay_protocol.link import QoS
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.wire import Member
@@ -17,15 +17,25 @@ from relay_server.clock import Clock, Timer
 LATCHED_KEPT = 64
 """Most latched samples kept for late joiners of one topic (one for each publisher)."""
 
+KEPT_BYTES = limits.ROBOT_FRAME
+"""Most bytes of latched samples kept for one topic, and most that wait for its type."""
+
+THROTTLE_SECONDS = 3600.0
+"""Longest throttle; a client that asks for more gets this."""
+
+ASKS = 64
+"""Subscriptions of one client to one topic, merged into one listener."""
+
 
 class Sample:
     """One message from the robot. It is converted at most once, and only if somebody takes it."""
 
-    __slots__ = ("_body", "_convert", "_encoded", "_payloads", "failure")
+    __slots__ = ("_body", "_convert", "_encoded", "_payloads", "failure", "size")
 
     def __init__(self, body: bytes, convert: Callable[[bytes], bytes]) -> None:
         self._body = body
         self._convert = convert
+        self.size = len(body)
         self._encoded: bytes | None = None
         self._payloads: dict[str, bytes] = {}
         self.failure: str = ""
@@ -71,20 +81,36 @@ class Listener:
         self._clock = clock
         self._receiver = receiver
         self.name = name
-        self.asks: dict[rosbridge.Id, rosbridge.Subscribe] = {}
+        self.throttle = 0.0
+        """Least seconds between two samples: the least any of the subscriptions asks for."""
+        self.depth = 0
+        """Samples that may wait for this client; 0 leaves it to the relay."""
+        self._asks: dict[rosbridge.Id, rosbridge.Subscribe] = {}
         self._next_at = 0.0
         self._waiting: Sample | None = None
         self._timer: Timer | None = None
 
-    @property
-    def throttle(self) -> float:
-        """Least seconds between two samples: the least any of the subscriptions asks for."""
-        return max(0.0, min((ask.throttle_rate for ask in self.asks.values()), default=0.0)) / 1000
+    def add(self, ask: rosbridge.Subscribe) -> None:
+        """One more subscription, or another one under the same id.
 
-    @property
-    def depth(self) -> int:
-        """Samples that may wait for this client; 0 leaves it to the relay."""
-        return max((ask.queue_length for ask in self.asks.values()), default=0)
+        :raises Refused: too many on this topic
+        """
+        if ask.id not in self._asks and len(self._asks) >= ASKS:
+            raise Refused(f"at most {ASKS} subscriptions to one topic can be held on one connection")
+        self._asks[ask.id] = ask
+        self._merge()
+
+    def remove(self, id: rosbridge.Id) -> bool:
+        """One subscription less; whether any are left."""
+        self._asks.pop(id, None)
+        self._merge()
+        return bool(self._asks)
+
+    def _merge(self) -> None:
+        asks = self._asks.values()
+        least = min((ask.throttle_rate for ask in asks), default=0.0) / 1000
+        self.throttle = min(max(0.0, least), THROTTLE_SECONDS)
+        self.depth = max(0, max((ask.queue_length for ask in asks), default=0))
 
     def offer(self, sample: Sample) -> None:
         """A new sample. Within the throttle the newest waits, so the last of a burst always arrives."""
@@ -97,6 +123,12 @@ class Listener:
                     self._timer = self._clock.callLater(self._next_at - now, self._due)
                 return
             self._next_at = now + throttle
+        # What waited under a longer throttle is older than this one.
+        self.close()
+        self._send(sample)
+
+    def replay(self, sample: Sample) -> None:
+        """A latched sample for a late joiner; each is of another publisher, so no throttle drops any."""
         self._send(sample)
 
     def close(self) -> None:
@@ -171,10 +203,14 @@ class TopicUplink:
         """Take a sample from the robot and hand it to the listeners."""
         if self.encoding == "cdr" and not types.knows(self.type):
             self._untyped.append(body)
+            while sum(map(len, self._untyped)) > KEPT_BYTES:
+                self._untyped.popleft()
             return None
         sample = Sample(body, converter(types, self.type, self.encoding))
         if self.latched:
             self._recent.append(sample)
+            while sum(each.size for each in self._recent) > KEPT_BYTES:
+                self._recent.popleft()
         for listener in list(self.listeners.values()):
             listener.offer(sample)
         return sample
@@ -189,7 +225,19 @@ class TopicUplink:
     def replay(self, listener: Listener) -> None:
         """Give a late joiner the latched samples the others have had."""
         for sample in list(self._recent):
-            listener.offer(sample)
+            listener.replay(sample)
+
+
+class Held(NamedTuple):
+    """A message that waits for the moment until it can be sent; see :meth:`Publications.publish`.
+
+    :param since: seconds of the relay's clock
+    """
+
+    body: bytes
+    stamp: int
+    failed: Callable[[str], None]
+    since: float
 
 
 class Publication:
@@ -204,4 +252,4 @@ class Publication:
         self.qos: QoS | None = None
         self.phase = Phase.WAITING
         self.holders: dict[Member, set[rosbridge.Id]] = {}
-        self.held: deque[tuple[bytes, int, Callable[[str], None]]] = deque(maxlen=64)
+        self.held: deque[Held] = deque(maxlen=64)

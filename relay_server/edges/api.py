@@ -30,6 +30,8 @@ T = TypeVar("T")
 
 STREAM_SECONDS = 5.0
 COALESCE_SECONDS = 0.25
+STALL_SECONDS = 5.0
+"""A client that takes nothing of its stream for so long is cut."""
 
 
 class Desk(Protocol):
@@ -317,21 +319,51 @@ class _RobotStream:
         self._desk = desk
         self._request = request
         self._wake: Deferred[None] | None = None
+        self._paused_since: float | None = None
 
     async def run(self) -> None:
-        """Until the client leaves or its credentials end."""
+        """Until the client leaves, takes nothing any more, or its credentials end."""
         stop = self._desk.on_change(self._changed)
+        self._request.registerProducer(self, True)
         try:
             while not self._request._disconnected:
-                principal = await self._api.principal(self._request)
-                body = jsontext.encode({"robots": await self._desk.robots(principal)})
-                self._request.write(b"event: robots\ndata: " + body + b"\n\n")
+                if self._paused_since is None:
+                    await self._tell()
+                elif self._clock.seconds() - self._paused_since > STALL_SECONDS:
+                    self._request.transport.abortConnection()
+                    return
                 await self._sleep(COALESCE_SECONDS)
                 await self._until_change()
-        except BadCredentials:
+        except (BadCredentials, Refused):
             self._request.write(b"event: ended\ndata: {}\n\n")
         finally:
             stop()
+            self._request.unregisterProducer()
+
+    async def _tell(self) -> None:
+        try:
+            principal = await self._api.principal(self._request)
+            body = jsontext.encode({"robots": await self._desk.robots(principal)})
+        except Unavailable:
+            # What is open goes on; the next look may do better.
+            return
+        self._request.write(b"event: robots\ndata: " + body + b"\n\n")
+
+    # --- Twisted's push producer ---
+
+    def pauseProducing(self) -> None:
+        """The transport's buffer is full."""
+        self._paused_since = self._clock.seconds()
+
+    def resumeProducing(self) -> None:
+        """The transport takes bytes again."""
+        self._paused_since = None
+        self._changed()
+
+    def stopProducing(self) -> None:
+        """The client has left; the request's own end follows."""
+
+    # --- waiting ---
 
     def _changed(self) -> None:
         wake, self._wake = self._wake, None
@@ -345,6 +377,7 @@ class _RobotStream:
         try:
             await wake
         finally:
+            self._wake = None
             cancel(timer)
 
     async def _sleep(self, seconds: float) -> None:

@@ -6,7 +6,7 @@ import ipaddress
 from collections.abc import Iterable
 from urllib.parse import urlsplit
 
-from relay_protocol.errors import Refused
+from relay_protocol.errors import Invalid, Refused
 
 
 class Origins:
@@ -17,12 +17,13 @@ class Origins:
 
     :param scheme: ``http`` or ``https``, what the relay itself speaks
     :param listed: ``https://host[:port]`` each
+    :raises Invalid: something listed is no origin
     """
 
     def __init__(self, scheme: str, listed: Iterable[str] = ()) -> None:
         self.tls = scheme == "https"
         self._scheme = scheme
-        self._listed = {_normal(each) for each in listed}
+        self._listed = {_checked(each) for each in listed}
 
     def check(self, origin: str | None, host: str) -> None:
         """Take or refuse a cookie that came with this ``Origin`` and ``Host``.
@@ -31,22 +32,33 @@ class Origins:
         """
         if origin is None:
             raise Refused("a session cookie counts only with an Origin header; programs use an access token")
-        if _normal(origin) in self._listed:
+        asked = _normal(origin)
+        if asked and asked in self._listed:
             return
         own = _normal(f"{self._scheme}://{host}")
-        if _normal(origin) != own or not _unrebindable(urlsplit(own).hostname or ""):
+        if not asked or asked != own or not _unrebindable(urlsplit(own).hostname or ""):
             raise Refused(
                 f"pages of {origin[:100]} may not use this relay; start it with --origin to allow that"
             )
 
 
+def _checked(listed: str) -> str:
+    normal = _normal(listed)
+    if not normal or urlsplit(listed).path.strip("/"):
+        raise Invalid(f"'{listed}' is no origin; write https://host or https://host:port")
+    return normal
+
+
 def _normal(origin: str) -> str:
+    """One spelling of an origin; nothing for what is none, such as ``null``."""
     try:
         parts = urlsplit(origin.strip().lower())
         port = parts.port
     except ValueError:
         return ""
     standard = {"http": 80, "https": 443}.get(parts.scheme)
+    if standard is None or not parts.hostname:
+        return ""
     return f"{parts.scheme}://{parts.hostname}:{port or standard}"
 
 

@@ -101,6 +101,9 @@ class Opening:
                 address=self._connection.address,
             )
             raise Refused("this key is not accepted for this robot; enroll the robot again if it should be")
+        if self._connection.ended:
+            # It left while the database was asked; a registration now would be a ghost.
+            return
         robot = hall.registry.presence(record.robot_id, record.robot, record.realm)
         control = Control(hall, self._connection, robot, hello)
         control.begin()
@@ -221,8 +224,8 @@ class Control:
             self.log.warn(
                 "robot {robot}: {level}: {text}",
                 robot=self._robot.name,
-                level=message.level,
-                text=message.text,
+                level=message.level[:20],
+                text=message.text[:500],
             )
             self._hall.journal.event(
                 "robot.alert",

@@ -7,7 +7,7 @@ link or the link of a channel.
 from __future__ import annotations
 
 import socket
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -25,6 +25,9 @@ from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, e
 from relay_server.clock import Clock, Timer, cancel, looping
 from relay_server.edges.caps import AddressCap
 from relay_server.outbox import Outbox
+
+PINGS = 256
+"""Pings without an answer that are remembered."""
 
 
 class Role(Protocol):
@@ -84,7 +87,8 @@ class RobotConnection(TwistedProtocol):
         self._busy = False
         self._heard = clock.seconds()
         self._beating = looping(clock, self._beat)
-        self._pings: dict[int, Deferred[float] | None] = {}
+        self._aborting: Timer | None = None
+        self._pings: OrderedDict[int, Deferred[float] | None] = OrderedDict()
         self.on_round_trip: Callable[[float], None] = lambda seconds: None
         self._outbox = Outbox(self._write, clock.seconds, self._overflow)
         self.address = ""
@@ -120,7 +124,13 @@ class RobotConnection(TwistedProtocol):
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """The connection is gone."""
         self._cap.leave(self.address)
+        cancel(self._aborting)
         self._end(reason.getErrorMessage())
+
+    @property
+    def ended(self) -> bool:
+        """Whether the connection is gone, or on its way out."""
+        return self._role is None
 
     # --- for roles ----------------------------------------------------------------------------------------
 
@@ -200,7 +210,14 @@ class RobotConnection(TwistedProtocol):
         while now in self._pings:
             now += 1
         self._pings[now] = waiting
+        while len(self._pings) > PINGS:
+            self._give_up(self._pings.popitem(last=False)[1])
         self.send(link.Ping(t=now))
+
+    @staticmethod
+    def _give_up(waiting: Deferred[float] | None) -> None:
+        if waiting is not None:
+            waiting.errback(Unavailable("the robot did not answer, or lost its connection"))
 
     def _beat(self) -> None:
         silent = self._clock.seconds() - self._heard
@@ -232,7 +249,7 @@ class RobotConnection(TwistedProtocol):
 
     def _go_on(self, _: Any) -> None:
         self._busy = False
-        if self._role is None:
+        if self.ended:
             return
         self.transport.resumeProducing()
         try:
@@ -249,8 +266,10 @@ class RobotConnection(TwistedProtocol):
 
     def _hang_up(self, reason: str) -> None:
         self._end(reason)
+        # TLS would not shut down while a producer is registered.
+        self.transport.unregisterProducer()
         self.transport.loseConnection()
-        self._clock.callLater(2.0, self.transport.abortConnection)
+        self._aborting = self._clock.callLater(2.0, self.transport.abortConnection)
 
     def _end(self, reason: str) -> None:
         role, self._role = self._role, None
@@ -259,10 +278,9 @@ class RobotConnection(TwistedProtocol):
         self._waiting.clear()
         if self._beating.running:
             self._beating.stop()
-        pings, self._pings = self._pings, {}
+        pings, self._pings = self._pings, OrderedDict()
         for waiting in pings.values():
-            if waiting is not None:
-                waiting.errback(Unavailable("the robot lost its connection"))
+            self._give_up(waiting)
         if role is not None:
             role.lost(reason)
 

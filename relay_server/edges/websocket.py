@@ -33,6 +33,9 @@ HANDSHAKE_STATUS = {
     closing.UNAVAILABLE: 503,
     closing.GOING_AWAY: 503,
 }
+EARLY_OVERHEAD = 64
+"""What a message before the proof counts for beside its bytes; empty ones take memory too."""
+
 REASON_BYTES = 123
 """Room for words in a close frame (RFC 6455 section 5.5.1)."""
 
@@ -100,6 +103,9 @@ class ClientProtocol(WebSocketServerProtocol):
                 self._admission = await self.factory.gate.admit(principal, self._robot, self._address())
         except SwitchboardError as error:
             self._failure = (_code_of(error), str(error))
+        if self.state == self.STATE_CLOSED:
+            self._turn_away()
+            raise ConnectionDeny(HANDSHAKE_STATUS[closing.UNAVAILABLE], "the client has left")
         if self._failure is not None and not request.origin:
             # Programs read the status; browsers can't, so they get a close code after the handshake.
             code, reason = self._failure
@@ -154,7 +160,7 @@ class ClientProtocol(WebSocketServerProtocol):
         self._session.start()
         early, self._early = self._early, []
         for message in early:
-            self._session.message(message)
+            self.onMessage(message, False)
 
     def _failed(self, failure: Any) -> None:
         error = failure.value
@@ -181,7 +187,7 @@ class ClientProtocol(WebSocketServerProtocol):
             self._message_early(payload)
 
     def _message_early(self, payload: bytes) -> None:
-        self._early_bytes += len(payload)
+        self._early_bytes += len(payload) + EARLY_OVERHEAD
         if self._early_bytes > limits.UNPROVEN_BYTES:
             self.close(closing.TOO_BIG, f"more than {limits.UNPROVEN_BYTES} bytes before the session began")
         elif self._proving:
@@ -234,11 +240,17 @@ class ClientProtocol(WebSocketServerProtocol):
         if session is not None:
             session.end()
 
+    def _closeConnection(self, abort: bool = False) -> None:
+        # TLS would not shut down while a producer is registered.
+        self.transport.unregisterProducer()
+        super()._closeConnection(abort)
+
     # --- ClientTransport ----------------------------------------------------------------------------------
 
     def send(self, message: bytes) -> None:
-        """One text message."""
-        self.sendMessage(message, isBinary=False)
+        """One text message. The peer may have begun to close: then nobody reads it."""
+        if self.state == self.STATE_OPEN:
+            self.sendMessage(message, isBinary=False)
 
     def ping(self, payload: bytes) -> None:
         """A websocket ping."""
