@@ -283,6 +283,7 @@ class Daemon:
                 memory=self._machine.memory(),
                 rtt_ms=round(round_trip * 1000, 3) if round_trip is not None else None,
                 stale_commands=self.motion.stale_commands,
+                unguarded_commands=self.motion.unguarded_commands,
                 watchdog_stops=self.motion.watchdog_stops,
                 dropped_samples=self._platform.dropped
                 + self._dropped

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import click
 import msgspec
 
-from robot_client.guard_protocol import ALIVE, Command, Leave, Line, Probe, Topic, decoder
+from robot_client.guard_protocol import Alive, Command, Leave, Line, Probe, Ready, Topic, decoder, encode
 from robot_client.ros_log import ensure_log_folder
 from robot_client.safety import GUARD_SHARE, Watchdog
 
@@ -27,6 +27,10 @@ NANO = 1_000_000_000
 REPEATS = 5
 REPEAT_EVERY = 40 * MILLI
 """A stop is said five times within 200 ms: the first ones may find a network that is just breaking."""
+
+LOOK_EVERY = 20 * MILLI
+LOOK_SELDOM = 500 * MILLI
+"""How often to look whether a new publisher has found its listeners: the less the longer nobody was there."""
 
 UNHEARD = 10 * NANO
 """How much longer to repeat while nobody who listens to the topic was found yet, after the daemon's end."""
@@ -40,6 +44,9 @@ class Outlets(Protocol):
 
     def zero(self, topic: str) -> bool:
         """Publish zero; whether anybody listens."""
+
+    def heard(self, topic: str) -> bool:
+        """Whether anybody listens."""
 
 
 class _Stop:
@@ -63,11 +70,14 @@ class Guard:
         self._now = now
         self._watchdog = Watchdog(within_ms, GUARD_SHARE)
         self._stops: dict[str, _Stop] = {}
+        self._unready: dict[str, tuple[int, int]] = {}
+        self._ready: list[str] = []
 
     def take(self, line: Line) -> bool:
         """One line from the daemon; whether it wants an answer."""
         if isinstance(line, Topic):
             self._outlets.open(line.topic, line.type)
+            self._unready[line.topic] = (self._now(), self._now())
         elif isinstance(line, Command):
             self._stops.pop(line.topic, None)
             self._watchdog.command(line.topic, "daemon", line.moving, line.at)
@@ -82,9 +92,15 @@ class Guard:
         self.leaving = True
         self.act()
 
+    def take_ready(self) -> list[str]:
+        """Topics it has become able to stop since it was asked last."""
+        ready, self._ready = self._ready, []
+        return ready
+
     def act(self) -> None:
         """Do what is due."""
         now = self._now()
+        self._look(now)
         self._begin(self._watchdog.expired(now))
         for topic, stop in list(self._stops.items()):
             if stop.next > now:
@@ -97,7 +113,7 @@ class Guard:
 
     def wait(self) -> float | None:
         """Seconds until :meth:`act` has something to do; ``None`` for as long as no line comes."""
-        times = [stop.next for stop in self._stops.values()]
+        times = [stop.next for stop in self._stops.values()] + [due for due, _ in self._unready.values()]
         due = self._watchdog.due()
         if due is not None:
             times.append(due)
@@ -107,6 +123,17 @@ class Guard:
     def done(self) -> bool:
         """Whether it may leave."""
         return self.leaving and not self._stops
+
+    def _look(self, now: int) -> None:
+        for topic, (due, since) in list(self._unready.items()):
+            if due > now:
+                continue
+            if self._outlets.heard(topic):
+                del self._unready[topic]
+                self._ready.append(topic)
+            else:
+                pause = min(max((now - since) // 10, LOOK_EVERY), LOOK_SELDOM)
+                self._unready[topic] = (now + pause, since)
 
     def _begin(self, topics: list[str]) -> None:
         for topic in topics:
@@ -138,6 +165,11 @@ class RosOutlets:
         """Publish zero."""
         publisher, type = self._publishers[topic]
         publisher.publish(self._types.zero(type, self._node.get_clock().now().to_msg()))
+        return self.heard(topic)
+
+    def heard(self, topic: str) -> bool:
+        """Whether DDS has matched a subscription."""
+        publisher, _ = self._publishers[topic]
         return bool(publisher.get_subscription_count())
 
 
@@ -168,16 +200,23 @@ def watch(guard: Guard, inlet: int, wake: int) -> None:
                 if not guard.leaving:
                     guard.orphaned()
         guard.act()
+        for topic in guard.take_ready():
+            _answer(Ready(topic))
 
 
 def _serve(guard: Guard, line: bytes) -> None:
     try:
         if guard.take(decoder.decode(line)):
-            os.write(1, ALIVE)
+            _answer(Alive())
     except msgspec.MsgspecError:
         _say("a line of the daemon made no sense")
     except Exception as error:  # a topic it can't guard must not keep it from guarding the others
         _say(f"a line of the daemon could not be followed: {error}")
+
+
+def _answer(answer: Alive | Ready) -> None:
+    with contextlib.suppress(BrokenPipeError):  # the daemon is gone; the end of the other pipe says so too
+        os.write(1, encode(answer))
 
 
 def _say(text: str) -> None:
@@ -206,7 +245,7 @@ def main(node: str, within_ms: int) -> None:
         os.setsid()  # what ends the daemon's group or terminal must not end its guard
     wake = _wake_on_sigterm()
     guard = Guard(within_ms, RosOutlets(node), time.monotonic_ns)
-    os.write(1, ALIVE)
+    _answer(Alive())
     watch(guard, 0, wake)
     # Publishers are not taken down in order: Python's and DDS's farewells take longer than the stop is worth.
     os._exit(0)

@@ -1,4 +1,4 @@
-"""What the daemon tells its guard: one JSON array per line on a pipe."""
+"""What the daemon and its guard tell each other: one JSON array per line on two pipes."""
 
 from __future__ import annotations
 
@@ -28,14 +28,24 @@ class Leave(msgspec.Struct, array_like=True, tag_field="line", tag="leave", froz
     """The daemon ends in order, the robot stands; go."""
 
 
-Line = Topic | Command | Probe | Leave
+class Alive(msgspec.Struct, array_like=True, tag_field="line", tag="alive", frozen=True):
+    """The guard's answer to a probe, and its first word."""
 
-ALIVE = b"alive\n"
+
+class Ready(msgspec.Struct, array_like=True, tag_field="line", tag="ready", frozen=True):
+    """The guard's publisher has found who listens to this topic: from now on it could stop it."""
+
+    topic: str
+
+
+Line = Topic | Command | Probe | Leave
+Answer = Alive | Ready
 
 decoder: msgspec.json.Decoder[Line] = msgspec.json.Decoder(Line)
+answer_decoder: msgspec.json.Decoder[Answer] = msgspec.json.Decoder(Answer)
 _encoder = msgspec.json.Encoder()
 
 
-def encode(line: Line) -> bytes:
+def encode(line: Line | Answer) -> bytes:
     """A line with its end."""
     return _encoder.encode(line) + b"\n"

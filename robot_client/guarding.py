@@ -13,7 +13,7 @@ from twisted.internet.protocol import ProcessProtocol
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from robot_client.guard_protocol import Command, Leave, Line, Probe, Topic, encode
+from robot_client.guard_protocol import Command, Leave, Line, Probe, Ready, Topic, answer_decoder, encode
 from robot_client.reactors import Timer
 
 PROBE_EVERY = 5.0
@@ -41,6 +41,7 @@ class GuardKeeper:
         self._process: _Process | None = None
         self._topics: dict[str, Topic] = {}
         self._commands: dict[str, Command] = {}
+        self._ready: set[str] = set()
         self._failures = 0
         self._timer: Timer | None = None
         self._left: Deferred[None] | None = None
@@ -97,14 +98,22 @@ class GuardKeeper:
         self._commands[topic] = line = Command(topic, moving, at)
         self._tell(line)
 
-    def heard(self) -> None:
+    def ready(self, topic: str) -> bool:
+        """Whether the guard that lives now could stop this topic."""
+        return topic in self._ready
+
+    def heard(self, line: bytes) -> None:
         """The guard answered."""
         self._heard = self._reactor.seconds()
         self._failures = 0
+        answer = answer_decoder.decode(line)
+        if isinstance(answer, Ready):
+            self._ready.add(answer.topic)
 
     def lost(self, why: str) -> None:
         """The guard is gone; get another."""
         self._process = None
+        self._ready.clear()
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         self._timer = None
@@ -146,6 +155,7 @@ class _Process(ProcessProtocol):
 
     def __init__(self, keeper: GuardKeeper) -> None:
         self._keeper = keeper
+        self._said = b""
 
     def tell(self, line: Line) -> None:
         """Write a line to it."""
@@ -160,7 +170,9 @@ class _Process(ProcessProtocol):
 
     def outReceived(self, data: bytes) -> None:
         """It answered."""
-        self._keeper.heard()
+        *lines, self._said = (self._said + data).split(b"\n")
+        for line in lines:
+            self._keeper.heard(line)
 
     def processEnded(self, reason: Failure) -> None:
         """It is gone and reaped."""

@@ -25,15 +25,22 @@ class GuardFeed(Protocol):
     def command(self, topic: str, moving: bool, at: int) -> None:
         """A command went out; ``at`` is the monotonic clock in nanoseconds."""
 
+    def ready(self, topic: str) -> bool:
+        """Whether it could stop this topic now."""
+
 
 class NoGuard:
-    """Nobody is told."""
+    """Nobody is told, by choice: motion does not wait for a guard."""
 
     def topic(self, topic: str, type: str) -> None:
         """Pass over."""
 
     def command(self, topic: str, moving: bool, at: int) -> None:
         """Pass over."""
+
+    def ready(self, topic: str) -> bool:
+        """Nothing to wait for."""
+        return True
 
 
 class _Outlet(NamedTuple):
@@ -61,6 +68,7 @@ class MotionDesk:
         self.stale_commands = 0
         self.invalid_commands = 0
         self.watchdog_stops = 0
+        self.unguarded_commands = 0
         self._platform = platform
         self._clock = clock
         self._now = now
@@ -91,6 +99,9 @@ class MotionDesk:
             self.invalid_commands += 1
             return False
         moving = verdict is Motion.MOVING
+        if moving and not self._guard.ready(outlet.topic):
+            self._hold_back(outlet.topic)
+            return False
         # The guard hears of a movement before it begins, and of a stop after it was sent.
         if moving:
             self._guard.command(outlet.topic, True, now)
@@ -100,6 +111,13 @@ class MotionDesk:
         self._watchdog.command(outlet.topic, source, moving, now)
         self._schedule()
         return True
+
+    def _hold_back(self, topic: str) -> None:
+        if not self.unguarded_commands:
+            self._log.info(
+                "commands to {topic} wait for the motion guard to be able to stop them", topic=topic
+            )
+        self.unguarded_commands += 1
 
     def close(self, source: str) -> None:
         """A publication ends; what it left moving is stopped. Its sink may be closed after this."""

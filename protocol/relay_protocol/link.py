@@ -209,6 +209,7 @@ class Health(Message, frozen=True, kw_only=True):
     :param memory: memory in use, 0 to 1
     :param rtt_ms: round trip to the relay as the robot measures it, milliseconds
     :param stale_commands: motion commands dropped because they were too old, since start
+    :param unguarded_commands: motion commands dropped because the guard could not have stopped them, since start
     :param watchdog_stops: times the watchdog sent zero because commands ceased, since start
     :param dropped_samples: samples dropped because the uplink was full, since start
     """
@@ -218,6 +219,7 @@ class Health(Message, frozen=True, kw_only=True):
     memory: float | None = None
     rtt_ms: float | None = None
     stale_commands: int = 0
+    unguarded_commands: int = 0
     watchdog_stops: int = 0
     dropped_samples: int = 0
 

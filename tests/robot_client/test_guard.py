@@ -14,7 +14,7 @@ class Outlets:
     def __init__(self) -> None:
         self.opened: list[str] = []
         self.zeros: list[tuple[int, str]] = []
-        self.heard = True
+        self.listened = True
         self.scene: Scene
 
     def open(self, topic: str, type: str) -> None:
@@ -22,7 +22,10 @@ class Outlets:
 
     def zero(self, topic: str) -> bool:
         self.zeros.append((self.scene.now // MS, topic))
-        return self.heard
+        return self.listened
+
+    def heard(self, topic: str) -> bool:
+        return self.listened
 
 
 class Scene:
@@ -32,6 +35,8 @@ class Scene:
         self.outlets.scene = self
         self.guard = Guard(500, self.outlets, lambda: self.now)
         self.guard.take(Topic("/cmd_vel", "geometry_msgs/msg/Twist"))
+        self.guard.act()
+        assert self.guard.take_ready() == ["/cmd_vel"]
 
     def move(self, moving: bool = True) -> None:
         self.guard.take(Command("/cmd_vel", moving, self.now))
@@ -95,7 +100,7 @@ def test_idle_guard_sleeps(scene: Scene) -> None:
 
 def test_orphan_does_not_stay(scene: Scene) -> None:
     """A guard whose stop nobody hears goes on for ten seconds, no longer."""
-    scene.outlets.heard = False
+    scene.outlets.listened = False
     scene.move()
     scene.guard.orphaned()
     scene.run(9900)
@@ -116,3 +121,17 @@ def test_lines_come_out_as_they_went_in(line: Topic | Command | Probe | Leave) -
     """Every line survives the pipe."""
     assert decoder.decode(encode(line)) == line
     assert encode(line).endswith(b"\n")
+
+
+def test_a_topic_is_ready_once_somebody_listens(scene: Scene) -> None:
+    """The guard says which topics it could stop: those its publisher has found a listener for, each once."""
+    scene.outlets.listened = False
+    scene.guard.take(Topic("/other", "geometry_msgs/msg/Twist"))
+    scene.run(100)
+    assert scene.guard.take_ready() == []
+    scene.outlets.listened = True
+    scene.run(100)
+    assert scene.guard.take_ready() == ["/other"]
+    scene.run(100)
+    assert scene.guard.take_ready() == []
+    assert scene.guard.wait() is None

@@ -9,7 +9,7 @@ from twisted.internet.error import ProcessTerminated
 from twisted.internet.task import Clock
 from twisted.python.failure import Failure
 
-from robot_client.guard_protocol import Command, Leave, Probe, Topic, decoder
+from robot_client.guard_protocol import Alive, Command, Leave, Probe, Ready, Topic, decoder, encode
 from robot_client.guarding import PROBE_EVERY, SILENT, GuardKeeper
 
 
@@ -98,7 +98,7 @@ def test_guard_that_answers_is_left_alone(scene: Scene) -> None:
     for _ in range(20):
         scene.reactor.advance(PROBE_EVERY)
         assert scene.process.lines[-1] == Probe()
-        scene.process.protocol.outReceived(b"alive\n")
+        scene.process.protocol.outReceived(encode(Alive()))
     assert scene.process.signals == []
 
 
@@ -128,3 +128,15 @@ def test_guard_that_stays_is_ended(scene: Scene) -> None:
     scene.keeper.stop()
     scene.reactor.advance(2.0)
     assert scene.process.signals == ["KILL"]
+
+
+def test_a_topic_is_ready_when_the_guard_says_so_and_not_after_its_end(scene: Scene) -> None:
+    """Only a guard that lives counts; its words may come in pieces."""
+    said = encode(Alive()) + encode(Ready("/cmd_vel"))
+    scene.process.protocol.outReceived(said[:12])
+    assert not scene.keeper.ready("/cmd_vel")
+    scene.process.protocol.outReceived(said[12:])
+    assert scene.keeper.ready("/cmd_vel")
+    assert not scene.keeper.ready("/other")
+    scene.process.end()
+    assert not scene.keeper.ready("/cmd_vel")

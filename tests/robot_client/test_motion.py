@@ -19,12 +19,16 @@ class Feed:
 
     def __init__(self) -> None:
         self.lines: list[tuple[str, bool]] = []
+        self.able = True
 
     def topic(self, topic: str, type: str) -> None:
         self.lines.append((topic + " " + type, False))
 
     def command(self, topic: str, moving: bool, at: int) -> None:
         self.lines.append((topic, moving))
+
+    def ready(self, topic: str) -> bool:
+        return self.able
 
 
 class Scene:
@@ -143,3 +147,14 @@ def test_watchdog_of_one_topic_leaves_the_other(scene: Scene) -> None:
     scene.command(GO)
     scene.clock.advance(0.15)
     assert scene.platform.published[2:] == [("/second", ZERO)]
+
+
+def test_nothing_moves_before_the_guard_can_stop_it(scene: Scene) -> None:
+    """Commands that move are dropped and counted until the guard is ready; zero always passes."""
+    scene.feed.able = False
+    assert not scene.command(GO)
+    assert scene.command(ZERO)
+    assert scene.desk.unguarded_commands == 1
+    scene.feed.able = True
+    assert scene.command(GO)
+    assert scene.sent == [ZERO, GO]
