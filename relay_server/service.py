@@ -281,6 +281,14 @@ class Relay:
 
     async def stop(self) -> None:
         """Refuse newcomers, tell clients and robots, finish what is being written."""
+        try:
+            await self._say_goodbye()
+        finally:
+            # Threads left running would keep the process from ending.
+            self._auth.stop()
+            self._store.stop()
+
+    async def _say_goodbye(self) -> None:
         if self._desk is not None:
             self._desk.say_goodbye("the relay is going down")
         for robot in self._registry:
@@ -296,8 +304,6 @@ class Relay:
         )
         # The farewells are on their way; a moment lets slow networks take them.
         await deferLater(self._reactor, 0.2)
-        self._auth.stop()
-        self._store.stop()
 
 
 async def _stopped(port: Any) -> None:

@@ -124,6 +124,7 @@ class RelaySite(Site):
     """The site of a relay: no access log (URLs may carry tickets), headers that close what browsers leave open."""
 
     requestFactory = BoundedRequest
+    noisy = False
 
     def __init__(self, root: IResource, reactor: Any, cap: AddressCap, tls: bool) -> None:
         super().__init__(root, requestFactory=self._request, timeout=IDLE_SECONDS, reactor=reactor)

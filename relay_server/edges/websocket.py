@@ -266,7 +266,8 @@ class ClientProtocol(WebSocketServerProtocol):
                     "a client at {address} is refused: {reason}", address=self._address(), reason=reason
                 )
             text = reason.encode()[:REASON_BYTES].decode(errors="ignore")
-            self.sendClose(code, text)
+            # Autobahn's sendClose takes no code that RFC 6455 itself defines, such as 1001 and 1009.
+            self.sendCloseFrame(code=code, reasonUtf8=text.encode(), isReply=False)
 
     def pause(self) -> None:
         """The transport's buffer is full."""

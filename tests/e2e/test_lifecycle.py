@@ -1,0 +1,375 @@
+"""Stopping, dying and coming back: of relays, of robots, of the demo; two relays on one host; PostgreSQL."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pgserver
+import psutil
+import psycopg
+import pytest
+from switchboard_harness import BIN, Client, Driver, Process, Relay, Robot, ask, running, wait_for
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+CLIENTS = Path(__file__).parent / "clients"
+PASSWORD = "correct horse"
+ODOMETRY = {"topic": "/odom", "type": "nav_msgs/msg/Odometry"}
+
+
+class House:
+    """A relay on a fixed port with a robot and its people."""
+
+    def __init__(self, folder: Path) -> None:
+        self.relay = Relay(folder, "--heartbeat", "0.5")
+        self.robot = Robot(self.relay, "rover")
+        self.driver = self.relay.user("driver")
+        self.viewer = self.relay.user("viewer")
+        self.relay.cli("right", "grant", "driver", "rover", "operator")
+        self.relay.cli("right", "grant", "viewer", "rover", "viewer")
+
+    def restart(self) -> None:
+        """A killed or stopped relay again, on the same ports."""
+        self.relay.start()
+        self.robot.wait_online()
+
+    def stop(self) -> None:
+        """End everything."""
+        self.robot.stop()
+        self.relay.stop()
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    """One house for all; each test leaves it whole."""
+    house = House(tmp_path_factory.mktemp("house"))
+    try:
+        yield house
+    finally:
+        house.stop()
+
+
+def close_of(client: Client) -> Any:
+    """Read until the other end closes; the close frame."""
+    with pytest.raises(ConnectionClosed) as closed:
+        while True:
+            client.receive(10)
+    assert closed.value.rcvd is not None
+    return closed.value.rcvd
+
+
+def drives(relay: Relay, robot: Robot, token: str) -> None:
+    """An operator makes the robot move, and lets go of it."""
+    driver = Driver(relay.connect(robot.name, token))
+    driver.start()
+    try:
+        wait_for("the robot moves", robot.moving)
+    finally:
+        driver.stop()
+    wait_for("the robot stands", lambda: not robot.moving(), 5)
+
+
+# --- the relay --------------------------------------------------------------------------------------------
+
+
+def test_a_relay_that_is_ended_says_goodbye_and_leaves_the_robot_standing(house: House) -> None:
+    """SIGTERM: clients get 1001 in words, the exit code is 0 within ten seconds, the driven robot stands."""
+    driver = Driver(house.relay.connect("rover", house.driver))
+    driver.start()
+    wait_for("the robot moves", house.robot.moving)
+    with house.relay.connect("rover", house.viewer) as client:
+        client.send(op="subscribe", **ODOMETRY)
+        client.until(op="publish")
+        begun = time.monotonic()
+        assert house.relay.stop() == 0
+        assert time.monotonic() - begun < 10
+        farewell = close_of(client)
+        assert farewell.code == 1001
+        assert "going down" in farewell.reason
+    wait_for("the robot stands", lambda: not house.robot.moving(), 5)
+    driver.stop()
+    assert "Traceback" not in house.relay.log
+    house.restart()
+    assert not house.robot.moving()
+    drives(house.relay, house.robot, house.driver)
+
+
+def test_a_killed_relay_comes_back_with_sessions_tokens_rights_and_robots(house: House) -> None:
+    """After kill -9 a new process has all that was acknowledged; the robot is back by itself."""
+    headers = {"Origin": f"http://127.0.0.1:{house.relay.http_port}"}
+    body = {"user": "driver", "password": PASSWORD}
+    login = ask(house.relay.http_port, "POST", "/api/v1/session", body, headers=headers)
+    house.relay.cli("right", "grant", "viewer", "rover", "operator")
+    house.relay.kill()
+    house.relay.start()
+    assert house.relay.process is not None
+    used = psutil.Process(house.relay.process.popen.pid).cpu_times()
+    # On an idle machine this is the time until READY.
+    assert used.user + used.system < 3
+    house.robot.wait_online(10)
+    session = ask(house.relay.http_port, "GET", "/api/v1/session", headers={"Cookie": login.cookie})
+    assert session.json["user"] == "driver"
+    with house.relay.connect("rover", house.viewer) as client:
+        wait_for("the robot answers a call", lambda: client.call("/reset")["result"])
+    house.relay.cli("right", "grant", "viewer", "rover", "viewer")
+    drives(house.relay, house.robot, house.driver)
+
+
+@pytest.mark.parametrize("what", ["right", "token", "user"])
+def test_what_was_revoked_before_a_kill_stays_revoked(house: House, what: str) -> None:
+    """A revocation is in the database before anybody is told, so no kill -9 can undo it."""
+    name = f"leaver-{what}"
+    token = house.relay.user(name)
+    house.relay.cli("right", "grant", name, "rover", "operator")
+    numbers = [str(each["id"]) for each in house.relay.cli("token", "list", "--user", name)]
+    revoke = {
+        "right": ["right", "revoke", name, "rover"],
+        "token": ["token", "revoke", *numbers],
+        "user": ["user", "disable", name],
+    }
+    with house.relay.connect("rover", token) as client:
+        assert client.call("/relay/ping")["result"]
+        done = house.relay.run_cli(*revoke[what])
+        house.relay.kill()
+    house.restart()
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(InvalidStatus) as refused:
+        house.relay.connect("rover", token)
+    assert refused.value.response.status_code == (403 if what == "right" else 401)
+
+
+def test_an_unmodified_client_program_goes_on_after_the_relay_was_restarted(house: House) -> None:
+    """roslibpy reconnects by itself and gets its topic again, with a restart and with a kill -9."""
+    command = [sys.executable, str(CLIENTS / "reconnecting.py"), house.relay.url("rover"), house.viewer]
+    client = Process(command, house.relay.folder, "reconnecting")
+    try:
+        client.wait_to_say("ODOMETRY 0")
+        house.relay.stop()
+        house.restart()
+        client.wait_to_say("ODOMETRY 1")
+        house.relay.kill()
+        house.restart()
+        client.wait_to_say("ODOMETRY 2")
+    finally:
+        client.stop()
+
+
+# --- the robot --------------------------------------------------------------------------------------------
+
+
+def test_a_client_stays_while_its_robot_is_away_and_goes_on_when_it_is_back(house: House) -> None:
+    """Robot offline: the connection stays, a call is answered in words, the subscription continues by itself."""
+    with house.relay.connect("rover", house.driver) as client:
+        client.send(op="set_level", level="error")
+        client.send(op="subscribe", **ODOMETRY)
+        client.until(op="publish")
+        house.robot.daemon.kill()
+        wait_for("it is offline", lambda: house.relay.state_of("rover") == "offline")
+        answer = client.call("/reset")
+        assert answer["result"] is False
+        assert "offline" in answer["values"]
+        client.drive(0.2)
+        assert "offline" in client.until(op="status")["msg"]
+        back = time.time()
+        house.robot.start_daemon()
+        house.robot.wait_online()
+
+        def fresh() -> bool:
+            stamp = client.until(op="publish", topic="/odom")["msg"]["header"]["stamp"]
+            return bool(stamp["sec"] >= int(back))
+
+        wait_for("odometry comes again", fresh)
+        wait_for("the robot answers a call", lambda: client.call("/reset")["result"])
+    drives(house.relay, house.robot, house.driver)
+
+
+def test_a_call_under_way_is_answered_when_the_robot_is_lost(house: House) -> None:
+    """Who waits for an answer gets words as soon as the robot is gone, not the end of a timeout."""
+    with house.relay.connect("rover", house.driver) as client:
+        wait_for("the robot answers a call", lambda: client.call("/reset")["result"])
+        house.robot.daemon.signal(signal.SIGSTOP)
+        try:
+            begun = time.monotonic()
+            answer = client.call("/reset", seconds=20)
+            assert time.monotonic() - begun < 15
+            assert answer["result"] is False
+            assert answer["values"]
+        finally:
+            house.robot.daemon.signal(signal.SIGCONT)
+            house.robot.wait_online()
+        wait_for("it answers again", lambda: client.call("/reset")["result"])
+
+
+def test_two_relays_live_side_by_side_on_one_host(house: House, tmp_path: Path) -> None:
+    """Each has its robots and its people; what opens one opens nothing at the other."""
+    other = Relay(tmp_path)
+    with running(other):
+        robot = Robot(other, "rover")
+        with running(robot):
+            token = other.user("driver")
+            other.cli("right", "grant", "driver", "rover", "operator")
+            for relay, foreign in ((other, house.driver), (house.relay, token)):
+                with pytest.raises(InvalidStatus) as refused:
+                    relay.connect("rover", foreign)
+                assert refused.value.response.status_code == 401
+            moved = len(house.robot.events("moving"))
+            drives(other, robot, token)
+            assert len(house.robot.events("moving")) == moved
+            drives(house.relay, house.robot, house.driver)
+            headers = {"Origin": f"http://127.0.0.1:{other.http_port}"}
+            body = {"user": "driver", "password": PASSWORD}
+            one = ask(other.http_port, "POST", "/api/v1/session", body, headers=headers)
+            headers = {"Origin": f"http://127.0.0.1:{house.relay.http_port}"}
+            two = ask(house.relay.http_port, "POST", "/api/v1/session", body, headers=headers)
+            # Browsers send both: cookies know no ports.
+            both = {"Cookie": f"{one.cookie}; {two.cookie}"}
+            for relay in (other, house.relay):
+                assert ask(relay.http_port, "GET", "/api/v1/session", headers=both).status == 200
+
+
+# --- the demo ---------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def demo_in(folder: Path) -> Iterator[Process]:
+    """``switchboard demo`` on a data folder, killed with all its children at the end, if need be."""
+    command = [str(BIN / "switchboard"), "demo", "--data", str(folder / "demo")]
+    demo = Process(command, folder, "demo")
+    try:
+        yield demo
+    finally:
+        if demo.popen.poll() is None:
+            for each in psutil.Process(demo.popen.pid).children(recursive=True):
+                each.kill()
+            demo.kill()
+
+
+def test_the_demo_works_for_all_three_logins_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    """READY, three passwords that work, rights as printed; Ctrl-C ends every process within five seconds."""
+    with demo_in(tmp_path) as demo:
+        url = demo.wait_to_say("READY http").split()[1]
+        port = int(url.rpartition(":")[2])
+        logins = dict(re.findall(r"^  (admin|driver|viewer) +(\S+)   ", demo.said(), re.MULTILINE))
+        cookies = {user: log_in(port, user, password) for user, password in logins.items()}
+        assert set(cookies) == {"admin", "driver", "viewer"}
+        seen = {user: robots_of(port, cookie) for user, cookie in cookies.items()}
+        assert seen["driver"] == {"robot-one": "operator"}
+        assert seen["viewer"] == {"robot-one": "viewer", "robot-two": "viewer"}
+        assert set(seen["admin"]) == {"robot-one", "robot-two"}
+        with enter(port, cookies["viewer"], "robot-two") as client:
+            client.send(op="set_level", level="error")
+            client.drive(0.2)
+            assert "needs the level operator" in client.until(op="status")["msg"]
+            client.send(op="subscribe", **ODOMETRY)
+            assert client.until(op="publish")["msg"]["twist"]["twist"]["linear"]["x"] == 0
+        with enter(port, cookies["driver"], "robot-one") as client:
+            moves_in_odometry(client)
+        family = [
+            psutil.Process(demo.popen.pid),
+            *psutil.Process(demo.popen.pid).children(recursive=True),
+        ]
+        assert len(family) >= 5
+        begun = time.monotonic()
+        demo.signal(signal.SIGINT)
+        _, alive = psutil.wait_procs(family[1:], timeout=10)
+        assert demo.popen.wait(10) == 0
+        took = time.monotonic() - begun
+        assert alive == []
+        assert took < 5, f"it took {took:.1f} s"
+    left = [
+        each.info["cmdline"]
+        for each in psutil.process_iter(["cmdline"])
+        if str(tmp_path) in " ".join(each.info["cmdline"] or [])
+    ]
+    assert left == []
+    log = (tmp_path / "demo" / "relay.log").read_text()
+    assert "Traceback" not in log + demo.log.read_text()
+    assert not any(password in log for password in logins.values())
+
+
+def log_in(port: int, user: str, password: str) -> str:
+    """A session's cookie."""
+    headers = {"Origin": f"http://127.0.0.1:{port}"}
+    answer = ask(port, "POST", "/api/v1/session", {"user": user, "password": password}, headers=headers)
+    assert answer.status == 200, answer.body
+    return answer.cookie
+
+
+def robots_of(port: int, cookie: str) -> dict[str, str]:
+    """Names and levels of the robots a session sees; all are online."""
+    robots = ask(port, "GET", "/api/v1/robots", headers={"Cookie": cookie}).json["robots"]
+    assert all(each["state"] != "offline" for each in robots)
+    return {each["name"]: each["level"] for each in robots}
+
+
+def enter(port: int, cookie: str, robot: str) -> Client:
+    """A websocket with a session's cookie."""
+    url, origin = f"ws://127.0.0.1:{port}/robots/{robot}", f"http://127.0.0.1:{port}"
+    return Client(connect(url, additional_headers={"Cookie": cookie}, origin=origin))
+
+
+def moves_in_odometry(client: Client) -> None:
+    """The robot's odometry tells speed while it is driven."""
+    client.send(op="subscribe", **ODOMETRY)
+    client.send(op="advertise", topic="/cmd_vel", type="geometry_msgs/msg/Twist")
+
+    def moving() -> bool:
+        client.drive(0.2, 0.6)
+        return bool(client.until(op="publish", topic="/odom")["msg"]["twist"]["twist"]["linear"]["x"] > 0.05)
+
+    wait_for("the robot moves", moving)
+
+
+# --- PostgreSQL -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[str]:
+    """URL of an empty database on a PostgreSQL server of our own.
+
+    Not in pytest's folder, which other users can't enter: under root the server is another user's.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="pg-of-e2e-"))
+    server = pgserver.get_server(folder / "data", cleanup_mode="stop")
+    try:
+        with psycopg.connect(server.get_uri(), autocommit=True) as connection:
+            connection.execute('CREATE DATABASE "relay"')
+        yield server.get_uri().replace("/postgres?", "/relay?")
+    finally:
+        server.cleanup()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def test_a_relay_on_postgresql_does_the_daily_round(postgres: str, tmp_path: Path) -> None:
+    """Enroll, watch, drive, revoke within a second, kill and restart: all of it on PostgreSQL."""
+    relay = Relay(tmp_path, database=postgres)
+    with running(relay):
+        robot = Robot(relay, "rover")
+        with running(robot):
+            token = relay.user("driver")
+            relay.cli("right", "grant", "driver", "rover", "operator")
+            drives(relay, robot, token)
+            relay.kill()
+            relay.start()
+            robot.wait_online()
+            with relay.connect("rover", token) as client:
+                client.send(op="subscribe", **ODOMETRY)
+                client.until(op="publish")
+                relay.run_cli("right", "revoke", "driver", "rover").check_returncode()
+                begun = time.monotonic()
+                closed = close_of(client)
+                assert time.monotonic() - begun < 1
+                assert closed.code == 4403
+                assert "revoked" in closed.reason
+            assert not (relay.data / "switchboard.db").exists()
+    assert "Traceback" not in relay.log
+    assert "postgres" not in relay.log
