@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Iterable
+from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from relay_protocol.errors import Invalid, Refused
@@ -32,34 +33,40 @@ class Origins:
         """
         if origin is None:
             raise Refused("a session cookie counts only with an Origin header; programs use an access token")
-        asked = _normal(origin)
-        if asked and asked in self._listed:
+        asked = _parse(origin)
+        if asked is not None and asked in self._listed:
             return
-        own = _normal(f"{self._scheme}://{host}")
-        if not asked or asked != own or not _unrebindable(urlsplit(own).hostname or ""):
+        own = _parse(f"{self._scheme}://{host}")
+        if asked is None or asked != own or not _unrebindable(asked.host):
             raise Refused(
                 f"pages of {origin[:100]} may not use this relay; start it with --origin to allow that"
             )
 
 
-def _checked(listed: str) -> str:
-    normal = _normal(listed)
-    if not normal or urlsplit(listed).path.strip("/"):
+class _Origin(NamedTuple):
+    scheme: str
+    host: str
+    port: int
+
+
+def _checked(listed: str) -> _Origin:
+    origin = _parse(listed)
+    if origin is None or urlsplit(listed).path.strip("/"):
         raise Invalid(f"'{listed}' is no origin; write https://host or https://host:port")
-    return normal
+    return origin
 
 
-def _normal(origin: str) -> str:
-    """One spelling of an origin; nothing for what is none, such as ``null``."""
+def _parse(text: str) -> _Origin | None:
+    """An origin, ``None`` for what is none, such as ``null``."""
     try:
-        parts = urlsplit(origin.strip().lower())
+        parts = urlsplit(text.strip().lower())
         port = parts.port
     except ValueError:
-        return ""
+        return None
     standard = {"http": 80, "https": 443}.get(parts.scheme)
     if standard is None or not parts.hostname:
-        return ""
-    return f"{parts.scheme}://{parts.hostname}:{port or standard}"
+        return None
+    return _Origin(parts.scheme, parts.hostname, port or standard)
 
 
 def _unrebindable(host: str) -> bool:

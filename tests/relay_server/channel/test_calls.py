@@ -1,0 +1,198 @@
+"""Service calls to the robot: each is answered exactly once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from relay_protocol import link
+from relay_server import session as session_module
+from relay_server.channel import calls as module
+from tests.relay_server.memory import TRIGGER, Person, World
+
+YES = b"\x00\x01\x00\x00\x01\x00\x00\x00\x03\x00\x00\x00ok\x00"
+
+
+def at_work(world: World) -> Person:
+    """A robot whose types are known, and an operator."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    person.says("call_service", service="/reset", id="first")
+    world.define()
+    answer(world)
+    person.client.take()
+    return person
+
+
+def answer(world: World, **fields: Any) -> None:
+    """The robot answers what it was called."""
+    for call in world.link.take(link.CallService):
+        said = {"result": True, "cdr": link.to_base64(YES)} | fields
+        world.channel.message(link.ServiceResponse(id=call.id, **said))
+
+
+def test_an_answer_comes_back_as_json_with_the_clients_id(world: World) -> None:
+    """Ids may be strings, numbers or missing; the service is called as the client wrote it."""
+    person = at_work(world)
+    for id in ("a", 7, 10**30, None):
+        person.says("call_service", service="reset", **({} if id is None else {"id": id}))
+    assert [call.service for call in world.link.all(link.CallService)] == ["/reset"] * 4
+    answer(world)
+    replies = person.hears("service_response")
+    assert [reply.get("id") for reply in replies] == ["a", 7, 10**30, None]
+    assert all(reply["service"] == "reset" and reply["result"] is True for reply in replies)
+    assert replies[0]["values"] == {"success": True, "message": "ok"}
+
+
+def test_the_type_is_asked_for_before_the_first_call(world: World) -> None:
+    """Once, however many calls wait for it."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    for number in range(3):
+        person.says("call_service", service="/reset", id=number)
+    assert world.link.all(link.GetType) == [link.GetType(type=TRIGGER)]
+    assert not world.link.all(link.CallService)
+    world.define()
+    answer(world)
+    assert [reply["id"] for reply in person.hears("service_response")] == [0, 1, 2]
+
+
+def test_a_call_ends_by_time(world: World) -> None:
+    """The robot is given the client's timeout, and the relay gives up a moment later."""
+    person = at_work(world)
+    person.says("call_service", service="/reset", id=1, timeout=2.5)
+    (call,) = world.link.all(link.CallService)
+    assert call.timeout == 2.5
+    world.clock.advance(2.5)
+    assert not person.hears("service_response")
+    world.clock.advance(module.GRACE)
+    (reply,) = person.hears("service_response")
+    assert (reply["result"], reply["values"]) == (False, "service /reset did not answer within 2.5 s")
+    answer(world)
+    assert not person.hears("service_response")
+
+
+@pytest.mark.parametrize("timeout", [None, 0, -1, 1e300])
+def test_odd_timeouts_are_taken_within_reason(world: World, timeout: float | None) -> None:
+    """None, nothing and less than nothing is the default; more than an hour is an hour."""
+    person = at_work(world)
+    person.says("call_service", service="/reset", timeout=timeout)
+    assert world.link.all(link.CallService)[0].timeout == (3600 if timeout == 1e300 else 30)
+
+
+def test_a_robot_that_never_defines_the_type_lets_nobody_hang(world: World) -> None:
+    """The call ends although it could not begin."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    person.says("call_service", service="/reset", timeout=1)
+    for _ in range(4):
+        world.clock.advance(1)
+    (reply,) = person.hears("service_response")
+    assert reply["result"] is False
+    assert not person.session._calls
+
+
+def test_a_lost_robot_ends_its_calls(world: World) -> None:
+    """At once, in words."""
+    person = at_work(world)
+    person.says("call_service", service="/reset")
+    world.robot_goes()
+    (reply,) = person.hears("service_response")
+    assert (reply["result"], reply["values"]) == (False, "robot rover lost its connection during the call")
+    person.says("call_service", service="/reset", type="std_srvs/Trigger")
+    assert person.hears("service_response")[0]["values"] == "robot rover is offline"
+
+
+def test_failures_are_told_in_the_robots_words(world: World) -> None:
+    """A result of false, with a reason or without, and an answer nobody can read."""
+    person = at_work(world)
+    for fields in (
+        {"result": False, "reason": "it is stuck", "cdr": None},
+        {"result": False, "cdr": None},
+        {"cdr": link.to_base64(b"\x00\x01\x00\x00\xff\xff\xff\xff\xff\xff\xff\xff")},
+        {"cdr": "no base64!"},
+    ):
+        person.says("call_service", service="/reset")
+        answer(world, **fields)
+    replies = person.hears("service_response")
+    assert [reply["result"] for reply in replies] == [False] * 4
+    assert [reply["values"] for reply in replies[:2]] == ["it is stuck", "service /reset failed"]
+    assert all(reply["values"].startswith("the robot's answer can't be read") for reply in replies[2:])
+
+
+def test_what_can_not_be_called_is_refused_in_words(world: World) -> None:
+    """Unknown services, arguments that do not fit, names that are none."""
+    person = at_work(world)
+    person.says("call_service", service="/nothing")
+    person.says("call_service", service="/reset", args={"speed": 1})
+    person.says("call_service", service="/reset", args=[1])
+    person.says("call_service", service="no name!")
+    values = [reply["values"] for reply in person.hears("service_response")]
+    assert values[0] == "service /nothing does not exist on robot rover"
+    assert "speed" in values[1]
+    assert values[2] == "std_srvs/srv/Trigger_Request has 0 arguments, not 1"
+    assert "is no ROS name" in values[3]
+    assert not world.link.all(link.CallService)
+
+
+def test_too_many_calls_of_one_client_are_refused(world: World) -> None:
+    """Those under way go on; their places are free again afterwards."""
+    person = at_work(world)
+    for number in range(session_module.CALLS + 1):
+        person.says("call_service", service="/reset", id=number)
+    (reply,) = person.hears("service_response")
+    assert reply["values"] == "256 calls of this connection are waiting already"
+    answer(world)
+    assert len(person.hears("service_response")) == session_module.CALLS
+    person.says("call_service", service="/reset")
+    assert len(world.link.all(link.CallService)) == 1
+
+
+def test_calls_of_a_client_that_leaves_give_their_places_back(world: World) -> None:
+    """However long a timeout they asked for: no one fills the robot's places by coming and going."""
+    keeper = at_work(world)
+    for _ in range(module.PENDING // session_module.CALLS + 1):
+        person = world.person()
+        for _ in range(session_module.CALLS):
+            person.says("call_service", service="/reset", timeout=3600)
+        person.session.end()
+        assert not person.session._calls
+    world.link.take(link.CallService)
+    keeper.says("call_service", service="/reset", id="mine")
+    answer(world)
+    assert [reply["id"] for reply in keeper.hears("service_response")] == ["mine"]
+    assert not world.channel._calls._pending
+
+
+def test_too_many_calls_on_one_robot_are_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All clients together have a bound."""
+    monkeypatch.setattr(module, "PENDING", 2)
+    person = at_work(world)
+    for _ in range(3):
+        person.says("call_service", service="/reset")
+    (reply,) = person.hears("service_response")
+    assert reply["values"] == "2 calls are waiting on this robot already"
+
+
+def test_a_request_too_large_for_a_robot_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot would have to cut the link of everybody."""
+    person = at_work(world)
+    monkeypatch.setattr(module, "LARGEST_REQUEST", 3)
+    person.says("call_service", service="/reset")
+    assert "a robot takes at most 3" in person.hears("service_response")[0]["values"]
+
+
+def test_a_robot_of_json_is_called_with_json(world: World) -> None:
+    """Arguments go and values come as they are."""
+    world.robot_comes(encodings=["json"])
+    person = world.person()
+    world.robot_joins()
+    person.says("call_service", service="/reset", args={"hard": True})
+    (call,) = world.link.all(link.CallService)
+    assert (call.cdr, bytes(call.args)) == (None, b'{"hard":true}')  # type: ignore[arg-type]
+    answer(world, cdr=None, values=link.msgspec.Raw(b'{"done": 1}'))
+    assert person.hears("service_response")[0]["values"] == {"done": 1}

@@ -1,0 +1,236 @@
+"""A channel's life: every event in every state, and what becomes of what clients want."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from twisted.internet.defer import Deferred
+
+from relay_protocol import link
+from relay_protocol.errors import Refused
+from relay_server.channel import State
+from relay_server.channel.lifecycle import JOIN_SECONDS, NEXT, REOPEN_SECONDS, Event
+from tests.relay_server.memory import MemoryLink, World, fails, text
+
+
+class Member:
+    """Somebody who only is there."""
+
+    def tell(self, level: str, text: str, id: Any = None) -> None:
+        """Not asked."""
+
+
+def brought_to(world: World, state: State) -> None:
+    """A channel in this state, by what really happens."""
+    channel = world.channel
+    if state is State.NEW:
+        return
+    channel.attach(Member())
+    if state in (State.OPENING, State.OPEN):
+        world.robot_comes()
+    if state is State.OPEN:
+        world.robot_joins()
+    if state is State.CLOSED:
+        channel.shut()
+
+
+@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("state", State)
+def test_every_event_in_every_state(world: World, state: State, event: Event) -> None:
+    """The table says what follows; what it does not list changes nothing."""
+    channel = world.channel
+    brought_to(world, state)
+    assert channel.state is state
+    channel._happen(event)
+    assert channel.state is NEXT.get((state, event), state)
+    assert (channel.wire.link is not None) == (state is State.OPEN and channel.state is State.OPEN)
+    assert (channel in world.robot.watchers) == (channel.state is not State.CLOSED)
+
+
+def test_nobody_opens_a_channel_to_a_robot_that_is_away(world: World) -> None:
+    """It waits, and opens when the robot registers."""
+    world.channel.attach(Member())
+    assert world.channel.state is State.WAITING
+    world.robot_comes()
+    assert world.channel.state is State.OPENING
+    world.robot_joins()
+    assert world.channel.state is State.OPEN
+
+
+def test_a_channel_lingers_after_its_last_member(world: World) -> None:
+    """Who comes back within the time finds it open; after it the robot is told to close."""
+    world.robot_comes()
+    channel, member = world.channel, Member()
+    channel.attach(member)
+    world.robot_joins()
+    channel.detach(member)
+    world.clock.advance(4.9)
+    channel.attach(member)
+    world.clock.advance(60)
+    assert channel.state is State.OPEN
+    channel.detach(member)
+    world.clock.advance(5.1)
+    assert channel.state is State.CLOSED
+    assert world.link.closed
+    assert len(world.control.all(link.CloseChannel)) == 1
+    assert world.channel is not channel
+    assert not [call for call in world.clock.getDelayedCalls() if call.active()]
+
+
+def test_a_late_robot_is_asked_again_and_the_former_ticket_is_worthless(world: World) -> None:
+    """Only the newest ticket opens."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    world.clock.advance(0)
+    first = world.control.take(link.OpenChannel)[-1].ticket
+    world.clock.advance(JOIN_SECONDS)
+    world.clock.advance(0)
+    second = world.control.take(link.OpenChannel)[-1].ticket
+    with pytest.raises(Refused):
+        world.channels.redeem(first)
+    assert world.channels.redeem(second) is world.channel
+
+
+def test_a_ticket_is_good_once_and_for_a_time(world: World) -> None:
+    """A used, an old, an unknown one: the same refusal."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    world.clock.advance(0)
+    ticket = world.control.take(link.OpenChannel)[-1].ticket
+    assert world.channels.redeem(ticket) is world.channel
+    old = world.channels._issue(world.channel)
+    world.clock.advance(31)
+    for each in (ticket, old, "unknown"):
+        with pytest.raises(Refused, match="unknown, used or too old"):
+            world.channels.redeem(each)
+
+
+def test_tickets_do_not_outlive_their_channel(world: World) -> None:
+    """Nothing is kept of a channel that was closed."""
+    world.robot_comes()
+    channel = world.channel
+    channel.attach(Member())
+    world.clock.advance(0)
+    channel.shut()
+    assert not world.channels._tickets
+    assert not list(world.channels)
+
+
+def test_a_second_link_to_an_open_channel_is_turned_away(world: World) -> None:
+    """The first one goes on."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    first = world.robot_joins()
+    second = MemoryLink()
+    world.channel.joined(second)
+    assert second.closed
+    assert first.closed is None
+    world.channel.link_lost(second)
+    assert world.channel.state is State.OPEN
+
+
+def test_a_broken_link_is_asked_for_anew_after_a_pause(world: World) -> None:
+    """No hammering."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    broken = world.robot_joins()
+    world.channel.link_lost(broken)
+    assert world.channel.state is State.OPENING
+    world.clock.advance(REOPEN_SECONDS / 2)
+    assert not world.control.all(link.OpenChannel)
+    world.clock.advance(REOPEN_SECONDS / 2)
+    assert len(world.control.all(link.OpenChannel)) == 1
+
+
+def test_a_robot_that_registers_anew_gives_a_new_channel_link(world: World) -> None:
+    """The former link is closed; the former control link too."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    former_control, former = world.control, world.robot_joins()
+    world.robot_comes()
+    assert former.closed
+    assert former_control.closed
+    assert world.robot_joins() is world.channel.wire.link
+
+
+def test_what_clients_want_is_taken_up_again_when_the_robot_is_back(world: World) -> None:
+    """Subscriptions and publications are replayed; clients notice nothing."""
+    person = world.person()
+    world.working()
+    person.says("subscribe", topic="/chatter")
+    person.says("advertise", topic="/cmd_vel", type="geometry_msgs/Twist")
+    number = world.link.all(link.Subscribe)[0].number
+    world.define()
+    world.robot_goes()
+    world.working()
+    assert [ask.topic for ask in world.link.all(link.Subscribe)] == ["/chatter"]
+    assert [ask.topic for ask in world.link.all(link.Advertise)] == ["/cmd_vel"]
+    world.subscribed(number)
+    world.define()
+    world.channel.sample(number, text("again"))
+    assert [each["msg"] for each in person.hears("publish")] == [{"data": "again"}]
+
+
+def test_callers_wait_for_the_channel_and_are_told_when_the_robot_goes(world: World) -> None:
+    """Not open yet: wait. Robot lost meanwhile: words, at once."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    told: list[Any] = []
+    asking = Deferred.fromCoroutine(world.channel.definition("std_msgs/msg/String"))
+    asking.addErrback(lambda failure: told.append(str(failure.value)))
+    assert not told
+    world.robot_goes()
+    assert told == ["robot rover is offline"]
+    assert fails(world.channel.definition("std_msgs/msg/String")) == "robot rover is offline"
+
+
+def test_a_robot_that_never_joins_keeps_nobody_waiting_for_ever(world: World) -> None:
+    """Asked for a round trip, a definition or a service: every question ends in words."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    told: list[str] = []
+    for work in (
+        world.channel.round_trip(),
+        world.channel.definition("std_msgs/msg/String"),
+        world.channel.call("/reset", "", b"", 2.0),
+    ):
+        Deferred.fromCoroutine(work).addErrback(lambda failure: told.append(str(failure.value)))
+    world.clock.pump([1.0] * 4)
+    assert told == ["robot rover did not answer within 4 s"]
+    world.clock.pump([1.0] * 30)
+    assert told[1:] == ["robot rover did not answer within 30 s"] * 2
+
+
+def test_a_round_trip_is_what_the_link_measures(world: World) -> None:
+    """Over the channel's own link."""
+    world.robot_comes()
+    world.channel.attach(Member())
+    world.robot_joins()
+    results: list[Any] = []
+    Deferred.fromCoroutine(world.channel.round_trip()).addBoth(results.append)
+    world.link.pings[0].callback(0.25)
+    assert results == [0.25]
+
+
+def test_detaching_gives_everything_back(world: World) -> None:
+    """The robot unsubscribes and unadvertises, and no name stays in use."""
+    people = [world.person(), world.person()]
+    world.working()
+    for person in people:
+        person.says("subscribe", topic="/chatter")
+        person.says("subscribe", topic="/later", type="std_msgs/String")
+        person.says("advertise", topic="/cmd_vel", type="geometry_msgs/Twist")
+        person.says("publish", topic="/new", type="std_msgs/String", msg={"data": "x"})
+    assert world.channel.wire.names == 4
+    people[0].session.end()
+    assert world.channel.wire.names == 4
+    assert not world.link.all(link.Unsubscribe)
+    people[1].session.end()
+    assert world.channel.wire.names == 0
+    assert len(world.link.all(link.Unsubscribe)) == 2
+    assert len(world.link.all(link.Unadvertise)) == 2
+    assert not world.channel.members
+    for part in (world.channel.subscriptions, world.channel.publications):
+        assert not part._topics
+        assert not part._numbers

@@ -1,0 +1,205 @@
+"""Topics towards the robot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from relay_protocol import link
+from relay_protocol.link import QoS
+from relay_server.channel import publications as module
+from tests.relay_server.memory import STRING, TWIST, Person, World, words
+
+
+def at_work(world: World) -> Person:
+    """A robot and somebody who wants to be told of errors."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    person.says("set_level", level="error")
+    return person
+
+
+def told(person: Person) -> list[str]:
+    """The errors the person was told."""
+    return [each["msg"] for each in person.hears("status")]
+
+
+def said(world: World) -> list[str]:
+    """The strings the robot was sent."""
+    return [words(body) for _, _, body in world.link.samples]
+
+
+def test_a_topic_is_advertised_once_and_counted_by_id(world: World) -> None:
+    """The publisher goes with the last advertisement."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type="std_msgs/String", id="a", latch=True, queue_size=3)
+    person.says("advertise", topic="out", type=STRING, id="b")
+    (asked,) = world.link.all(link.Advertise)
+    assert (asked.topic, asked.type, asked.latch, asked.queue_size) == ("/out", STRING, True, 3)
+    person.says("unadvertise", topic="/out", id="a")
+    person.says("unadvertise", topic="/out", id="unknown")
+    assert not world.link.all(link.Unadvertise)
+    person.says("unadvertise", topic="/out", id="b")
+    assert world.link.all(link.Unadvertise) == [link.Unadvertise(number=asked.number)]
+    assert world.channel.wire.names == 0
+
+
+def test_what_is_asked_of_a_publisher_reaches_the_robot_within_reason(world: World) -> None:
+    """Quality of service as the client wrote it; a queue of any number is not."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING, queue_size=10**30, qos={"depth": 5})
+    (asked,) = world.link.all(link.Advertise)
+    assert asked.queue_size == module.QUEUE_SIZE
+    assert asked.qos == QoS(depth=5)
+
+
+def test_json_becomes_cdr_when_the_type_is_known(world: World) -> None:
+    """What comes before the definition waits for it, in order."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING)
+    person.says("publish", topic="/out", msg={"data": "a"})
+    person.says("publish", topic="/out", msg={"data": "b"})
+    assert not world.link.samples
+    world.define()
+    person.says("publish", topic="/out", msg={"data": "c"})
+    assert said(world) == ["a", "b", "c"]
+    assert {number for number, _, _ in world.link.samples} == {world.link.all(link.Advertise)[0].number}
+
+
+def test_the_stamp_is_the_moment_before_which_it_was_not_sent(world: World) -> None:
+    """The sending time of the latest ping answered goes with the command."""
+    person = at_work(world)
+    person.answers_pings()
+    pinged = world.now_ns()
+    world.clock.advance(0.05)
+    person.says("publish", topic="/chatter", msg={"data": "a"})
+    world.define()
+    assert [stamp for _, stamp, _ in world.link.samples] == [pinged]
+
+
+def test_publishing_without_advertising_takes_the_graphs_type(world: World) -> None:
+    """Or the one that came along; nobody knows it otherwise."""
+    person = at_work(world)
+    person.says("publish", topic="/chatter", msg={"data": "x"})
+    person.says("publish", topic="/new", type="std_msgs/String", msg={"data": "y"})
+    person.says("publish", topic="/nobody/knows", msg={})
+    assert [ask.topic for ask in world.link.all(link.Advertise)] == ["/chatter", "/new"]
+    assert told(person) == ["topic /nobody/knows does not exist and no type was given; advertise it first"]
+
+
+def test_types_that_can_not_be_are_refused(world: World) -> None:
+    """Conflicts, none, and what is no type name."""
+    person = at_work(world)
+    person.says("advertise", topic="/chatter", type="std_msgs/Bool")
+    person.says("advertise", topic="/new", type="")
+    person.says("advertise", topic="/new", type="x" * 10_000)
+    person.says("advertise", topic="/new", type="std_msgs/msg/../../String")
+    first, second, *others = told(person)
+    assert first == f"topic /chatter has the type {STRING}, not std_msgs/msg/Bool"
+    assert second == "topic /new does not exist; advertise it with its type"
+    assert all("is no type name" in each for each in others) and len(others) == 2
+    assert not world.link.all(link.Advertise)
+    assert world.channel.wire.names == 0
+
+
+def test_messages_that_do_not_fit_are_told_and_not_sent(world: World) -> None:
+    """The sentence names topic and field."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING)
+    world.define()
+    for body in ({"data": 7}, {"dat": "x"}, [1], "text", None):
+        person.says("publish", topic="/out", msg=body)
+    errors = told(person)
+    assert len(errors) == 5
+    assert all(each.startswith("publish /out: ") for each in errors)
+    assert "data must be a string" in errors[0]
+    assert not world.link.samples
+
+
+def test_what_was_held_is_not_done_when_the_robot_comes_back(world: World) -> None:
+    """Neither when its link had been open, nor when it had not opened yet."""
+    person = at_work(world)
+    person.says("publish", topic="/chatter", msg={"data": "before the type"})
+    world.robot_goes()
+    world.robot_comes()
+    person.says("publish", topic="/chatter", msg={"data": "before the link"})
+    world.robot_goes()
+    world.working()
+    world.define()
+    assert said(world) == []
+
+
+def test_what_was_held_too_long_is_dropped_and_told(world: World) -> None:
+    """A robot that can't open its channel for a while is not sent the past."""
+    world.robot_comes()
+    person = world.person()
+    person.says("set_level", level="error")
+    person.says("publish", topic="/chatter", msg={"data": "old"}, id="p1")
+    world.clock.advance(module.HELD_SECONDS)
+    person.says("publish", topic="/chatter", msg={"data": "new"})
+    world.clock.advance(0.5)
+    world.robot_joins()
+    world.define()
+    assert said(world) == ["new"]
+    (error,) = person.hears("status")
+    assert error["id"] == "p1"
+    assert "could not be reached in time" in error["msg"]
+
+
+def test_nothing_is_queued_for_a_robot_that_is_away(world: World) -> None:
+    """The publisher is told at once."""
+    person = world.person()
+    person.says("set_level", level="error")
+    person.says("advertise", topic="/cmd_vel", type="geometry_msgs/Twist")
+    person.says("publish", topic="/cmd_vel", msg={})
+    assert told(person) == ["robot rover is offline; the message was dropped"]
+    world.working()
+    assert not world.link.samples
+
+
+def test_a_robot_that_can_not_advertise_is_told_to_all_who_wait(world: World) -> None:
+    """Later messages are refused, and advertising again tries again."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING)
+    number = world.link.all(link.Advertise)[0].number
+    world.channel.message(link.Failed(what="advertise", ref=str(number), reason="no such type"))
+    person.says("publish", topic="/out", msg={})
+    assert told(person) == [
+        "advertise /out: no such type",
+        "the robot could not advertise /out; the message was dropped",
+    ]
+    person.says("advertise", topic="/out", type=STRING, id="again")
+    assert len(world.link.all(link.Advertise)) == 2
+
+
+def test_a_type_without_definition_fails_its_topics(world: World) -> None:
+    """What waited for it is let go."""
+    person = at_work(world)
+    person.says("publish", topic="/cmd_vel", msg={})
+    world.channel.message(link.Failed(what="get_type", ref=TWIST, reason="not installed"))
+    assert told(person) == ["advertise /cmd_vel: not installed"]
+    assert not world.channel.publications._topics["/cmd_vel"].held
+
+
+def test_a_robot_of_json_is_sent_json(world: World) -> None:
+    """No definition is asked for."""
+    world.robot_comes(encodings=["json"])
+    person = world.person()
+    world.robot_joins()
+    person.says("publish", topic="/chatter", msg={"data": "x"})
+    assert [body for _, _, body in world.link.samples] == [b'{"data":"x"}']
+    assert not world.link.all(link.GetType)
+
+
+def test_advertisements_of_one_client_are_bounded(world: World, monkeypatch: Any) -> None:
+    """By topic and by id: nobody takes the names of all others."""
+    monkeypatch.setattr(module, "ADVERTISEMENTS", 5)
+    person, other = at_work(world), world.person()
+    for number in range(4):
+        person.says("advertise", topic=f"/t{number}", type=STRING)
+    for number in range(4):
+        person.says("advertise", topic="/t0", type=STRING, id=number)
+    assert told(person) == ["at most 5 advertisements can be held on one connection"] * 3
+    assert world.channel.wire.names == 4
+    other.says("advertise", topic="/mine", type=STRING)
+    assert world.channel.wire.names == 5

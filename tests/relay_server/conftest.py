@@ -1,0 +1,47 @@
+"""A world in memory, and a relay's database in a file, for the tests of the relay's parts."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from twisted.internet import reactor
+
+from relay_db.engine import Database
+from relay_server.store import Store
+from tests.relay_server.memory import World
+
+
+@pytest.fixture
+def world() -> World:
+    """One robot, offline, and nobody there."""
+    return World()
+
+
+@pytest.fixture(scope="session")
+def upgraded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A SQLite file with all tables, to be copied."""
+    path = tmp_path_factory.mktemp("db") / "switchboard.db"
+    database = Database(f"sqlite:///{path}")
+    database.upgrade()
+    database.close()
+    return path
+
+
+@pytest.fixture
+def database(upgraded: Path, tmp_path: Path) -> Database:
+    """A database of its own; :func:`store` closes it."""
+    path = tmp_path / "switchboard.db"
+    shutil.copyfile(upgraded, path)
+    return Database(f"sqlite:///{path}")
+
+
+@pytest.fixture
+def store(database: Database) -> Iterator[Store]:
+    """The store of a relay, running on the reactor of the tests."""
+    running = Store(reactor, database)  # type: ignore[arg-type]
+    running.start()
+    yield running
+    running.stop()

@@ -1,0 +1,255 @@
+"""The ends of a relay in memory: a robot's links, a client's websocket, and a world that joins them on a Clock."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import msgspec
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock
+
+from relay_protocol import link
+from relay_protocol.errors import Unavailable
+from relay_protocol.rights import Grant, Level, Rules
+from relay_server.access import Permit, Principal
+from relay_server.channel import Channel, Channels
+from relay_server.freshness import Freshness
+from relay_server.local import RelayNode
+from relay_server.registry import Presence, Registry
+from relay_server.session import Session, Timing
+
+M = TypeVar("M", bound=link.Message)
+
+STRING = "std_msgs/msg/String"
+TWIST = "geometry_msgs/msg/Twist"
+TRIGGER = "std_srvs/srv/Trigger"
+TEXTS = {
+    STRING: "string data\n",
+    TWIST: "Vector3 linear\nVector3 angular\n"
+    + "=" * 80
+    + "\nMSG: geometry_msgs/msg/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n",
+    TRIGGER: "---\nbool success\nstring message\n",
+}
+GRAPH = link.Graph(
+    full=True,
+    topics={
+        "/chatter": link.Topic(types=[STRING], publishers=["/talker"], subscribers=["/logger"]),
+        "/secret": link.Topic(types=[STRING], publishers=["/vault"]),
+        "/cmd_vel": link.Topic(types=[TWIST], subscribers=["/base"]),
+    },
+    services={
+        "/reset": link.Service(types=[TRIGGER], providers=["/base"]),
+        "/vault/open": link.Service(types=[TRIGGER], providers=["/vault"]),
+    },
+    nodes={"/talker": {}, "/base": {}, "/logger": {}, "/vault": {}},
+)
+MOTION = link.Describe(host="shed", distro="jazzy", motion=link.MotionPolicy(types=[TWIST]))
+
+
+def text(words: str) -> bytes:
+    """A std_msgs/String in CDR."""
+    data = words.encode() + b"\x00"
+    return b"\x00\x01\x00\x00" + len(data).to_bytes(4, "little") + data
+
+
+def words(cdr: bytes) -> str:
+    """What a std_msgs/String in CDR says."""
+    return cdr[8 : 8 + int.from_bytes(cdr[4:8], "little") - 1].decode()
+
+
+class MemoryLink:
+    """A robot's link as the relay writes to it."""
+
+    def __init__(self) -> None:
+        self.said: list[link.Message] = []
+        self.samples: list[tuple[int, int, bytes]] = []
+        self.closed: str | None = None
+        self.pings: list[Deferred[float]] = []
+
+    def send(self, message: link.Message) -> None:
+        """Keep it, once it has proved to be JSON that a robot can read."""
+        msgspec.json.decode(msgspec.json.encode(message))
+        self.said.append(message)
+
+    def sample(self, number: int, stamp: int, body: bytes) -> None:
+        """Keep it."""
+        self.samples.append((number, stamp, body))
+
+    def close(self, reason: str) -> None:
+        """The relay hangs up."""
+        self.closed = self.closed or reason
+
+    def round_trip(self) -> Deferred[float]:
+        """A ping the test answers."""
+        self.pings.append(Deferred())
+        return self.pings[-1]
+
+    def all(self, kind: type[M]) -> list[M]:
+        """Messages of one kind so far."""
+        return [message for message in self.said if isinstance(message, kind)]
+
+    def take(self, kind: type[M]) -> list[M]:
+        """Messages of one kind, and forget them."""
+        found = self.all(kind)
+        self.said = [message for message in self.said if not isinstance(message, kind)]
+        return found
+
+
+class MemoryClient:
+    """A client's websocket as a session writes to it."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+        self.pings: list[bytes] = []
+        self.closed: tuple[int, str] | None = None
+
+    def send(self, message: bytes) -> None:
+        """Keep it; a closed websocket takes nothing."""
+        assert self.closed is None, "sent after the close"
+        self.sent.append(message)
+
+    def ping(self, payload: bytes) -> None:
+        """Keep it; the test answers."""
+        assert self.closed is None, "pinged after the close"
+        self.pings.append(payload)
+
+    def close(self, code: int, reason: str) -> None:
+        """The session cuts the client."""
+        assert self.closed is None, "closed twice"
+        self.closed = (code, reason)
+
+    def take(self) -> list[dict[str, Any]]:
+        """What came, decoded, and forget it."""
+        sent, self.sent = self.sent, []
+        return [json.loads(each) for each in sent]
+
+
+class Person:
+    """A session with its client's end."""
+
+    def __init__(self, session: Session, client: MemoryClient) -> None:
+        self.session = session
+        self.client = client
+
+    def says(self, op: str, **fields: Any) -> None:
+        """One rosbridge message from this client."""
+        self.session.message(json.dumps({"op": op, **fields}).encode())
+
+    def hears(self, op: str) -> list[dict[str, Any]]:
+        """What came of one op; the rest is forgotten."""
+        return [message for message in self.client.take() if message["op"] == op]
+
+    def answers_pings(self) -> None:
+        """Send a pong to every ping."""
+        pings, self.client.pings = self.client.pings, []
+        for payload in pings:
+            self.session.pong(payload)
+
+
+class World:
+    """One robot and its channel, on a clock of the test's own."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.clock.advance(1000)
+        self.registry = Registry(lambda: 1.7e9 + self.clock.seconds())
+        tickets = itertools.count(1)
+        self.channels = Channels(
+            self.clock,
+            linger=5.0,
+            new_ticket=lambda: f"ticket-{next(tickets)}",
+            wall_ns=lambda: self.now_ns() + 10**18,
+        )
+        self.robot = self.registry.presence(1, "rover", "main")
+        self.control = MemoryLink()
+        self.link = MemoryLink()
+        self.people: list[Session] = []
+        self._tokens = itertools.count(1)
+
+    def now_ns(self) -> int:
+        """The clock in nanoseconds."""
+        return round(self.clock.seconds() * 1e9)
+
+    @property
+    def channel(self) -> Channel:
+        """The robot's channel as it stands."""
+        return self.channels.of(self.robot)
+
+    def robot_comes(self, encodings: Iterable[str] = ("cdr", "json"), graph: link.Graph = GRAPH) -> None:
+        """The robot registers and tells of its graph."""
+        self.robot.encodings = tuple(encodings)
+        self.control = MemoryLink()
+        self.registry.registered(self.robot, self.control)
+        self.robot.description = MOTION
+        self.registry.graph(self.robot, graph)
+
+    def robot_goes(self) -> None:
+        """The control link ends."""
+        self.registry.lost(self.robot, self.control)
+
+    def robot_joins(self) -> MemoryLink:
+        """The robot dials with the ticket it was given."""
+        self.clock.advance(0)
+        ticket = self.control.take(link.OpenChannel)[-1].ticket
+        self.link = MemoryLink()
+        self.channels.redeem(ticket).joined(self.link)
+        return self.link
+
+    def define(self, *types: str) -> None:
+        """The robot answers what definitions it was asked for."""
+        for asked in self.link.take(link.GetType):
+            assert not types or asked.type in types
+            self.channel.message(link.TypeDefinition(type=asked.type, text=TEXTS[asked.type]))
+
+    def subscribed(self, number: int, type_name: str = STRING, encoding: str = "cdr", **more: Any) -> None:
+        """The robot confirms a subscription."""
+        self.channel.message(
+            link.Subscribed(number=number, topic="/x", type=type_name, encoding=encoding, **more)
+        )
+
+    def person(
+        self, level: Level = Level.OPERATOR, allow: tuple[str, ...] = (), deny: tuple[str, ...] = ()
+    ) -> Person:
+        """A client with a right on the robot, its session begun."""
+        principal = Principal(7, "ann", "main", False, next(self._tokens), None)
+        permit = Permit(principal, 1, Rules([Grant(level, allow, deny)]))
+        client = MemoryClient()
+        session = Session(
+            self.clock,
+            client,
+            permit,
+            self.robot,
+            self.channel,
+            RelayNode(lambda robot_id: self.people),
+            Freshness(self.now_ns, self.now_ns(), lambda: next(self._tokens).to_bytes(8, "big")),
+            Timing(client_ping=2.0, driving_ping=0.1, stall_limit=5.0),
+            address="192.0.2.7",
+            since=1.7e9,
+            ended=self.people.remove,
+        )
+        self.people.append(session)
+        session.start()
+        return Person(session, client)
+
+    def working(self, *people: Person) -> None:
+        """The robot is there, joined, and has told of all types it was asked for."""
+        self.robot_comes()
+        self.robot_joins()
+        self.define()
+
+
+def fails(work: Any) -> str:
+    """Start a coroutine that must fail now; its words."""
+    errors: list[BaseException] = []
+    Deferred.fromCoroutine(work).addErrback(lambda failure: errors.append(failure.value))
+    assert errors, "it has not failed"
+    return str(errors[0])
+
+
+__all__ = [
+    "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink", "Person",
+    "Presence", "Unavailable", "World", "fails", "text", "words",
+]  # fmt: skip

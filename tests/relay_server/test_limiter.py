@@ -1,0 +1,107 @@
+"""Failed logins are counted per account and network."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_server import limiter as module
+from relay_server.limiter import FAILURES, FAILURES_OF_NETWORK, WINDOW, LoginLimiter, network_of
+
+
+class Time:
+    """A clock the test moves."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def time() -> Time:
+    """Zero."""
+    return Time()
+
+
+def exhausted(time: Time) -> LoginLimiter:
+    """A limiter that has had all failures of ann from one address."""
+    limiter = LoginLimiter(time)
+    for _ in range(FAILURES):
+        assert limiter.wait("ann", "192.0.2.1") == 0
+        limiter.failed("ann", "192.0.2.1")
+    return limiter
+
+
+def test_the_eleventh_try_waits_for_the_first_to_be_forgotten(time: Time) -> None:
+    """Ten failures in fifteen minutes, in a sliding window."""
+    limiter = exhausted(time)
+    time.now = 60.0
+    assert limiter.wait("ann", "192.0.2.1") == WINDOW - 60
+    time.now = WINDOW
+    assert limiter.wait("ann", "192.0.2.1") == 0
+
+
+def test_nobody_locks_an_account_from_afar(time: Time) -> None:
+    """The same account from another network, and another account from the same one, go on."""
+    limiter = exhausted(time)
+    assert limiter.wait("ann", "192.0.2.2") == 0
+    assert limiter.wait("bob", "192.0.2.1") == 0
+
+
+def test_an_account_is_one_however_it_is_written(time: Time) -> None:
+    """Other spellings of a name are no further tries."""
+    limiter = exhausted(time)
+    assert limiter.wait("ANN", "192.0.2.1") > 0
+    assert limiter.wait("\uff21nn", "192.0.2.1") > 0
+
+
+def test_guessing_names_is_no_way_around(time: Time) -> None:
+    """A network has a limit over all accounts together, and others have their own."""
+    limiter = LoginLimiter(time)
+    for number in range(FAILURES_OF_NETWORK):
+        limiter.failed(f"user{number}", "192.0.2.1")
+    assert limiter.wait("new", "192.0.2.1") > 0
+    assert limiter.wait(None, "192.0.2.1") > 0
+    assert limiter.wait("new", "192.0.2.2") == 0
+
+
+def test_success_forgets_the_failures_of_the_pair_only(time: Time) -> None:
+    """The account starts anew; what the network did otherwise stays."""
+    limiter = exhausted(time)
+    limiter.succeeded("ann", "192.0.2.1")
+    assert limiter.wait("ann", "192.0.2.1") == 0
+    for number in range(FAILURES_OF_NETWORK - FAILURES + 1):
+        limiter.failed(f"user{number}", "192.0.2.1")
+    assert limiter.wait("bob", "192.0.2.1") > 0
+
+
+def test_a_try_that_could_not_be_judged_is_taken_back(time: Time) -> None:
+    """A database that is away locks nobody out."""
+    limiter = LoginLimiter(time)
+    for _ in range(3 * FAILURES_OF_NETWORK):
+        limiter.failed("ann", "192.0.2.1")
+        limiter.forgive("ann", "192.0.2.1")
+    assert limiter.wait("ann", "192.0.2.1") == 0
+
+
+def test_what_is_remembered_is_bounded(time: Time, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The longest unused pairs are forgotten."""
+    monkeypatch.setattr(module, "KEYS", 10)
+    limiter = LoginLimiter(time)
+    for number in range(100):
+        limiter.failed("ann", f"192.0.2.{number}")
+    assert len(limiter._failures) == 10
+
+
+@pytest.mark.parametrize(
+    ("address", "network"),
+    [
+        ("192.0.2.1", "192.0.2.1"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("::ffff:192.0.2.1", "192.0.2.1"),
+        ("local", "local"),
+    ],
+)
+def test_networks(address: str, network: str) -> None:
+    """One address of IPv4, a /64 of IPv6, mapped addresses as what they are."""
+    assert network_of(address) == network

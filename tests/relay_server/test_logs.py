@@ -1,0 +1,99 @@
+"""The relay's log: one line an event, inert whatever somebody sent."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from twisted.logger import LogLevel
+from twisted.python.failure import Failure
+
+from relay_server import logs
+
+HOSTILE = "\x1b[2Jrover\u202e\u009b31m\x7f\u2028\r\ud800\x00"
+
+
+class Log:
+    """What was given to Twisted as observer, and what it writes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, as_json: bool, debug: bool = False) -> None:
+        self.text = ""
+        observers: list[Any] = []
+        monkeypatch.setattr(
+            logs.globalLogBeginner, "beginLoggingTo", lambda given, **more: observers.extend(given)
+        )
+        logs.begin(as_json, debug, out=self)  # type: ignore[arg-type]
+        self._observe = observers[0]
+
+    def write(self, text: str) -> None:
+        """As a file."""
+        self.text += text
+
+    def flush(self) -> None:
+        """As a file."""
+
+    def event(self, words: str, level: LogLevel = LogLevel.info, **more: Any) -> str:
+        """Log something; what was written of it."""
+        self.text = ""
+        self._observe(
+            {
+                "log_format": "{words}",
+                "words": words,
+                "log_level": level,
+                "log_time": 0.5,
+                "log_namespace": "relay_server.session",
+                **more,
+            }
+        )
+        return self.text
+
+
+def test_a_line_has_time_level_and_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time is UTC, in milliseconds."""
+    assert Log(monkeypatch, False).event("hello") == "1970-01-01T00:00:00.500Z info     hello\n"
+
+
+def test_control_characters_are_spelled_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Escape sequences, bidirectional marks, C1 and half characters drive no terminal."""
+    line = Log(monkeypatch, False).event(HOSTILE)
+    assert line.removesuffix("\n").isprintable()
+    assert "\\x1b[2Jrover\\u202e\\x9b31m\\x7f\\u2028\\r\\ud800\\x00" in line
+
+
+def test_nobody_forges_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line break in what was sent is indented, so it begins no entry of its own."""
+    lines = Log(monkeypatch, False).event("x\n1970-01-01T00:00:00.500Z critical forged").splitlines()
+    assert lines[1].startswith("    1970")
+    assert "\n" not in Log(monkeypatch, True).event("x\nforged").removesuffix("\n")
+
+
+def test_json_lines_hold_what_was_said_in_pure_ascii(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One object a line, readable by programs, harmless on a terminal."""
+    line = Log(monkeypatch, True).event(HOSTILE)
+    assert line.isascii()
+    assert line.removesuffix("\n").isprintable()
+    assert json.loads(line) == {
+        "time": "1970-01-01T00:00:00.500Z",
+        "level": "info",
+        "logger": "relay_server.session",
+        "message": HOSTILE,
+    }
+
+
+def test_libraries_speak_up_only_with_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their chatter would bury ours; debugging shows all."""
+    log = Log(monkeypatch, False)
+    assert log.event("chatter", log_namespace="autobahn.websocket") == ""
+    assert "careful" in log.event("careful", LogLevel.warn, log_namespace="autobahn.websocket")
+    assert log.event("detail", LogLevel.debug) == ""
+    debugging = Log(monkeypatch, False, debug=True)
+    assert "detail" in debugging.event("detail", LogLevel.debug)
+
+
+def test_a_failure_shows_its_words_and_only_a_crash_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors are sentences; tracebacks are for faults of ours."""
+    log = Log(monkeypatch, False)
+    failure = Failure(ValueError("no good"))
+    assert log.event("it failed", LogLevel.error, log_failure=failure).endswith("it failed: no good\n")
+    assert "ValueError" in log.event("it failed", LogLevel.critical, log_failure=failure)

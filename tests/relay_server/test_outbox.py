@@ -1,0 +1,212 @@
+"""What waits for a slow receiver."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relay_server import outbox as module
+from relay_server.outbox import Outbox
+
+MIB = 1024 * 1024
+
+
+class Receiver:
+    """An outbox with a transport that takes bytes only when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.got: list[bytes] = []
+        self.cut = 0
+        self.takes = 10**9
+        self.outbox = Outbox(self._write, lambda: self.now, self._overflow)
+
+    def _write(self, message: bytes) -> None:
+        assert self.outbox.paused_since is None, "written while paused"
+        self.got.append(message)
+        self.takes -= 1
+        if self.takes == 0:
+            self.outbox.pause()
+
+    def _overflow(self) -> None:
+        self.cut += 1
+
+    def resume(self, takes: int = 10**9) -> list[bytes]:
+        """Let some messages through; what came."""
+        self.got, self.takes = [], takes
+        self.outbox.resume()
+        return self.got
+
+
+def paused() -> Receiver:
+    """A receiver that takes nothing."""
+    receiver = Receiver()
+    receiver.outbox.pause()
+    return receiver
+
+
+def test_what_is_sent_to_a_fast_receiver_passes_straight_through() -> None:
+    """Nothing waits while the transport takes bytes."""
+    receiver = Receiver()
+    receiver.outbox.control(b"a")
+    receiver.outbox.data("t", b"b")
+    assert receiver.got == [b"a", b"b"]
+    assert receiver.outbox.waiting_bytes == 0
+
+
+def test_control_goes_before_data_and_keeps_its_order() -> None:
+    """After a pause replies come first, as they were given."""
+    receiver = paused()
+    receiver.outbox.data("t", b"data")
+    receiver.outbox.control(b"one")
+    receiver.outbox.control(b"two")
+    assert receiver.resume() == [b"one", b"two", b"data"]
+
+
+def test_topics_take_turns() -> None:
+    """A topic with many samples does not hold up one with few."""
+    receiver = paused()
+    for number in range(3):
+        receiver.outbox.data("busy", b"busy%d" % number)
+    receiver.outbox.data("rare", b"rare")
+    assert receiver.resume() == [b"busy0", b"rare", b"busy1", b"busy2"]
+
+
+def test_turns_go_on_where_they_were_when_the_transport_fills_again() -> None:
+    """Being paused in between changes neither order nor turns."""
+    receiver = paused()
+    for number in range(3):
+        receiver.outbox.data("a", b"a%d" % number)
+        receiver.outbox.data("b", b"b%d" % number)
+    got = [*receiver.resume(1), *receiver.resume(2), *receiver.resume()]
+    assert got == [b"a0", b"b0", b"a1", b"b1", b"a2", b"b2"]
+
+
+def test_the_newest_samples_survive_the_depth() -> None:
+    """The oldest give way, and are counted."""
+    receiver = paused()
+    for number in range(10):
+        receiver.outbox.data("t", b"%d" % number, depth=3)
+    assert receiver.outbox.dropped == 7
+    assert receiver.resume() == [b"7", b"8", b"9"]
+
+
+def test_a_depth_below_one_keeps_the_newest() -> None:
+    """A client's queue length may be any number: it must not empty the queue under our feet."""
+    receiver = paused()
+    receiver.outbox.data("t", b"old", depth=0)
+    receiver.outbox.data("t", b"new", depth=-5)
+    assert receiver.resume() == [b"new"]
+
+
+def test_samples_older_than_the_age_limit_give_way_but_the_newest_stays() -> None:
+    """After a stall there is no burst of stale samples, and a topic's last word is not lost."""
+    receiver = paused()
+    receiver.outbox.data("t", b"old")
+    receiver.outbox.data("t", b"older than a second")
+    receiver.outbox.data("u", b"last")
+    receiver.now += module.DATA_AGE + 1
+    assert receiver.resume() == [b"older than a second", b"last"]
+    assert receiver.outbox.dropped == 1
+    assert receiver.outbox.waiting_bytes == 0
+
+
+def test_the_fullest_topic_gives_way_to_the_others() -> None:
+    """A point cloud does not push out the joint states."""
+    receiver = paused()
+    receiver.outbox.data("small", b"s1")
+    receiver.outbox.data("small", b"s2")
+    for _ in range(8):
+        receiver.outbox.data("cloud", bytes(MIB // 2))
+    assert receiver.outbox.waiting_bytes <= module.DATA_BYTES
+    assert [each for each in receiver.resume() if len(each) == 2] == [b"s1", b"s2"]
+
+
+def test_single_large_samples_of_many_topics_stay_within_twice_the_bound() -> None:
+    """However sizes and topics fall: bytes of one slow receiver have a bound."""
+    receiver = paused()
+    for number in range(8):
+        receiver.outbox.data(number, b"small")
+        receiver.outbox.data(number, bytes(3 * MIB + MIB // 2))
+        assert receiver.outbox.waiting_bytes <= 2 * module.DATA_BYTES
+
+
+def test_a_receiver_whose_replies_pile_up_is_cut_once() -> None:
+    """Control is never dropped; over the bound the receiver must go, and nothing is kept for it."""
+    receiver = paused()
+    for _ in range(module.CONTROL_MESSAGES + 5):
+        receiver.outbox.control(b"reply")
+    assert receiver.cut == 1
+    assert receiver.outbox.waiting_bytes == 0
+    assert receiver.resume() == []
+
+
+def test_few_large_replies_cut_too() -> None:
+    """The bound is in bytes as well."""
+    receiver = paused()
+    for _ in range(3):
+        receiver.outbox.control(bytes(MIB))
+    assert receiver.cut == 1
+
+
+def test_a_forgotten_topic_frees_its_bytes() -> None:
+    """What waits of a topic nobody wants is let go."""
+    receiver = paused()
+    receiver.outbox.data("t", b"12345")
+    receiver.outbox.data("u", b"1")
+    receiver.outbox.forget("t")
+    receiver.outbox.forget("never seen")
+    assert receiver.outbox.waiting_bytes == 1
+    assert receiver.resume() == [b"1"]
+
+
+def test_a_closed_outbox_writes_nothing_any_more() -> None:
+    """Neither what waited nor what comes later."""
+    receiver = paused()
+    receiver.outbox.control(b"a")
+    receiver.outbox.close()
+    receiver.outbox.data("t", b"b")
+    receiver.outbox.control(b"c")
+    assert receiver.resume() == []
+    assert receiver.outbox.waiting_bytes == 0
+
+
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("data"), st.integers(0, 4), st.integers(0, 3 * MIB), st.integers(-1, 6)),
+        st.tuples(st.just("control"), st.integers(0, 300_000)),
+        st.tuples(st.just("pause")),
+        st.tuples(st.just("resume"), st.integers(1, 6)),
+        st.tuples(st.just("forget"), st.integers(0, 4)),
+        st.tuples(st.just("wait"), st.floats(0, 2)),
+    ),
+    max_size=40,
+)
+
+
+@given(STEPS)
+@settings(deadline=None, max_examples=150)
+def test_the_account_of_waiting_bytes_never_drifts(steps: list[tuple[str, int, int, int]]) -> None:
+    """Whatever happens in whatever order: what is counted is what waits, within the bounds, and newest last."""
+    receiver = Receiver()
+    box = receiver.outbox
+    for serial, (what, *values) in enumerate(steps):
+        if what == "data":
+            box.data(values[0], serial.to_bytes(4, "big") + bytes(values[1]), values[2])
+        elif what == "control":
+            box.control(serial.to_bytes(4, "big") + bytes(values[0]))
+        elif what == "resume":
+            receiver.resume(values[0])
+        elif what == "pause":
+            box.pause()
+        elif what == "forget":
+            box.forget(values[0])
+        else:
+            receiver.now += values[0]
+        waiting = sum(len(each) for queue in box._data.values() for _, each in queue.samples)
+        assert box.waiting_bytes == waiting + sum(map(len, box._control))
+        assert all(queue.samples for queue in box._data.values())
+        assert waiting <= 2 * module.DATA_BYTES
+        assert sum(map(len, box._control)) <= module.CONTROL_BYTES
+    receiver.resume()
+    assert box.waiting_bytes == 0

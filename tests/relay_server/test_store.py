@@ -1,0 +1,87 @@
+"""The database asked from the reactor."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+from twisted.internet.defer import CancelledError, Deferred
+
+from relay_db import queries
+from relay_protocol.errors import Unavailable
+from relay_server.store import Store, Threads
+
+
+@pytest.fixture
+def threads() -> Iterator[Threads]:
+    """One thread, two places."""
+    running = Threads(reactor, "test", 1, 2, "come back later")  # type: ignore[arg-type]
+    running.start()
+    yield running
+    running.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_write_is_seen_by_the_next_read(store: Store) -> None:
+    """It has been committed when it returns."""
+    user = await store.write(queries.add_user, "ann", None)
+    assert await store.read(queries.find_user, "ann") == user
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_failed_write_leaves_nothing(store: Store) -> None:
+    """Errors come back as they were raised, and the transaction is undone."""
+
+    def half(session: queries.Session) -> None:  # type: ignore[name-defined]
+        queries.add_user(session, "ann", None)
+        raise KeyError("half way")
+
+    with pytest.raises(KeyError, match="half way"):
+        await store.write(half)
+    assert await store.read(queries.find_user, "ann") is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_too_many_askers_are_refused_in_words(threads: Threads) -> None:
+    """The queue is bounded, and has room again when work is done."""
+    go = threading.Event()
+    waiting = [Deferred.fromCoroutine(threads.run(go.wait, 20)) for _ in range(2)]
+    with pytest.raises(Unavailable, match="come back later"):
+        await threads.run(int)
+    go.set()
+    for each in waiting:
+        await each
+    assert await threads.run(int, "7") == 7
+
+
+@pytest_twisted.ensureDeferred
+async def test_askers_who_leave_keep_their_place_until_the_work_is_done(threads: Threads) -> None:
+    """Else coming and going would fill the queue without end while a database hangs."""
+    go = threading.Event()
+    waiting = [Deferred.fromCoroutine(threads.run(go.wait, 20)) for _ in range(2)]
+    for each in waiting:
+        each.cancel()
+        with pytest.raises(CancelledError):
+            await each
+    with pytest.raises(Unavailable):
+        await threads.run(int)
+    go.set()
+    while threads._under_way:
+        done: Deferred[None] = Deferred()
+        reactor.callLater(0.005, done.callback, None)  # type: ignore[attr-defined]
+        await done
+    assert await threads.run(int, "7") == 7
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_damaged_database_is_unavailable_in_words(store: Store, tmp_path: Path) -> None:
+    """Whoever asks is told so, without internals."""
+    (tmp_path / "switchboard.db").write_bytes(b"junk" * 4096)
+    with pytest.raises(Unavailable) as told:
+        await store.read(queries.list_users)
+    assert "SELECT" not in str(told.value)
+    assert str(tmp_path) not in str(told.value)
