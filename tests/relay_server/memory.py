@@ -234,7 +234,7 @@ class World:
         session.start()
         return Person(session, client)
 
-    def working(self, *people: Person) -> None:
+    def working(self) -> None:
         """The robot is there, joined, and has told of all types it was asked for."""
         self.robot_comes()
         self.robot_joins()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from pathlib import Path
 
@@ -56,10 +57,8 @@ def handshake(server: SSL.Context, newest: int = SSL.TLS1_3_VERSION) -> SSL.Conn
                 waiting.discard(end)
             except SSL.WantReadError:
                 pass
-            try:
+            with contextlib.suppress(SSL.WantReadError):
                 peer.bio_write(end.bio_read(1 << 16))
-            except SSL.WantReadError:
-                pass
         if not waiting:
             return client
     raise AssertionError("the handshake did not end")

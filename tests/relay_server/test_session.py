@@ -1,0 +1,335 @@
+"""One client on one robot: every message is judged before anything else sees it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from relay_protocol import link
+from relay_protocol.rights import Grant, Level, Rules
+from relay_server import closing
+from relay_server import session as module
+from relay_server.session import normal_type
+from tests.relay_server.memory import STRING, TWIST, Person, World, text
+
+
+def told(person: Person, level: str = "error") -> list[str]:
+    """The statuses of a level."""
+    return [each["msg"] for each in person.hears("status") if each["level"] == level]
+
+
+@pytest.mark.parametrize(
+    ("op", "fields", "needs"),
+    [
+        ("subscribe", {"topic": "/chatter"}, Level.VIEWER),
+        ("publish", {"topic": "/chatter", "msg": {}}, Level.OPERATOR),
+        ("advertise", {"topic": "/chatter", "type": STRING}, Level.OPERATOR),
+        ("call_service", {"service": "/reset"}, Level.OPERATOR),
+    ],
+)
+def test_every_operation_is_judged(world: World, op: str, fields: dict[str, Any], needs: Level) -> None:
+    """By level, by deny and by allow; what is refused never reaches the robot."""
+    world.robot_comes()
+    may = {"subscribe": "subscribe", "call_service": "call"}.get(op, "publish")
+    viewer = world.person(Level.VIEWER)
+    denied = world.person(Level.OWNER, deny=(f"{may}:/*",))
+    allowed = world.person(Level.VIEWER, allow=(f"{may}:/*",))
+    world.robot_joins()
+    for person, right in ((viewer, needs is Level.VIEWER), (denied, False), (allowed, True)):
+        before = len(world.link.said)
+        person.says("set_level", level="error")
+        person.says(op, id="x", **fields)
+        refused = told(person)
+        assert bool(refused) is not right
+        assert right or len(world.link.said) == before
+        assert person.session.refusals == len(refused)
+        person.session.end()
+
+
+def test_a_refused_call_is_answered_even_to_those_who_asked_for_no_status(world: World) -> None:
+    """The caller waits for an answer; the reason is in it."""
+    person = world.person(Level.VIEWER)
+    person.says("call_service", service="/reset", id="x")
+    (reply,) = person.client.take()
+    assert (reply["op"], reply["id"], reply["result"]) == ("service_response", "x", False)
+    assert reply["values"] == "call on /reset needs the level operator; you are viewer on this robot"
+
+
+def test_status_comes_only_when_asked_for(world: World) -> None:
+    """Common clients break on an op they don't know; each level includes those above."""
+    person = world.person()
+    person.says("subscribe", topic="no name!")
+    assert not person.client.take()
+    heard = {}
+    for level in ("info", "warning", "error", "none"):
+        person.says("set_level", level=level)
+        for kind in ("info", "warning", "error"):
+            person.session.tell(kind, "words")
+        heard[level] = [each["level"] for each in person.hears("status")]
+    assert heard == {
+        "info": ["info", "warning", "error"],
+        "warning": ["warning", "error"],
+        "error": ["error"],
+        "none": [],
+    }
+
+
+def test_an_unknown_level_is_refused(world: World) -> None:
+    """The old one stays."""
+    person = world.person()
+    person.says("set_level", level="error")
+    person.says("set_level", level="loud", id="x")
+    (status,) = person.hears("status")
+    assert status["id"] == "x"
+    assert status["msg"] == "level 'loud' is none of info, warning, error, none"
+
+
+def test_operations_that_are_not_served_are_refused_in_words(world: World) -> None:
+    """Services offered by clients; unknown operations; compression is only a warning."""
+    person = world.person()
+    person.says("set_level", level="warning")
+    person.says("advertise_service", service="/mine", type="std_srvs/Trigger")
+    person.says("dance")
+    person.says("subscribe", topic="/x", type=STRING, compression="cbor")
+    first, second, third = person.hears("status")
+    assert first["msg"] == "services offered by clients are not carried to robots by this relay"
+    assert second["msg"].startswith("unknown op 'dance'")
+    assert (third["level"], third["msg"]) == (
+        "warning",
+        "compression cbor is not served; /x comes as plain JSON",
+    )
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [b"", b"{}", b"[1]", b"\xff", b'{"op":"publish"}', b'{"op":"subscribe","topic":7}', b"[" * 500, b"NaN"],
+)
+def test_a_hundred_messages_in_a_row_that_are_no_rosbridge_cut_the_client(world: World, junk: bytes) -> None:
+    """Ninety-nine do not, and a good one starts the count anew."""
+    person = world.person()
+    for _ in range(module.MALFORMED - 1):
+        person.session.message(junk)
+    person.says("set_level", level="error")
+    for _ in range(module.MALFORMED - 1):
+        person.session.message(junk)
+    assert person.client.closed is None
+    person.session.message(junk)
+    assert person.client.closed is not None
+    assert person.client.closed[0] == closing.TOO_MANY_ERRORS
+    assert not world.people
+
+
+def test_rosauths_message_is_taken_and_not_used(world: World) -> None:
+    """Who is here is authenticated already."""
+    person = world.person()
+    person.says("set_level", level="info")
+    person.says("auth", mac="x", client="y", dest="z", rand=1, t=2, level="admin", end=3)
+    assert not person.client.take()
+
+
+# --- motion -----------------------------------------------------------------------------------------------
+
+
+def test_a_motion_command_that_may_be_too_old_is_dropped_counted_and_told(world: World) -> None:
+    """Without a pong its age is not known to be less; after one it goes through."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    person.says("set_level", level="warning")
+    world.clock.advance(0.6)
+    person.says("publish", topic="/cmd_vel", msg={}, id="c")
+    assert "may be 600 ms old" in told(person, "warning")[0]
+    assert person.session.stale_commands == 1
+    person.answers_pings()
+    person.says("publish", topic="/cmd_vel", msg={})
+    world.define()
+    assert len(world.link.samples) == 1
+    assert not told(person, "warning")
+
+
+def test_the_robot_says_what_is_motion_and_how_old_it_may_be(world: World) -> None:
+    """By type or by topic, with its own deadline; other topics are not judged by age."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    world.robot.description = link.Describe(motion=link.MotionPolicy(topics=["/chatter"], deadline_ms=2000))
+    for advance, topic, stale in ((1.0, "/cmd_vel", 0), (0.9, "/chatter", 0), (0.2, "/chatter", 1)):
+        world.clock.advance(advance)
+        person.says("publish", topic=topic, msg={})
+        assert person.session.stale_commands == stale
+    world.define(STRING, TWIST)
+    assert len(world.link.samples) == 2
+
+
+def test_who_may_drive_is_pinged_more_often_than_who_watches(world: World) -> None:
+    """Ten times a second against every two seconds; a change of rights changes that too."""
+    driver, viewer = world.person(Level.OPERATOR), world.person(Level.VIEWER)
+    allowed = world.person(Level.VIEWER, allow=("publish:/cmd_vel",))
+    world.clock.pump([0.1] * 10)
+    assert [len(each.client.pings) for each in (driver, viewer, allowed)] == [11, 1, 11]
+    driver.session.permit.rules = Rules([Grant(Level.VIEWER)])
+    driver.session.permit.on_change()
+    world.clock.pump([0.1] * 10)
+    assert len(driver.client.pings) <= 13
+
+
+# --- slow and silent clients ------------------------------------------------------------------------------
+
+
+def test_a_client_that_takes_nothing_is_cut_after_the_stall_limit(world: World) -> None:
+    """With words; one that takes something in between is not."""
+    person, other = world.person(), world.person()
+    for each in (person, other):
+        each.session.pause()
+    for second in range(6):
+        for _ in range(10):
+            world.clock.advance(0.1)
+            person.answers_pings()
+            other.answers_pings()
+        if second == 3:
+            other.session.resume()
+            other.session.pause()
+    assert person.client.closed == (closing.TOO_SLOW, "nothing was taken for 5 s")
+    assert other.client.closed is None
+
+
+def test_a_client_that_answers_no_ping_is_cut(world: World) -> None:
+    """A half-open connection is not kept for ever."""
+    person = world.person()
+    world.clock.pump([0.1] * 59)
+    assert person.client.closed is None
+    world.clock.pump([0.1] * 3)
+    assert person.client.closed is not None
+    assert person.client.closed[0] == closing.TOO_SLOW
+
+
+def test_a_client_whose_replies_pile_up_is_cut(world: World) -> None:
+    """While other clients go on."""
+    person, other = world.person(), world.person()
+    person.session.pause()
+    for number in range(1100):
+        person.says("call_service", service="/relay/ping", id=number)
+    assert person.client.closed == (closing.TOO_SLOW, "replies pile up; read faster")
+    assert world.people == [other.session]
+
+
+def test_a_slow_client_loses_samples_and_no_other_does(world: World) -> None:
+    """Newest win, drops are counted, by the queue length the client asked for."""
+    slow, quick = world.person(), world.person()
+    world.working()
+    for person in (slow, quick):
+        person.says("subscribe", topic="/chatter", queue_length=2)
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number)
+    world.define()
+    slow.session.pause()
+    for word in "abcde":
+        world.channel.sample(number, text(word))
+    slow.session.resume()
+    assert [each["msg"]["data"] for each in slow.hears("publish")] == ["d", "e"]
+    assert [each["msg"]["data"] for each in quick.hears("publish")] == list("abcde")
+    assert (slow.session.outbox.dropped, quick.session.outbox.dropped) == (3, 0)
+
+
+def test_what_waits_of_a_topic_unsubscribed_is_not_sent(world: World) -> None:
+    """Nobody wants it any more."""
+    person = world.person()
+    world.working()
+    person.says("subscribe", topic="/chatter")
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number)
+    world.define()
+    person.session.pause()
+    world.channel.sample(number, text("late"))
+    person.says("unsubscribe", topic="/chatter")
+    person.session.resume()
+    assert not person.hears("publish")
+
+
+# --- rights that change -----------------------------------------------------------------------------------
+
+
+def test_rights_taken_away_while_open_take_back_what_they_gave(world: World) -> None:
+    """Subscriptions and advertisements end, with the reason; the rest goes on."""
+    person = world.person()
+    world.working()
+    person.says("set_level", level="error")
+    person.says("subscribe", topic="/chatter")
+    person.says("subscribe", topic="/secret")
+    person.says("advertise", topic="/cmd_vel", type=TWIST)
+    person.session.permit.rules = Rules([Grant(Level.VIEWER, deny=("subscribe:/secret",))])
+    person.session.permit.on_change()
+    assert told(person) == [
+        "unsubscribed from /secret: subscribe on /secret is denied to you by 'subscribe:/secret'",
+        "unadvertised /cmd_vel: publish on /cmd_vel needs the level operator; you are viewer on this robot",
+    ]
+    assert len(world.link.all(link.Unsubscribe)) == len(world.link.all(link.Unadvertise)) == 1
+    assert world.channel.wire.names == 1
+    person.says("publish", topic="/cmd_vel", msg={})
+    assert told(person)
+
+
+@pytest.mark.parametrize(
+    ("reason", "code"),
+    [
+        ("your right on this robot was revoked", closing.FORBIDDEN),
+        ("your session was ended; log in again", closing.UNAUTHENTICATED),
+        ("your account was disabled", closing.UNAUTHENTICATED),
+        ("your session has expired; log in again", closing.UNAUTHENTICATED),
+    ],
+)
+def test_a_revoked_client_is_cut_with_the_reason(world: World, reason: str, code: int) -> None:
+    """The code tells whether logging in again helps."""
+    person = world.person()
+    person.session.permit.on_revoke(reason)
+    assert person.client.closed == (code, reason)
+    assert not world.channel.members
+
+
+# --- the end ----------------------------------------------------------------------------------------------
+
+
+def test_an_ended_session_does_nothing_more(world: World) -> None:
+    """No message, sample, ping, answer or second end has any effect, and no timer is left."""
+    person = world.person()
+    world.working()
+    person.says("subscribe", topic="/chatter", throttle_rate=100)
+    person.says("subscribe", topic="/relay/status")
+    person.says("call_service", service="/reset")
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number)
+    world.define()
+    world.channel.sample(number, text("a"))
+    world.channel.sample(number, text("waits"))
+    person.client.take()
+    person.session.close(closing.GOING_AWAY, "the relay is going down")
+    person.session.end()
+    person.session.close(closing.GOING_AWAY, "again")
+    person.says("subscribe", topic="/secret")
+    person.session.resume()
+    world.channel.sample(number, text("b"))
+    world.robot_goes()
+    assert not person.client.sent
+    assert not world.people
+    world.clock.advance(5.1)
+    assert not [call for call in world.clock.getDelayedCalls() if call.active()]
+
+
+def test_types_in_the_habit_of_ros_1_are_understood() -> None:
+    """``pkg/Name`` is a message or a service; nothing stays nothing."""
+    assert normal_type("std_msgs/String") == STRING
+    assert normal_type("std_srvs/Trigger", "srv") == "std_srvs/srv/Trigger"
+    assert normal_type(STRING) == STRING
+    assert normal_type(None) == normal_type("") == ""
+
+
+def test_the_number_of_topics_of_one_client_is_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it has goes on."""
+    monkeypatch.setattr(module, "SUBSCRIPTIONS", 2)
+    person = world.person()
+    person.says("set_level", level="error")
+    for topic in ("/a", "/b", "/c", "/a"):
+        person.says("subscribe", topic=topic, type=STRING)
+    assert told(person) == ["at most 2 topics can be subscribed on one connection"]
+    assert world.channel.wire.names == 2
