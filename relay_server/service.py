@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import secrets
 import time
 from typing import Any
@@ -93,7 +94,7 @@ class Relay:
         self._auth.start()
         self._revision = await self._store.read(queries.revision)
         name = self._relay_name()
-        http = await self._listen(self.settings.http, self._site())
+        http = await self._listen(self.settings.http, self._site(name))
         self.http_port = http.getHost().port
         hall = RobotHall(
             name, self._store, self._registry, self._channels, self._journal, time.monotonic, time.time
@@ -104,15 +105,11 @@ class Relay:
         self._polling.start(self.settings.refresh, now=False)
         self._purging.start(PURGE_SECONDS, now=True)
 
-    def _site(self) -> RelaySite:
+    def _site(self, name: str) -> RelaySite:
         settings = self.settings
         origins = Origins(settings.scheme, settings.origins)
         # Cookies know no ports: relays side by side on one host must not overwrite each other's.
-        cookie = (
-            f"switchboard_{secrets.token_hex(4)}"
-            if not settings.http.port
-            else f"switchboard_{settings.http.port}"
-        )
+        cookie = f"switchboard_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
         self._desk = FrontDesk(
             self._reactor,
             self._store,
