@@ -8,55 +8,10 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
-from switchboard_harness import ChaosProxy, Driver, Relay, Robot, wait_for
-
-LIMIT_MS = 500
-SIM_STEP_MS = 20
-
-
-class Drive:
-    """A relay, a robot and somebody driving, each behind a proxy that can be broken."""
-
-    def __init__(self, folder: Path) -> None:
-        self.relay = Relay(folder, "--heartbeat", "0.5")
-        self.robot_side = ChaosProxy(self.relay.robots_port)
-        self.client_side = ChaosProxy(self.relay.http_port)
-        self.robot = Robot(self.relay, "rover", port=self.robot_side.port)
-        self.token = self.relay.user("driver")
-        self.relay.cli("right", "grant", "driver", "rover", "operator")
-        self._drivers: list[Driver] = []
-
-    def start_driving(self) -> Driver:
-        """Drive in circles until the robot moves by its own record."""
-        driver = Driver(self.relay.connect_by(self.client_side.port, "rover", self.token))
-        driver.start()
-        self._drivers.append(driver)
-        wait_for("the robot moves", self.robot.moving)
-        # Some commands more, so that all links are in the state they are in for hours.
-        enough = len(self.robot.events("command")) + 5
-        wait_for("it is driven", lambda: len(self.robot.events("command")) >= enough)
-        return driver
-
-    def stands_within_limit(self, since: int) -> None:
-        """The robot came to a standstill soon enough after a fault at ``since`` (monotonic ns)."""
-        wait_for("the robot stands", lambda: not self.robot.moving(), 10)
-        stood = self.robot.events("standstill")[-1]["t"]
-        took_ms = (stood - since) / 1e6
-        assert took_ms <= LIMIT_MS + SIM_STEP_MS, f"it took {took_ms:.0f} ms"
-
-    def stop(self) -> None:
-        """End everything."""
-        self.robot_side.heal()
-        self.client_side.heal()
-        for driver in self._drivers:
-            driver.stop()
-        self.robot.stop()
-        self.relay.stop()
-        self.robot_side.close()
-        self.client_side.close()
+from switchboard_drive import Drive
+from switchboard_harness import wait_for
 
 
 @pytest.fixture(scope="module")
@@ -67,14 +22,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
         yield drive
     finally:
         drive.stop()
-
-
-def drives_again(drive: Drive) -> None:
-    """All is back by itself: somebody new can drive, and lets go."""
-    drive.robot.wait_online()
-    driver = drive.start_driving()
-    driver.stop()
-    wait_for("the robot stands", lambda: not drive.robot.moving(), 5)
 
 
 @pytest.mark.parametrize("fault", ["client vanishes", "client link black hole", "client link reset"])
@@ -91,7 +38,7 @@ def test_the_robot_stands_when_its_driver_is_lost(drive: Drive, fault: str) -> N
     drive.stands_within_limit(since)
     driver.stop()
     drive.client_side.heal()
-    drives_again(drive)
+    drive.again()
 
 
 @pytest.mark.parametrize("fault", ["robot link black hole", "robot link reset", "relay to robot only"])
@@ -108,7 +55,7 @@ def test_the_robot_stands_when_its_link_is_lost(drive: Drive, fault: str) -> Non
     drive.stands_within_limit(since)
     driver.stop()
     drive.robot_side.heal()
-    drives_again(drive)
+    drive.again()
 
 
 def test_no_command_from_before_a_partition_is_executed_after_it(drive: Drive) -> None:
@@ -126,7 +73,7 @@ def test_no_command_from_before_a_partition_is_executed_after_it(drive: Drive) -
     late = [each for each in drive.robot.events("command", healed) if each["v"] or each["w"]]
     assert late == []
     assert not drive.robot.moving()
-    drives_again(drive)
+    drive.again()
 
 
 def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_when_it_wakes(
@@ -149,7 +96,7 @@ def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_whe
         wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
     late = [each for each in drive.robot.events("command", woken) if each["v"] or each["w"]]
     assert late == []
-    drives_again(drive)
+    drive.again()
 
 
 def test_the_robot_stands_when_the_relay_is_killed_and_all_is_back_after_its_restart(drive: Drive) -> None:
@@ -160,7 +107,7 @@ def test_the_robot_stands_when_the_relay_is_killed_and_all_is_back_after_its_res
     drive.stands_within_limit(since)
     driver.stop()
     drive.relay.start()
-    drives_again(drive)
+    drive.again()
 
 
 def test_the_robot_stands_when_its_daemon_is_killed(drive: Drive) -> None:
@@ -171,7 +118,7 @@ def test_the_robot_stands_when_its_daemon_is_killed(drive: Drive) -> None:
     drive.stands_within_limit(since)
     driver.stop()
     drive.robot.start_daemon()
-    drives_again(drive)
+    drive.again()
 
 
 def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
@@ -191,4 +138,4 @@ def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
         wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
     late = [each for each in drive.robot.events("command", woken) if each["v"] or each["w"]]
     assert late == []
-    drives_again(drive)
+    drive.again()

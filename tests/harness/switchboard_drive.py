@@ -1,0 +1,61 @@
+"""A robot being driven, with everything in between breakable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from switchboard_harness import ChaosProxy, Driver, Relay, Robot, wait_for
+
+LIMIT_MS = 500
+SIM_STEP_MS = 20
+
+
+class Drive:
+    """A relay, a robot and somebody driving, each behind a proxy that can be broken."""
+
+    def __init__(self, folder: Path) -> None:
+        self.relay = Relay(folder, "--heartbeat", "0.5")
+        self.robot_side = ChaosProxy(self.relay.robots_port)
+        self.client_side = ChaosProxy(self.relay.http_port)
+        self.robot = Robot(self.relay, "rover", port=self.robot_side.port)
+        self.token = self.relay.user("driver")
+        self.relay.cli("right", "grant", "driver", "rover", "operator")
+        self._drivers: list[Driver] = []
+
+    def start_driving(self) -> Driver:
+        """Drive in circles until the robot moves by its own record."""
+        driver = Driver(self.relay.connect_by(self.client_side.port, "rover", self.token))
+        driver.start()
+        self._drivers.append(driver)
+        wait_for("the robot moves", self.robot.moving)
+        # Some commands more, so that all links are in the state they are in for hours.
+        enough = len(self.robot.events("command")) + 5
+        wait_for("it is driven", lambda: len(self.robot.events("command")) >= enough)
+        return driver
+
+    def standstill_ms(self, since: int) -> float:
+        """Milliseconds from a fault at ``since`` (monotonic ns) to the standstill, by the robot's own record."""
+        wait_for("the robot stands", lambda: not self.robot.moving(), 10)
+        return float(self.robot.events("standstill")[-1]["t"] - since) / 1e6
+
+    def stands_within_limit(self, since: int) -> None:
+        """The robot came to a standstill soon enough after a fault."""
+        took_ms = self.standstill_ms(since)
+        assert took_ms <= LIMIT_MS + SIM_STEP_MS, f"it took {took_ms:.0f} ms"
+
+    def again(self) -> None:
+        """All is back by itself: somebody new can drive, and lets go."""
+        self.robot.wait_online()
+        self.start_driving().stop()
+        wait_for("the robot stands", lambda: not self.robot.moving(), 5)
+
+    def stop(self) -> None:
+        """End everything."""
+        self.robot_side.heal()
+        self.client_side.heal()
+        for driver in self._drivers:
+            driver.stop()
+        self.robot.stop()
+        self.relay.stop()
+        self.robot_side.close()
+        self.client_side.close()
