@@ -46,6 +46,8 @@ from relay_server.tls import ServerTls
 
 FIRST_LINK_SECONDS = 3600.0
 PURGE_SECONDS = 3600.0
+EVENT_SECONDS = 30 * 86400.0
+"""Events are kept this long; the audit log is kept for ever."""
 
 
 class Relay:
@@ -102,6 +104,10 @@ class Relay:
         robots = await self._listen(self.settings.robots, self._robot_factory(hall))
         self.robots_port = robots.getHost().port
         await self._listen_locally()
+        if self._tls is None and not (self.settings.http.loopback and self.settings.robots.loopback):
+            self.log.warn(
+                "without --tls-cert and --tls-key passwords and commands cross the network in the clear"
+            )
         self._polling.start(self.settings.refresh, now=False)
         self._purging.start(PURGE_SECONDS, now=True)
 
@@ -249,9 +255,14 @@ class Relay:
         )
 
     def _purge(self) -> Deferred[Any]:
-        return Deferred.fromCoroutine(self._store.write(queries.purge_expired, time.time())).addErrback(
-            lambda failure: self.log.error("expired tokens stay for now: {reason}", reason=failure.value)
+        return Deferred.fromCoroutine(self._forget_old()).addErrback(
+            lambda failure: self.log.error("old rows stay for now: {reason}", reason=failure.value)
         )
+
+    async def _forget_old(self) -> None:
+        now = time.time()
+        await self._store.write(queries.purge_expired, now)
+        await self._store.write(queries.purge_events, now - EVENT_SECONDS)
 
     def reload_tls(self) -> None:
         """Read the certificate again (SIGHUP)."""
