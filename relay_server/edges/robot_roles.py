@@ -222,9 +222,9 @@ class Control:
             self._hall.registry.changed()
         elif isinstance(message, link.Alert):
             self.log.warn(
-                "robot {robot}: {level}: {text}",
+                "robot {robot}: {severity}: {text}",
                 robot=self._robot.name,
-                level=message.level[:20],
+                severity=message.level[:20],
                 text=message.text[:500],
             )
             self._hall.journal.event(

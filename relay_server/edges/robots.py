@@ -268,8 +268,8 @@ class RobotConnection(TwistedProtocol):
         self._end(reason)
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()
-        self.transport.loseConnection()
         self._aborting = self._clock.callLater(2.0, self.transport.abortConnection)
+        self.transport.loseConnection()
 
     def _end(self, reason: str) -> None:
         role, self._role = self._role, None

@@ -124,8 +124,13 @@ async def service_node(session: Session, args: Any) -> Any:
 
 async def service_providers(session: Session, args: Any) -> Any:
     wanted = _text(args, "service")
-    names = (normal_type(wanted, "srv"), wanted if wanted.startswith("/") else "/" + wanted)
-    found = [each for name, each in _services(session).items() if name in names or names[0] in each.types]
+    # It may be given by its type or by its name, and both may have slashes inside.
+    try:
+        type_name = normal_type(wanted, "srv")
+    except Invalid:
+        type_name = ""
+    full = _name(args, "service")
+    found = [each for name, each in _services(session).items() if name == full or type_name in each.types]
     return {"providers": sorted({node for each in found for node in each.providers})}
 
 

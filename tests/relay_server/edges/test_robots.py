@@ -1,0 +1,439 @@
+"""The edge towards robots: bytes on transports in memory, a real database behind."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.error import ConnectionDone
+from twisted.internet.testing import StringTransportWithDisconnection
+from twisted.python.failure import Failure
+
+from relay_db import queries
+from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
+from relay_protocol.frames import FrameDecoder, JsonFrame, encode_json, encode_sample, encode_video
+from relay_server import passwords
+from relay_server.edges.caps import AddressCap
+from relay_server.edges.robot_roles import REPLACE_SECONDS, Opening, RobotHall
+from relay_server.edges.robots import PINGS, LinkTiming, RobotConnection, RobotFactory
+from relay_server.journal import Journal
+from relay_server.registry import Presence, Registry
+from relay_server.store import Store
+from tests.relay_server.memory import World
+
+RELAY = "lab relay"
+KEY = bytes(range(32))
+FINGERPRINT = identity.fingerprint(identity.public_half(KEY))
+
+
+class Transport(StringTransportWithDisconnection):
+    """A TCP connection in memory; like TLS it does not close while a producer is registered."""
+
+    aborted = False
+
+    def setTcpNoDelay(self, on: bool) -> None:
+        """As TCP."""
+
+    def setTcpKeepAlive(self, on: bool) -> None:
+        """As TCP."""
+
+    def getHandle(self) -> None:
+        """No socket."""
+
+    def loseConnection(self) -> None:
+        """Close, unless a producer still holds it."""
+        if self.connected and self.producer is None:
+            super().loseConnection()
+
+    def abortConnection(self) -> None:
+        """Close at once."""
+        self.aborted = True
+        if self.connected:
+            super().abortConnection()
+
+
+class Hall:
+    """A relay's end for robots, with one enrolled robot."""
+
+    def __init__(self, store: Store) -> None:
+        self.world = World()
+        self.store = store
+        self.registry = Registry(lambda: 1000.0)
+        self.cap = AddressCap(3)
+        clock = self.world.clock
+        journal = Journal(store, lambda: 1000.0)
+        self.hall = RobotHall(
+            RELAY, store, self.registry, self.world.channels, journal, clock.seconds, lambda: 1000.0
+        )
+        timing = LinkTiming(2.0)
+        self.factory = RobotFactory(
+            lambda: RobotConnection(
+                clock, self.world.now_ns, timing, lambda each: Opening(self.hall, each), self.cap
+            )
+        )
+
+    def dial(self) -> Robot:
+        """A robot's new connection."""
+        return Robot(self)
+
+    @property
+    def presence(self) -> Presence | None:
+        """The robot as the registry sees it."""
+        return next((robot for robot in self.registry if robot.name == "r2-d2"), None)
+
+
+class Robot:
+    """A robot's end of one connection."""
+
+    def __init__(self, hall: Hall) -> None:
+        self.hall = hall
+        self.transport = Transport()
+        self.connection = hall.factory.buildProtocol(None)
+        self.transport.protocol = self.connection
+        self._decoder = FrameDecoder(limits.COMMAND_FRAME)
+        self.connection.makeConnection(self.transport)
+
+    def says(self, message: link.Message) -> None:
+        """One message."""
+        self.sends(encode_json(jsontext.encode(message)))
+
+    def sends(self, data: bytes) -> None:
+        """Bytes."""
+        self.connection.dataReceived(data)
+
+    def hears(self) -> list[dict[str, Any]]:
+        """What came since the last time."""
+        data = self.transport.value()
+        self.transport.clear()
+        return [json.loads(frame.body) for frame in self._decoder.feed(data) if isinstance(frame, JsonFrame)]
+
+    def refusal(self) -> dict[str, Any]:
+        """The refusal, with which the connection has ended."""
+        last = self.hears()[-1]
+        assert last["op"] == "refused"
+        assert not self.transport.connected
+        return last
+
+    def hello(self, robot: str = "r2-d2", key: str = FINGERPRINT) -> str:
+        """Say who one is going to be; the nonce."""
+        self.says(link.Hello(version=PROTOCOL_VERSION, robot=robot, key=key, encodings=["cdr"]))
+        (challenge,) = self.hears()
+        assert (challenge["op"], challenge["relay"]) == ("challenge", RELAY)
+        return str(challenge["nonce"])
+
+    def prove(self, nonce: str, robot: str = "r2-d2", key: bytes = KEY) -> None:
+        """Sign a nonce."""
+        signature = identity.sign(key, RELAY, robot, link.from_base64(nonce, "nonce"))
+        self.says(link.Prove(signature=link.to_base64(signature)))
+
+    async def registers(self) -> dict[str, Any]:
+        """The whole ceremony; the answer."""
+        self.prove(self.hello())
+        await self.answered()
+        first = self.hears()[0]
+        return first
+
+    async def answered(self) -> None:
+        """The database has been asked."""
+        await until(lambda: not self.connection._busy)
+
+    def breaks(self) -> None:
+        """The network loses the connection."""
+        self.transport.connected = False
+        self.connection.connectionLost(Failure(ConnectionDone()))
+
+
+async def until(true: Callable[[], bool]) -> None:
+    """Let the reactor work until something holds."""
+    for _ in range(2000):
+        if true():
+            return
+        tick: Deferred[None] = Deferred()
+        reactor.callLater(0.005, tick.callback, None)  # type: ignore[attr-defined]
+        await tick
+    raise AssertionError("it never held")
+
+
+@pytest.fixture
+def hall(store: Store) -> Iterator[Hall]:
+    """A relay's end for robots; its database knows the key of r2-d2."""
+    with store.database.begin() as session:
+        robot = queries.add_robot(session, "r2-d2")
+        code = passwords.token_hash(passwords.normalise_code("ABCD"))
+        queries.issue_enrolment_code(session, robot.id, code, 2000.0)
+        public = identity.public_half(KEY)
+        queries.redeem_enrolment_code(session, "r2-d2", code, public, FINGERPRINT, "test", 1000.0)
+    yield Hall(store)
+
+
+# --- registering ------------------------------------------------------------------------------------------
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_proves_its_key_is_registered(hall: Hall) -> None:
+    """Welcomed, online, with heartbeats both ways and the large frame limit."""
+    robot = hall.dial()
+    welcome = await robot.registers()
+    assert (welcome["op"], welcome["heartbeat"], welcome["frame_limit"]) == (
+        "welcome",
+        2.0,
+        limits.ROBOT_FRAME,
+    )
+    assert hall.presence is not None
+    assert hall.presence.control is robot.connection
+    assert hall.presence.key == FINGERPRINT
+    robot.sends(encode_json(b'{"op":"ping","t":7,"x":"' + b"x" * limits.HANDSHAKE_FRAME + b'"}'))
+    assert {"op": "pong", "t": 7, "at": hall.world.now_ns()} in robot.hears()
+    hall.world.clock.advance(limits.UNPROVEN_SECONDS)
+    assert "refused" not in [each["op"] for each in robot.hears()]
+
+
+@pytest_twisted.ensureDeferred
+async def test_unknown_robots_and_wrong_keys_are_told_the_same(hall: Hall) -> None:
+    """Both are challenged, and refused in the same words: who is enrolled here is nobody's business."""
+    told = []
+    other = bytes(reversed(KEY))
+    for name, key, signer in (
+        ("r2-d2", FINGERPRINT, other),
+        ("r2-d2", identity.fingerprint(identity.public_half(other)), other),
+        ("unknown", FINGERPRINT, KEY),
+        ("r2-d2\x00", FINGERPRINT, KEY),
+        ("", "", KEY),
+    ):
+        robot = hall.dial()
+        robot.prove(robot.hello(name, key), name, signer)
+        await robot.answered()
+        told.append(robot.refusal())
+    assert all(each == told[0] for each in told)
+    assert told[0]["reason"].startswith("this key is not accepted for this robot")
+    assert hall.presence is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_recorded_signature_is_worthless(hall: Hall) -> None:
+    """It is good for one nonce of one connection, and for one try."""
+    first, second = hall.dial(), hall.dial()
+    nonce = first.hello()
+    second.hello()
+    second.prove(nonce)
+    await second.answered()
+    assert "not accepted" in second.refusal()["reason"]
+    first.prove(nonce)
+    first.prove(nonce)
+    await first.answered()
+    assert hall.presence is None or hall.presence.control is None
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([link.Prove(signature="")], "'prove' came before 'hello'"),
+        ([link.Hello(version=2, robot="x", key="", encodings=[])], "speaks version 1"),
+        ([link.Enroll(version=9, robot="x", code="", public_key="")], "speaks version 1"),
+        ([link.Join(version=0, ticket="x")], "speaks version 1"),
+        ([link.Ping(t=1)], "unknown op 'ping'"),
+        ([link.Welcome(session="", heartbeat=1, frame_limit=1)], "unknown op 'welcome'"),
+    ],
+)
+def test_messages_out_of_place_break_the_contract(
+    hall: Hall, messages: list[link.Message], words: str
+) -> None:
+    """Said by ``refused``, and the connection ends."""
+    robot = hall.dial()
+    for message in messages:
+        robot.says(message)
+    refusal = robot.refusal()
+    assert words in refusal["reason"]
+    assert refusal["code"] == "malformed"
+
+
+def test_nothing_but_the_proof_comes_after_hello(hall: Hall) -> None:
+    """Neither another hello nor a join."""
+    for message in (
+        link.Hello(version=1, robot="x", key="", encodings=[]),
+        link.Join(version=1, ticket="x"),
+        link.Enroll(version=1, robot="x", code="", public_key=""),
+    ):
+        robot = hall.dial()
+        robot.hello()
+        robot.says(message)
+        assert "can't come after 'hello'" in robot.refusal()["reason"]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\xff\xff\xff\xff",
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+        b"\x00\x00\x00\x00",
+        b"\x00\x00\x00\x02\x09x",
+        b"\x00\x00\x00\x02\x01x",
+        encode_json(b"{"),
+        encode_json(b"\xff\xff"),
+        encode_json(b"[" * 1000),
+        encode_sample(1, 2, b"x"),
+        encode_video(1, 2, b"x"),
+        encode_json(b"x" * limits.HANDSHAKE_FRAME),
+    ],
+)
+def test_hostile_bytes_are_refused_in_words(hall: Hall, data: bytes) -> None:
+    """Frames of 4 GiB, other protocols, junk, bulk before the proof: nothing is kept, nothing breaks."""
+    robot = hall.dial()
+    robot.sends(data)
+    assert robot.refusal()["code"] in ("malformed", "frame_too_large")
+    robot.sends(data)
+    assert robot.hears() == []
+    assert not [call for call in hall.world.clock.getDelayedCalls() if call.active()]
+
+
+def test_a_trickle_is_cut_by_an_absolute_deadline(hall: Hall) -> None:
+    """Each byte buys no time."""
+    robot = hall.dial()
+    robot.sends(b"\x00\x00\x10\x00")
+    for _ in range(99):
+        hall.world.clock.advance(0.1)
+        robot.sends(b"x")
+    assert robot.transport.connected
+    hall.world.clock.advance(0.11)
+    refusal = robot.refusal()
+    assert "within 10 s" in refusal["reason"]
+    assert refusal["retry_after"] == 5
+
+
+def test_too_much_before_the_proof_is_cut(hall: Hall) -> None:
+    """64 KiB in all, in however small pieces."""
+    robot = hall.dial()
+    message = encode_json(b'{"op":"hello","pad":"' + b"x" * 1000 + b'"')
+    robot.sends(b"".join([message[:-1]] * 1))
+    for _ in range(70):
+        if robot.transport.connected:
+            robot.sends(b"x" * 1000)
+    assert not robot.transport.connected
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_leaves_while_the_database_is_asked_leaves_no_ghost(hall: Hall) -> None:
+    """It is not registered on a connection that is gone, and may register again at once."""
+    robot = hall.dial()
+    robot.prove(robot.hello())
+    robot.breaks()
+    await robot.answered()
+    assert hall.presence is None or hall.presence.control is None
+    assert not [call for call in hall.world.clock.getDelayedCalls() if call.active()]
+    assert (await hall.dial().registers())["op"] == "welcome"
+
+
+def test_connections_of_one_address_are_capped(hall: Hall) -> None:
+    """The one too many is told to come back; places are given back."""
+    robots = [hall.dial() for _ in range(3)]
+    one_more = hall.dial()
+    refusal = one_more.refusal()
+    assert "too many connections" in refusal["reason"]
+    assert refusal["retry_after"] == 10
+    robots[0].breaks()
+    assert hall.dial().transport.connected
+
+
+# --- registered -------------------------------------------------------------------------------------------
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_a_robot_tells_of_itself_is_kept(hall: Hall) -> None:
+    """Facts, graph and health."""
+    robot = hall.dial()
+    await robot.registers()
+    robot.says(link.Describe(host="shed"))
+    robot.says(link.Graph(full=True, nodes={"/n": {}}))
+    robot.says(link.Health(battery=0.5))
+    robot.says(link.Alert(level="warning", text="\x1b[2J" + "x" * 10_000))
+    presence = hall.presence
+    assert presence is not None
+    assert (presence.description.host, presence.graph.nodes, presence.health.battery) == ("shed", {"/n"}, 0.5)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_silent_robot_is_cut_after_three_heartbeats(hall: Hall) -> None:
+    """It is pinged meanwhile; one that answers stays, and its round trip is known."""
+    robot = hall.dial()
+    await robot.registers()
+    for _ in range(4):
+        hall.world.clock.advance(2)
+        for each in robot.hears():
+            hall.world.clock.advance(0.01)
+            robot.says(link.Pong(t=each["t"], at=0))
+    assert hall.presence is not None
+    assert hall.presence.rtt == pytest.approx(0.01)
+    hall.world.clock.pump([2.0] * 3)
+    assert hall.presence.control is not None
+    hall.world.clock.pump([2.0] * 1)
+    assert robot.transport.aborted
+    assert hall.presence.control is None
+    assert not [call for call in hall.world.clock.getDelayedCalls() if call.active()]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_never_pongs_fills_no_memory(hall: Hall) -> None:
+    """It sends other things, so it is not cut; what it owes is bounded."""
+    robot = hall.dial()
+    await robot.registers()
+    trips: list[Any] = []
+    robot.connection.round_trip().addErrback(lambda failure: trips.append(str(failure.value)))
+    for _ in range(PINGS + 50):
+        hall.world.clock.advance(2)
+        robot.says(link.Health())
+    assert len(robot.connection._pings) <= PINGS
+    assert trips == ["the robot did not answer, or lost its connection"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_newer_link_replaces_the_older_but_not_at_once(hall: Hall) -> None:
+    """Two daemons with one key do not replace each other for ever."""
+    first = hall.dial()
+    await first.registers()
+    second = hall.dial()
+    second.prove(second.hello())
+    await second.answered()
+    refusal = second.refusal()
+    assert "is its key used twice?" in refusal["reason"]
+    assert refusal["retry_after"] == REPLACE_SECONDS
+    assert first.transport.connected
+    hall.world.clock.advance(REPLACE_SECONDS)
+    third = hall.dial()
+    assert (await third.registers())["op"] == "welcome"
+    assert first.hears()[-1] == {"op": "bye", "reason": "the robot has connected anew"}
+    assert not first.transport.connected
+    assert hall.presence is not None
+    assert hall.presence.control is third.connection
+
+
+@pytest.mark.parametrize(
+    "data", [encode_sample(1, 2, b"x"), encode_video(1, 2, b"x"), encode_json(b'{"op":"hello"}')]
+)
+@pytest_twisted.ensureDeferred
+async def test_what_has_no_place_on_a_control_link_ends_it(hall: Hall, data: bytes) -> None:
+    """The robot is offline then."""
+    robot = hall.dial()
+    await robot.registers()
+    robot.sends(data)
+    assert robot.refusal()["code"] == "malformed"
+    assert hall.presence is not None
+    assert hall.presence.control is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_takes_no_commands_is_cut(hall: Hall) -> None:
+    """What may not be lost piles up only so far."""
+    robot = hall.dial()
+    await robot.registers()
+    robot.connection._outbox.pause()
+    for _ in range(1100):
+        robot.connection.send(link.Ping(t=1))
+    assert robot.transport.aborted
+    assert hall.presence is not None
+    assert hall.presence.control is None

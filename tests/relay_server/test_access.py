@@ -1,0 +1,204 @@
+"""The only judge, with a real database: what is open follows the rights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet.defer import Deferred
+
+from relay_db import queries
+from relay_protocol.rights import Level, Operation
+from relay_server.access import Access, BadCredentials, Permit, Principal
+from relay_server.store import Store
+
+HASH = "ab" * 32
+
+
+@dataclass
+class Hall:
+    """An access with one user, one token and one robot in its database."""
+
+    store: Store
+    now: float = 1000.0
+    told: list[str] = field(default_factory=list)
+
+    async def open(self) -> Hall:
+        """Fill the database."""
+        self.access = Access(self.store, lambda: self.now)
+        self.user = await self.store.write(queries.add_user, "ann", None)
+        self.robot = await self.store.write(queries.add_robot, "rover")
+        await self.grant("viewer")
+        await self.store.write(
+            queries.create_token, self.user.id, HASH, kind="access", expires=5000.0, now=self.now
+        )
+        record = await self.store.read(queries.principal_by_token, HASH, self.now)
+        assert record is not None
+        self.principal = Principal.of(record)
+        return self
+
+    async def grant(self, level: str, **patterns: Any) -> None:
+        """Give ann a right on the robot."""
+        await self.store.write(queries.grant_right, self.robot.id, level, user_id=self.user.id, **patterns)
+
+    async def permit(self) -> Permit:
+        """A permit whose holder notes what it is told."""
+        permit = await self.access.permit(self.principal, self.robot.id)
+        assert permit is not None
+        permit.on_change = lambda: self.told.append("changed")
+        permit.on_revoke = self.told.append
+        return permit
+
+
+class SlowStore:
+    """A store in front of another: the first read waits after it has been done, until the test lets it go."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self.read_done: Deferred[None] = Deferred()
+        self.go: Deferred[None] = Deferred()
+
+    async def read(self, query: Callable[..., Any], *args: Any) -> Any:
+        """As the store's."""
+        found = await self._store.read(query, *args)
+        if not self.read_done.called:
+            self.read_done.callback(None)
+            await self.go
+        return found
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_permit_judges_by_the_rights_in_the_database(store: Store) -> None:
+    """And there is none without any right."""
+    hall = await Hall(store).open()
+    permit = await hall.permit()
+    assert permit.judge(Operation.SUBSCRIBE, "/scan").allowed
+    assert not permit.judge(Operation.PUBLISH, "/cmd_vel").allowed
+    await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
+    assert await hall.access.permit(hall.principal, hall.robot.id) is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_changed_rights_reach_what_is_open(store: Store) -> None:
+    """The permit judges anew in place, and its holder is told once; nothing changed, nothing told."""
+    hall = await Hall(store).open()
+    permit = await hall.permit()
+    await hall.access.refresh()
+    assert hall.told == []
+    await hall.grant("operator", deny=["publish:/arm"])
+    await hall.access.refresh()
+    await hall.access.refresh()
+    assert hall.told == ["changed"]
+    assert permit.rules.level is Level.OPERATOR
+    assert not permit.judge(Operation.PUBLISH, "/arm").allowed
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("right", "your right on this robot was revoked"),
+        ("token", "your session was ended; log in again"),
+        ("user", "your session was ended; log in again"),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_what_is_revoked_is_told_once_and_nothing_is_allowed_after(
+    store: Store, what: str, words: str
+) -> None:
+    """A right, a token, an account: each ends what was opened with it."""
+    hall = await Hall(store).open()
+    permit = await hall.permit()
+    if what == "right":
+        await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
+    elif what == "token":
+        await store.write(queries.revoke_token, hall.principal.token_id)
+    else:
+        await store.write(queries.set_disabled, hall.user.id, True)
+    await hall.access.refresh()
+    await hall.access.refresh()
+    assert hall.told == [words]
+    assert not permit.judge(Operation.SUBSCRIBE, "/scan").allowed
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_token_that_runs_out_ends_what_is_open(store: Store) -> None:
+    """To the second, without asking the database."""
+    hall = await Hall(store).open()
+    await hall.permit()
+    hall.now = 4999.9
+    hall.access.expire()
+    assert hall.told == []
+    hall.now = 5000.0
+    hall.access.expire()
+    hall.access.expire()
+    assert hall.told == ["your session has expired; log in again"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_released_permit_is_told_nothing(store: Store) -> None:
+    """Nobody holds it, nothing keeps it."""
+    hall = await Hall(store).open()
+    permit = await hall.permit()
+    hall.access.release(permit)
+    hall.access.release(permit)
+    await store.write(queries.revoke_token, hall.principal.token_id)
+    await hall.access.refresh()
+    assert hall.told == []
+    assert not hall.access._permits
+
+
+@pytest_twisted.ensureDeferred
+async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: Store) -> None:
+    """A refresh that goes by between the reading and its result is not missed."""
+    hall = await Hall(store).open()
+    slow = SlowStore(store)
+    hall.access._store = slow  # type: ignore[assignment]
+    asking = Deferred.fromCoroutine(hall.access.permit(hall.principal, hall.robot.id))
+    await slow.read_done
+    await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
+    await hall.access.refresh()
+    slow.go.callback(None)
+    assert await asking is None
+    assert not hall.access._permits
+
+
+@pytest_twisted.ensureDeferred
+async def test_no_list_is_kept_of_rights_revoked_while_they_were_read(store: Store) -> None:
+    """The next look shows the truth."""
+    hall = await Hall(store).open()
+    slow = SlowStore(store)
+    hall.access._store = slow  # type: ignore[assignment]
+    asking = Deferred.fromCoroutine(hall.access.robots(hall.principal))
+    await slow.read_done
+    await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
+    await hall.access.refresh()
+    slow.go.callback(None)
+    await asking
+    assert await hall.access.robots(hall.principal) == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_no_permit_for_a_token_that_ended_since_it_was_proved(store: Store) -> None:
+    """Between the token's proof and the permit anything may happen."""
+    hall = await Hall(store).open()
+    await store.write(queries.revoke_token, hall.principal.token_id)
+    with pytest.raises(BadCredentials, match="session was ended"):
+        await hall.access.permit(hall.principal, hall.robot.id)
+
+
+@pytest_twisted.ensureDeferred
+async def test_robots_are_listed_with_the_right_on_each(store: Store) -> None:
+    """Kept until something changes, then read again."""
+    hall = await Hall(store).open()
+    await store.write(queries.add_robot, "hidden")
+    ((robot, rules),) = await hall.access.robots(hall.principal)
+    assert (robot.name, rules.level) == ("rover", Level.VIEWER)
+    await hall.grant("owner")
+    ((_, rules),) = await hall.access.robots(hall.principal)
+    assert rules.level is Level.VIEWER
+    await hall.access.refresh()
+    ((_, rules),) = await hall.access.robots(hall.principal)
+    assert rules.level is Level.OWNER

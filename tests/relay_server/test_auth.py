@@ -1,0 +1,244 @@
+"""Who is it? Passwords, tokens, login links and tickets."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterator
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+
+from relay_db import queries
+from relay_db.queries import UserRecord
+from relay_protocol.errors import Refused, Unavailable
+from relay_protocol.limits import TICKET_SECONDS
+from relay_server import auth as module
+from relay_server import limiter, passwords
+from relay_server.access import Principal
+from relay_server.auth import Authenticator, BadCredentials, TooManyTries
+from relay_server.store import Store
+
+PASSWORD = "correct horse"
+HASHED = passwords.hash_password(PASSWORD)
+HERE = "192.0.2.1"
+
+
+class Time:
+    """A clock the test moves, monotonic and wall alike."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def time() -> Time:
+    """A thousand seconds after the beginning."""
+    return Time()
+
+
+@pytest.fixture
+def auth(store: Store, time: Time) -> Iterator[Authenticator]:
+    """An authenticator on the reactor of the tests."""
+    running = Authenticator(reactor, store, time, time)  # type: ignore[arg-type]
+    running.start()
+    yield running
+    running.stop()
+
+
+@pytest_twisted.async_yield_fixture
+async def ann(store: Store) -> AsyncIterator[UserRecord]:
+    """A user with a password."""
+    yield await store.write(queries.add_user, "ann", HASHED)
+
+
+async def words(work: Any) -> str:
+    """What a refused login is told."""
+    with pytest.raises(BadCredentials) as told:
+        await work
+    return str(told.value)
+
+
+async def token(store: Store, user: UserRecord, kind: Any = "access", expires: float | None = 5000.0) -> str:
+    """A fresh token of a user."""
+    fresh = passwords.new_token()
+    await store.write(
+        queries.create_token, user.id, passwords.token_hash(fresh), kind=kind, expires=expires, now=1000.0
+    )
+    return fresh
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_right_password_names_its_user(auth: Authenticator, ann: UserRecord) -> None:
+    """However the name is written."""
+    principal = await auth.password("Ann", PASSWORD, HERE)
+    assert (principal.user_id, principal.name, principal.admin) == (ann.id, "ann", False)
+
+
+@pytest_twisted.ensureDeferred
+async def test_every_wrong_login_is_told_the_same(auth: Authenticator, store: Store, ann: UserRecord) -> None:
+    """Unknown user, wrong password, no password, disabled account: nobody learns which."""
+    await store.write(queries.add_user, "linkonly", None)
+    off = await store.write(queries.add_user, "off", HASHED)
+    await store.write(queries.set_disabled, off.id, True)
+    told = {
+        await words(auth.password(user, password, HERE))
+        for user, password in (
+            ("ann", "wrong password"),
+            ("nobody", PASSWORD),
+            ("linkonly", PASSWORD),
+            ("off", PASSWORD),
+            ("not a name\x00", PASSWORD),
+            ("\ud800", "\ud800"),
+        )
+    }
+    assert told == {"user or password is wrong"}
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_limit_is_judged_before_anything_is_hashed(
+    auth: Authenticator, ann: UserRecord, time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over the limit even the right password is not looked at; time or another network lets it in."""
+    hashed: list[str] = []
+
+    def verify(password: str, stored: str | None) -> bool:
+        hashed.append(password)
+        return password == PASSWORD
+
+    monkeypatch.setattr(passwords, "verify_password", verify)
+    for _ in range(limiter.FAILURES):
+        await words(auth.password("ann", "wrong", HERE))
+    with pytest.raises(TooManyTries) as told:
+        await auth.password("ann", PASSWORD, HERE)
+    assert told.value.retry_after == limiter.WINDOW
+    assert len(hashed) == limiter.FAILURES
+    await auth.password("ann", PASSWORD, "198.51.100.1")
+    time.now += limiter.WINDOW
+    await auth.password("ann", PASSWORD, HERE)
+
+
+@pytest_twisted.ensureDeferred
+async def test_tries_at_the_same_time_count_too(
+    auth: Authenticator, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A burst is no way around: each counts when it begins."""
+    monkeypatch.setattr(passwords, "verify_password", lambda password, stored: False)
+    burst = [Deferred.fromCoroutine(auth.password("ann", "wrong", HERE)) for _ in range(limiter.FAILURES + 5)]
+    refused = []
+    for each in burst:
+        with pytest.raises((BadCredentials, TooManyTries)) as told:
+            await each
+        refused.append(told.type)
+    assert refused.count(TooManyTries) == 5
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_login_that_could_not_be_judged_counts_nothing(
+    auth: Authenticator, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A database that is away for a while locks nobody out."""
+
+    async def away(*args: Any) -> Any:
+        raise Unavailable("the database does not answer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(auth._store, "read", away)
+        for _ in range(limiter.FAILURES * 2):
+            with pytest.raises(Unavailable):
+                await auth.password("ann", PASSWORD, HERE)
+    assert (await auth.password("ann", PASSWORD, HERE)).name == "ann"
+
+
+@pytest_twisted.ensureDeferred
+async def test_tokens_prove_their_user_until_they_end(
+    auth: Authenticator, store: Store, ann: UserRecord, time: Time
+) -> None:
+    """Access tokens and portal sessions do; login codes, unknown, revoked and expired ones don't."""
+    access, login = await token(store, ann), await token(store, ann, "login")
+    principal = await auth.token(access)
+    assert (principal.name, principal.expires) == ("ann", 5000.0)
+    session = await auth.open_session(principal)
+    assert (await auth.token(session)).name == "ann"
+    told = {await words(auth.token(each)) for each in (login, "unknown", "", "\ud800", "x" * 100_000)}
+    await store.write(queries.revoke_token, principal.token_id)
+    told.add(await words(auth.token(access)))
+    time.now += module.SESSION_SECONDS
+    told.add(await words(auth.token(session)))
+    assert told == {"the access token is unknown, expired or revoked"}
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_login_link_is_good_once(auth: Authenticator, store: Store, ann: UserRecord) -> None:
+    """Used, expired and unknown ones are told the same; an access token is none."""
+    code = await token(store, ann, "login")
+    old = await token(store, ann, "login", expires=1000.0)
+    access = await token(store, ann)
+    assert (await auth.login_code(code, HERE)).name == "ann"
+    told = {await words(auth.login_code(each, HERE)) for each in (code, old, access, "unknown")}
+    assert told == {"the login link is unknown, expired or already used; ask for a new one"}
+
+
+@pytest_twisted.ensureDeferred
+async def test_guessing_login_links_is_limited(
+    auth: Authenticator, store: Store, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By network; a good one from elsewhere goes through."""
+    monkeypatch.setattr(limiter, "FAILURES_OF_NETWORK", 3)
+    code = await token(store, ann, "login")
+    for _ in range(3):
+        await words(auth.login_code("guess", HERE))
+    with pytest.raises(TooManyTries):
+        await auth.login_code(code, HERE)
+    assert (await auth.login_code(code, "198.51.100.1")).name == "ann"
+
+
+# --- tickets ----------------------------------------------------------------------------------------------
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_ticket_is_good_once_for_one_robot_and_a_minute(
+    auth: Authenticator, store: Store, ann: UserRecord, time: Time
+) -> None:
+    """Every other use is told the same, and spends it."""
+    principal = await auth.token(await token(store, ann))
+    good, other, late = (auth.issue_ticket(principal, "rover") for _ in range(3))
+    assert (await auth.ticket(good, "rover")) == principal
+    told = {await words(auth.ticket(good, "rover")), await words(auth.ticket("unknown", "rover"))}
+    told.add(await words(auth.ticket(other, "tank")))
+    told.add(await words(auth.ticket(other, "rover")))
+    time.now += TICKET_SECONDS
+    told.add(await words(auth.ticket(late, "rover")))
+    assert told == {"the ticket is unknown, used, expired or for another robot; ask for a new one"}
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_ticket_dies_with_the_session_that_asked_for_it(
+    auth: Authenticator, store: Store, ann: UserRecord
+) -> None:
+    """Logging out in between leaves no way in."""
+    principal = await auth.token(await token(store, ann))
+    ticket = auth.issue_ticket(principal, "rover")
+    await store.write(queries.revoke_token, principal.token_id)
+    assert "has ended" in await words(auth.ticket(ticket, "rover"))
+
+
+def test_tickets_are_bounded_and_nobody_takes_them_all(
+    auth: Authenticator, time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One user's oldest gives way to that user's newest; old ones are forgotten."""
+    monkeypatch.setattr(module, "TICKETS", 150)
+    greedy = Principal(1, "greedy", "main", False, 1, None)
+    others = [Principal(number, "x", "main", False, number, None) for number in range(2, 60)]
+    for _ in range(1000):
+        auth.issue_ticket(greedy, "rover")
+    assert len(auth._tickets) == module.TICKETS_OF_ONE
+    with pytest.raises(Refused, match="too many tickets"):
+        for other in others:
+            auth.issue_ticket(other, "rover")
+    time.now += TICKET_SECONDS
+    auth.issue_ticket(others[0], "rover")
+    assert len(auth._tickets) == 1

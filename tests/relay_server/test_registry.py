@@ -1,0 +1,146 @@
+"""Who is there, and the mirror of a robot's graph."""
+
+from __future__ import annotations
+
+from relay_protocol import link
+from relay_server import graph as graph_module
+from relay_server.graph import GraphMirror
+from relay_server.metrics import RelayCollector, registry_of
+from relay_server.registry import State
+from tests.relay_server.memory import STRING, MemoryLink, World
+
+
+class Watcher:
+    """Something that follows a robot."""
+
+    def __init__(self) -> None:
+        self.saw: list[str] = []
+
+    def robot_online(self) -> None:
+        """As a channel."""
+        self.saw.append("online")
+
+    def robot_offline(self) -> None:
+        """As a channel."""
+        self.saw.append("offline")
+
+    def graph_changed(self) -> None:
+        """As a channel."""
+        self.saw.append("graph")
+
+
+def test_a_robot_is_offline_online_or_in_use(world: World) -> None:
+    """In use while somebody works with it."""
+    assert world.robot.state is State.OFFLINE
+    world.robot_comes()
+    assert world.robot.state is State.ONLINE
+    world.robot.users = 1
+    assert world.robot.state is State.IN_USE
+    world.robot_goes()
+    assert world.robot.state is State.OFFLINE
+
+
+def test_a_new_link_replaces_the_old_one_and_starts_afresh(world: World) -> None:
+    """Watchers see it go and come; what the old one said of graph, types and health is forgotten."""
+    world.robot_comes()
+    world.robot.types.add(STRING, "string data\n")
+    world.robot.health = link.Health(battery=0.5)
+    watcher = Watcher()
+    world.robot.watchers.append(watcher)
+    former, newer = world.control, MemoryLink()
+    world.registry.registered(world.robot, newer)
+    assert watcher.saw == ["offline", "online"]
+    assert former.closed == "the robot has connected anew"
+    assert not world.robot.graph.topics
+    assert not world.robot.types.knows(STRING)
+    assert world.robot.health.battery is None
+
+
+def test_the_end_of_a_replaced_link_changes_nothing(world: World) -> None:
+    """The robot is there by the newer one."""
+    world.robot_comes()
+    former = world.control
+    world.robot_comes()
+    world.registry.lost(world.robot, former)
+    assert world.robot.state is State.ONLINE
+    world.registry.lost(world.robot, world.control)
+    assert world.robot.state is State.OFFLINE
+    assert not world.robot.graph.nodes
+
+
+def test_listeners_hear_of_changes_until_they_leave(world: World) -> None:
+    """One who leaves while being told is no trouble to the others."""
+    heard: list[str] = []
+    stop_first = world.registry.on_change(lambda: (heard.append("first"), stop_first()))  # type: ignore[func-returns-value]
+    world.registry.on_change(lambda: heard.append("second"))
+    world.registry.changed()
+    world.registry.changed()
+    assert heard == ["first", "second", "second"]
+
+
+def test_a_removed_robot_is_told_and_forgotten(world: World) -> None:
+    """Its link is closed; a second time does nothing."""
+    world.robot_comes()
+    world.registry.forget(1)
+    world.registry.forget(1)
+    assert world.control.closed == "this robot was removed from the relay"
+    assert world.registry.find(1) is None
+
+
+def test_a_graph_is_taken_whole_or_as_what_changed() -> None:
+    """``null`` takes a name away; a full graph replaces everything."""
+    mirror = GraphMirror()
+    topic, service = link.Topic(types=[STRING]), link.Service(types=["a/srv/B"])
+    mirror.apply(
+        link.Graph(
+            full=True,
+            topics={"/a": topic},
+            services={"/s": service},
+            actions={"/x": service},
+            nodes={"/n": {}},
+        )
+    )
+    mirror.apply(link.Graph(topics={"/b": topic, "/a": None}, nodes={"/n": None, "/m": {}}))
+    assert set(mirror.topics) == {"/b"}
+    assert mirror.nodes == {"/m"}
+    assert mirror.topic_type("/b") == STRING
+    assert mirror.topic_type("/a") is None
+    assert mirror.service_type("/s") == "a/srv/B"
+    assert mirror.service_type("/none") is None
+    mirror.apply(link.Graph(full=True, topics={"/c": link.Topic(types=[])}))
+    assert mirror.topic_type("/c") is None
+    assert (set(mirror.topics), mirror.services, mirror.actions, mirror.nodes) == ({"/c"}, {}, {}, set())
+
+
+def test_a_robot_can_not_fill_the_memory_with_names() -> None:
+    """More than the bound, and names longer than ROS has, are passed over; known names still change."""
+    mirror = GraphMirror()
+    for first in range(0, graph_module.NAMES + 5000, 5000):
+        names = [f"/t{number}" for number in range(first, first + 5000)]
+        mirror.apply(
+            link.Graph(
+                topics={name: link.Topic(types=["a/msg/A"]) for name in names},
+                nodes={name: {} for name in names},
+            )
+        )
+    assert len(mirror.topics) == len(mirror.nodes) == graph_module.NAMES
+    mirror.apply(link.Graph(topics={"/t0": link.Topic(types=[STRING])}))
+    assert mirror.topic_type("/t0") == STRING
+    mirror.apply(link.Graph(full=True, topics={"/" + "x" * 255: link.Topic(types=[STRING])}))
+    assert not mirror.topics
+
+
+def test_figures_tell_robots_by_state_clients_and_channels(world: World) -> None:
+    """As they are when they are asked for."""
+    figures = registry_of(RelayCollector(world.registry, world.channels, lambda: world.people))
+    assert figures.get_sample_value("switchboard_robots", {"state": "offline"}) == 1
+    world.robot_comes()
+    person = world.person()
+    person.session.pause()
+    person.says("call_service", service="/relay/ping")
+    assert figures.get_sample_value("switchboard_robots", {"state": "online"}) == 1
+    assert figures.get_sample_value("switchboard_robots", {"state": "offline"}) == 0
+    assert figures.get_sample_value("switchboard_clients") == 1
+    assert figures.get_sample_value("switchboard_channels") == 1
+    assert figures.get_sample_value("switchboard_client_waiting_bytes") == person.session.outbox.waiting_bytes
+    assert person.session.outbox.waiting_bytes > 0
