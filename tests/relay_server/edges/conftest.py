@@ -1,0 +1,23 @@
+"""A relay's end for robots, for the tests of the edge."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_db import queries
+from relay_protocol import identity
+from relay_server import passwords
+from relay_server.store import Store
+from tests.relay_server.edges.robot_ends import FINGERPRINT, KEY, Hall
+
+
+@pytest.fixture
+def hall(store: Store) -> Hall:
+    """A relay's end for robots; its database knows the key of r2-d2."""
+    with store.database.begin() as session:
+        robot = queries.add_robot(session, "r2-d2")
+        code = passwords.token_hash(passwords.normalise_code("ABCD"))
+        queries.issue_enrolment_code(session, robot.id, code, 2000.0)
+        public = identity.public_half(KEY)
+        queries.redeem_enrolment_code(session, "r2-d2", code, public, FINGERPRINT, "test", 1000.0)
+    return Hall(store)

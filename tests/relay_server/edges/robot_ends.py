@@ -1,0 +1,159 @@
+"""A relay's end for robots on transports in memory, and a robot's end of one connection."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.error import ConnectionDone
+from twisted.internet.testing import StringTransportWithDisconnection
+from twisted.python.failure import Failure
+
+from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
+from relay_protocol.frames import FrameDecoder, JsonFrame, encode_json
+from relay_server.edges.caps import AddressCap
+from relay_server.edges.robot_roles import Opening, RobotHall
+from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
+from relay_server.journal import Journal
+from relay_server.registry import Presence, Registry
+from relay_server.store import Store
+from tests.relay_server.memory import World
+
+RELAY = "lab relay"
+KEY = bytes(range(32))
+FINGERPRINT = identity.fingerprint(identity.public_half(KEY))
+
+
+class Transport(StringTransportWithDisconnection):
+    """A TCP connection in memory; like TLS it does not close while a producer is registered."""
+
+    aborted = False
+
+    def setTcpNoDelay(self, on: bool) -> None:
+        """As TCP."""
+
+    def setTcpKeepAlive(self, on: bool) -> None:
+        """As TCP."""
+
+    def getHandle(self) -> None:
+        """No socket."""
+
+    def loseConnection(self) -> None:
+        """Close, unless a producer still holds it."""
+        if self.connected and self.producer is None:
+            super().loseConnection()
+
+    def abortConnection(self) -> None:
+        """Close at once."""
+        self.aborted = True
+        if self.connected:
+            super().abortConnection()
+
+
+class Hall:
+    """A relay's end for robots, with one enrolled robot."""
+
+    def __init__(self, store: Store) -> None:
+        self.world = World()
+        self.store = store
+        self.registry = Registry(lambda: 1000.0)
+        self.cap = AddressCap(3)
+        clock = self.world.clock
+        journal = Journal(store, lambda: 1000.0)
+        self.hall = RobotHall(
+            RELAY, store, self.registry, self.world.channels, journal, clock.seconds, lambda: 1000.0
+        )
+        timing = LinkTiming(2.0)
+        self.factory = RobotFactory(
+            lambda: RobotConnection(
+                clock, self.world.now_ns, timing, lambda each: Opening(self.hall, each), self.cap
+            )
+        )
+
+    def dial(self) -> Robot:
+        """A robot's new connection."""
+        return Robot(self)
+
+    @property
+    def presence(self) -> Presence | None:
+        """The robot as the registry sees it."""
+        return next((robot for robot in self.registry if robot.name == "r2-d2"), None)
+
+
+class Robot:
+    """A robot's end of one connection."""
+
+    def __init__(self, hall: Hall) -> None:
+        self.hall = hall
+        self.transport = Transport()
+        self.connection = hall.factory.buildProtocol(None)
+        self.transport.protocol = self.connection
+        self._decoder = FrameDecoder(limits.COMMAND_FRAME)
+        self.connection.makeConnection(self.transport)
+
+    def says(self, message: link.Message) -> None:
+        """One message."""
+        self.sends(encode_json(jsontext.encode(message)))
+
+    def sends(self, data: bytes) -> None:
+        """Bytes."""
+        self.connection.dataReceived(data)
+
+    def frames(self) -> list[Any]:
+        """Frames that came since the last time."""
+        data = self.transport.value()
+        self.transport.clear()
+        return self._decoder.feed(data)
+
+    def hears(self) -> list[dict[str, Any]]:
+        """Messages that came since the last time."""
+        return [json.loads(frame.body) for frame in self.frames() if isinstance(frame, JsonFrame)]
+
+    def refusal(self) -> dict[str, Any]:
+        """The refusal, with which the connection has ended."""
+        last = self.hears()[-1]
+        assert last["op"] == "refused"
+        assert not self.transport.connected
+        return last
+
+    def hello(self, robot: str = "r2-d2", key: str = FINGERPRINT) -> str:
+        """Say who one is going to be; the nonce."""
+        self.says(link.Hello(version=PROTOCOL_VERSION, robot=robot, key=key, encodings=["cdr"]))
+        (challenge,) = self.hears()
+        assert (challenge["op"], challenge["relay"]) == ("challenge", RELAY)
+        return str(challenge["nonce"])
+
+    def prove(self, nonce: str, robot: str = "r2-d2", key: bytes = KEY) -> None:
+        """Sign a nonce."""
+        signature = identity.sign(key, RELAY, robot, link.from_base64(nonce, "nonce"))
+        self.says(link.Prove(signature=link.to_base64(signature)))
+
+    async def registers(self) -> dict[str, Any]:
+        """The whole ceremony; the answer."""
+        self.prove(self.hello())
+        await self.answered()
+        first = self.hears()[0]
+        return first
+
+    async def answered(self) -> None:
+        """The database has been asked."""
+        await until(lambda: not self.connection._busy)
+
+    def breaks(self) -> None:
+        """The network loses the connection."""
+        self.transport.connected = False
+        self.connection.connectionLost(Failure(ConnectionDone()))
+
+
+async def until(true: Callable[[], bool]) -> None:
+    """Let the reactor work until something holds."""
+    for _ in range(2000):
+        if true():
+            return
+        tick: Deferred[None] = Deferred()
+        reactor.callLater(0.005, tick.callback, None)  # type: ignore[attr-defined]
+        await tick
+    raise AssertionError("it never held")

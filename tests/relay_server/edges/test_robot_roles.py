@@ -1,0 +1,204 @@
+"""Enrolling, and joining a channel: what a robot's connection may be besides a control link."""
+
+from __future__ import annotations
+
+import pytest
+import pytest_twisted
+
+from relay_db import queries
+from relay_protocol import identity, limits, link
+from relay_protocol.frames import encode_sample
+from relay_server import passwords
+from relay_server.channel import State
+from tests.relay_server.edges.robot_ends import RELAY, Hall, Robot, until
+from tests.relay_server.memory import STRING, text
+
+NEW_KEY = bytes(range(32, 64))
+PUBLIC = identity.public_half(NEW_KEY)
+
+
+async def code_for(hall: Hall, robot: str, expires: float = 2000.0) -> str:
+    """A fresh enrolment code, the robot added if there is none."""
+    record = await hall.store.read(queries.find_robot, robot)
+    if record is None:
+        record = await hall.store.write(queries.add_robot, robot)
+    code = passwords.new_enrolment_code()
+    await hall.store.write(queries.issue_enrolment_code, record.id, passwords.code_hash(code), expires)
+    return code
+
+
+async def enrolling(hall: Hall, code: str, robot: str = "c-3po", public_key: bytes = PUBLIC) -> Robot:
+    """A robot that has asked to be enrolled and got an answer."""
+    end = hall.dial()
+    end.says(link.Enroll(version=1, robot=robot, code=code, public_key=link.to_base64(public_key)))
+    await end.answered()
+    return end
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_enrolls_by_its_code_and_registers_with_its_key(hall: Hall) -> None:
+    """However the code was typed; the relay closes, and the event is on record."""
+    code = await code_for(hall, "c-3po")
+    robot = await enrolling(hall, code.lower().replace("-", " "))
+    assert robot.hears() == [{"op": "enrolled", "robot": "c-3po", "relay": RELAY}]
+    assert not robot.transport.connected
+    again = hall.dial()
+    again.prove(again.hello("c-3po", identity.fingerprint(PUBLIC)), "c-3po", NEW_KEY)
+    await again.answered()
+    assert again.hears()[0]["op"] == "welcome"
+    entry = (await hall.store.read(queries.list_audit))[-1]
+    assert (entry.action, entry.target) == ("robot.enrolled", "c-3po")
+
+
+@pytest_twisted.ensureDeferred
+async def test_codes_that_are_not_good_are_told_the_same(hall: Hall) -> None:
+    """Used, expired, unknown, another robot's, an unknown robot's."""
+    used = await code_for(hall, "used")
+    await enrolling(hall, used, "used")
+    expired = await code_for(hall, "expired", expires=999.0)
+    other = await code_for(hall, "other")
+    reasons = set()
+    for robot, code in (
+        ("used", used),
+        ("expired", expired),
+        ("used", other),
+        ("nobody", other),
+        ("used", "?"),
+    ):
+        end = await enrolling(hall, code, robot)
+        reasons.add(end.refusal()["reason"])
+    assert len(reasons) == 1
+    assert (await enrolling(hall, other, "other")).hears()[0]["op"] == "enrolled"
+
+
+@pytest.mark.parametrize(
+    ("robot", "public_key", "words"),
+    [
+        ("c-3po", "", "32 bytes"),
+        ("c-3po", link.to_base64(PUBLIC + b"x"), "32 bytes"),
+        ("c-3po", "no base64", "base64"),
+        ("C-3PO!", link.to_base64(PUBLIC), "a robot's name"),
+        ("x" * 64, link.to_base64(PUBLIC), "a robot's name"),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_what_can_not_be_enrolled_does_not_spend_the_code(
+    hall: Hall, robot: str, public_key: str, words: str
+) -> None:
+    """Keys of the wrong length and impossible names are refused in words."""
+    code = await code_for(hall, "c-3po")
+    end = hall.dial()
+    end.says(link.Enroll(version=1, robot=robot, code=code, public_key=public_key))
+    await end.answered()
+    assert words in end.refusal()["reason"]
+    assert (await enrolling(hall, code)).hears()[0]["op"] == "enrolled"
+
+
+# --- channels ---------------------------------------------------------------------------------------------
+
+
+class Member:
+    """Somebody who is there."""
+
+    def tell(self, level: str, text: str, id: object = None) -> None:
+        """Not asked."""
+
+
+async def asked_to_join(hall: Hall) -> tuple[Robot, str]:
+    """A registered robot in use, and the ticket it was given."""
+    robot = hall.dial()
+    await robot.registers()
+    assert hall.presence is not None
+    hall.world.channels.of(hall.presence).attach(Member())
+    hall.world.clock.advance(0)
+    (ask,) = [each for each in robot.hears() if each["op"] == "open_channel"]
+    return robot, ask["ticket"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_joins_its_channel_and_samples_flow(hall: Hall) -> None:
+    """``joined`` tells the relay's clock; what comes over the link reaches the channel."""
+    _, ticket = await asked_to_join(hall)
+    end = hall.dial()
+    end.says(link.Join(version=1, ticket=ticket))
+    assert hall.presence is not None
+    channel = hall.world.channels.of(hall.presence)
+    joined = end.hears()[0]
+    assert joined == {"op": "joined", "channel": channel.name, "at": hall.world.now_ns()}
+    assert channel.state is State.OPEN
+    got: list[tuple[int, bytes]] = []
+    channel.subscriptions.sample = lambda number, body: got.append((number, body))  # type: ignore[method-assign]
+    end.sends(encode_sample(7, 1, text("hi")))
+    end.sends(encode_sample(8, 1, bytes(limits.HANDSHAKE_FRAME)))
+    assert [number for number, _ in got] == [7, 8]
+    end.says(link.Ping(t=5))
+    assert {"op": "pong", "t": 5, "at": hall.world.now_ns()} in end.hears()
+    end.says(link.Bye(reason="restarting"))
+    assert channel.state is State.OPENING
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_ticket_that_is_not_good_opens_nothing(hall: Hall) -> None:
+    """Used, invented or empty; the channel goes on waiting or working."""
+    _, ticket = await asked_to_join(hall)
+    hall.dial().says(link.Join(version=1, ticket=ticket))
+    for bad in (ticket, "invented", ""):
+        end = hall.dial()
+        end.says(link.Join(version=1, ticket=bad))
+        assert end.refusal()["reason"] == "the channel ticket is unknown, used or too old"
+        end.breaks()
+    assert hall.presence is not None
+    assert hall.world.channels.of(hall.presence).state is State.OPEN
+
+
+@pytest_twisted.ensureDeferred
+async def test_losing_the_control_link_ends_the_channel_link(hall: Hall) -> None:
+    """And the other way round the channel is asked for anew."""
+    control, ticket = await asked_to_join(hall)
+    end = hall.dial()
+    end.says(link.Join(version=1, ticket=ticket))
+    end.breaks()
+    hall.world.clock.advance(0.5)
+    (ask,) = [each for each in control.hears() if each["op"] == "open_channel"]
+    end = hall.dial()
+    end.says(link.Join(version=1, ticket=ask["ticket"]))
+    control.breaks()
+    assert end.hears()[-1]["op"] == "bye"
+    assert not end.transport.connected
+    assert hall.presence is not None
+    assert hall.world.channels.of(hall.presence).state is State.WAITING
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_slow_robot_gets_the_newest_samples_and_every_message(hall: Hall) -> None:
+    """Towards robots too data gives way and control does not."""
+    _, ticket = await asked_to_join(hall)
+    end = hall.dial()
+    end.says(link.Join(version=1, ticket=ticket))
+    end.hears()
+    producer = end.transport.producer
+    assert producer is not None
+    producer.pauseProducing()
+    for number in range(300):
+        end.connection.sample(1, number, text(str(number)))
+    end.connection.send(link.GetType(type=STRING))
+    assert end.hears() == []
+    producer.resumeProducing()
+    first, *samples = end.frames()
+    assert b"get_type" in first.body
+    assert [frame.stamp for frame in samples] == list(range(300 - 128, 300))
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_link_closed_by_the_relay_is_dropped_if_the_robot_does_not_close_it(hall: Hall) -> None:
+    """A moment for the farewell, then the connection is aborted; a closed one leaves no timer."""
+    robot = hall.dial()
+    await robot.registers()
+    robot.transport.loseConnection = lambda: None  # type: ignore[method-assign]
+    robot.connection.close("going down")
+    robot.connection.close("again")
+    assert [each["op"] for each in robot.hears()].count("bye") == 1
+    assert not robot.transport.aborted
+    hall.world.clock.advance(2)
+    assert robot.transport.aborted
+    await until(lambda: not hall.world.clock.getDelayedCalls())
