@@ -371,4 +371,5 @@ def test_no_page_scrolls_sideways(open_page: OpenPage, tmp_path: Path, width: in
     shots["cockpit"] = page
     for name, each in shots.items():
         assert each.evaluate("document.documentElement.scrollWidth") <= width, name
+        each.evaluate("window.scrollTo(0, 0)")
         each.screenshot(path=tmp_path / f"{name}-{width}.png", full_page=True)

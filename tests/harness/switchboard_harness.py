@@ -232,6 +232,7 @@ class Robot:
         port: int | None = None,
         camera: bool = False,
         daemon_env: dict[str, str] | None = None,
+        enroll_options: tuple[str, ...] = (),
     ) -> None:
         self.relay = relay
         self.name = name
@@ -245,13 +246,13 @@ class Robot:
         command += ["--camera" if camera else "--no-camera"]
         self.sim = Process(command, self.folder, "sim", ros_environment(self.domain))
         code = relay.cli("robot", "add", name)["enrolment_code"]
-        self.enroll(code, port or relay.robots_port).check_returncode()
+        self.enroll(code, port or relay.robots_port, *enroll_options).check_returncode()
         self.sim.wait_to_say("READY")
         self.daemon = self._daemon()
         self.wait_online()
 
     def enroll(self, code: str, port: int, *options: str) -> subprocess.CompletedProcess[str]:
-        """``switchboard-robot enroll``."""
+        """``switchboard-robot enroll``; options such as ``--tls``, ``--ca`` FILE."""
         command = [
             str(BIN / "switchboard-robot"),
             "enroll",

@@ -1,0 +1,144 @@
+"""Ten seconds of load from a real ROS 2 publisher: what is promised holds, and nothing grows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from switchboard_harness import Client, wait_for
+from switchboard_load import STRING, Counter, Publisher, Stalled, meter_of, status_of
+
+from relay_protocol.limits import MIB
+
+SECONDS = 12.0
+RATE = 1000.0
+WARM = 2000
+
+
+@dataclass
+class Run:
+    """What was seen while the publisher was at work."""
+
+    sent: dict[str, Any] = field(default_factory=dict)
+    fast: Counter | None = None
+    throttled: Counter | None = None
+    latched: str = ""
+    cut_after: float = 0.0
+    stalled_ended: bool = False
+    memory_warm: dict[str, int] = field(default_factory=dict)
+    memory_most: dict[str, int] = field(default_factory=dict)
+    memory_end: dict[str, int] = field(default_factory=dict)
+    status: dict[str, Any] = field(default_factory=dict)
+    health_before: dict[str, Any] = field(default_factory=dict)
+
+
+@pytest.fixture(scope="module")
+def run(world: Any) -> Iterator[Run]:
+    """One run for all: a fast client, a throttled one, one that stalls, and one that comes late."""
+    relay, robot = world.relay, world.robot
+    staller = relay.user("staller")
+    relay.cli("right", "grant", "staller", "rover", "viewer")
+    meter = meter_of(relay, robot)
+    result = Run(health_before=status_of(relay, "rover")["health"])
+    publisher = Publisher(robot, SECONDS, RATE)
+    topics = {"small": 0, "big": 0, "unsure": 0}
+    watcher = relay.connect("rover", world.viewer)
+    publisher.known_to(watcher)
+    fast = result.fast = Counter(watcher, topics)
+    throttled = result.throttled = Counter(
+        relay.connect("rover", world.operator), {"small": 500, "burst": 500}
+    )
+    try:
+        wait_for("it is warm", lambda: fast.last("small") > WARM, 60)
+        result.memory_warm = meter.memory()
+        stalled = Stalled(relay, "rover", staller, ["small", "big"])
+        result.cut_after = stalled.cut_after(relay, "staller")
+        result.memory_most = meter.memory()
+        result.stalled_ended = stalled.ended()
+        stalled.close()
+        sent = result.sent = publisher.sent()
+        for name in ("small", "big"):
+            wait_for(f"the last of {name} comes", lambda name=name: fast.last(name) == sent[name] - 1)
+        for name in ("small", "burst"):
+            wait_for(f"the last of {name} comes", lambda name=name: throttled.last(name) == sent[name] - 1)
+        with relay.connect("rover", world.viewer) as late:
+            result.latched = latched_of(late)
+        result.memory_end = meter.memory()
+        result.status = status_of(relay, "rover")
+        yield result
+    finally:
+        fast.stop()
+        throttled.stop()
+        publisher.stop()
+
+
+def latched_of(client: Client) -> str:
+    """What a late joiner gets of the latched topic."""
+    client.send(op="subscribe", topic="/load/latched", type=STRING)
+    return str(client.until(op="publish", topic="/load/latched")["msg"]["data"])
+
+
+def test_the_publisher_was_as_fast_as_asked(run: Run) -> None:
+    """A thousand messages a second left the publisher, so what follows was measured under that load."""
+    assert run.sent["small"] / run.sent["seconds"] > 0.9 * RATE
+
+
+@pytest.mark.parametrize("name", ["small", "big"])
+def test_nothing_is_lost_and_the_order_is_kept(run: Run, name: str) -> None:
+    """From the first message that came to the last that was sent, every number is there, in order."""
+    assert run.fast is not None
+    assert run.fast.broken == ""
+    assert run.fast.lost(name) == []
+    assert run.fast.in_order(name)
+    assert len(run.fast.numbers[name]) > 0.8 * run.sent[name]
+
+
+def test_a_best_effort_publisher_is_heard(run: Run) -> None:
+    """A publisher that is not reliable is subscribed to as it offers, and comes through in order."""
+    assert run.fast is not None
+    assert run.fast.in_order("unsure")
+    assert len(run.fast.numbers["unsure"]) > 0.5 * run.sent["unsure"]
+
+
+def test_a_throttled_client_gets_few_and_always_the_last(run: Run) -> None:
+    """At most two a second with ``throttle_rate`` 500, in order, and the last message of all arrives."""
+    assert run.throttled is not None
+    assert run.throttled.in_order("small")
+    assert len(run.throttled.numbers["small"]) <= 2 * run.sent["seconds"] + 3
+    assert run.throttled.last("small") == run.sent["small"] - 1
+
+
+def test_the_last_of_a_burst_passes_the_throttle_of_the_robot(run: Run) -> None:
+    """Where nobody wants more, the robot itself throttles, and sends the last of a burst."""
+    assert run.throttled is not None
+    assert run.throttled.last("burst") == run.sent["burst"] - 1
+    assert len(run.throttled.numbers["burst"]) < 20
+
+
+def test_a_late_joiner_gets_what_was_latched(run: Run) -> None:
+    """Published once, before anybody came, and still there for who subscribes at the end."""
+    assert run.latched.startswith("000000000 ")
+
+
+def test_a_client_that_takes_nothing_is_cut_and_costs_little(run: Run) -> None:
+    """It is let go after some seconds, having cost less than 8 MiB; the fast client beside it lost nothing."""
+    assert 4 < run.cut_after < 15
+    assert run.stalled_ended
+    assert run.memory_most["relay"] - run.memory_warm["relay"] < 8 * MIB
+
+
+def test_queues_are_empty_at_the_end_and_nothing_was_dropped(run: Run) -> None:
+    """``switchboard status`` shows no waiting bytes and no drops, in the relay and in the robot."""
+    clients = {each["user"]: each for each in run.status["clients"]}
+    for user in ("viewer", "operator"):
+        assert clients[user]["waiting_bytes"] == 0
+        assert clients[user]["drops"] == 0
+    assert run.status["health"]["dropped_samples"] == run.health_before["dropped_samples"]
+
+
+@pytest.mark.parametrize("process", ["relay", "daemon"])
+def test_memory_stays_level(run: Run, process: str) -> None:
+    """Ten thousand messages later the process is as large as it was when it had warmed up."""
+    assert run.memory_end[process] - run.memory_warm[process] < 8 * MIB
