@@ -135,8 +135,7 @@ class Robot:
         """The whole ceremony; the answer."""
         self.prove(self.hello())
         await self.answered()
-        first = self.hears()[0]
-        return first
+        return self.hears()[0]
 
     async def answered(self) -> None:
         """The database has been asked."""
