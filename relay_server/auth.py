@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorThreads
+from twisted.logger import Logger
 
 from relay_db import queries
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
@@ -52,6 +53,8 @@ class Authenticator:
     :param wall: Unix time in seconds
     """
 
+    log = Logger()
+
     def __init__(
         self,
         reactor: IReactorThreads,
@@ -71,7 +74,9 @@ class Authenticator:
     def start(self) -> None:
         """Start the threads that hash passwords, and make ready for the first unknown user."""
         self._hashing.start()
-        Deferred.fromCoroutine(self._hashing.run(passwords.prepare))
+        Deferred.fromCoroutine(self._hashing.run(passwords.prepare)).addErrback(
+            lambda failure: self.log.failure("passwords can't be hashed", failure)
+        )
 
     def stop(self) -> None:
         """Wait for the hashing under way and end its threads."""

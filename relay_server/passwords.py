@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import secrets
+import threading
 import unicodedata
 from functools import cache
 from typing import Any
@@ -24,6 +25,9 @@ CODE_ALPHABET = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """32 characters, 5 bit each; without 0, 1, I and O, which are read for each other."""
 _CODE_GROUPS = 4
 _CODE_GROUP = 4
+
+
+_loading = threading.Lock()
 
 
 def hash_password(text: str) -> str:
@@ -98,9 +102,11 @@ def _normal(text: str) -> str | None:
 
 @cache
 def _argon2() -> Any:
-    from passlib.hash import argon2
+    # The library loads its hashes when first asked, and breaks when two threads ask at once.
+    with _loading:
+        from passlib.hash import argon2
 
-    return argon2.using(type="ID", memory_cost=19456, time_cost=2, parallelism=1)
+        return argon2.using(type="ID", memory_cost=19456, time_cost=2, parallelism=1)
 
 
 @cache

@@ -116,6 +116,11 @@ class BoundedRequest(Request):
             return
         super().handleContentChunk(data)
 
+    def render(self, resource: IResource) -> None:
+        # Twisted has named itself and its version by now.
+        self.setHeader(b"server", b"switchboard")
+        super().render(resource)
+
     def _too_big(self) -> None:
         self.channel.refuse(b"413 Content Too Large", f"a request may carry at most {BODY_BYTES} bytes")
 
@@ -151,7 +156,6 @@ class RelaySite(Site):
         request.site = self
         for name, value in self._headers.items():
             request.setHeader(name, value)
-        request.setHeader(b"server", b"switchboard")
         return request
 
 

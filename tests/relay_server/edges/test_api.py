@@ -1,0 +1,233 @@
+"""``/api/v1`` on transports in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from relay_server.edges import api as module
+from tests.relay_server.edges.http_client import ORIGIN, World, parse
+
+SESSION = "/api/v1/session"
+COOKIE = {"Cookie": "sb=ann"}
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """A site with an empty portal."""
+    return World(tmp_path)
+
+
+@pytest.mark.parametrize("tls", [False, True])
+def test_a_login_sets_a_cookie_that_is_for_this_site_alone(tmp_path: Path, tls: bool) -> None:
+    """Not for scripts, not for other sites, over TLS only where there is TLS."""
+    world = World(tmp_path, tls)
+    answer = world.ask("POST", SESSION, {"user": "ann", "password": "correct horse"})
+    assert (answer.status, answer.json) == (200, {"user": "ann", "admin": False, "realm": "main"})
+    (cookie,) = answer.cookies
+    parts = cookie.lower().split("; ")
+    assert parts[0] == "sb=ann"
+    assert {"httponly", "samesite=strict", "path=/", "max-age=43200"} <= set(parts)
+    assert ("secure" in parts) is tls
+    assert world.ask("POST", SESSION, {"code": "once"}).json["admin"] is True
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "code"),
+    [
+        ({"user": "ann", "password": "wrong"}, 401, "bad_credentials"),
+        ({"code": "unknown"}, 401, "bad_credentials"),
+        ({"user": "ann", "password": "again"}, 429, "too_many_tries"),
+        ({"user": "ann"}, 400, "invalid"),
+        ({}, 400, "invalid"),
+        ({"user": 7, "password": "x"}, 400, "malformed"),
+        ([], 400, "malformed"),
+    ],
+)
+def test_a_login_that_fails_is_told_as_problem_details(
+    world: World, body: Any, status: int, code: str
+) -> None:
+    """Without a cookie; who has tried too often is told when to come back."""
+    answer = world.ask("POST", SESSION, body)
+    assert (answer.status, answer.json["status"], answer.json["code"]) == (status, status, code)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert not answer.cookies
+    assert answer.headers.get("retry-after") == ("60" if status == 429 else None)
+    assert (answer.headers.get("www-authenticate") == "Bearer") is (status == 401)
+
+
+@pytest.mark.parametrize(
+    "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""]
+)
+def test_a_form_of_another_page_is_no_login(world: World, kind: str) -> None:
+    """Only JSON is read, which no form can send."""
+    answer = world.ask("POST", SESSION, {"code": "once"}, Content_Type=kind)
+    assert (answer.status, answer.cookies) == (400, [])
+    assert kind.startswith("multipart") or answer.json["detail"] == "send the body as application/json"
+
+
+@pytest.mark.parametrize("raw", [b"{", b"\xff", b'{"code":"a","code":', b"[" * 200])
+def test_a_body_that_is_no_json_is_told(world: World, raw: bytes) -> None:
+    """In words."""
+    assert world.ask("POST", SESSION, raw=raw).status == 400
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:9091", None])
+def test_a_cookie_changes_nothing_without_the_own_origin(world: World, origin: str | None) -> None:
+    """Neither logging out nor asking for tickets; looking is no change; a token needs no Origin."""
+    given = {"Origin": origin} if origin else {}
+    assert world.ask("DELETE", SESSION, **COOKIE, **given).status == 403
+    assert world.ask("POST", "/api/v1/tickets", {"robot": "rover"}, **COOKIE, **given).status == 403
+    assert world.ask("GET", SESSION, **COOKIE, **given).status == 200
+    assert world.ask("POST", "/api/v1/tickets", {"robot": "rover"}, Authorization="Bearer ann").status == 201
+
+
+def test_logging_out_ends_the_session_and_takes_the_cookie_back(world: World) -> None:
+    """The token is worth nothing then."""
+    answer = world.ask("DELETE", SESSION, Origin=ORIGIN, **COOKIE)
+    assert (answer.status, answer.body) == (204, b"")
+    assert "max-age=0" in answer.cookies[0].lower()
+    assert world.ask("GET", SESSION, **COOKIE).status == 401
+
+
+def test_robots_and_tickets(world: World) -> None:
+    """What the principal sees; a robot that is not there is not found."""
+    token = {"Authorization": "Bearer ann"}
+    assert world.ask("GET", "/api/v1/robots", **token).json == {
+        "robots": [{"name": "rover", "seen by": "ann"}]
+    }
+    assert world.ask("GET", "/api/v1/robots/rover", **token).json["name"] == "rover"
+    assert world.ask("GET", "/api/v1/robots/tank", **token).status == 404
+    ticket = world.ask("POST", "/api/v1/tickets", {"robot": "rover"}, **token)
+    assert ticket.json == {"ticket": "ticket of ann", "expires_in": 60, "robot": "rover"}
+    assert world.ask("POST", "/api/v1/tickets", {"robot": "tank"}, **token).status == 404
+    assert world.ask("POST", "/api/v1/tickets", {}, **token).status == 400
+    for path in ("/api/v1/robots", "/api/v1/robots/rover", "/api/v1/robots/stream", "/metrics"):
+        assert world.ask("GET", path).status == 401
+
+
+def test_health_tells_whether_the_database_answers(world: World) -> None:
+    """To everyone; without it new asks get 503 in words."""
+    assert world.ask("GET", "/healthz").json == {"status": "ok"}
+    world.desk.up = False
+    answer = world.ask("GET", "/healthz")
+    assert (answer.status, answer.json["title"]) == (503, "Unavailable")
+    assert world.ask("GET", "/api/v1/robots", Authorization="Bearer ann").status == 503
+
+
+def test_metrics_are_for_administrators(world: World) -> None:
+    """Others are refused."""
+    assert world.ask("GET", "/metrics", Authorization="Bearer ann").status == 403
+    answer = world.ask("GET", "/metrics", Authorization="Bearer root")
+    assert answer.status == 200
+    assert answer.headers["content-type"].startswith("text/plain")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/api/v1/nothing", 404),
+        ("GET", "/api/", 404),
+        ("PUT", SESSION, 405),
+        ("DELETE", "/healthz", 405),
+    ],
+)
+def test_what_is_not_routed_is_told_as_problem_details(
+    world: World, method: str, path: str, status: int
+) -> None:
+    """404 and 405 too."""
+    answer = world.ask(method, path)
+    assert (answer.status, answer.json["status"]) == (status, status)
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_fault_of_ours_shows_no_insides(world: World) -> None:
+    """500, in general words."""
+    answer = world.ask("POST", SESSION, {"code": "break"})
+    assert answer.status == 500
+    assert b"insides" not in answer.body
+
+
+# --- the stream -------------------------------------------------------------------------------------------
+
+
+def streaming(world: World) -> Any:
+    """A client that follows the robots."""
+    transport = world.connect()
+    world.send(
+        transport, b"GET /api/v1/robots/stream HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer ann\r\n\r\n"
+    )
+    assert parse(transport.value()).headers["content-type"] == "text/event-stream"
+    return transport
+
+
+def events(transport: Any) -> list[str]:
+    """Names of the events that came since the last time."""
+    lines = transport.value().decode().splitlines()
+    transport.clear()
+    return [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
+
+
+def test_the_stream_tells_at_once_then_at_every_change_and_every_few_seconds(world: World) -> None:
+    """Changes in quick succession are told once."""
+    transport = streaming(world)
+    assert events(transport) == ["robots"]
+    world.clock.advance(module.COALESCE_SECONDS)
+    world.desk.changed()
+    assert events(transport) == ["robots"]
+    for _ in range(10):
+        world.desk.changed()
+    world.clock.advance(module.COALESCE_SECONDS)
+    assert events(transport) == []
+    world.clock.advance(module.STREAM_SECONDS)
+    assert events(transport) == ["robots"]
+
+
+def test_a_client_that_leaves_its_stream_leaves_nothing_behind(world: World) -> None:
+    """Neither a listener nor a timer, at whatever moment."""
+    for seconds in (0.0, module.COALESCE_SECONDS):
+        transport = streaming(world)
+        world.clock.advance(seconds)
+        transport.loseConnection()
+        assert world.desk.listeners == []
+        world.clock.advance(0)
+        assert not world.clock.getDelayedCalls()
+
+
+def test_the_stream_ends_with_the_credentials(world: World) -> None:
+    """The client is told, so that it does not just try again."""
+    transport = streaming(world)
+    del world.desk.tokens["ann"]
+    events(transport)
+    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
+    assert events(transport) == ["ended"]
+    assert world.desk.listeners == []
+
+
+def test_a_database_that_is_away_does_not_end_the_stream(world: World) -> None:
+    """What is open goes on, and tells again when it can."""
+    transport = streaming(world)
+    events(transport)
+    world.desk.up = False
+    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
+    assert transport.value() == b""
+    world.desk.up = True
+    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
+    assert events(transport) == ["robots"]
+
+
+def test_a_client_that_takes_nothing_of_its_stream_is_cut(world: World) -> None:
+    """Nothing piles up for it meanwhile."""
+    transport = streaming(world)
+    events(transport)
+    transport.producer.pauseProducing()
+    for _ in range(3):
+        world.clock.advance(module.COALESCE_SECONDS)
+        world.desk.changed()
+    assert transport.value() == b""
+    assert transport.connected
+    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS] * 2)
+    assert not transport.connected
+    assert world.desk.listeners == []

@@ -1,0 +1,176 @@
+"""HTTP as such: deadlines, limits, headers, the portal's files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from relay_protocol import limits
+from relay_server.edges import site as module
+from tests.relay_server.edges.http_client import World, parse
+
+GET = b"GET /healthz HTTP/1.1\r\nHost: x\r\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A built portal, and a file beside it that is nobody's business."""
+    portal = tmp_path / "portal"
+    (portal / "assets").mkdir(parents=True)
+    (portal / "index.html").write_text("<!doctype html>")
+    (portal / "assets" / "app-1234.js").write_text("let a")
+    (portal / "icon.svg").write_text("<svg/>")
+    (tmp_path / "secret").write_text("secret")
+    (portal / "link").symlink_to(tmp_path / "secret")
+    return portal
+
+
+@pytest.fixture
+def world(folder: Path) -> World:
+    """A site with a portal."""
+    return World(folder)
+
+
+@pytest.mark.parametrize("sent", [b"", GET, GET + b"Content-Length: 10\r\n\r\nx"])
+def test_a_request_that_trickles_is_cut_by_an_absolute_deadline(world: World, sent: bytes) -> None:
+    """Head or body: each byte buys no time."""
+    transport = world.connect()
+    world.send(transport, sent)
+    for _ in range(5):
+        world.clock.advance(limits.UNPROVEN_SECONDS / 5 - 0.01)
+        if sent and not sent.endswith(b"x"):
+            world.send(transport, b"X: y\r\n")
+    assert transport.connected
+    world.clock.advance(0.1)
+    assert not transport.connected
+    assert parse(transport.value()).status == 408
+    assert not world.cap._counts
+
+
+def test_a_kept_connection_is_dropped_when_it_idles(world: World) -> None:
+    """Its next request gets a deadline of its own, which is absolute too."""
+    transport = world.connect()
+    world.send(transport, GET + b"\r\n")
+    world.clock.advance(module.IDLE_SECONDS - 1)
+    assert transport.connected
+    world.send(transport, b"GET /healthz HTTP/1.1\r\nHo")
+    world.clock.advance(1.1)
+    assert not transport.connected
+    assert not world.cap._counts
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_a_body_that_is_too_large_is_refused(world: World, chunked: bool) -> None:
+    """Announced: before any of it is taken. In chunks: when it is too much."""
+    transport = world.connect()
+    head = b"POST /api/v1/session HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+    if chunked:
+        world.send(transport, head + b"Transfer-Encoding: chunked\r\n\r\n")
+        for _ in range(module.BODY_BYTES // 4096 + 1):
+            world.send(transport, b"1000\r\n" + b"x" * 4096 + b"\r\n")
+    else:
+        world.send(transport, head + b"Content-Length: %d\r\n\r\n" % (module.BODY_BYTES + 1))
+    assert parse(transport.value()).status == 413
+    assert not transport.connected
+
+
+def test_too_many_connections_of_one_address_are_refused(world: World) -> None:
+    """With 429; what they send is not looked at; places are given back."""
+    kept = [world.connect() for _ in range(4)]
+    refused = world.connect()
+    assert parse(refused.value()).status == 429
+    assert not refused.connected
+    kept[0].loseConnection()
+    assert world.ask("GET", "/healthz").status == 200
+    for each in kept[1:]:
+        each.loseConnection()
+    assert not world.cap._counts
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/", 200),
+        ("/nothing", 404),
+        ("/api/v1/session", 401),
+        ("/api/none", 404),
+        ("/robots/rover", 200),
+        ("/healthz", 200),
+    ],
+)
+@pytest.mark.parametrize("tls", [False, True])
+def test_every_answer_carries_the_security_headers(folder: Path, path: str, status: int, tls: bool) -> None:
+    """Pages, API, errors; with TLS browsers are told to stay with it."""
+    answer = World(folder, tls).ask("GET", path)
+    assert answer.status == status
+    for name, value in module.SECURITY_HEADERS.items():
+        assert answer.headers[name.decode()] == value.decode()
+    assert answer.headers["server"] == "switchboard"
+    assert ("strict-transport-security" in answer.headers) is tls
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../secret",
+        "/..%2fsecret",
+        "/%2e%2e/secret",
+        "/assets/../../secret",
+        "/assets/%2e%2e/%2e%2e/secret",
+        "/%2fetc/passwd",
+        "/link",
+        "/assets",
+        "/assets/",
+        "/a%00b",
+        "/%ff%fe",
+        "/..\\secret",
+    ],
+)
+def test_nothing_beside_the_portal_is_served(world: World, path: str) -> None:
+    """Whatever the path says, links included."""
+    answer = world.ask("GET", path)
+    assert answer.status == 404
+    assert b"secret" not in answer.body.replace(path.encode(), b"")
+
+
+def test_the_portals_page_is_served_for_the_addresses_it_routes(world: World) -> None:
+    """Names with a hash of their content are kept by browsers, the page is not."""
+    for path in ("/", "/login", "/fleet", "/cockpit/rover"):
+        page = world.ask("GET", path)
+        assert (page.status, page.body, page.headers["cache-control"]) == (
+            200,
+            b"<!doctype html>",
+            "no-cache",
+        )
+        assert page.headers["content-type"] == "text/html; charset=utf-8"
+    asset = world.ask("GET", "/assets/app-1234.js")
+    assert "immutable" in asset.headers["cache-control"]
+    assert world.ask("GET", "/icon.svg").headers["content-type"] == "image/svg+xml"
+    assert world.ask("HEAD", "/").body == b""
+
+
+def test_a_portal_that_was_not_built_is_told(tmp_path: Path) -> None:
+    """With what to do."""
+    answer = World(tmp_path / "none").ask("GET", "/")
+    assert (answer.status, answer.json["detail"]) == (503, "The portal is not built; run 'make web'.")
+
+
+def test_a_plain_get_of_a_robot_tells_what_speaks_there(world: World) -> None:
+    """And nothing below it is there."""
+    about = world.ask("GET", "/robots/rover").json
+    assert (about["product"], about["version"], about["protocol"]) == ("switchboard", "1.2.3", "rosbridge v2")
+    assert world.ask("GET", "/robots/rover/more").status == 404
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"\x16\x03\x01\x02\x00", b"GET\r\n\r\n", b"\x00" * 100, b"GET / HTTP/9.9\r\n\r\n", b"A" * 100_000],
+)
+def test_bytes_that_are_no_http_do_no_harm(world: World, data: bytes) -> None:
+    """The connection ends at the deadline at the latest, and gives its place back."""
+    transport = world.connect()
+    world.send(transport, data)
+    world.clock.pump([limits.UNPROVEN_SECONDS, module.IDLE_SECONDS])
+    assert not transport.connected
+    assert not world.cap._counts

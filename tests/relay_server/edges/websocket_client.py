@@ -1,0 +1,211 @@
+"""A real websocket client (sans-io) on a transport in memory, and a gate that lets it in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock
+from twisted.internet.testing import StringTransportWithDisconnection
+from websockets.client import ClientProtocol
+from websockets.exceptions import InvalidStatus
+from websockets.frames import Frame, Opcode
+from websockets.http11 import Response
+from websockets.uri import parse_uri
+
+from relay_protocol.errors import NotFound, Refused, Unavailable
+from relay_server.access import BadCredentials, Principal
+from relay_server.edges.caps import AddressCap
+from relay_server.edges.websocket import ClientFactory
+
+ANN = Principal(1, "ann", "main", False, 1, None)
+AUTH = '{"op":"auth","mac":"good"}'
+
+
+class MemorySession:
+    """A session that notes what it is given."""
+
+    def __init__(self, transport: Any) -> None:
+        self.transport = transport
+        self.got: list[Any] = []
+
+    def start(self) -> None:
+        """The client is in."""
+        self.got.append("start")
+
+    def message(self, payload: bytes) -> None:
+        """One message."""
+        self.got.append(payload)
+
+    def pong(self, payload: bytes) -> None:
+        """A pong."""
+        self.got.append(("pong", payload))
+
+    def pause(self) -> None:
+        """Full."""
+        self.got.append("pause")
+
+    def resume(self) -> None:
+        """Not full any more."""
+        self.got.append("resume")
+
+    def end(self) -> None:
+        """Gone."""
+        self.got.append("end")
+
+    def close(self, code: int, reason: str) -> None:
+        """As a session does."""
+        self.transport.close(code, reason)
+        self.end()
+
+
+class MemoryGate:
+    """Lets in whoever says ``good``, to the robot ``rover``; the test may hold it up."""
+
+    def __init__(self) -> None:
+        self.accepting = True
+        self.asked: list[Any] = []
+        self.sessions: list[MemorySession] = []
+        self.admitted = 0
+        self.wait: Deferred[None] | None = None
+
+    async def _prove(self, *asked: Any) -> Principal:
+        self.asked.append(asked)
+        if self.wait is not None:
+            await self.wait
+        if "good" not in asked:
+            raise BadCredentials("the access token is unknown, expired or revoked")
+        return ANN
+
+    async def bearer(self, token: str) -> Principal:
+        """An access token."""
+        return await self._prove("bearer", token)
+
+    async def ticket(self, ticket: str, robot: str) -> Principal:
+        """A ticket."""
+        return await self._prove("ticket", ticket, robot)
+
+    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
+        """A cookie."""
+        if not header:
+            return None
+        if origin is None:
+            raise Refused("a session cookie counts only with an Origin header")
+        return await self._prove("cookie", header)
+
+    async def admit(self, principal: Principal, robot: str, address: str) -> Any:
+        """A robot."""
+        if robot == "broken":
+            raise RuntimeError("the secret of our insides")
+        if robot == "away":
+            raise Unavailable("the database does not answer")
+        if robot != "rover":
+            raise NotFound("there is no such robot, or you have no right on it")
+        self.admitted += 1
+        return principal
+
+    def open(self, admission: Any, transport: Any, opened_ns: int) -> MemorySession:
+        """A session."""
+        self.admitted -= 1
+        self.sessions.append(MemorySession(transport))
+        return self.sessions[-1]
+
+    def turn_away(self, admission: Any) -> None:
+        """Left before."""
+        self.admitted -= 1
+
+
+class Transport(StringTransportWithDisconnection):
+    """TCP in memory; like TLS it does not close while a producer is registered."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        # Twisted's HTTP channel is the producer when a websocket takes over.
+        self.registerProducer(object(), True)
+
+    def setTcpNoDelay(self, on: bool) -> None:
+        """As TCP."""
+
+    def loseConnection(self) -> None:
+        """Close, unless a producer still holds it."""
+        if self.connected and self.producer is None:
+            super().loseConnection()
+
+    def unregisterProducer(self) -> None:
+        """As TCP, which does not mind when there is none."""
+        self.producer = None
+
+    def abortConnection(self) -> None:
+        """Close at once."""
+        if self.connected:
+            super().abortConnection()
+
+
+class Client:
+    """A websocket client and the relay's end of it."""
+
+    def __init__(self, gate: MemoryGate, path: str = "/robots/rover", **headers: str) -> None:
+        self.eof = False
+        self.clock = Clock()
+        self.cap = AddressCap(5)
+        self.cap.enter("192.168.1.1")
+        factory = ClientFactory(self.clock, lambda: round(self.clock.seconds() * 1e9), gate, self.cap)
+        self.transport = Transport()
+        protocols = [headers.pop("subprotocol")] if "subprotocol" in headers else None
+        self.core = ClientProtocol(parse_uri(f"ws://relay:9090{path}"), subprotocols=protocols)  # type: ignore[arg-type]
+        self.end = factory.buildProtocol(None)
+        self.transport.protocol = self.end
+        self.end.makeConnection(self.transport)
+        request = self.core.connect()
+        for name, value in headers.items():
+            request.headers[name] = value
+        self.core.send_request(request)
+        self.run()
+
+    def run(self) -> None:
+        """Carry bytes both ways until there are none."""
+        while True:
+            out = b"".join(self.core.data_to_send())
+            back = self.transport.value()
+            self.transport.clear()
+            if not out and not back:
+                break
+            if out and self.transport.connected:
+                self.end.dataReceived(out)
+            if back:
+                self.core.receive_data(back)
+        if not self.transport.connected and not self.eof:
+            self.eof = True
+            self.core.receive_eof()
+
+    def says(self, text: str) -> None:
+        """One text message."""
+        self.core.send_text(text.encode())
+        self.run()
+
+    @property
+    def status(self) -> int:
+        """Of the handshake."""
+        refused = self.core.handshake_exc
+        if isinstance(refused, InvalidStatus):
+            return refused.response.status_code
+        assert refused is None
+        return next(event.status_code for event in self._events() if isinstance(event, Response))
+
+    def _events(self) -> list[Any]:
+        self.seen = [*getattr(self, "seen", []), *self.core.events_received()]
+        return self.seen
+
+    @property
+    def heard(self) -> list[bytes]:
+        """Text messages so far."""
+        return [
+            bytes(each.data)
+            for each in self._events()
+            if isinstance(each, Frame) and each.opcode is Opcode.TEXT
+        ]
+
+    @property
+    def closed(self) -> int | None:
+        """The close code, when the relay has closed."""
+        return self.core.close_rcvd.code if self.core.close_rcvd else None

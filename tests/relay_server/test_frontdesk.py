@@ -1,0 +1,212 @@
+"""What edges ask for, put together, on a real database."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+
+from relay_db import queries
+from relay_protocol.errors import NotFound, Refused
+from relay_server import closing, limiter, passwords
+from relay_server.access import Access, BadCredentials, Principal
+from relay_server.auth import Authenticator, TooManyTries
+from relay_server.edges.origins import Origins
+from relay_server.frontdesk import NO_ROBOT, FrontDesk
+from relay_server.journal import Journal
+from relay_server.session import Session, Timing
+from relay_server.store import Store
+from tests.relay_server.memory import MemoryClient, World
+
+PASSWORD = "correct horse"
+HERE = "192.0.2.1"
+HOST = "127.0.0.1:9090"
+
+
+class Desk:
+    """A front desk, and what it is made of."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self.world = World()
+        self.access = Access(store, self.wall)
+        self.auth = Authenticator(reactor, store, self.world.clock.seconds, self.wall)  # type: ignore[arg-type]
+        self.auth.start()
+        self.desk = FrontDesk(
+            self.world.clock,
+            store,
+            self.auth,
+            self.access,
+            self.world.registry,
+            self.world.channels,
+            Journal(store, self.wall),
+            Origins("http"),
+            Timing(2.0, 0.1, 5.0),
+            cookie="sb",
+            clock_ns=self.world.now_ns,
+            wall=self.wall,
+        )
+        with store.database.begin() as session:
+            ann = queries.add_user(session, "ann", passwords.hash_password(PASSWORD))
+            rover = queries.add_robot(session, "rover", "in the shed")
+            queries.add_robot(session, "hidden")
+            queries.grant_right(session, rover.id, "operator", user_id=ann.id)
+        self.ann, self.rover = ann, rover
+
+    def wall(self) -> float:
+        """Unix time."""
+        return 1000.0 + self.world.clock.seconds()
+
+    async def logged_in(self) -> tuple[Principal, str]:
+        """Ann's principal by a fresh session, and its token."""
+        _, token = await self.desk.password("ann", PASSWORD, HERE)
+        return await self.desk.token(token), token
+
+    async def opens(self, principal: Principal) -> tuple[Session, MemoryClient]:
+        """A websocket of this principal."""
+        client = MemoryClient()
+        admission = await self.desk.admit(principal, "rover", HERE)
+        session = self.desk.open(admission, client, self.world.now_ns())
+        session.start()
+        return session, client
+
+    async def events(self, kind: str) -> list[Any]:
+        """What was recorded of a kind, once what is being written is written."""
+        await self.store.write(queries.revision)
+        return [each for each in await self.store.read(queries.list_events) if each.kind == kind]
+
+
+@pytest.fixture
+def front(store: Store) -> Iterator[Desk]:
+    """A desk with ann, who operates rover and knows nothing of hidden."""
+    made = Desk(store)
+    yield made
+    made.auth.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_logging_in_and_out_are_on_record(front: Desk) -> None:
+    """A login with how and from where; a refused one with its reason, without the password."""
+    await front.logged_in()
+    with pytest.raises(BadCredentials):
+        await front.desk.password("ann", "hunter2hunter2", HERE)
+    (refused,) = await front.events("login.refused")
+    assert refused.data == {"user": "ann", "address": HERE, "reason": "bad_credentials"}
+    entry = (await front.store.read(queries.list_audit))[-1]
+    assert (entry.actor, entry.action, entry.origin, entry.data) == (
+        "user:ann",
+        "login",
+        HERE,
+        {"how": "password"},
+    )
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_flood_of_logins_does_not_reach_the_database(front: Desk) -> None:
+    """What is over the limit was recorded while under it."""
+    for _ in range(limiter.FAILURES):
+        with pytest.raises(BadCredentials):
+            await front.desk.password("nobody", "x", HERE)
+    for _ in range(20):
+        with pytest.raises(TooManyTries):
+            await front.desk.password("nobody", "x", HERE)
+    assert len(await front.events("login.refused")) == limiter.FAILURES
+
+
+@pytest_twisted.ensureDeferred
+async def test_logging_out_cuts_what_was_opened_with_that_session(front: Desk) -> None:
+    """Other sessions of the same user go on."""
+    (first, token), (second, _) = await front.logged_in(), await front.logged_in()
+    _, cut = await front.opens(first)
+    _, kept = await front.opens(second)
+    await front.desk.logout(first)
+    assert cut.closed == (closing.UNAUTHENTICATED, "your session was ended; log in again")
+    assert kept.closed is None
+    with pytest.raises(BadCredentials):
+        await front.desk.token(token)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_without_rights_is_like_no_robot(front: Desk) -> None:
+    """For websockets and for tickets: one and the same answer."""
+    principal, _ = await front.logged_in()
+    for robot in ("hidden", "nothing", "", "x" * 10_000, "\x00"):
+        for asking in (front.desk.admit(principal, robot, HERE), front.desk.issue_ticket(principal, robot)):
+            with pytest.raises(NotFound) as told:
+                await asking
+            assert str(told.value) == NO_ROBOT
+    assert not front.access._permits
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_is_turned_away_leaves_nothing(front: Desk) -> None:
+    """No permit is kept of somebody who left before the session began."""
+    principal, _ = await front.logged_in()
+    front.desk.turn_away(await front.desk.admit(principal, "rover", HERE))
+    assert not front.access._permits
+    assert not list(front.desk)
+
+
+@pytest_twisted.ensureDeferred
+async def test_open_sessions_are_counted_shown_and_recorded(front: Desk) -> None:
+    """A robot somebody works with is in use; afterwards nothing is left of them."""
+    principal, _ = await front.logged_in()
+    changes: list[None] = []
+    stop = front.desk.on_change(lambda: changes.append(None))
+    session, _ = await front.opens(principal)
+    other, _ = await front.opens(principal)
+    (view,) = await front.desk.robots(principal)
+    assert (view["name"], view["level"], view["description"]) == ("rover", "operator", "in the shed")
+    assert [each["user"] for each in view["clients"]] == ["ann", "ann"]
+    shown = next(each for each in front.desk.status() if each["name"] == "rover" and each["clients"])
+    assert shown["clients"][0]["address"] == HERE
+    session.end()
+    other.end()
+    assert len(changes) == 4
+    stop()
+    assert (await front.desk.robots(principal))[0]["clients"] == []
+    assert not front.access._permits
+    assert not list(front.desk)
+    assert len(await front.events("client.joined")) == len(await front.events("client.left")) == 2
+
+
+@pytest_twisted.ensureDeferred
+async def test_going_down_tells_everyone_and_lets_nobody_in(front: Desk) -> None:
+    """With the code that says: again in a moment."""
+    principal, _ = await front.logged_in()
+    ends = [await front.opens(principal) for _ in range(3)]
+    front.desk.say_goodbye("the relay is going down")
+    assert not front.desk.accepting
+    assert {client.closed for _, client in ends} == {(closing.GOING_AWAY, "the relay is going down")}
+    assert not list(front.desk)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_cookie_names_its_user_only_with_the_relays_own_origin(front: Desk) -> None:
+    """Among other cookies; without one of ours a page of our own is told to log in again."""
+    principal, token = await front.logged_in()
+    header, own = f"other=1; sb={token}", f"http://{HOST}"
+    assert await front.desk.cookie(header, own, HOST) == principal
+    for origin in (None, "null", "http://evil.example"):
+        with pytest.raises(Refused):
+            await front.desk.cookie(header, origin, HOST)
+    for header in ("", "other=1", "sbx=1", ";;;=", "sb"):
+        assert await front.desk.cookie(header, None, HOST) is None
+        assert await front.desk.cookie(header, "http://evil.example", HOST) is None
+    with pytest.raises(BadCredentials, match="session has ended"):
+        await front.desk.cookie("", own, HOST)
+    with pytest.raises(BadCredentials):
+        await front.desk.cookie("sb=forged", own, HOST)
+
+
+@pytest_twisted.ensureDeferred
+async def test_health_is_whether_the_database_answers(front: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that nobody gets through to is not well, and is again afterwards."""
+    assert await front.desk.healthy()
+    with monkeypatch.context() as patch:
+        patch.setattr(front.store._readers, "_most", 0)
+        assert not await front.desk.healthy()
+    assert await front.desk.healthy()
