@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -99,6 +100,8 @@ class RosSource:
         self._ignore = ignore
         self._generation = 0
         self._subscription: Any = None
+        self._former: Any = None
+        self._passed_on: deque[bytes] = deque(maxlen=ros2_qos.DEPTH)
         self._match = self._look()
         self._build()
 
@@ -132,6 +135,7 @@ class RosSource:
         self._on_sample = None
         self._generation += 1
         self._node.destroy_subscription(self._subscription)
+        self._retire()
         self._on_close(self)
 
     def _look(self) -> ros2_qos.Match:
@@ -144,23 +148,46 @@ class RosSource:
     def _build(self) -> None:
         self._generation += 1
         generation = self._generation
-        old = self._subscription
         profile = ros2_qos.for_subscription(self._match, self._asked)
         put = self._hop.put
 
         def arrived(body: bytes) -> None:
             put(lambda sample: self._deliver(generation, sample), body, len(body))
 
+        self._retire()
+        self._passed_on.clear()
+        self._former = self._subscription
         self._subscription = self._node.create_subscription(
             self._class, self._topic, arrived, profile, raw=True
         )
-        if old is not None:
-            self._node.destroy_subscription(old)
+
+    def _retire(self) -> None:
+        former, self._former = self._former, None
+        if former is not None:
+            self._node.destroy_subscription(former)
 
     def _deliver(self, generation: int, body: bytes) -> None:
-        # What an older subscription still had in flight would come twice.
-        if generation == self._generation and self._on_sample is not None:
-            self._on_sample(body)
+        if self._on_sample is None:
+            return
+        # Finding the publishers takes a new subscription a while: until it hears something the former one counts.
+        if generation == self._generation:
+            self._retire()
+            if self._repeats(body):
+                return
+        elif self._former is None or generation != self._generation - 1:
+            return
+        else:
+            self._passed_on.append(body)
+        self._on_sample(body)
+
+    def _repeats(self, body: bytes) -> bool:
+        """Whether the former subscription has passed this sample on already; then also what came before it."""
+        if body not in self._passed_on:
+            self._passed_on.clear()
+            return False
+        while self._passed_on.popleft() != body:
+            pass
+        return True
 
 
 class RosSink:

@@ -74,6 +74,23 @@ def run(world: Any) -> Iterator[Run]:
         publisher.stop()
 
 
+def test_who_was_there_before_the_publisher_loses_nothing(world: Any) -> None:
+    """The robot's subscription changes to what the new publisher offers without a gap and without a repetition."""
+    counter = Counter(
+        world.relay.connect("rover", world.viewer), dict.fromkeys(("small", "big", "unsure", "burst"), 0)
+    )
+    publisher = Publisher(world.robot, 2.0, RATE)
+    try:
+        sent = publisher.sent()
+        for name in ("small", "big"):
+            wait_for(f"the last of {name} comes", lambda name=name: counter.last(name) == sent[name] - 1)
+            assert counter.lost(name) == []
+            assert counter.in_order(name)
+    finally:
+        counter.stop()
+        publisher.stop()
+
+
 def latched_of(client: Client) -> str:
     """What a late joiner gets of the latched topic."""
     client.send(op="subscribe", topic="/load/latched", type=STRING)
