@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, TimeoutError
 from twisted.internet.error import CannotListenError
 from twisted.logger import Logger
 from twisted.python.failure import Failure
@@ -28,8 +29,13 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
     :returns: exit code; 1 when it could not start, said on stderr in words
     """
     reactor = monotonic_reactor()
-    relay = Relay(reactor, settings)
+    try:
+        relay = Relay(reactor, settings)
+    except SwitchboardError as error:
+        sys.stderr.write(f"switchboard: {error}\n")
+        return 1
     failed: list[int] = []
+    stuck: list[str] = []
 
     async def begin() -> None:
         await relay.start()
@@ -40,10 +46,13 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
         failed.append(1)
         reactor.stop()
 
+    def unfinished(failure: Failure) -> None:
+        timed_out = failure.check(TimeoutError)
+        stuck.append(f"no answer within {STOP_SECONDS:g} s" if timed_out else failure.getErrorMessage())
+
     def stopping() -> Deferred[Any]:
-        done = Deferred.fromCoroutine(relay.stop())
-        done.addErrback(lambda failure: log.failure("stopping failed", failure))
-        return done.addTimeout(STOP_SECONDS, reactor).addErrback(lambda _: None)
+        done = Deferred.fromCoroutine(relay.stop()).addTimeout(STOP_SECONDS, reactor)
+        return done.addErrback(unfinished)
 
     def start() -> None:
         Deferred.fromCoroutine(begin()).addErrback(wrong)
@@ -52,7 +61,13 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
     reactor.addSystemEventTrigger("before", "shutdown", stopping)
     signal.signal(signal.SIGHUP, lambda *_: reactor.callFromThread(relay.reload_tls))
     reactor.run()
-    return failed[0] if failed else 0
+    code = failed[0] if failed else 0
+    if stuck:
+        # Threads that wait for a database that hangs would keep the process for as long as it does.
+        log.error("leaving with the database unfinished: {reason}", reason=stuck[0])
+        sys.stdout.flush()
+        os._exit(code)
+    return code
 
 
 def monotonic_reactor() -> Any:

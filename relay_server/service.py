@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import secrets
+import threading
 import time
 from typing import Any
 
@@ -36,6 +36,7 @@ from relay_server.edges.robot_roles import Opening, RobotHall
 from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
 from relay_server.edges.site import Portal, RelaySite, Robots, Root
 from relay_server.edges.websocket import ClientFactory
+from relay_server.folder import DataFolder
 from relay_server.frontdesk import FrontDesk
 from relay_server.journal import Journal
 from relay_server.metrics import RelayCollector, registry_of
@@ -61,6 +62,7 @@ class Relay:
     def __init__(self, reactor: Any, settings: Settings) -> None:
         self._reactor = reactor
         self.settings = settings
+        self._folder = DataFolder(settings.data)
         self._database = Database(settings.database)
         self._store = Store(reactor, self._database)
         self._tls = (
@@ -95,7 +97,7 @@ class Relay:
         self._store.start()
         self._auth.start()
         self._revision = await self._store.read(queries.revision)
-        name = self._relay_name()
+        name = self.settings.name or self._folder.relay_name()
         http = await self._listen(self.settings.http, self._site(name))
         self.http_port = http.getHost().port
         hall = RobotHall(
@@ -162,22 +164,9 @@ class Relay:
         admin = AdminSocket(self.status, self.refresh)
         site = Site(admin.app.resource(), reactor=self._reactor)
         site.log = lambda request: None
-        endpoint = UNIXServerEndpoint(self._reactor, str(self.settings.socket_path), mode=0o600, wantPID=True)
+        self._folder.clear_socket(self.settings.socket_path)
+        endpoint = UNIXServerEndpoint(self._reactor, str(self.settings.socket_path), mode=0o600)
         self._ports.append(await endpoint.listen(site))
-
-    def _relay_name(self) -> str:
-        """What robots sign for: given, or made up once and kept beside the database."""
-        if self.settings.name:
-            return self.settings.name
-        path = self.settings.data / "relay.name"
-        try:
-            return path.read_text().strip()
-        except FileNotFoundError:
-            name = f"relay-{secrets.token_hex(8)}"
-            path.write_text(name + "\n")
-            return name
-        except OSError as error:
-            raise Invalid(f"the relay's name can't be read from {path.name}: {error.strerror}") from None
 
     async def first_login(self) -> str | None:
         """A one-time login link for the administrator of a relay nobody can log in to yet."""
@@ -292,9 +281,20 @@ class Relay:
         try:
             await self._say_goodbye()
         finally:
-            # Threads left running would keep the process from ending.
+            await self._finish_threads()
+            self._folder.release()
+
+    async def _finish_threads(self) -> None:
+        """Let what is being written be written; waiting for a database that hangs must not block the reactor."""
+
+        def finish() -> None:
             self._auth.stop()
             self._store.stop()
+            self._reactor.callFromThread(done.callback, None)
+
+        done: Deferred[None] = Deferred()
+        threading.Thread(target=finish, name="finish", daemon=True).start()
+        await done
 
     async def _say_goodbye(self) -> None:
         if self._desk is not None:

@@ -1,0 +1,56 @@
+"""The data folder belongs to one relay at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import secrets
+from pathlib import Path
+
+from relay_protocol.errors import Invalid, Unavailable
+
+
+class DataFolder:
+    """The folder of one running relay: its lock, its name, its local socket.
+
+    The kernel keeps the lock, so it ends with the process however that ends; a file with a process id in it would
+    outlive a power cut and then name somebody else's process.
+
+    :raises Unavailable: another relay runs on this folder
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = os.open(path / "relay.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            raise Unavailable(
+                "another relay runs on this data folder; stop it first, or give --data"
+            ) from None
+
+    def clear_socket(self, socket: Path) -> None:
+        """Take away a socket that a killed relay left behind; only the holder of the lock can have one."""
+        with contextlib.suppress(FileNotFoundError):
+            socket.unlink()
+
+    def relay_name(self) -> str:
+        """What robots sign for, made up once.
+
+        :raises Invalid: it can't be read
+        """
+        path = self.path / "relay.name"
+        try:
+            return path.read_text().strip()
+        except FileNotFoundError:
+            name = f"relay-{secrets.token_hex(8)}"
+            path.write_text(name + "\n")
+            return name
+        except OSError as error:
+            raise Invalid(f"the relay's name can't be read from {path.name}: {error.strerror}") from None
+
+    def release(self) -> None:
+        """Let another relay have the folder."""
+        os.close(self._lock)
