@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
-from switchboard_harness import Relay, Robot
+from switchboard_harness import Client, Relay, Robot, wait_for
 
 
 @dataclass
@@ -20,6 +20,11 @@ class World:
     stranger: str
 
 
+def topics_of(client: Client) -> set[str]:
+    """The topics a client sees."""
+    return set(client.call("/rosapi/topics")["values"]["topics"])
+
+
 @pytest.fixture(scope="session")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """The world most end-to-end tests share."""
@@ -30,6 +35,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             operator, viewer, stranger = (relay.user(name) for name in ("operator", "viewer", "stranger"))
             relay.cli("right", "grant", "operator", "rover", "operator")
             relay.cli("right", "grant", "viewer", "rover", "viewer")
+            with relay.connect("rover", viewer) as client:
+                # It is online before it has found out all of its own graph.
+                wait_for("its graph is known", lambda: {"/odom", "/scan", "/cmd_vel"} <= topics_of(client))
             yield World(relay, robot, operator, viewer, stranger)
         finally:
             robot.stop()
