@@ -1,0 +1,31 @@
+"""A token bucket: so many at once, so many a second after that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+
+class TokenBucket:
+    """Allows bursts, bounds the rate in the long run.
+
+    :param rate: tokens a second
+    :param burst: tokens it holds at most
+    :param seconds: a monotonic clock
+    """
+
+    def __init__(self, rate: float, burst: float, seconds: Callable[[], float]) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._seconds = seconds
+        self._tokens = burst
+        self._at = seconds()
+
+    def take(self) -> bool:
+        """Whether one more may pass now; if so it is counted."""
+        now = self._seconds()
+        self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate)
+        self._at = now
+        if self._tokens < 1:
+            return False
+        self._tokens -= 1
+        return True
