@@ -1,7 +1,9 @@
-"""How far the relay's monotonic clock is from ours, from pings on one link.
+"""How far the relay's monotonic clock may be from ours, from pings on one link.
 
-The estimate of Cristian (1989): of an exchange with the round trip ``r``, the true offset lies within ``r/2``
-of the one computed from its middle. So the exchange with the smallest round trip is the best.
+The relay read its clock (``at``) no earlier than we asked and no later than its answer came, so the true offset
+lies between ``at - received`` and ``at - sent`` of every exchange, however unequal the two ways were. A command
+stamped ``stamp`` is ``now + offset - stamp`` old, so its age is at most ``now - stamp`` plus the least of the
+window's ``at - sent``, each widened by what two clocks can have drifted apart since.
 """
 
 from __future__ import annotations
@@ -10,15 +12,26 @@ from collections import deque
 from typing import NamedTuple
 
 WINDOW = 16
-_CONTRADICTION_NS = 1_000_000
-"""Clocks drift by microseconds in the seconds of a window; more than this is a clock that was stopped."""
+"""Exchanges kept: some 16 s at one a second."""
+
+DRIFT = 1000
+"""Two clocks drift apart by at most one part in this many: each may be slewed by 500 ppm (adjtimex)."""
 
 
 class Exchange(NamedTuple):
-    """One ping and its pong; nanoseconds."""
+    """One ping and its pong; nanoseconds, ``at`` on the relay's clock, the others on our own."""
 
-    offset: int
-    round_trip: int
+    sent: int
+    at: int
+    received: int
+
+    def most(self, now: int) -> int:
+        """The largest offset that is possible."""
+        return self.at - self.sent + (now - self.sent) // DRIFT + 1
+
+    def least(self, now: int) -> int:
+        """The smallest offset that is possible."""
+        return self.at - self.received - (now - self.sent) // DRIFT - 1
 
 
 class Offset:
@@ -26,7 +39,6 @@ class Offset:
 
     def __init__(self) -> None:
         self._window: deque[Exchange] = deque(maxlen=WINDOW)
-        self._best: Exchange | None = None
 
     def add(self, sent: int, at: int, now: int) -> None:
         """Take one exchange.
@@ -37,33 +49,31 @@ class Offset:
         """
         if now < sent:
             return
-        exchange = Exchange(at - (sent + now) // 2, now - sent)
-        if self._best is not None and _contradict(self._best, exchange):
+        exchange = Exchange(sent, at, now)
+        if any(_contradict(each, exchange, now) for each in self._window):
             self._window.clear()
         self._window.append(exchange)
-        self._best = min(self._window, key=lambda each: each.round_trip)
 
     @property
     def known(self) -> bool:
         """Whether there was any exchange."""
-        return self._best is not None
-
-    @property
-    def error(self) -> int:
-        """Most the offset can be wrong by, nanoseconds."""
-        return self._best.round_trip // 2 if self._best else 0
+        return bool(self._window)
 
     @property
     def round_trip(self) -> int | None:
         """Latest round trip, nanoseconds."""
-        return self._window[-1].round_trip if self._window else None
+        return self._window[-1].received - self._window[-1].sent if self._window else None
 
-    def age(self, stamp: int, now: int) -> int:
-        """How long ago the relay's clock showed ``stamp``, nanoseconds; negative when it has yet to."""
-        return now + (self._best.offset if self._best else 0) - stamp
+    def oldest(self, stamp: int, now: int) -> int | None:
+        """How long ago the relay's clock showed ``stamp``, at most, nanoseconds.
+
+        Negative when it surely has yet to show it; ``None`` while there was no exchange.
+        """
+        if not self._window:
+            return None
+        return now + min(each.most(now) for each in self._window) - stamp
 
 
-def _contradict(one: Exchange, other: Exchange) -> bool:
+def _contradict(one: Exchange, other: Exchange, now: int) -> bool:
     """Whether no true offset fits both exchanges: a machine was suspended, or the relay is another one."""
-    room = one.round_trip // 2 + other.round_trip // 2 + _CONTRADICTION_NS
-    return abs(one.offset - other.offset) > room
+    return one.most(now) < other.least(now) or other.most(now) < one.least(now)

@@ -16,9 +16,6 @@ DAEMON_SHARE = 0.8
 GUARD_SHARE = 0.9
 """Shares of ``stop_within_ms`` after which each watchdog acts; the rest is for scheduling and delivery."""
 
-_FUTURE_ROOM_NS = 50 * MILLI
-"""How far beyond the known error of the offset a stamp may lie ahead: two clocks drift between pings."""
-
 
 class Freshness(enum.Enum):
     """What the age of a command says about it."""
@@ -29,17 +26,15 @@ class Freshness(enum.Enum):
 
 
 def freshness(stamp: int, now: int, offset: Offset, deadline_ms: int) -> Freshness:
-    """Judge a command by its stamp.
+    """Judge a command by the greatest age it can have.
 
     :param stamp: the relay's monotonic clock, nanoseconds, see :class:`relay_protocol.frames.SampleFrame`
     :param now: own monotonic clock, nanoseconds
     """
-    age = offset.age(stamp, now)
-    if not offset.known or age > deadline_ms * MILLI:
+    oldest = offset.oldest(stamp, now)
+    if oldest is None or oldest > deadline_ms * MILLI:
         return Freshness.STALE
-    if age < -(offset.error + _FUTURE_ROOM_NS):
-        return Freshness.AHEAD
-    return Freshness.FRESH
+    return Freshness.AHEAD if oldest < 0 else Freshness.FRESH
 
 
 def is_motion(policy: MotionPolicy, topic: str, type: str) -> bool:

@@ -1,47 +1,97 @@
-"""The offset between two monotonic clocks."""
+"""The offset between two monotonic clocks, and the age of commands by it."""
 
 from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_client.offset import Offset
+from robot_client.offset import DRIFT, Offset
+from robot_client.safety import Freshness, freshness
 
 MS = 1_000_000
+SECOND = 1000 * MS
+DEADLINE_MS = 500
+DRIFT_PPM = 1_000_000 // DRIFT
+
+delays = st.one_of(st.integers(0, 5 * MS), st.integers(0, 400 * MS), st.integers(0, 3 * SECOND))
+"""One way through a network: mostly quick, at times slow, at times stalled."""
+
+
+def age_at_most(offset: Offset, stamp: int, now: int) -> int:
+    """The bound, where there is one."""
+    found = offset.oldest(stamp, now)
+    assert found is not None
+    return found
 
 
 @given(
-    st.integers(-(10**15), 10**15),
-    st.lists(st.tuples(st.integers(0, 400 * MS), st.integers(0, 400 * MS)), min_size=1, max_size=30),
+    true=st.integers(-(10**15), 10**15),
+    drift=st.integers(-DRIFT_PPM, DRIFT_PPM),
+    exchanges=st.lists(st.tuples(delays, delays), min_size=1, max_size=40),
+    since=st.integers(0, 3 * SECOND),
+    over=st.one_of(st.integers(1, 10), st.integers(1, 3 * SECOND)),
 )
-def test_error_holds_the_true_offset(true: int, exchanges: list[tuple[int, int]]) -> None:
-    """However unequal the two ways are, the true offset lies within the stated error."""
+def test_no_command_older_than_the_deadline_is_ever_fresh(
+    true: int, drift: int, exchanges: list[tuple[int, int]], since: int, over: int
+) -> None:
+    """However long, unequal and stalled the ways of pings and commands are, and while the clocks drift apart."""
+    start = 10**15
+
+    def relay(own: int) -> int:
+        return own + true + (own - start) * drift // 1_000_000
+
+    offset = Offset()
+    now = start
+    for there, back in exchanges:
+        offset.add(now, relay(now + there), now + there + back)
+        now += there + back + SECOND
+    now += since
+    assert freshness(relay(now) - DEADLINE_MS * MS - over, now, offset, DEADLINE_MS) is not Freshness.FRESH
+
+
+@given(st.integers(-(10**15), 10**15), st.integers(1, 60), st.integers(0, (DEADLINE_MS - 50) * MS))
+def test_on_an_even_link_commands_in_time_pass(true: int, count: int, age: int) -> None:
+    """With 25 ms each way, whatever is younger than the deadline by a round trip is executed."""
     offset = Offset()
     now = 10**15
-    for there, back in exchanges:
-        offset.add(now, now + there + true, now + there + back)
-        now += there + back + 1000 * MS
-    found = -offset.age(0, 0) * -1
-    assert abs(found - true) <= offset.error + 1
+    for _ in range(count):
+        offset.add(now, now + 25 * MS + true, now + 50 * MS)
+        now += SECOND
+    assert freshness(now + true - age, now, offset, DEADLINE_MS) is Freshness.FRESH
 
 
-def test_smallest_round_trip_wins() -> None:
-    """One quick exchange among slow ones decides."""
+def test_way_back_that_stalls_makes_no_old_command_young() -> None:
+    """400 ms from relay to robot and none the other way: a command 690 ms old is not taken for one of 490 ms."""
     offset = Offset()
-    offset.add(0, 1000 * MS + 90 * MS, 100 * MS)
-    offset.add(200 * MS, 1200 * MS + 1 * MS, 202 * MS)
-    offset.add(300 * MS, 1300 * MS + 5 * MS, 400 * MS)
-    assert offset.error == 1 * MS
-    assert offset.age(1000 * MS, 0) == 0
+    for second in range(16):
+        offset.add(second * SECOND, second * SECOND, second * SECOND + 400 * MS)
+    now = 16 * SECOND
+    assert freshness(now - 690 * MS, now, offset, DEADLINE_MS) is Freshness.STALE
+
+
+def test_stalled_join_makes_no_old_command_young() -> None:
+    """An answer to the joining that lay about for a second leaves the age of what lay behind it as it is."""
+    offset = Offset()
+    offset.add(0, 0, SECOND)
+    assert freshness(10 * MS, SECOND, offset, DEADLINE_MS) is Freshness.STALE
+
+
+def test_the_tightest_exchange_counts() -> None:
+    """One quick way to the relay among slow ones decides."""
+    offset = Offset()
+    offset.add(0, 1090 * MS, 100 * MS)
+    offset.add(200 * MS, 1201 * MS, 202 * MS)
+    offset.add(300 * MS, 1385 * MS, 400 * MS)
+    assert 1 * MS <= age_at_most(offset, 1400 * MS, 400 * MS) < 2 * MS
 
 
 def test_stopped_clock_is_noticed() -> None:
     """After a suspend of ten seconds, which stops one clock only, the first exchange replaces all before it."""
     offset = Offset()
     for second in range(16):
-        offset.add(second * 1000 * MS, second * 1000 * MS, second * 1000 * MS + MS)
-    offset.add(20_000 * MS, 30_000 * MS, 20_010 * MS)
-    assert abs(offset.age(30_000 * MS, 20_000 * MS)) <= 5 * MS
+        offset.add(second * SECOND, second * SECOND, second * SECOND + MS)
+    offset.add(20 * SECOND, 30 * SECOND, 20 * SECOND + 10 * MS)
+    assert 0 <= age_at_most(offset, 30 * SECOND, 20 * SECOND) <= 10 * MS
 
 
 def test_pong_from_the_future_is_passed_over() -> None:
@@ -49,3 +99,4 @@ def test_pong_from_the_future_is_passed_over() -> None:
     offset = Offset()
     offset.add(500, 0, 400)
     assert not offset.known
+    assert offset.oldest(0, 400) is None
