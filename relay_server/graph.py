@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TypeVar
+
 from relay_protocol import limits
+from relay_protocol.errors import MalformedMessage
 from relay_protocol.link import Graph, Service, Topic
 
 NAMES = 20_000
 """Most topics, services, actions and nodes, each, that are kept of one robot; further ones are passed over."""
+
+_NODE = 100
+_ENTRY = 300
+_STRING = 56
+"""What a node, an entry and a string take in memory, bytes, beside the characters."""
+
+Entry = TypeVar("Entry", Topic, Service)
 
 
 class GraphMirror:
@@ -17,26 +28,46 @@ class GraphMirror:
         self.services: dict[str, Service] = {}
         self.actions: dict[str, Service] = {}
         self.nodes: set[str] = set()
+        self._bytes = 0
 
     def apply(self, graph: Graph) -> None:
-        """Take a full graph or a difference (SPEC section 2.3)."""
+        """Take a full graph or a difference (SPEC section 2.4).
+
+        :raises MalformedMessage: the whole would take more memory than one robot gets
+        """
         if graph.full:
             self.clear()
-        for target, changes in (
-            (self.topics, graph.topics),
-            (self.services, graph.services),
-            (self.actions, graph.actions),
-        ):
-            for name, value in changes.items():
-                if value is None:
-                    target.pop(name, None)
-                elif name in target or (len(target) < NAMES and len(name) <= limits.NAME):
-                    target[name] = value  # type: ignore[assignment]
+        self._take(self.topics, graph.topics)
+        self._take(self.services, graph.services)
+        self._take(self.actions, graph.actions)
         for name, node in graph.nodes.items():
             if node is None:
-                self.nodes.discard(name)
-            elif len(self.nodes) < NAMES and len(name) <= limits.NAME:
+                if name in self.nodes:
+                    self.nodes.discard(name)
+                    self._count(-_size(name))
+            elif name not in self.nodes and len(self.nodes) < NAMES:
+                self._count(_size(name))
                 self.nodes.add(name)
+
+    def _take(self, target: dict[str, Entry], changes: Mapping[str, Entry | None]) -> None:
+        for name, value in changes.items():
+            former = target.get(name)
+            if value is not None and (former is not None or len(target) < NAMES):
+                self._count(_size(name, value))
+                target[name] = value
+            elif value is None:
+                target.pop(name, None)
+            if former is not None:
+                self._count(-_size(name, former))
+
+    def _count(self, size: int) -> None:
+        self._bytes += size
+        if self._bytes > limits.GRAPH_BYTES:
+            self.clear()
+            raise MalformedMessage(
+                f"the robot's graph takes more than {limits.GRAPH_BYTES // limits.MIB} MiB here; "
+                "run its nodes in domains of their own"
+            )
 
     def clear(self) -> None:
         """Nothing is known any more."""
@@ -44,6 +75,7 @@ class GraphMirror:
         self.services.clear()
         self.actions.clear()
         self.nodes.clear()
+        self._bytes = 0
 
     def topic_type(self, name: str) -> str | None:
         """The type of a topic, ``None`` when it does not exist."""
@@ -54,3 +86,15 @@ class GraphMirror:
         """The type of a service, ``None`` when it does not exist."""
         service = self.services.get(name)
         return service.types[0] if service and service.types else None
+
+
+def _size(name: str, entry: Topic | Service | None = None) -> int:
+    """About what a name and its entry, or a node, take in memory, bytes."""
+    if entry is None:
+        return _NODE + _STRING + len(name.encode())
+    lists = (
+        (entry.types, entry.publishers, entry.subscribers)
+        if isinstance(entry, Topic)
+        else (entry.types, entry.providers)
+    )
+    return _ENTRY + sum(_STRING + len(text.encode()) for each in ([name], *lists) for text in each)

@@ -21,6 +21,7 @@ from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
 from robot_client.channel import Channel, Wire
 from robot_client.config import Settings
 from robot_client.connection import Connection, Dial
+from robot_client.graph_parts import parts
 from robot_client.link import ChannelLink, Ended, Event, JoinedChannel, Said, Sampled
 from robot_client.monitor import Machine
 from robot_client.motion import GuardFeed, MotionDesk
@@ -150,7 +151,7 @@ class Daemon:
         self._frame_limit = welcome.frame_limit
         self._connection.say(self._description())
         self._told = self._platform.graph()
-        self._connection.say(whole(self._told))
+        self._tell_graph(whole(self._told))
         self._tell_health()
         while self._alerts:
             self._connection.say(self._alerts.popleft())
@@ -264,7 +265,11 @@ class Daemon:
         changes = difference(self._told, view)
         self._told = view
         if changes is not None:
-            self._connection.say(changes)
+            self._tell_graph(changes)
+
+    def _tell_graph(self, graph: link.Graph) -> None:
+        for part in parts(graph):
+            self._connection.say(part)
 
     def _look_for_trouble(self) -> None:
         trouble = self._platform.trouble()

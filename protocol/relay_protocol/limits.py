@@ -10,7 +10,31 @@ HANDSHAKE_FRAME = 16 * KIB
 """Largest frame on a robot link that has not proved who it is."""
 
 ROBOT_FRAME = 16 * MIB
-"""Largest frame a proven robot may send (a point cloud or a raw picture)."""
+"""Largest frame a proven robot may send on a channel link (a point cloud or a raw picture)."""
+
+CONTROL_FRAME = 1 * MIB
+"""Largest frame a robot may send on its control link."""
+
+JSON_BODY = 1 * MIB
+"""Largest JSON text taken from a robot: a sample in JSON, the JSON values of an answer."""
+
+GRAPH_BYTES = 8 * MIB
+"""Memory the relay spends on the mirror of one robot's graph."""
+
+GRAPH_ENDS = 1024
+"""Most types of a topic or service, and most nodes at each of its ends."""
+
+TYPE_TEXTS = 16 * MIB
+"""Most characters of type definitions taken from one robot."""
+
+LABEL = 255
+"""Longest fact a robot tells of itself (host, agent, …), in characters."""
+
+FACTS = 64
+"""Most further facts (``extra``), and most names in each list of what a robot counts as motion."""
+
+WORDS = 4096
+"""Longest sentence for people that comes over a robot link, in characters; longer ones are cut."""
 
 COMMAND_FRAME = 4 * MIB
 """Largest frame the relay sends to a robot."""

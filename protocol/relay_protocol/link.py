@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import base64
 import binascii
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 
-from relay_protocol import frames, jsontext
+from relay_protocol import frames, jsontext, limits
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
+
+Name = Annotated[str, Meta(max_length=limits.NAME)]
+Label = Annotated[str, Meta(max_length=limits.LABEL)]
+Ends = Annotated[list[Name], Meta(max_length=limits.GRAPH_ENDS)]
+Few = Annotated[list[Name], Meta(max_length=limits.FACTS)]
 
 
 def lower_tag(name: str) -> str:
@@ -25,6 +31,13 @@ def lower_tag(name: str) -> str:
 
 class Message(msgspec.Struct, tag_field="op", tag=lower_tag, omit_defaults=True, frozen=True):
     """Base of everything with an ``op``."""
+
+
+def _cut(message: Message, field: str) -> None:
+    """Words for people are cut, on either end: they are no reason to lose a link."""
+    text = getattr(message, field)
+    if len(text) > limits.WORDS:
+        msgspec.structs.force_setattr(message, field, text[: limits.WORDS - 1] + "…")
 
 
 # --- before the robot is known ---
@@ -39,10 +52,10 @@ class Hello(Message, frozen=True, kw_only=True):
     """
 
     version: int
-    robot: str
-    key: str
-    encodings: list[str]
-    agent: str = ""
+    robot: Label
+    key: Label
+    encodings: Few
+    agent: Label = ""
 
 
 class Challenge(Message, frozen=True, kw_only=True):
@@ -55,17 +68,17 @@ class Challenge(Message, frozen=True, kw_only=True):
 class Prove(Message, frozen=True, kw_only=True):
     """Robot: the Ed25519 signature (base64) of :func:`relay_protocol.identity.proof_text`."""
 
-    signature: str
+    signature: Label
 
 
 class Enroll(Message, frozen=True, kw_only=True):
     """Robot: register my public key (32 bytes, base64) by this code of one use."""
 
     version: int
-    robot: str
-    code: str
-    public_key: str
-    agent: str = ""
+    robot: Label
+    code: Label
+    public_key: Label
+    agent: Label = ""
 
 
 class Enrolled(Message, frozen=True, kw_only=True):
@@ -79,7 +92,7 @@ class Join(Message, frozen=True, kw_only=True):
     """Robot, on a new connection: this is the channel you asked me to open."""
 
     version: int
-    ticket: str
+    ticket: Label
 
 
 class Joined(Message, frozen=True, kw_only=True):
@@ -105,7 +118,7 @@ class Welcome(Message, frozen=True, kw_only=True):
 
     :param session: name of this registration, for logs on both ends
     :param heartbeat: seconds between pings, each way
-    :param frame_limit: largest frame the robot may send from now on, bytes
+    :param frame_limit: largest frame the robot may send on its channel links, bytes
     """
 
     session: str
@@ -134,6 +147,9 @@ class Bye(Message, frozen=True, kw_only=True):
 
     reason: str
 
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
+
 
 # --- control link, robot to relay ---
 
@@ -147,8 +163,8 @@ class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     :param stop_within_ms: the robot stands still this long after the last valid command
     """
 
-    types: list[str] = msgspec.field(default_factory=list)
-    topics: list[str] = msgspec.field(default_factory=list)
+    types: Few = msgspec.field(default_factory=list)
+    topics: Few = msgspec.field(default_factory=list)
     deadline_ms: int = COMMAND_DEADLINE_MS
     stop_within_ms: int = STOP_WITHIN_MS
 
@@ -162,29 +178,29 @@ class Describe(Message, frozen=True, kw_only=True):
     :param extra: anything else worth showing, text by text
     """
 
-    host: str = ""
-    platform: str = ""
-    distro: str = ""
-    os: str = ""
-    agent: str = ""
+    host: Label = ""
+    platform: Label = ""
+    distro: Label = ""
+    os: Label = ""
+    agent: Label = ""
     started: float = 0.0
     motion: MotionPolicy = msgspec.field(default_factory=MotionPolicy)
-    extra: dict[str, str] = msgspec.field(default_factory=dict)
+    extra: Annotated[dict[Label, Label], Meta(max_length=limits.FACTS)] = msgspec.field(default_factory=dict)
 
 
 class Topic(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One topic of the graph: its types (usually one) and the full names of the nodes at its ends."""
 
-    types: list[str]
-    publishers: list[str] = msgspec.field(default_factory=list)
-    subscribers: list[str] = msgspec.field(default_factory=list)
+    types: Ends
+    publishers: Ends = msgspec.field(default_factory=list)
+    subscribers: Ends = msgspec.field(default_factory=list)
 
 
 class Service(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One service (or action) of the graph and the nodes that provide it."""
 
-    types: list[str]
-    providers: list[str] = msgspec.field(default_factory=list)
+    types: Ends
+    providers: Ends = msgspec.field(default_factory=list)
 
 
 class Graph(Message, frozen=True, kw_only=True):
@@ -195,10 +211,10 @@ class Graph(Message, frozen=True, kw_only=True):
     """
 
     full: bool = False
-    topics: dict[str, Topic | None] = msgspec.field(default_factory=dict)
-    services: dict[str, Service | None] = msgspec.field(default_factory=dict)
-    actions: dict[str, Service | None] = msgspec.field(default_factory=dict)
-    nodes: dict[str, dict[str, Any] | None] = msgspec.field(default_factory=dict)
+    topics: dict[Name, Topic | None] = msgspec.field(default_factory=dict)
+    services: dict[Name, Service | None] = msgspec.field(default_factory=dict)
+    actions: dict[Name, Service | None] = msgspec.field(default_factory=dict)
+    nodes: dict[Name, dict[str, Any] | None] = msgspec.field(default_factory=dict)
 
 
 class Health(Message, frozen=True, kw_only=True):
@@ -227,8 +243,11 @@ class Health(Message, frozen=True, kw_only=True):
 class Alert(Message, frozen=True, kw_only=True):
     """Robot: something a person should know. ``level`` is ``info``, ``warning`` or ``error``."""
 
-    level: str
+    level: Label
     text: str
+
+    def __post_init__(self) -> None:
+        _cut(self, "text")
 
 
 # --- control link, relay to robot ---
@@ -334,9 +353,9 @@ class Subscribed(Message, frozen=True, kw_only=True):
     """
 
     number: int
-    topic: str
-    type: str
-    encoding: str
+    topic: Name
+    type: Name
+    encoding: Label
     latched: bool = False
     publishers: int = 0
 
@@ -348,28 +367,35 @@ class Advertised(Message, frozen=True, kw_only=True):
     """
 
     number: int
-    topic: str
-    type: str
-    encoding: str
+    topic: Name
+    type: Name
+    encoding: Label
     motion: bool = False
 
 
 class Failed(Message, frozen=True, kw_only=True):
     """Robot: a request could not be done. ``what`` is its ``op``, ``ref`` its number, id or type."""
 
-    what: str
+    what: Label
     ref: str
     reason: str
+
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
+        _cut(self, "ref")
 
 
 class ServiceResponse(Message, frozen=True, kw_only=True):
     """Robot: the answer to ``call_service``; ``reason`` when ``result`` is false."""
 
-    id: str
+    id: Label
     result: bool
     cdr: str | None = None
     values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
     reason: str = ""
+
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
 
 
 class TypeDefinition(Message, frozen=True, kw_only=True):
@@ -381,9 +407,9 @@ class TypeDefinition(Message, frozen=True, kw_only=True):
     :param hash: RIHS01 type hash where the distribution has one
     """
 
-    type: str
-    text: str
-    hash: str = ""
+    type: Name
+    text: Annotated[str, Meta(max_length=limits.TYPE_DEFINITION)]
+    hash: Label = ""
 
 
 Opening = Hello | Prove | Enroll | Join

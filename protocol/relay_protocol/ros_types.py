@@ -13,7 +13,7 @@ import orjson
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
-from relay_protocol.limits import COMMAND_FRAME, MIB
+from relay_protocol.limits import COMMAND_FRAME, MIB, TYPE_TEXTS
 from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
 from relay_protocol.ros.reader import ReaderFactory
 from relay_protocol.ros.typedefs import typedef
@@ -81,6 +81,7 @@ class TypeRegistry:
     def __init__(self) -> None:
         self._types: dict[str, _Compiled] = {}
         self._texts: dict[str, str] = {}
+        self._characters = 0
 
     def add(self, type_name: str, text: str) -> None:
         """Register a definition; the same again changes nothing, another one replaces the former.
@@ -94,8 +95,12 @@ class TypeRegistry:
             return
         if len(self._texts) >= _TYPES_OF_A_ROBOT and name not in self._texts:
             raise Invalid(f"{name}: this robot has sent {_TYPES_OF_A_ROBOT} types already")
+        characters = self._characters + len(text) - len(self._texts.get(name, ""))
+        if characters > TYPE_TEXTS:
+            raise Invalid(f"{name}: this robot has sent definitions of {TYPE_TEXTS // MIB} MiB already")
         compiled = _shared.compiled(name, text)
         self._texts[name] = text
+        self._characters = characters
         for part in parts_of(name):
             self._types[part] = compiled
         # What it contains is known too, unless the robot sent a text of its own for it.

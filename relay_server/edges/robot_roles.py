@@ -198,7 +198,7 @@ class Control:
         robot.encodings = tuple(self._hello.encodings)
         robot.address = connection.address
         connection.on_round_trip = self._round_trip
-        connection.proven(self, limits.ROBOT_FRAME)
+        connection.proven(self, limits.CONTROL_FRAME)
         hall.registry.registered(robot, connection)
         hall.journal.event("robot.online", "relay", robot_id=robot.robot_id, address=connection.address)
         self.log.info(
@@ -266,6 +266,10 @@ class ChannelEnd:
 
     def message(self, body: bytes) -> None:
         """An answer, or a definition."""
+        if len(body) > limits.JSON_BODY and body.count(b"{") + body.count(b"[") > 1:
+            raise MalformedMessage(
+                f"JSON of more than {limits.JSON_BODY} bytes is taken only with its bulk as base64 in 'cdr'"
+            )
         message = jsontext.decode(link.robot_channel_decoder, body)
         if isinstance(message, (link.Ping, link.Pong)):
             self._connection.heartbeat(message)

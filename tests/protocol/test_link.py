@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_protocol import frames, jsontext, link
+from relay_protocol import frames, jsontext, limits, link
 from relay_protocol.errors import Invalid, MalformedMessage
 
 DECODERS = {
@@ -26,6 +26,8 @@ TEXT = st.text(max_size=8)
 def values(kind: Any) -> st.SearchStrategy[Any]:
     """Values of one annotation."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return values(arguments[0])
     if origin in (typing.Union, types.UnionType):
         return st.one_of(*map(values, arguments))
     if origin is list:
@@ -48,7 +50,7 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
 
 def structs(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
     """Messages of one type with any fields."""
-    hints = typing.get_type_hints(kind)
+    hints = typing.get_type_hints(kind, include_extras=True)
     return st.fixed_dictionaries({name: values(hints[name]) for name in kind.__struct_fields__}).map(
         lambda fields: kind(**fields)
     )
@@ -132,3 +134,55 @@ def test_what_is_no_base64_is_refused_by_name(text: str) -> None:
     """The error names the field."""
     with pytest.raises(Invalid, match="nonce is not base64"):
         link.from_base64(text, "nonce")
+
+
+LONG = "x" * (limits.LABEL + 1)
+MANY = ["x"] * (limits.GRAPH_ENDS + 1)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"op": "describe", "host": LONG},
+        {"op": "describe", "extra": {LONG: ""}},
+        {"op": "describe", "extra": {"a": LONG}},
+        {"op": "describe", "extra": {str(number): "" for number in range(limits.FACTS + 1)}},
+        {"op": "describe", "motion": {"types": ["x"] * (limits.FACTS + 1)}},
+        {"op": "describe", "motion": {"topics": [LONG]}},
+        {"op": "graph", "topics": {LONG: {"types": []}}},
+        {"op": "graph", "topics": {"/a": {"types": [], "publishers": MANY}}},
+        {"op": "graph", "services": {"/a": {"types": [LONG]}}},
+        {"op": "graph", "nodes": {LONG: {}}},
+        {"op": "alert", "level": LONG, "text": ""},
+    ],
+    ids=lambda message: "-".join(message),
+)
+def test_what_a_robot_tells_of_itself_is_bounded(message: dict[str, Any]) -> None:
+    """No field is longer, no list has more than the contract says."""
+    with pytest.raises(MalformedMessage, match="length <="):
+        jsontext.decode(link.robot_control_decoder, jsontext.encode(message))
+
+
+def test_a_definition_is_bounded() -> None:
+    """A text over the limit is not taken."""
+    message = {"op": "type_definition", "type": "a/msg/B", "text": "#" * (limits.TYPE_DEFINITION + 1)}
+    with pytest.raises(MalformedMessage, match="length <="):
+        jsontext.decode(link.robot_channel_decoder, jsontext.encode(message))
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "fields"),
+    [
+        (link.Bye, "reason", {}),
+        (link.Alert, "text", {"level": "info"}),
+        (link.Failed, "reason", {"what": "subscribe", "ref": "1"}),
+        (link.ServiceResponse, "reason", {"id": "1", "result": False}),
+    ],
+)
+def test_words_for_people_are_cut(kind: Any, field: str, fields: dict[str, Any]) -> None:
+    """On the way out and on the way in: a long sentence costs nobody the link."""
+    long = "x" * (limits.WORDS + 1)
+    assert len(getattr(kind(**fields, **{field: long}), field)) == limits.WORDS
+    body = jsontext.encode({"op": link.lower_tag(kind.__name__), **fields, field: long})
+    decoder = link.robot_control_decoder if kind is link.Alert else link.robot_channel_decoder
+    assert getattr(jsontext.decode(decoder, body), field) == "x" * (limits.WORDS - 1) + "…"

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.limits import TYPE_DEFINITION
 from relay_protocol.ros_types import TypeRegistry
 
 LINE = "=" * 80
@@ -444,6 +445,19 @@ def test_the_number_of_types_is_bounded() -> None:
     with pytest.raises(Invalid, match="has sent 4096 types already"):
         types.add("a/msg/More", "int8 a")
     types.add("a/msg/T0", "int8 b")
+
+
+def test_the_texts_of_all_types_together_are_bounded() -> None:
+    """A robot can't fill the relay's memory with comments; a text that replaces another takes its place."""
+    types = TypeRegistry()
+    comment = "#" * (TYPE_DEFINITION - 10)
+    for number in range(64):
+        types.add(f"a/msg/T{number}", f"int8 a{comment}")
+    with pytest.raises(Invalid, match="has sent definitions of 16 MiB already"):
+        types.add("a/msg/More", f"int8 a{comment}")
+    types.add("a/msg/T0", f"int8 b{comment}")
+    types.add("a/msg/T0", "int8 b")
+    types.add("a/msg/More", f"int8 a{comment}")
 
 
 def test_typedefs_list_every_type_once() -> None:

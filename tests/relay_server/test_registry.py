@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from relay_protocol import link
+import pytest
+
+from relay_protocol import limits, link
+from relay_protocol.errors import MalformedMessage
 from relay_server import graph as graph_module
 from relay_server.graph import GraphMirror
 from relay_server.metrics import RelayCollector, registry_of
@@ -113,20 +116,31 @@ def test_a_graph_is_taken_whole_or_as_what_changed() -> None:
 
 
 def test_a_robot_can_not_fill_the_memory_with_names() -> None:
-    """More than the bound, and names longer than ROS has, are passed over; known names still change."""
+    """More than the bound are passed over; known names still change."""
     mirror = GraphMirror()
+    mirror.apply(link.Graph(topics={"/t0": link.Topic(types=["a/msg/A"])}))
     for first in range(0, graph_module.NAMES + 5000, 5000):
-        names = [f"/t{number}" for number in range(first, first + 5000)]
-        mirror.apply(
-            link.Graph(
-                topics={name: link.Topic(types=["a/msg/A"]) for name in names},
-                nodes={name: {} for name in names},
-            )
-        )
-    assert len(mirror.topics) == len(mirror.nodes) == graph_module.NAMES
+        mirror.apply(link.Graph(nodes={f"/n{number}": {} for number in range(first, first + 5000)}))
+    assert len(mirror.nodes) == graph_module.NAMES
     mirror.apply(link.Graph(topics={"/t0": link.Topic(types=[STRING])}))
     assert mirror.topic_type("/t0") == STRING
-    mirror.apply(link.Graph(full=True, topics={"/" + "x" * 255: link.Topic(types=[STRING])}))
+
+
+def _long_topic(letter: str) -> link.Topic:
+    names = [f"/{letter * 200}{number}" for number in range(limits.GRAPH_ENDS)]
+    return link.Topic(types=[STRING], publishers=names, subscribers=names)
+
+
+def test_a_graph_that_takes_too_much_memory_is_refused_in_words() -> None:
+    """Whether it comes at once or by and by; what is taken back or replaced counts no more."""
+    mirror = GraphMirror()
+    for letter in "abcdefgh" * 10:
+        mirror.apply(link.Graph(topics={"/same": _long_topic(letter)}))
+        mirror.apply(link.Graph(topics={"/gone": _long_topic(letter)}))
+        mirror.apply(link.Graph(topics={"/gone": None}, nodes={"/n": {}, "/m": None}))
+    with pytest.raises(MalformedMessage, match="graph takes more than 8 MiB"):
+        for number in range(20):
+            mirror.apply(link.Graph(topics={f"/t{number}": _long_topic("x")}))
     assert not mirror.topics
 
 

@@ -152,6 +152,15 @@ def test_graph_is_told_in_differences(scene: Scene) -> None:
     assert "full" not in told
 
 
+def test_a_graph_too_large_for_one_frame_is_told_in_several(scene: Scene) -> None:
+    """The relay takes at most 1 MiB at a time."""
+    scene.platform.view = GraphView(nodes=frozenset(f"/{'n' * 200}{number}" for number in range(8000)))
+    line = scene.register()
+    told = [each for each in line.heard() if each["op"] == "graph"]
+    assert [each.get("full", False) for each in told] == [True, False]
+    assert sum(len(each["nodes"]) for each in told) == 8000
+
+
 def test_lost_link_is_dialled_again_and_told_all(scene: Scene) -> None:
     """After a loss the robot is back within half a second, and tells the whole graph anew."""
     scene.register().lose()

@@ -7,7 +7,7 @@ import pytest_twisted
 
 from relay_db import queries
 from relay_protocol import identity, limits, link
-from relay_protocol.frames import encode_sample
+from relay_protocol.frames import encode_json, encode_sample
 from relay_server import passwords
 from relay_server.channel import State
 from tests.relay_server.edges.robot_ends import RELAY, Hall, Robot, until
@@ -149,6 +149,36 @@ async def test_a_ticket_that_is_not_good_opens_nothing(hall: Hall) -> None:
         end.breaks()
     assert hall.presence is not None
     assert hall.world.channels.of(hall.presence).state is State.OPEN
+
+
+@pytest.mark.parametrize(
+    ("body", "taken"),
+    [
+        (
+            b'{"op":"service_response","id":"1","result":true,"cdr":"' + b"AAAA" * limits.JSON_BODY + b'"}',
+            True,
+        ),
+        (
+            b'{"op":"service_response","id":"1","result":true,"values":['
+            + b"[]," * limits.JSON_BODY
+            + b"1]}",
+            False,
+        ),
+        (b'{"op":"ping","t":1,"x":[' + b"{}," * limits.JSON_BODY + b"1]}", False),
+    ],
+    ids=["cdr", "values", "ping"],
+)
+@pytest_twisted.ensureDeferred
+async def test_large_json_is_taken_only_for_its_cdr(hall: Hall, body: bytes, taken: bool) -> None:
+    """Millions of brackets would stall everyone; base64 does not."""
+    _, ticket = await asked_to_join(hall)
+    end = hall.dial()
+    end.says(link.Join(version=1, ticket=ticket))
+    end.hears()
+    end.sends(encode_json(body))
+    assert end.transport.connected is taken
+    if not taken:
+        assert "as base64 in 'cdr'" in end.refusal()["reason"]
 
 
 @pytest_twisted.ensureDeferred

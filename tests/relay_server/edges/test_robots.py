@@ -199,6 +199,31 @@ async def test_what_a_robot_tells_of_itself_is_kept(hall: Hall) -> None:
     assert (presence.description.host, presence.graph.nodes, presence.health.battery) == ("shed", {"/n"}, 0.5)
 
 
+@pytest.mark.parametrize("op", ["graph", "alert"])
+@pytest_twisted.ensureDeferred
+async def test_a_control_link_takes_no_large_frame(hall: Hall, op: str) -> None:
+    """What could stall the relay is refused by its length, before it is there."""
+    robot = hall.dial()
+    await robot.registers()
+    robot.sends((limits.CONTROL_FRAME + 1).to_bytes(4, "big") + b'\x00{"op":"' + op.encode())
+    assert robot.refusal()["code"] == "frame_too_large"
+    assert hall.presence is not None
+    assert hall.presence.control is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_graph_without_end_is_refused_in_words(hall: Hall) -> None:
+    """The robot is cut and what it told is forgotten."""
+    robot = hall.dial()
+    await robot.registers()
+    ends = ["/" + "n" * 200 + str(number) for number in range(limits.GRAPH_ENDS)]
+    for number in range(40):
+        robot.says(link.Graph(topics={f"/t{number}": link.Topic(types=["a/msg/B"], publishers=ends)}))
+    assert "graph takes more than 8 MiB" in robot.refusal()["reason"]
+    assert hall.presence is not None
+    assert not hall.presence.graph.topics
+
+
 @pytest_twisted.ensureDeferred
 async def test_a_silent_robot_is_cut_after_three_heartbeats(hall: Hall) -> None:
     """It is pinged meanwhile; one that answers stays, and its round trip is known."""
