@@ -16,11 +16,14 @@ from twisted.logger import Logger
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import PeerError, Refused, SwitchboardError, Unavailable
+from relay_protocol.limits import MIB
 from relay_protocol.rights import Level, Operation
 from relay_protocol.ros.definition import normalise
 from relay_server import closing
 from relay_server.access import Permit
+from relay_server.bucket import TokenBucket
 from relay_server.channel import Channel, resolve
+from relay_server.channel.publications import HELD_SECONDS
 from relay_server.channel.topics import Listener
 from relay_server.clock import Clock, looping
 from relay_server.freshness import Freshness
@@ -30,6 +33,13 @@ from relay_server.registry import Presence
 LEVELS = {"info": 0, "warning": 1, "error": 2, "none": 3}
 SUBSCRIPTIONS = 1024
 CALLS = 256
+CALL_BYTES = 2 * MIB
+"""Arguments of calls that wait, over all of them."""
+
+CHANGES_A_SECOND = 50.0
+CHANGES_AT_ONCE = 1000.0
+"""Subscriptions, advertisements and their ends one client may ask for; messages and calls are not counted."""
+
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
 
@@ -110,6 +120,8 @@ class Session:
         self._level = LEVELS["none"]
         self._listeners: dict[str, Listener] = {}
         self._calls: set[Deferred[None]] = set()
+        self._call_bytes = 0
+        self._changes = TokenBucket(CHANGES_A_SECOND, CHANGES_AT_ONCE, clock.seconds)
         self._malformed = 0
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
@@ -119,8 +131,13 @@ class Session:
         permit.on_revoke = self._revoked
 
     @property
+    def user(self) -> int:
+        """Whose it is."""
+        return self.permit.principal.user_id
+
+    @property
     def name(self) -> str:
-        """The user behind it."""
+        """The user's name."""
         return self.permit.principal.name
 
     @property
@@ -192,6 +209,8 @@ class Session:
             handler = _HANDLERS.get(type(operation))
             if handler is None:
                 raise Refused("services offered by clients are not carried to robots by this relay")
+            if type(operation) in _CHANGES and not self._changes.take():
+                raise Refused(f"too many changes at once; at most {CHANGES_A_SECOND:g} a second are followed")
             handler(self, operation)
         except SwitchboardError as error:
             self._refuse(operation, error)
@@ -307,6 +326,7 @@ class Session:
         if self.robot.control is None:
             raise Unavailable(f"robot {self.robot.name} is offline; the message was dropped")
         publication = self.channel.publications.get(self, topic, normal_type(ask.type))
+        good_for = HELD_SECONDS
         if self.robot.is_motion(topic, publication.type):
             age_ms = self._freshness.age() / 1e6
             deadline_ms = self.robot.description.motion.deadline_ms
@@ -319,11 +339,13 @@ class Session:
                     ask.id,
                 )
                 return
+            good_for = (deadline_ms - age_ms) / 1000
 
         def failed(reason: str) -> None:
             self.tell("error", reason, ask.id)
 
-        self.channel.publications.publish(publication, bytes(ask.msg), self._freshness.not_before, failed)
+        stamp = self._freshness.not_before
+        self.channel.publications.publish(self, publication, bytes(ask.msg), stamp, failed, good_for)
 
     # --- services -----------------------------------------------------------------------------------------
 
@@ -331,19 +353,30 @@ class Session:
         service = resolve(ask.service)
         if len(self._calls) >= CALLS:
             raise Refused(f"{CALLS} calls of this connection are waiting already")
+        raw = bytes(ask.args or b"")
+        size = len(raw)
+        if self._call_bytes + size > CALL_BYTES:
+            raise Refused(
+                "the arguments of the calls that wait already are too large together; wait for answers"
+            )
         local = self._local.service(service)
         if local is None:
             self._judge(Operation.CALL, service)
             answer: Awaitable[bytes] = self.channel.call(
-                service, normal_type(ask.type, "srv"), bytes(ask.args or b""), ask.timeout
+                service, normal_type(ask.type, "srv"), raw, ask.timeout
             )
         else:
-            args = jsontext.decode_any(bytes(ask.args)) if ask.args else {}
+            args = jsontext.decode_any(raw) if raw else {}
             answer = self._call_local(local, args)
         running = Deferred.fromCoroutine(self._finish(ask, answer))
         self._calls.add(running)
+        self._call_bytes += size
         running.addErrback(self._unexpected, ask)
-        running.addBoth(lambda _: self._calls.discard(running))
+        running.addBoth(self._call_ended, running, size)
+
+    def _call_ended(self, _: Any, running: Deferred[None], size: int) -> None:
+        self._calls.discard(running)
+        self._call_bytes -= size
 
     async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
         return jsontext.encode(await local(self, args))
@@ -415,6 +448,14 @@ def normal_type(name: str | None, kind: str = "msg") -> str:
     package, slash, rest = name.partition("/")
     return normalise(f"{package}/{kind}/{rest}" if slash and "/" not in rest else name)
 
+
+_CHANGES = {
+    rosbridge.Subscribe,
+    rosbridge.Unsubscribe,
+    rosbridge.Advertise,
+    rosbridge.Unadvertise,
+    rosbridge.SetLevel,
+}
 
 _HANDLERS: dict[type, Callable[[Session, Any], None]] = {
     rosbridge.Subscribe: Session._subscribe,

@@ -15,11 +15,15 @@ class Definitions:
     """Asks the robot for the definitions that its channel needs.
 
     :param defined: called with the name of each type that becomes known
+    :param unusable: called with the name of each type that is not to be had, and why
     """
 
-    def __init__(self, wire: Wire, defined: Callable[[str], None]) -> None:
+    def __init__(
+        self, wire: Wire, defined: Callable[[str], None], unusable: Callable[[str, str], None]
+    ) -> None:
         self._wire = wire
         self._defined = defined
+        self._unusable = unusable
         self._asked: dict[str, list[Deferred[None]]] = {}
 
     def want(self, type_name: str) -> None:
@@ -50,7 +54,9 @@ class Definitions:
         try:
             self._wire.robot.types.add(message.type, message.text)
         except SwitchboardError as error:
-            self._fail(waiting, Invalid(f"the robot's definition of {message.type} is unusable: {error}"))
+            reason = f"the robot's definition of {message.type} is unusable: {error}"
+            self._fail(waiting, Invalid(reason))
+            self._unusable(message.type, reason)
             return
         for each in waiting:
             each.callback(None)
@@ -60,6 +66,7 @@ class Definitions:
         """The robot does not have the type."""
         waiting = self._asked.pop(type_name, [])
         self._fail(waiting, Invalid(f"type {type_name}: {reason}"))
+        self._unusable(type_name, reason)
 
     def reset(self) -> None:
         """The link is gone."""

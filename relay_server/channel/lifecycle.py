@@ -101,8 +101,9 @@ class Channel:
         self._timer: Timer | None = None
         self._idle: Timer | None = None
         self._opened: list[Deferred[None]] = []
-        self.wire = Wire(robot)
-        definitions = Definitions(self.wire, self._typed)
+        self._pinging: list[Deferred[float]] = []
+        self.wire = Wire(clock, robot)
+        definitions = Definitions(self.wire, self._typed, self._untypeable)
         self._definitions = definitions
         self.subscriptions = Subscriptions(self.wire, definitions)
         self.publications = Publications(clock, self.wire, definitions, wall_ns)
@@ -163,11 +164,26 @@ class Channel:
 
         async def work() -> float:
             await self._open()
-            if self.wire.link is None:
-                raise Unavailable(f"robot {self.robot.name} is not connected")
-            return await self.wire.link.round_trip()
+            return await self._ping()
 
         return await self._within(limits.CALL_SECONDS, work())
+
+    def _ping(self) -> Deferred[float]:
+        """One ping serves all who ask while it is under way."""
+        waiting: Deferred[float] = Deferred()
+        if self.wire.link is None:
+            waiting.errback(Unavailable(f"robot {self.robot.name} is not connected"))
+            return waiting
+        self._pinging.append(waiting)
+        if len(self._pinging) == 1:
+            self.wire.link.round_trip().addBoth(self._pinged)
+        return waiting
+
+    def _pinged(self, result: float | Failure) -> None:
+        waiting, self._pinging = self._pinging, []
+        for each in waiting:
+            if not each.called:
+                each.errback(result) if isinstance(result, Failure) else each.callback(result)
 
     async def definition(self, type_name: str) -> None:
         """Wait until the robot's definition of a type is known.
@@ -217,6 +233,7 @@ class Channel:
     def graph_changed(self) -> None:
         """The robot told of a change in its graph."""
         self.subscriptions.graph_changed()
+        self.publications.graph_changed()
 
     def joined(self, channel_link: ChannelLink) -> None:
         """The robot has come with our ticket."""
@@ -245,8 +262,6 @@ class Channel:
         reason = message.reason
         if message.what == "get_type":
             self._definitions.refused(message.ref, reason)
-            self.subscriptions.type_refused(message.ref, reason)
-            self.publications.type_refused(message.ref, reason)
         elif message.ref.isdecimal():
             refuse = {"subscribe": self.subscriptions.refused, "advertise": self.publications.refused}
             if message.what in refuse:
@@ -255,6 +270,10 @@ class Channel:
     def _typed(self, type_name: str) -> None:
         self.subscriptions.typed(type_name)
         self.publications.typed(type_name)
+
+    def _untypeable(self, type_name: str, reason: str) -> None:
+        self.subscriptions.type_refused(type_name, reason)
+        self.publications.type_refused(type_name, reason)
 
     # --- life ---------------------------------------------------------------------------------------------
 
@@ -297,6 +316,7 @@ class Channel:
             broken.close(event.value)
         self.subscriptions.lost()
         self.publications.lost()
+        self.wire.asks.reset()
         self._definitions.reset()
         self._calls.lost()
 
@@ -316,10 +336,10 @@ class Channel:
                 each.errback(error)
 
 
-_HANDLERS: dict[type, Callable[[Channel, object], None]] = {
-    link.Subscribed: lambda channel, message: channel.subscriptions.subscribed(message),  # type: ignore[arg-type]
-    link.Advertised: lambda channel, message: channel.publications.advertised(message),  # type: ignore[arg-type]
-    link.ServiceResponse: lambda channel, message: channel._calls.answered(message),  # type: ignore[arg-type]
-    link.TypeDefinition: lambda channel, message: channel._definitions.add(message),  # type: ignore[arg-type]
-    link.Failed: lambda channel, message: channel._failed(message),  # type: ignore[arg-type]
+_HANDLERS: dict[type, Callable[[Channel, Any], None]] = {
+    link.Subscribed: lambda channel, message: channel.subscriptions.subscribed(message),
+    link.Advertised: lambda channel, message: channel.publications.advertised(message),
+    link.ServiceResponse: lambda channel, message: channel._calls.answered(message),
+    link.TypeDefinition: lambda channel, message: channel._definitions.add(message),
+    link.Failed: lambda channel, message: channel._failed(message),
 }

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 from relay_protocol import jsontext, link, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
+from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.topics import Held, Phase, Publication
-from relay_server.channel.wire import Member, Wire, resolve
+from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire, resolve
 from relay_server.clock import Clock
 
 ADVERTISEMENTS = 1024
@@ -18,6 +20,10 @@ ADVERTISEMENTS = 1024
 
 QUEUE_SIZE = 10_000
 """Deepest queue of a publisher on the robot; who asks for more gets this."""
+
+HELD_MESSAGES = 64
+HELD_BYTES = MIB
+"""What may be held of one client, over all topics of a robot."""
 
 HELD_SECONDS = 3.0
 """A message that could not go out by then is dropped: nobody wants it done that late."""
@@ -95,19 +101,52 @@ class Publications:
                 self._ask(publication)
         return publication
 
-    def publish(self, publication: Publication, body: bytes, stamp: int, failed: Failed) -> None:
+    def publish(
+        self,
+        member: Member,
+        publication: Publication,
+        body: bytes,
+        stamp: int,
+        failed: Failed,
+        good_for: float = HELD_SECONDS,
+    ) -> None:
         """Send one message to the robot, or hold it for the moment until the link or the type is there.
 
         :param body: JSON of the message
         :param stamp: the relay's monotonic nanoseconds; the message can't have been sent before
         :param failed: told in words when it could not be sent
+        :param good_for: seconds from now after which it must not be sent any more
         """
         if publication.phase is Phase.FAILED:
             failed(f"the robot could not advertise {publication.topic}; the message was dropped")
-        elif self._wire.link is None or self._untyped(publication):
-            publication.held.append(Held(body, stamp, failed, self._clock.seconds()))
+        elif publication.phase is Phase.WAITING or self._untyped(publication):
+            until = self._clock.seconds() + min(good_for, HELD_SECONDS)
+            self._hold(publication, Held(member, body, stamp, failed, until))
         else:
             self._convert(publication, body, stamp, failed)
+
+    def _hold(self, publication: Publication, message: Held) -> None:
+        mine = (
+            len(each.body)
+            for topic in self._topics.values()
+            for each in topic.held
+            if each.member is message.member
+        )
+        if sum(mine) + len(message.body) > HELD_BYTES:
+            message.failed(f"publish {publication.topic}: too much waits for the robot already; dropped")
+            return
+        publication.held.append(message)
+        if len(publication.held) > HELD_MESSAGES:
+            oldest = publication.held.popleft()
+            oldest.failed(
+                f"publish {publication.topic}: too much waits for the robot; the oldest was dropped"
+            )
+
+    def graph_changed(self) -> None:
+        """What the robot could not advertise may be possible now."""
+        for publication in list(self._topics.values()):
+            if publication.phase is Phase.FAILED:
+                self._ask(publication)
 
     def opened(self) -> None:
         """The robot is there: advertise everything."""
@@ -128,17 +167,22 @@ class Publications:
 
     def advertised(self, message: link.Advertised) -> None:
         """The publisher stands."""
+        self._wire.asks.answered(("advertise", message.number))
         publication = self._numbers.get(message.number)
         if publication is not None:
             publication.phase = Phase.ACTIVE
 
     def refused(self, number: int, reason: str) -> None:
         """The robot could not advertise."""
+        self._wire.asks.answered(("advertise", number))
         publication = self._numbers.get(number)
         if publication is None:
             return
         publication.phase = Phase.FAILED
+        held = list(publication.held)
         publication.held.clear()
+        for each in held:
+            each.failed(f"publish {publication.topic}: {reason}")
         for member in list(publication.holders):
             member.tell("error", f"advertise {publication.topic}: {reason}")
 
@@ -164,6 +208,12 @@ class Publications:
         if sum(len(each.holders.get(member, ())) for each in self._topics.values()) >= ADVERTISEMENTS:
             raise Refused(f"at most {ADVERTISEMENTS} advertisements can be held on one connection")
         publication = self._topics.get(topic)
+        if publication is None or member not in publication.holders:
+            mine = sum(
+                any(each.user == member.user for each in topic.holders) for topic in self._topics.values()
+            )
+            if mine >= USER_TOPICS:
+                raise Refused(f"you advertise {USER_TOPICS} topics of this robot, the most one user may")
         if publication is None:
             publication = Publication(self._wire.number(), topic, type_name)
             self._topics[topic] = self._numbers[publication.number] = publication
@@ -172,28 +222,32 @@ class Publications:
     def _ask(self, publication: Publication) -> None:
         if self._wire.link is None:
             return
-        publication.phase = Phase.ASKED
-        self._wire.send(
-            link.Advertise(
-                number=publication.number,
-                topic=publication.topic,
-                type=publication.type,
-                latch=publication.latch,
-                queue_size=publication.queue_size,
-                qos=publication.qos,
-            )
+        publication.phase = Phase.WAITING
+        self._definitions.want(publication.type)
+        message = link.Advertise(
+            number=publication.number,
+            topic=publication.topic,
+            type=publication.type,
+            latch=publication.latch,
+            queue_size=publication.queue_size,
+            qos=publication.qos,
         )
-        if self._untyped(publication):
-            self._definitions.want(publication.type)
-        else:
-            self._flush(publication)
+
+        def sent() -> None:
+            publication.phase = Phase.ASKED
+            if not self._untyped(publication):
+                self._flush(publication)
+
+        self._wire.asks.ask(Ask(("advertise", publication.number), message, sent))
 
     def _flush(self, publication: Publication) -> None:
+        if publication.phase is Phase.WAITING:
+            return
         held = list(publication.held)
         publication.held.clear()
-        oldest = self._clock.seconds() - HELD_SECONDS
+        now = self._clock.seconds()
         for each in held:
-            if each.since < oldest:
+            if each.until < now:
                 each.failed(f"publish {publication.topic}: the robot could not be reached in time; dropped")
             else:
                 self._convert(publication, each.body, each.stamp, each.failed)
@@ -214,10 +268,14 @@ class Publications:
             self._wire.link.sample(publication.number, stamp, encoded)
 
     def _let_go(self, publication: Publication, member: Member) -> None:
-        if publication.holders.pop(member, None) is None or publication.holders:
+        if publication.holders.pop(member, None) is None:
+            return
+        publication.held = deque(each for each in publication.held if each.member is not member)
+        if publication.holders:
             return
         del self._topics[publication.topic]
         del self._numbers[publication.number]
         self._wire.names -= 1
+        self._wire.asks.withdraw(("advertise", publication.number))
         if publication.phase in (Phase.ASKED, Phase.ACTIVE):
             self._wire.send(link.Unadvertise(number=publication.number))

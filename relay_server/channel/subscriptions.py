@@ -5,10 +5,10 @@ from __future__ import annotations
 from twisted.logger import Logger
 
 from relay_protocol import link
-from relay_protocol.errors import Invalid
+from relay_protocol.errors import Invalid, Refused
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.topics import Listener, Phase, TopicUplink
-from relay_server.channel.wire import Member, Wire, resolve
+from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire, resolve
 
 
 class Subscriptions:
@@ -27,10 +27,13 @@ class Subscriptions:
 
         :param type_name: empty when the client leaves it to the graph
         :raises Invalid: the topic has another type; nobody knows its type; too many topics
+        :raises Refused: the user has too many topics of this robot subscribed
         """
         topic = resolve(listener.name)
         has = self.check(topic, type_name)
         uplink = self._topics.get(topic)
+        if uplink is None or member not in uplink.listeners:
+            self._check_room(member)
         if uplink is None:
             uplink = TopicUplink(self._wire.number(), topic, has or type_name, qos)
             self._topics[topic] = self._numbers[uplink.number] = uplink
@@ -55,6 +58,15 @@ class Subscriptions:
             raise Invalid(f"topic {topic} does not exist; give its type to wait for it")
         return has
 
+    def _check_room(self, member: Member) -> None:
+        mine = sum(
+            any(each.user == member.user for each in uplink.listeners) for uplink in self._topics.values()
+        )
+        if mine >= USER_TOPICS:
+            raise Refused(
+                f"you have {USER_TOPICS} topics of this robot subscribed, the most one user may have"
+            )
+
     def remove(self, member: Member, topic: str) -> None:
         """A client wants a topic no more; the robot stops sending it after the last."""
         uplink = self._topics.get(topic)
@@ -64,7 +76,8 @@ class Subscriptions:
             del self._topics[topic]
             del self._numbers[uplink.number]
             self._wire.names -= 1
-            if uplink.phase in (Phase.ASKED, Phase.ACTIVE):
+            known = self._wire.asks.withdraw(("subscribe", uplink.number))
+            if known and uplink.phase in (Phase.ASKED, Phase.ACTIVE):
                 self._wire.send(link.Unsubscribe(number=uplink.number))
         elif uplink.phase is not Phase.WAITING and uplink.least_throttle_ms() != uplink.throttle_ms:
             self._send(uplink)
@@ -99,6 +112,7 @@ class Subscriptions:
 
     def subscribed(self, message: link.Subscribed) -> None:
         """The robot has subscribed."""
+        self._wire.asks.answered(("subscribe", message.number))
         uplink = self._numbers.get(message.number)
         if uplink is not None:
             uplink.activate(message.type, message.encoding, message.latched, message.publishers)
@@ -107,6 +121,7 @@ class Subscriptions:
 
     def refused(self, number: int, reason: str) -> None:
         """The robot could not subscribe."""
+        self._wire.asks.answered(("subscribe", number))
         uplink = self._numbers.get(number)
         if uplink is None:
             return
@@ -146,12 +161,11 @@ class Subscriptions:
 
     def _send(self, uplink: TopicUplink) -> None:
         uplink.throttle_ms = uplink.least_throttle_ms()
-        self._wire.send(
-            link.Subscribe(
-                number=uplink.number,
-                topic=uplink.topic,
-                type=uplink.type,
-                throttle_ms=uplink.throttle_ms,
-                qos=uplink.qos,
-            )
+        message = link.Subscribe(
+            number=uplink.number,
+            topic=uplink.topic,
+            type=uplink.type,
+            throttle_ms=uplink.throttle_ms,
+            qos=uplink.qos,
         )
+        self._wire.asks.ask(Ask(("subscribe", uplink.number), message, lambda: None))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from relay_protocol import jsontext, limits, rosbridge
-from relay_protocol.errors import Refused, SwitchboardError
+from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.link import QoS
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.wire import Member
@@ -59,9 +59,15 @@ class Sample:
 def converter(types: TypeRegistry, type_name: str, encoding: str) -> Callable[[bytes], bytes]:
     """What turns a sample's body into JSON."""
     if encoding == "json":
-        # A robot's own JSON is decoded and written anew: what goes out is well-formed whatever came in.
-        return lambda body: jsontext.encode(jsontext.decode_any(body))
+        return _json_anew
     return lambda body: types.to_json(type_name, body)
+
+
+def _json_anew(body: bytes) -> bytes:
+    """A robot's own JSON, decoded and written anew: what goes out is well-formed whatever came in."""
+    if len(body) > limits.JSON_BODY:
+        raise Invalid(f"JSON of {len(body)} bytes; a sample in JSON may have {limits.JSON_BODY}")
+    return jsontext.encode(jsontext.decode_any(body))
 
 
 class Receiver(Protocol):
@@ -231,13 +237,14 @@ class TopicUplink:
 class Held(NamedTuple):
     """A message that waits for the moment until it can be sent; see :meth:`Publications.publish`.
 
-    :param since: seconds of the relay's clock
+    :param until: seconds of the relay's clock; nobody wants it sent later
     """
 
+    member: Member
     body: bytes
     stamp: int
     failed: Callable[[str], None]
-    since: float
+    until: float
 
 
 class Publication:
@@ -252,4 +259,4 @@ class Publication:
         self.qos: QoS | None = None
         self.phase = Phase.WAITING
         self.holders: dict[Member, set[rosbridge.Id]] = {}
-        self.held: deque[Held] = deque(maxlen=64)
+        self.held: deque[Held] = deque()

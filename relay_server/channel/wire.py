@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import itertools
 import re
-from typing import Protocol
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
 from twisted.internet.defer import Deferred
 
 from relay_protocol import limits, link, rosbridge
 from relay_protocol.errors import Invalid
+from relay_server.clock import Clock, Timer, cancel
 from relay_server.registry import Presence
 
 NAMES = 4096
 """Topics subscribed or advertised on one robot at a time."""
+
+USER_TOPICS = 256
+"""Topics of one robot that one user may have subscribed, and again advertised, over all connections."""
+
+ASKS = 64
+"""Requests to a robot that may be without an answer at a time."""
+
+ASK_SECONDS = 5.0
+"""A request without an answer for so long no longer holds up others."""
 
 _NAME = re.compile(r"/[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 
@@ -37,16 +48,97 @@ class ChannelLink(Protocol):
 class Member(Protocol):
     """A session, as a channel uses it."""
 
+    @property
+    def user(self) -> int:
+        """Whose it is: what one person may ask of a robot is bounded over all of his connections."""
+
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """Report something in words, to clients that want to hear it."""
+
+
+class Ask(NamedTuple):
+    """A request to the robot.
+
+    :param key: what it is about; a newer one about the same replaces one that waits
+    :param sent: called when it goes out
+    """
+
+    key: tuple[str, int]
+    message: link.Message
+    sent: Callable[[], None]
+
+
+class Asks:
+    """Requests to the robot, a bounded number under way at a time, so that no client can flood its link.
+
+    :param send: puts one on the link
+    """
+
+    def __init__(self, clock: Clock, send: Callable[[link.Message], None]) -> None:
+        self._clock = clock
+        self._send = send
+        self._under_way: dict[tuple[str, int], float] = {}
+        self._waiting: dict[tuple[str, int], Ask] = {}
+        self._timer: Timer | None = None
+
+    def ask(self, ask: Ask) -> None:
+        """Send it, now or when its turn comes."""
+        if ask.key in self._under_way or len(self._under_way) >= ASKS:
+            self._waiting[ask.key] = ask
+            self._look_later()
+        else:
+            self._put(ask)
+
+    def answered(self, key: tuple[str, int]) -> None:
+        """The robot has answered, one way or the other."""
+        if self._under_way.pop(key, None) is not None:
+            self._go_on()
+
+    def withdraw(self, key: tuple[str, int]) -> bool:
+        """Don't ask any more; whether the robot knows of it already."""
+        waited = self._waiting.pop(key, None) is not None
+        return not waited or key in self._under_way
+
+    def reset(self) -> None:
+        """The link is gone."""
+        self._under_way.clear()
+        self._waiting.clear()
+        cancel(self._timer)
+        self._timer = None
+
+    def _put(self, ask: Ask) -> None:
+        self._under_way[ask.key] = self._clock.seconds()
+        self._send(ask.message)
+        ask.sent()
+
+    def _go_on(self) -> None:
+        for key in list(self._waiting):
+            if len(self._under_way) >= ASKS:
+                break
+            if key not in self._under_way:
+                self._put(self._waiting.pop(key))
+
+    def _look_later(self) -> None:
+        if self._timer is None:
+            self._timer = self._clock.callLater(ASK_SECONDS, self._look)
+
+    def _look(self) -> None:
+        """A robot that leaves a request without an answer must not hold up the others."""
+        self._timer = None
+        oldest = self._clock.seconds() - ASK_SECONDS
+        self._under_way = {key: since for key, since in self._under_way.items() if since > oldest}
+        self._go_on()
+        if self._waiting:
+            self._look_later()
 
 
 class Wire:
     """The open link to the robot, or none, and what names and numbers are in use on it."""
 
-    def __init__(self, robot: Presence) -> None:
+    def __init__(self, clock: Clock, robot: Presence) -> None:
         self.robot = robot
         self.link: ChannelLink | None = None
+        self.asks = Asks(clock, self.send)
         self.names = 0
         self._numbers = itertools.count(1)
 

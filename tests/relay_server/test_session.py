@@ -10,8 +10,9 @@ from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server import closing
 from relay_server import session as module
+from relay_server.channel import subscriptions
 from relay_server.session import normal_type
-from tests.relay_server.memory import STRING, TWIST, Person, World, text
+from tests.relay_server.memory import STRING, TEXTS, TWIST, Person, World, text
 
 
 def told(person: Person, level: str = "error") -> list[str]:
@@ -154,11 +155,12 @@ def test_the_robot_says_what_is_motion_and_how_old_it_may_be(world: World) -> No
     person = world.person()
     world.robot_joins()
     world.robot.description = link.Describe(motion=link.MotionPolicy(topics=["/chatter"], deadline_ms=2000))
+    for name in (STRING, TWIST):
+        world.robot.types.add(name, TEXTS[name])
     for advance, topic, stale in ((1.0, "/cmd_vel", 0), (0.9, "/chatter", 0), (0.2, "/chatter", 1)):
         world.clock.advance(advance)
         person.says("publish", topic=topic, msg={})
         assert person.session.stale_commands == stale
-    world.define(STRING, TWIST)
     assert len(world.link.samples) == 2
 
 
@@ -333,3 +335,42 @@ def test_the_number_of_topics_of_one_client_is_bounded(world: World, monkeypatch
         person.says("subscribe", topic=topic, type=STRING)
     assert told(person) == ["at most 2 topics can be subscribed on one connection"]
     assert world.channel.wire.names == 2
+
+
+def test_one_user_can_not_take_all_topics_of_a_robot(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is bounded is the person, over all connections: opening more of them gives no more."""
+    monkeypatch.setattr(subscriptions, "USER_TOPICS", 3)
+    people = [world.person(), world.person()]
+    for number, person in enumerate(people):
+        person.says("set_level", level="error")
+        for topic in ("a", "b"):
+            person.says("subscribe", topic=f"/{topic}{number}", type=STRING)
+    assert told(people[0]) == []
+    assert told(people[1]) == ["you have 3 topics of this robot subscribed, the most one user may have"]
+
+
+def test_changes_faster_than_any_program_needs_are_refused(world: World) -> None:
+    """A loop of subscribe and unsubscribe does not reach the robot; a second later changes are followed again."""
+    person = world.person()
+    person.says("set_level", level="error")
+    for _ in range(int(module.CHANGES_AT_ONCE)):
+        person.says("subscribe", topic="/chatter", type=STRING)
+        person.says("unsubscribe", topic="/chatter")
+    assert "too many changes at once" in told(person)[0]
+    world.clock.advance(1)
+    person.says("subscribe", topic="/secret", type=STRING)
+    assert told(person) == []
+
+
+def test_arguments_of_calls_that_wait_are_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What calls keep in memory is given back when they end."""
+    monkeypatch.setattr(module, "CALL_BYTES", 100)
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    person.says("set_level", level="error")
+    for _ in range(2):
+        person.says("call_service", service="/reset", args={"x": "y" * 60})
+    assert "too large together" in told(person)[0]
+    person.session.end()
+    assert person.session._call_bytes == 0

@@ -234,3 +234,18 @@ def test_detaching_gives_everything_back(world: World) -> None:
     for part in (world.channel.subscriptions, world.channel.publications):
         assert not part._topics
         assert not part._numbers
+
+
+def test_one_ping_serves_all_who_ask_meanwhile(world: World) -> None:
+    """Clients that ping the robot a thousand times cost it one ping at a time."""
+    world.robot_comes()
+    world.person()
+    world.robot_joins()
+    results: list[object] = []
+    for _ in range(3):
+        Deferred.fromCoroutine(world.channel.round_trip()).addBoth(results.append)
+    assert len(world.link.pings) == 1
+    world.link.pings[0].callback(0.25)
+    assert results == [0.25, 0.25, 0.25]
+    Deferred.fromCoroutine(world.channel.round_trip())
+    assert len(world.link.pings) == 2

@@ -177,7 +177,7 @@ def test_a_type_without_definition_fails_its_topics(world: World) -> None:
     person = at_work(world)
     person.says("publish", topic="/cmd_vel", msg={})
     world.channel.message(link.Failed(what="get_type", ref=TWIST, reason="not installed"))
-    assert told(person) == ["advertise /cmd_vel: not installed"]
+    assert told(person) == ["publish /cmd_vel: not installed", "advertise /cmd_vel: not installed"]
     assert not world.channel.publications._topics["/cmd_vel"].held
 
 
@@ -203,3 +203,27 @@ def test_advertisements_of_one_client_are_bounded(world: World, monkeypatch: Any
     assert world.channel.wire.names == 4
     other.says("advertise", topic="/mine", type=STRING)
     assert world.channel.wire.names == 5
+
+
+def test_a_command_is_not_held_longer_than_it_is_good(world: World) -> None:
+    """What waits for a type's definition grows old like anything else; too old a command is dropped and told."""
+    person = at_work(world)
+    world.robot.description = link.Describe(motion=link.MotionPolicy(types=[TWIST], deadline_ms=500))
+    person.says("publish", topic="/cmd_vel", msg={})
+    world.clock.advance(0.6)
+    world.define(TWIST)
+    assert world.link.samples == []
+    assert "in time" in told(person)[0]
+
+
+def test_what_one_client_makes_the_relay_hold_is_bounded(world: World) -> None:
+    """However many topics it uses; further messages are dropped and told."""
+    person = at_work(world)
+    for number in range(5):
+        person.says("advertise", topic=f"/t{number}", type=STRING)
+        person.says("publish", topic=f"/t{number}", msg={"data": "x" * 300_000})
+    held = [len(each.held) for each in world.channel.publications._topics.values()]
+    assert sum(held) == 3
+    assert len([words for words in told(person) if "too much waits" in words]) == 2
+    person.session.end()
+    assert world.channel.publications._topics == {}

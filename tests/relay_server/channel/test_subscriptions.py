@@ -46,10 +46,15 @@ def test_one_uplink_serves_everyone_and_ends_with_the_last(world: World) -> None
 
 def test_the_robot_throttles_by_the_least_that_satisfies_everyone(world: World) -> None:
     """Changed when clients come, go, or ask for another rate."""
-    _, (slow, quick) = watching(world, {"throttle_rate": 1000}, {"throttle_rate": 200, "id": "a"})
+    number, (slow, quick) = watching(world, {"throttle_rate": 1000}, {"throttle_rate": 200, "id": "a"})
+    answer = link.Subscribed(number=number, topic="/chatter", type=STRING, encoding="cdr")
+    world.channel.message(answer)
     quick.says("subscribe", topic="/chatter", throttle_rate=50, id="b")
+    world.channel.message(answer)
     quick.says("unsubscribe", topic="/chatter", id="b")
+    world.channel.message(answer)
     quick.says("unsubscribe", topic="/chatter")
+    world.channel.message(answer)
     slow.says("subscribe", topic="/chatter", throttle_rate=0, id="c")
     assert [ask.throttle_ms for ask in world.link.all(link.Subscribe)] == [1000, 200, 50, 200, 1000, 0]
     assert len({ask.number for ask in world.link.all(link.Subscribe)}) == 1
@@ -188,7 +193,14 @@ def test_a_robot_that_speaks_json_needs_no_types(world: World) -> None:
     number = world.link.all(link.Subscribe)[0].number
     world.subscribed(number, encoding="json")
     assert not world.link.all(link.GetType)
-    for body in (b'{"data": "hi"}', b'{"data": NaN}', b"\xff", b'{"data":"x"},"op":"status"', b"[" * 100):
+    for body in (
+        b'{"data": "hi"}',
+        b'{"data": NaN}',
+        b"\xff",
+        b'{"data":"x"},"op":"status"',
+        b"[" * 100,
+        b" " * 2**20 + b"1",
+    ):
         world.channel.sample(number, body)
     assert [message["msg"] for message in person.hears("publish")] == [{"data": "hi"}]
 
