@@ -184,6 +184,8 @@ class Relay:
     def connect(self, robot: str, token: str, **options: Any) -> Client:
         """A websocket client with a Bearer token."""
         headers = {"Authorization": f"Bearer {token}"}
+        # Who has stopped reading doesn't see the answer to its close behind what it has not read.
+        options.setdefault("close_timeout", 1)
         return Client(connect(self.url(robot), additional_headers=headers, **options))
 
     def connect_by(self, port: int, robot: str, token: str) -> Client:
