@@ -8,10 +8,11 @@ rosbridge ``auth`` as its first message.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
 from autobahn.twisted.websocket import WebSocketServerFactory, WebSocketServerProtocol
+from autobahn.websocket.protocol import WebSocketProtocol
 from autobahn.websocket.types import ConnectionDeny, ConnectionRequest
 from twisted.internet.defer import Deferred
 from twisted.internet.protocol import connectionDone
@@ -26,6 +27,8 @@ from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.caps import AddressCap
 from relay_server.frontdesk import Admission
 from relay_server.session import ClientTransport, Session
+
+T = TypeVar("T")
 
 HANDSHAKE_STATUS = {
     closing.UNAUTHENTICATED: 401,
@@ -83,14 +86,45 @@ class ClientProtocol(WebSocketServerProtocol):
         self._early: list[bytes] = []
         self._early_bytes = 0
         self._deadline: Timer | None = None
+        self._asking = False
         self._open = False
         self._opened_ns = 0
 
     # --- handshake ----------------------------------------------------------------------------------------
 
+    def connectionMade(self) -> None:
+        """The site has handed over a connection that asked to become a websocket."""
+        super().connectionMade()
+        self._take_at_most(limits.UNPROVEN_BYTES)
+        # One for handshake and auth together; a session ends it.
+        self._deadline = self.factory.clock.callLater(limits.UNPROVEN_SECONDS, self._nobody)
+
+    def _take_at_most(self, size: int) -> None:
+        self.maxFramePayloadSize = self.maxMessagePayloadSize = size
+
+    def dataReceived(self, data: bytes) -> None:
+        """Bytes. Who asked to come in says nothing more before the answer (RFC 6455 section 4.1)."""
+        if self._asking:
+            # Autobahn would take them for a handshake of their own, and open a second session here.
+            self._drop("it sent more before its handshake was answered")
+        else:
+            super().dataReceived(data)
+
+    def _drop(self, reason: str) -> None:
+        self.log.info("a client at {address} is cut: {reason}", address=self._address(), reason=reason)
+        self._stop_deadline()
+        self.dropConnection(abort=True)
+
     def onConnect(self, request: ConnectionRequest) -> Deferred[str | None]:
         """Find out who it is before the handshake is answered."""
-        return Deferred.fromCoroutine(self._connect(request))
+        self._asking = True
+        self.transport.pauseProducing()
+        return Deferred.fromCoroutine(self._connect(request)).addBoth(self._asked)
+
+    def _asked(self, answer: T) -> T:
+        if self.state != self.STATE_CLOSED:
+            self.transport.resumeProducing()
+        return answer
 
     async def _connect(self, request: ConnectionRequest) -> str | None:
         self._robot = unquote(request.path.removeprefix("/robots/"))
@@ -134,6 +168,10 @@ class ClientProtocol(WebSocketServerProtocol):
 
     def onOpen(self) -> None:
         """The handshake is done."""
+        self._asking = False
+        if self.data:
+            self._drop("it sent more before its handshake was answered")
+            return
         self._open = True
         self._opened_ns = self.factory.clock_ns()
         # Twisted's HTTP channel was the producer of this transport until now.
@@ -143,19 +181,22 @@ class ClientProtocol(WebSocketServerProtocol):
             self.close(*self._failure)
         elif self._admission is not None:
             self._begin()
-        else:
-            self._deadline = self.factory.clock.callLater(limits.UNPROVEN_SECONDS, self._nobody)
 
     def _nobody(self) -> None:
         self._deadline = None
-        self.close(
-            closing.UNAUTHENTICATED, "log in: no credentials came with the connection, nor an auth message"
-        )
+        if self._open:
+            self.close(
+                closing.UNAUTHENTICATED,
+                "log in: no credentials came with the connection, nor an auth message",
+            )
+        else:
+            self._drop(f"no handshake within {limits.UNPROVEN_SECONDS:g} s")
 
     def _begin(self) -> None:
         assert self._admission is not None
         admission, self._admission = self._admission, None
         self._stop_deadline()
+        self._take_at_most(limits.CLIENT_MESSAGE)
         self._session = self.factory.gate.open(admission, self, self._opened_ns)
         self._session.start()
         early, self._early = self._early, []
@@ -228,6 +269,7 @@ class ClientProtocol(WebSocketServerProtocol):
     def connectionLost(self, reason: Any = connectionDone) -> None:
         """The connection that began as an HTTP request is gone."""
         self.factory.cap.leave(self._address())
+        self._stop_deadline()
         super().connectionLost(reason)
 
     def onClose(self, wasClean: bool, code: int | None, reason: str | None) -> None:
@@ -250,7 +292,8 @@ class ClientProtocol(WebSocketServerProtocol):
     def send(self, message: bytes) -> None:
         """One text message. The peer may have begun to close: then nobody reads it."""
         if self.state == self.STATE_OPEN:
-            self.sendMessage(message, isBinary=False)
+            # sendMessage would refuse what is over the limit for what comes in.
+            self.sendFrame(opcode=WebSocketProtocol.MESSAGE_TYPE_TEXT, payload=message)
 
     def ping(self, payload: bytes) -> None:
         """A websocket ping."""
@@ -329,10 +372,9 @@ class ClientFactory(WebSocketServerFactory):
             # Text is checked once, as a whole, by relay_protocol.jsontext.
             utf8validateIncoming=False,
             requireMaskedClientFrames=True,
-            maxFramePayloadSize=limits.CLIENT_FRAME,
-            maxMessagePayloadSize=limits.CLIENT_MESSAGE,
             failByDrop=False,
-            openHandshakeTimeout=limits.UNPROVEN_SECONDS,
+            # The protocol's own deadline and limits of size, which change when a session begins.
+            openHandshakeTimeout=0,
             closeHandshakeTimeout=1,
             tcpNoDelay=True,
             # Pings are the session's: they also tell how old a command can be.

@@ -205,3 +205,82 @@ def test_long_reasons_are_cut_to_what_a_close_frame_holds(gate: MemoryGate) -> N
     assert client.core.close_rcvd is not None
     assert client.core.close_rcvd.reason == "ü" * 61
     assert not client.transport.connected
+
+
+# --- before the session -----------------------------------------------------------------------------------
+
+
+def frame_head(size: int) -> bytes:
+    """The beginning of a masked text frame that announces this size (RFC 6455 section 5.2)."""
+    return b"\x81\xff" + size.to_bytes(8, "big") + b"mask"
+
+
+def test_a_large_frame_before_the_proof_is_refused_by_its_length(gate: MemoryGate) -> None:
+    """Nothing of it is awaited or kept."""
+    client = Client(gate)
+    client.end.dataReceived(frame_head(limits.UNPROVEN_BYTES + 1))
+    client.run()
+    assert client.closed == closing.TOO_BIG
+
+
+def test_a_session_takes_and_sends_larger_messages(gate: MemoryGate) -> None:
+    """Up to the limit for clients; what the relay sends has none here."""
+    client = Client(gate, Authorization="Bearer good")
+    client.core.max_message_size = None
+    client.says("x" * limits.CLIENT_MESSAGE)
+    assert len(gate.sessions[0].got[-1]) == limits.CLIENT_MESSAGE
+    picture = b"y" * (limits.CLIENT_MESSAGE + 1)
+    gate.sessions[0].transport.send(picture)
+    client.run()
+    assert client.heard == [picture]
+    client.end.dataReceived(frame_head(limits.CLIENT_MESSAGE + 1))
+    client.run()
+    assert client.closed == closing.TOO_BIG
+
+
+def test_one_deadline_counts_for_handshake_and_proof_together(gate: MemoryGate) -> None:
+    """A database that hangs is no reason to hold a connection open; late answers open nothing."""
+    gate.wait = Deferred()
+    client = Client(gate, Authorization="Bearer good")
+    client.clock.advance(limits.UNPROVEN_SECONDS - 0.1)
+    assert client.transport.connected
+    client.clock.advance(0.2)
+    assert not client.transport.connected
+    gate.wait.callback(None)
+    assert not gate.sessions
+    assert gate.admitted == 0
+    assert not client.clock.getDelayedCalls()
+
+
+def test_a_second_handshake_while_the_first_waits_is_cut(gate: MemoryGate) -> None:
+    """One socket has one session, and nobody is asked twice; until the answer nothing more is read."""
+    gate.wait = Deferred()
+    client = Client(gate, Authorization="Bearer good")
+    assert client.transport.producerState == "paused"
+    request = b"GET /robots/rover HTTP/1.1\r\nHost: relay:9090\r\nUpgrade: websocket\r\n\r\n"
+    client.end.dataReceived(request)
+    assert not client.transport.connected
+    gate.wait.callback(None)
+    assert gate.asked == [("bearer", "good")]
+    assert not gate.sessions
+    assert gate.admitted == 0
+    assert not client.cap._counts
+
+
+def test_the_transport_reads_on_after_the_answer(gate: MemoryGate) -> None:
+    """What was held meanwhile comes then."""
+    gate.wait = Deferred()
+    client = Client(gate, Authorization="Bearer good")
+    gate.wait.callback(None)
+    client.run()
+    assert client.transport.producerState == "producing"
+    client.says('{"op":"x"}')
+    assert gate.sessions[0].got == ["start", b'{"op":"x"}']
+
+
+def test_bytes_behind_the_handshake_in_one_piece_are_cut(gate: MemoryGate) -> None:
+    """A client must wait for the answer before it sends more (RFC 6455 section 4.1)."""
+    client = Client(gate, tail=b"GET / HTTP/1.1\r\n\r\n", Authorization="Bearer good")
+    assert not client.transport.connected
+    assert not gate.sessions
+    assert gate.admitted == 0

@@ -142,9 +142,14 @@ class Transport(StringTransportWithDisconnection):
 
 
 class Client:
-    """A websocket client and the relay's end of it."""
+    """A websocket client and the relay's end of it.
 
-    def __init__(self, gate: MemoryGate, path: str = "/robots/rover", **headers: str) -> None:
+    :param tail: bytes sent in one piece with the handshake
+    """
+
+    def __init__(
+        self, gate: MemoryGate, path: str = "/robots/rover", tail: bytes = b"", **headers: str
+    ) -> None:
         self.eof = False
         self.clock = Clock()
         self.cap = AddressCap(5)
@@ -160,6 +165,7 @@ class Client:
         for name, value in headers.items():
             request.headers[name] = value
         self.core.send_request(request)
+        self.core.writes.append(tail)
         self.run()
 
     def run(self) -> None:
