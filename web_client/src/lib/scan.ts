@@ -1,7 +1,7 @@
 /** A laser scan as points around the robot, and the scale to draw it at. Metres; x ahead, y left (REP 103). */
 import type { LaserScan } from './types'
 
-const SCALES = [1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200]
+const SCALES = [1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9, 10, 12, 15, 20, 25, 30, 40, 50, 80, 120, 200]
 
 /** Pairs x, y of all valid returns, one after the other. */
 export function points(scan: LaserScan): Float32Array {
@@ -32,7 +32,9 @@ export function radius(scan: LaserScan, present: number | null): number {
   valid.sort((a, b) => a - b)
   const far = valid[Math.ceil((valid.length - 1) * 0.95)]!
   if (present !== null && far <= present && far > present * 0.45) return present
-  return SCALES.find((scale) => scale >= far) ?? SCALES.at(-1)!
+  // Grown with room to spare: in the open the view would else jump at every metre.
+  const wanted = present !== null && far > present ? far * 1.15 : far
+  return SCALES.find((scale) => scale >= wanted) ?? SCALES.at(-1)!
 }
 
 /** Distances in metres at which to draw rings. */
