@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from sqlalchemy.orm import Session
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorThreads
 from twisted.logger import Logger
@@ -46,6 +47,16 @@ class _Ticket:
     until: float
 
 
+@dataclass(frozen=True)
+class Login(Principal):
+    """Somebody who has just logged in, for whom a session may be opened.
+
+    :param password_hash: what was stored then; a session is opened only while that is still so
+    """
+
+    password_hash: str | None = field(default=None, repr=False)
+
+
 class Authenticator:
     """Turns credentials into a :class:`Principal`, or raises.
 
@@ -82,7 +93,7 @@ class Authenticator:
         """Wait for the hashing under way and end its threads."""
         self._hashing.stop()
 
-    async def password(self, user: str, password: str, address: str) -> Principal:
+    async def password(self, user: str, password: str, address: str) -> Login:
         """Check a password; unknown users cost the same time as known ones.
 
         :param address: where the ask comes from, for the limit on failures
@@ -101,14 +112,14 @@ class Authenticator:
             self._limiter.forgive(user, address)
             raise
 
-    async def _password(self, user: str, password: str, address: str) -> Principal:
+    async def _password(self, user: str, password: str, address: str) -> Login:
         record = await self._store.read(queries.find_user, user)
         stored = record.password_hash if record is not None and not record.disabled else None
         right = await self._hashing.run(passwords.verify_password, password, stored)
         if record is None or not right:
             raise BadCredentials("user or password is wrong")
         self._limiter.succeeded(user, address)
-        return Principal(record.id, record.name, record.realm, record.admin, 0, None)
+        return Login(record.id, record.name, record.realm, record.admin, 0, None, stored)
 
     async def token(self, token: str) -> Principal:
         """The principal behind an access token or a portal session.
@@ -122,7 +133,7 @@ class Authenticator:
             raise BadCredentials("the access token is unknown, expired or revoked")
         return Principal.of(record)
 
-    async def login_code(self, code: str, address: str) -> Principal:
+    async def login_code(self, code: str, address: str) -> Login:
         """The principal of a one-time login link; the code is spent by this.
 
         :raises BadCredentials: unknown, expired or used
@@ -131,25 +142,26 @@ class Authenticator:
         wait = self._limiter.wait(None, address)
         if wait > 0:
             raise TooManyTries(wait)
-        record = await self._store.write(queries.consume_login, passwords.token_hash(code), self._wall())
-        if record is None:
+        login = await self._store.write(_consume, passwords.token_hash(code), self._wall())
+        if login is None:
             self._limiter.failed(None, address)
             raise BadCredentials("the login link is unknown, expired or already used; ask for a new one")
-        return Principal.of(record)
+        return login
 
-    async def open_session(self, principal: Principal) -> str:
-        """A portal session for a principal just proved; returns the token its cookie carries."""
+    async def open_session(self, login: Login, address: str, how: str) -> str:
+        """A portal session for somebody just proved, and an audit entry; returns the token its cookie carries.
+
+        :param how: ``password`` or ``link``, for the record
+        :raises BadCredentials: the password was changed or the account disabled meanwhile
+        :raises Unavailable: it can't be put on record
+        """
         token = passwords.new_token()
-        now = self._wall()
-        await self._store.write(
-            queries.create_token,
-            principal.user_id,
-            passwords.token_hash(token),
-            kind="session",
-            label="portal",
-            expires=now + SESSION_SECONDS,
-            now=now,
-        )
+        try:
+            await self._store.write(
+                _open_session, login, passwords.token_hash(token), address, how, self._wall()
+            )
+        except Refused as error:
+            raise BadCredentials(str(error)) from None
         return token
 
     def issue_ticket(self, principal: Principal, robot: str) -> str:
@@ -180,3 +192,33 @@ class Authenticator:
         if not live:
             raise BadCredentials("the session that asked for this ticket has ended; log in again")
         return found.principal
+
+
+def _consume(s: Session, code_hash: str, now: float) -> Login | None:
+    """Use a login link up."""
+    found = queries.consume_login(s, code_hash, now)
+    user = None if found is None else queries.get_user(s, found.user_id)
+    if user is None:
+        return None
+    return Login(user.id, user.name, user.realm, user.admin, 0, None, user.password_hash)
+
+
+def _open_session(s: Session, login: Login, token_hash: str, origin: str, how: str, now: float) -> None:
+    """The session and its audit entry, both or neither."""
+    queries.open_session(
+        s,
+        login.user_id,
+        token_hash,
+        password_hash=login.password_hash,
+        expires=now + SESSION_SECONDS,
+        now=now,
+    )
+    queries.append_audit(
+        s,
+        at=now,
+        actor=f"user:{login.name}",
+        action="login",
+        target=login.name,
+        origin=origin,
+        data={"how": how},
+    )

@@ -88,25 +88,25 @@ class FrontDesk:
     async def password(self, user: str, password: str, address: str) -> tuple[Principal, str]:
         """Log in by password; a principal and the token of a new portal session."""
         try:
-            principal = await self._auth.password(user, password, address)
+            login = await self._auth.password(user, password, address)
         except SwitchboardError as error:
             # Who is over the limit was recorded while under it; a flood must not reach the database.
             if not isinstance(error, TooManyTries):
                 self._journal.event(
-                    "login.refused", "relay", user=user[:64], address=address, reason=error.code
+                    "login.refused",
+                    "relay",
+                    cause=address,
+                    user=user[:64],
+                    address=address,
+                    reason=error.code,
                 )
             raise
-        return await self._logged_in(principal, address, "password")
+        return login, await self._auth.open_session(login, address, "password")
 
     async def login_code(self, code: str, address: str) -> tuple[Principal, str]:
         """Log in by a one-time link."""
-        principal = await self._auth.login_code(code, address)
-        return await self._logged_in(principal, address, "link")
-
-    async def _logged_in(self, principal: Principal, address: str, how: str) -> tuple[Principal, str]:
-        token = await self._auth.open_session(principal)
-        self._journal.audit(f"user:{principal.name}", "login", principal.name, address, how=how)
-        return principal, token
+        login = await self._auth.login_code(code, address)
+        return login, await self._auth.open_session(login, address, "link")
 
     async def logout(self, principal: Principal) -> None:
         """End the session the principal came with, and what was opened with it."""
@@ -150,7 +150,12 @@ class FrontDesk:
         permit = None if record is None else await self._access.permit(principal, record.id)
         if record is None or permit is None:
             self._journal.event(
-                "client.refused", "relay", user_id=principal.user_id, robot=robot[:64], address=address
+                "client.refused",
+                "relay",
+                cause=f"user:{principal.name}",
+                user_id=principal.user_id,
+                robot=robot[:64],
+                address=address,
             )
             raise NotFound(NO_ROBOT)
         return Admission(permit, self._registry.presence(record.id, record.name, record.realm), address)
@@ -184,6 +189,7 @@ class FrontDesk:
         self._journal.event(
             "client.joined",
             f"user:{principal.name}",
+            cause=f"user:{principal.name}",
             robot_id=robot.robot_id,
             user_id=principal.user_id,
             address=admission.address,
@@ -200,6 +206,7 @@ class FrontDesk:
         self._journal.event(
             "client.left",
             f"user:{principal.name}",
+            cause=f"user:{principal.name}",
             robot_id=session.robot.robot_id,
             user_id=principal.user_id,
             drops=session.outbox.dropped,

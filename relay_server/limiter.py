@@ -37,18 +37,21 @@ class LoginLimiter:
 
     The pair is what is limited, so nobody can lock an account from afar.
 
-    An account of ``None`` stands for tries that name nobody (login links): only the network is counted.
+    An account of ``None`` stands for tries that name nobody (login links): only the network is counted. Robots that
+    prove themselves are accounts too.
 
     :param seconds: a monotonic clock
+    :param of_network: failures of one network on all accounts together, if not :data:`FAILURES_OF_NETWORK`
     """
 
-    def __init__(self, seconds: Callable[[], float]) -> None:
+    def __init__(self, seconds: Callable[[], float], of_network: int | None = None) -> None:
         self._seconds = seconds
+        self._of_network = of_network
         self._failures: OrderedDict[_Key, deque[float]] = OrderedDict()
 
     def wait(self, account: str | None, address: str) -> float:
         """Seconds until another try is allowed; 0 when it is allowed now."""
-        return max(self._wait(key, most) for key, most in _keys(account, address))
+        return max(self._wait(key, most) for key, most in self._keys(account, address))
 
     def _wait(self, key: _Key, most: int) -> float:
         times = self._failures.get(key)
@@ -63,7 +66,7 @@ class LoginLimiter:
 
     def failed(self, account: str | None, address: str) -> None:
         """Count one failure. Call before hashing begins, and :meth:`succeeded` when it went well."""
-        for key, most in _keys(account, address):
+        for key, most in self._keys(account, address):
             times = self._failures.setdefault(key, deque(maxlen=most))
             times.append(self._seconds())
             self._failures.move_to_end(key)
@@ -72,7 +75,7 @@ class LoginLimiter:
 
     def forgive(self, account: str | None, address: str) -> None:
         """Take the latest failure back: nothing was tried."""
-        for key, _ in _keys(account, address):
+        for key, _ in self._keys(account, address):
             times = self._failures.get(key)
             if times:
                 times.pop()
@@ -83,14 +86,13 @@ class LoginLimiter:
         if account is not None:
             self._failures.pop((findable(account), network_of(address)), None)
 
+    def _keys(self, account: str | None, address: str) -> list[tuple[_Key, int]]:
+        """What a try counts for, with the most failures each. An account is one however its name is written."""
+        network = network_of(address)
+        keys: list[tuple[_Key, int]] = [((None, network), self._of_network or FAILURES_OF_NETWORK)]
+        if account is not None:
+            keys.append(((findable(account), network), FAILURES))
+        return keys
+
 
 _Key = tuple[str | None, str]
-
-
-def _keys(account: str | None, address: str) -> list[tuple[_Key, int]]:
-    """What a try counts for, with the most failures each. An account is one however its name is written."""
-    network = network_of(address)
-    keys: list[tuple[_Key, int]] = [((None, network), FAILURES_OF_NETWORK)]
-    if account is not None:
-        keys.append(((findable(account), network), FAILURES))
-    return keys

@@ -11,6 +11,9 @@ from relay_protocol import link
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.graph import GraphMirror
 
+REPLACE_SECONDS = 3.0
+"""A registration younger than this is not replaced."""
+
 
 class ControlLink(Protocol):
     """A robot's control link, as the registry and channels use it."""
@@ -48,6 +51,7 @@ class Presence:
     """One robot as the relay sees it now.
 
     :param registered_at: monotonic seconds of the latest registration
+    :param patience: seconds for which that registration is not replaced
     :param rtt: round trip relay–robot of the latest ping, seconds
     :param last_seen: Unix time of the latest byte, ``None`` when never seen since the start
     """
@@ -57,6 +61,7 @@ class Presence:
     realm: str
     control: ControlLink | None = None
     registered_at: float = 0.0
+    patience: float = REPLACE_SECONDS
     session: str = ""
     key: str = ""
     address: str = ""

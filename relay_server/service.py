@@ -251,7 +251,9 @@ class Relay:
     async def _forget_old(self) -> None:
         now = time.time()
         await self._store.write(queries.purge_expired, now)
-        await self._store.write(queries.purge_events, now - EVENT_SECONDS)
+        # In small transactions: logins wait for the same writer.
+        while await self._store.write(queries.purge_events, now - EVENT_SECONDS):
+            pass
 
     def reload_tls(self) -> None:
         """Read the certificate again (SIGHUP)."""

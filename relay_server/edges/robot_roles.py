@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
 
+from sqlalchemy.orm import Session
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_db import queries
+from relay_db.queries import RobotRecord
 from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
-from relay_protocol.errors import Invalid, MalformedMessage, Refused
+from relay_protocol.errors import Invalid, MalformedMessage, Refused, Unavailable
 from relay_protocol.frames import SampleFrame
 from relay_server import passwords
 from relay_server.channel import Channel, Channels
 from relay_server.edges.robots import RobotConnection
 from relay_server.journal import Journal
-from relay_server.registry import Presence, Registry
+from relay_server.limiter import LoginLimiter
+from relay_server.registry import REPLACE_SECONDS, Presence, Registry
 from relay_server.store import Store
 
-REPLACE_SECONDS = 3.0
-"""A registration younger than this is not replaced: two daemons with one key would flap for ever."""
+MOST_PATIENCE = 60.0
+FLAPPING_SECONDS = 2 * MOST_PATIENCE
+"""Who replaces a registration younger than this doubles the time the next one must wait, up to
+:data:`MOST_PATIENCE`: two daemons with one key would take the robot from each other for ever."""
+
+FAILURES_OF_NETWORK = 1000
+"""Failed proofs and enrolments of one network: many robots may dial from behind one address."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +50,10 @@ class RobotHall:
     journal: Journal
     seconds: Callable[[], float]
     wall: Callable[[], float]
+    failures: LoginLimiter = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "failures", LoginLimiter(self.seconds, FAILURES_OF_NETWORK))
 
 
 class Opening:
@@ -88,59 +102,73 @@ class Opening:
         self._connection.send(link.Challenge(nonce=link.to_base64(self._nonce), relay=self._hall.relay))
 
     async def _prove(self, hello: link.Hello, proof: link.Prove) -> None:
-        hall = self._hall
+        hall, connection = self._hall, self._connection
         signature = link.from_base64(proof.signature, "the signature")
-        record = await hall.store.read(queries.robot_key, hello.robot, hello.key)
-        if record is None or not identity.verify(
-            record.public_key, hall.relay, hello.robot, self._nonce, signature
-        ):
-            hall.journal.event(
-                "robot.refused",
-                "relay",
-                claimed=hello.robot[: limits.ROBOT_NAME],
-                address=self._connection.address,
-            )
-            raise Refused("this key is not accepted for this robot; enroll the robot again if it should be")
-        if self._connection.ended:
+        if self._over_limit(hello.robot):
+            return
+        with self._counted(hello.robot, "robot.refused"):
+            record = await hall.store.read(queries.robot_key, hello.robot, hello.key)
+            if record is None or not identity.verify(
+                record.public_key, hall.relay, hello.robot, self._nonce, signature
+            ):
+                raise Refused(
+                    "this key is not accepted for this robot; enroll the robot again if it should be"
+                )
+        if connection.ended:
             # It left while the database was asked; a registration now would be a ghost.
             return
         robot = hall.registry.presence(record.robot_id, record.robot, record.realm)
-        control = Control(hall, self._connection, robot, hello)
-        control.begin()
+        Control(hall, connection, robot, hello).begin()
+        # A key that was revoked since it was read: whoever looked for robots to cut may have missed this one.
+        again = await hall.store.read(queries.robot_key, hello.robot, hello.key)
+        if again is None or again.robot_id != record.robot_id:
+            connection.close("the robot's key is not accepted any more")
 
     async def _enroll(self, message: link.Enroll) -> None:
-        hall = self._hall
+        hall, connection = self._hall, self._connection
         identity.check_robot_name(message.robot)
         public_key = link.from_base64(message.public_key, "the public key")
         if len(public_key) != identity.PUBLIC_KEY_BYTES:
             raise Invalid(f"an Ed25519 public key has {identity.PUBLIC_KEY_BYTES} bytes")
-        try:
-            record = await hall.store.write(
-                queries.redeem_enrolment_code,
-                message.robot,
-                passwords.token_hash(passwords.normalise_code(message.code)),
-                public_key,
-                identity.fingerprint(public_key),
-                message.agent[:200],
-                hall.wall(),
+        if self._over_limit(message.robot):
+            return
+        with self._counted(message.robot, "robot.enrolment_refused"):
+            record = await hall.store.write(_redeem, message, public_key, connection.address, hall.wall())
+        connection.send(link.Enrolled(robot=record.name, relay=hall.relay))
+        connection.finish("enrolled")
+
+    def _over_limit(self, claimed: str) -> bool:
+        """Whether this robot has failed too often from here; judged before the database is asked."""
+        wait = self._hall.failures.wait(claimed, self._connection.address)
+        if wait > 0:
+            self._connection.refuse(
+                link.Refused(
+                    reason=f"too many failures of this robot from your network; try again in {int(wait) + 1} s",
+                    retry_after=wait,
+                )
             )
+        return wait > 0
+
+    @contextmanager
+    def _counted(self, claimed: str, refused: str) -> Iterator[None]:
+        """A try that may fail: counted before it begins, so that many at once are no way around the limit.
+
+        :param refused: kind of the event that tells of a refusal
+        """
+        hall, address = self._hall, self._connection.address
+        hall.failures.failed(claimed, address)
+        try:
+            yield
         except Refused:
             hall.journal.event(
-                "robot.enrolment_refused",
-                "relay",
-                claimed=message.robot[: limits.ROBOT_NAME],
-                address=self._connection.address,
+                refused, "relay", cause=address, claimed=claimed[: limits.ROBOT_NAME], address=address
             )
             raise
-        hall.journal.audit(
-            f"robot:{record.name}",
-            "robot.enrolled",
-            record.name,
-            self._connection.address,
-            key=identity.fingerprint(public_key),
-        )
-        self._connection.send(link.Enrolled(robot=record.name, relay=hall.relay))
-        self._connection.finish("enrolled")
+        except Unavailable:
+            # Nothing was tried.
+            hall.failures.forgive(claimed, address)
+            raise
+        hall.failures.succeeded(claimed, address)
 
     def _join(self, message: link.Join) -> None:
         try:
@@ -152,6 +180,25 @@ class Opening:
         end = ChannelEnd(channel, self._connection)
         self._connection.proven(end, limits.ROBOT_FRAME)
         channel.joined(self._connection)
+
+
+def _redeem(s: Session, message: link.Enroll, public_key: bytes, origin: str, now: float) -> RobotRecord:
+    """Enroll the robot and put that on record, both or neither."""
+    fingerprint = identity.fingerprint(public_key)
+    code = passwords.code_hash(message.code)
+    record = queries.redeem_enrolment_code(
+        s, message.robot, code, public_key, fingerprint, message.agent[:200], now
+    )
+    queries.append_audit(
+        s,
+        at=now,
+        actor=f"robot:{record.name}",
+        action="robot.enrolled",
+        target=record.name,
+        origin=origin,
+        data={"key": fingerprint},
+    )
+    return record
 
 
 def _wrong_version(version: int) -> MalformedMessage:
@@ -178,14 +225,16 @@ class Control:
         """Register the robot, unless it has only just registered from elsewhere."""
         robot, hall, connection = self._robot, self._hall, self._connection
         now = hall.seconds()
-        if robot.control is not None and now - robot.registered_at < REPLACE_SECONDS:
+        wait = robot.registered_at + robot.patience - now
+        if robot.control is not None and wait > 0:
             connection.refuse(
                 link.Refused(
                     reason="this robot registered a moment ago on another connection; is its key used twice?",
-                    retry_after=REPLACE_SECONDS,
+                    retry_after=wait,
                 )
             )
             return
+        self._replace(now - robot.registered_at)
         session = secrets.token_hex(4)
         connection.send(
             link.Welcome(
@@ -200,12 +249,29 @@ class Control:
         connection.on_round_trip = self._round_trip
         connection.proven(self, limits.CONTROL_FRAME)
         hall.registry.registered(robot, connection)
-        hall.journal.event("robot.online", "relay", robot_id=robot.robot_id, address=connection.address)
+        self._event("robot.online", address=connection.address)
         self.log.info(
             "robot {robot} is online from {address} ({agent})",
             robot=robot.name,
             address=connection.address,
             agent=self._hello.agent[:100],
+        )
+
+    def _replace(self, age: float) -> None:
+        """Take the place of a registration of this age, seconds, if there is one."""
+        robot = self._robot
+        if robot.control is None or age >= FLAPPING_SECONDS:
+            robot.patience = REPLACE_SECONDS
+            return
+        # Once may be a robot that came back before its old connection was known to be dead.
+        if robot.patience > REPLACE_SECONDS:
+            self._event("robot.key_used_twice", address=self._connection.address, other=robot.address)
+        robot.patience = min(MOST_PATIENCE, robot.patience * 2)
+
+    def _event(self, kind: str, source: str = "relay", **data: Any) -> bool:
+        robot = self._robot
+        return self._hall.journal.event(
+            kind, source, cause=f"robot:{robot.realm}/{robot.name}", robot_id=robot.robot_id, **data
         )
 
     def message(self, body: bytes) -> None:
@@ -221,23 +287,17 @@ class Control:
             self._robot.description = message
             self._hall.registry.changed()
         elif isinstance(message, link.Alert):
-            self.log.warn(
-                "robot {robot}: {severity}: {text}",
-                robot=self._robot.name,
-                severity=message.level[:20],
-                text=message.text[:500],
-            )
-            self._hall.journal.event(
-                "robot.alert",
-                f"robot:{self._robot.name}",
-                robot_id=self._robot.robot_id,
-                level=message.level[:20],
-                text=message.text[:500],
-            )
+            self._alert(message.level[:20], message.text[:500])
         elif isinstance(message, (link.Ping, link.Pong)):
             self._connection.heartbeat(message)
         elif isinstance(message, link.Bye):
             self._connection.close("bye")
+
+    def _alert(self, level: str, text: str) -> None:
+        if self._event("robot.alert", f"robot:{self._robot.name}", level=level, text=text):
+            self.log.warn(
+                "robot {robot}: {severity}: {text}", robot=self._robot.name, severity=level, text=text
+            )
 
     def sample(self, frame: SampleFrame) -> None:
         """The control link never carries bulk data."""
@@ -250,7 +310,7 @@ class Control:
         self._hall.registry.lost(robot, self._connection)
         if was_ours:
             self.log.info("robot {robot} is offline: {reason}", robot=robot.name, reason=reason)
-            self._hall.journal.event("robot.offline", "relay", robot_id=robot.robot_id, reason=reason[:200])
+            self._event("robot.offline", reason=reason[:200])
 
     def _round_trip(self, seconds: float) -> None:
         self._robot.rtt = seconds

@@ -161,7 +161,7 @@ async def test_tokens_prove_their_user_until_they_end(
     access, login = await token(store, ann), await token(store, ann, "login")
     principal = await auth.token(access)
     assert (principal.name, principal.expires) == ("ann", 5000.0)
-    session = await auth.open_session(principal)
+    session = await auth.open_session(await auth.password("ann", PASSWORD, HERE), HERE, "password")
     assert (await auth.token(session)).name == "ann"
     told = {await words(auth.token(each)) for each in (login, "unknown", "", "\ud800", "x" * 100_000)}
     await store.write(queries.revoke_token, principal.token_id)
@@ -169,6 +169,37 @@ async def test_tokens_prove_their_user_until_they_end(
     time.now += module.SESSION_SECONDS
     told.add(await words(auth.token(session)))
     assert told == {"the access token is unknown, expired or revoked"}
+
+
+@pytest.mark.parametrize("how", ["password", "link"])
+@pytest_twisted.ensureDeferred
+async def test_a_login_does_not_outrun_a_changed_password(
+    auth: Authenticator, store: Store, ann: UserRecord, how: str
+) -> None:
+    """What was right when it was looked at opens no session once it is wrong; nothing is on record then."""
+    code = await token(store, ann, "login")
+    login = await (auth.password("ann", PASSWORD, HERE) if how == "password" else auth.login_code(code, HERE))
+    await auth.open_session(login, HERE, how)
+    await store.write(queries.set_password, ann.id, passwords.hash_password("another one"))
+    assert "log in again" in await words(auth.open_session(login, HERE, how))
+    assert not await store.read(queries.list_tokens, ann.id)
+    assert [entry.action for entry in await store.read(queries.list_audit)] == ["login"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_login_that_can_not_be_put_on_record_opens_no_session(
+    auth: Authenticator, store: Store, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both or neither: whoever is in is in the audit log."""
+    login = await auth.password("ann", PASSWORD, HERE)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise Unavailable("the disk is full")
+
+    monkeypatch.setattr(queries, "append_audit", full)
+    with pytest.raises(Unavailable):
+        await auth.open_session(login, HERE, "password")
+    assert not await store.read(queries.list_tokens, ann.id)
 
 
 @pytest_twisted.ensureDeferred

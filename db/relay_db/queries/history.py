@@ -8,7 +8,7 @@ import sqlite3
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Text, delete, insert, select, type_coerce, update
+from sqlalchemy import Text, delete, func, insert, select, type_coerce, update
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
@@ -21,6 +21,9 @@ _START = hashlib.sha256(b"").hexdigest()
 """What the first entry follows."""
 
 _PAGE = 1000
+
+EVENTS = 1_000_000
+"""Most events kept, whatever their age."""
 
 
 def record_event(
@@ -66,9 +69,20 @@ def list_events(
     return [EventRecord(*row) for row in s.execute(query)]
 
 
-def purge_events(s: Session, before: float) -> int:
-    """Forget events older than that moment (Unix seconds); how many."""
-    return len(s.scalars(delete(Event).where(Event.at < before).returning(Event.id)).all())
+def purge_events(s: Session, before: float, most: int = EVENTS, batch: int = _PAGE) -> int:
+    """Forget one batch of the events that are too old or too many; how many. Call again until it is 0.
+
+    :param before: Unix seconds; older events go
+    :param most: rows that may stay, whatever their age
+    :param batch: rows of one transaction, so that nobody waits long for the writer
+    """
+    newest = select(func.coalesce(func.max(Event.id), 0)).scalar_subquery()
+    old = select(Event.id).where(Event.at < before).order_by(Event.at).limit(batch)
+    surplus = select(Event.id).where(Event.id <= newest - most).order_by(Event.id).limit(batch)
+    gone = s.execute(delete(Event).where(Event.id.in_(old))).rowcount  # type: ignore[attr-defined]
+    if gone == 0:
+        gone = s.execute(delete(Event).where(Event.id.in_(surplus))).rowcount  # type: ignore[attr-defined]
+    return int(gone)
 
 
 def append_audit(

@@ -13,7 +13,7 @@ from relay_db.names import findable_hex
 from relay_db.names import label as checked_label
 from relay_db.queries.records import PrincipalRecord, TokenRecord
 from relay_db.queries.state import bump
-from relay_protocol.errors import NotFound
+from relay_protocol.errors import NotFound, Refused
 
 TokenKind = Literal["access", "session", "login"]
 _LOGIN: tuple[TokenKind, ...] = ("login",)
@@ -47,6 +47,21 @@ def create_token(
         "expires": expires,
     }
     return s.scalars(insert(AccessToken).values(**values).returning(AccessToken.id)).one()
+
+
+def open_session(
+    s: Session, user_id: int, token_hash: str, *, password_hash: str | None, expires: float, now: float
+) -> int:
+    """Keep the token of a browser session, unless its user's password was changed since it was looked at.
+
+    :param password_hash: what was stored when the user was proved
+    :raises Refused: another is stored now, or the user was disabled or removed
+    """
+    standing = select(User.password_hash, User.disabled).where(User.id == user_id).with_for_update()
+    user = s.execute(standing).one_or_none()
+    if user is None or user.disabled or user.password_hash != password_hash:
+        raise Refused("the account was changed while you logged in; log in again")
+    return create_token(s, user_id, token_hash, kind="session", label="portal", expires=expires, now=now)
 
 
 def principal_by_token(

@@ -215,3 +215,19 @@ def test_events_are_listed_latest_first(database: Database) -> None:
         assert listed(robot_id=rover.id) == [1]
         assert queries.purge_events(s, before=2.5) == 2
         assert listed() == [3]
+
+
+def test_events_are_forgotten_in_batches_by_age_and_by_number(database: Database) -> None:
+    """The oldest first, so many at a time; none is left over the bound however young."""
+    with database.begin() as s:
+        for number in range(10):
+            queries.record_event(s, at=float(number), kind="online", source="relay", data={})
+
+        def left() -> list[float]:
+            return sorted(event.at for event in queries.list_events(s))
+
+        assert queries.purge_events(s, before=5.0, most=100, batch=3) == 3
+        assert left() == [3, 4, 5, 6, 7, 8, 9]
+        assert [queries.purge_events(s, before=5.0, most=2, batch=2) for _ in range(4)] == [2, 2, 1, 0]
+        assert left() == [8, 9]
+        assert queries.purge_events(s, before=5.0) == 0

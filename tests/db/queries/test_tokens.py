@@ -9,7 +9,7 @@ import pytest
 from relay_db import queries
 from relay_db.engine import Database
 from relay_db.queries import PrincipalRecord, UserRecord
-from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.errors import Invalid, NotFound, Refused
 
 HASH = "a" * 64
 
@@ -114,3 +114,31 @@ def test_tokens_that_cannot_be_are_refused(database: Database, ann: UserRecord) 
             queries.create_token(s, 99, HASH, kind="access", expires=None, now=1.0)
         with pytest.raises(Invalid, match="label"):
             queries.create_token(s, ann.id, HASH, kind="access", label="a\nb", expires=None, now=1.0)
+
+
+def test_a_session_opens_only_while_the_password_is_the_one_that_was_verified(
+    database: Database, ann: UserRecord
+) -> None:
+    """Changed, disabled or removed meanwhile: refused, and nothing is kept."""
+
+    def opens(stored: str | None) -> int:
+        with database.begin() as s:
+            return queries.open_session(s, ann.id, HASH, password_hash=stored, expires=9.0, now=1.0)
+
+    first = opens(None)
+    with database.begin() as s:
+        assert [(each.id, each.kind) for each in queries.list_tokens(s)] == [(first, "session")]
+        queries.set_password(s, ann.id, "hash")
+    with pytest.raises(Refused, match="log in again"):
+        opens(None)
+    opens("hash")
+    with database.begin() as s:
+        queries.set_disabled(s, ann.id, True)
+        queries.revoke_token(s, queries.list_tokens(s)[0].id)
+    with pytest.raises(Refused):
+        opens("hash")
+    with database.begin() as s:
+        assert not queries.list_tokens(s)
+        queries.remove_user(s, ann.id)
+    with pytest.raises(Refused):
+        opens("hash")

@@ -62,9 +62,9 @@ class Hall:
         self.registry = Registry(lambda: 1000.0)
         self.cap = AddressCap(3)
         clock = self.world.clock
-        journal = Journal(store, lambda: 1000.0)
+        self.journal = Journal(store, clock.seconds)
         self.hall = RobotHall(
-            RELAY, store, self.registry, self.world.channels, journal, clock.seconds, lambda: 1000.0
+            RELAY, store, self.registry, self.world.channels, self.journal, clock.seconds, lambda: 1000.0
         )
         timing = LinkTiming(2.0)
         self.factory = RobotFactory(

@@ -7,8 +7,9 @@ import pytest_twisted
 
 from relay_db import queries
 from relay_protocol import identity, limits, link
+from relay_protocol.errors import Unavailable
 from relay_protocol.frames import encode_json, encode_sample
-from relay_server import passwords
+from relay_server import limiter, passwords
 from relay_server.channel import State
 from tests.relay_server.edges.robot_ends import RELAY, Hall, Robot, until
 from tests.relay_server.memory import STRING, text
@@ -69,6 +70,39 @@ async def test_codes_that_are_not_good_are_told_the_same(hall: Hall) -> None:
         reasons.add(end.refusal()["reason"])
     assert len(reasons) == 1
     assert (await enrolling(hall, other, "other")).hears()[0]["op"] == "enrolled"
+
+
+@pytest_twisted.ensureDeferred
+async def test_guessing_codes_is_limited_and_a_good_one_makes_good(hall: Hall) -> None:
+    """Ten tries for one robot from one network; a robot that enrolls may prove itself at once."""
+    code = await code_for(hall, "c-3po")
+    for _ in range(limiter.FAILURES - 1):
+        end = await enrolling(hall, "wrong")
+        assert "too many" not in end.refusal()["reason"]
+    assert (await enrolling(hall, code)).hears()[0]["op"] == "enrolled"
+    for _ in range(limiter.FAILURES):
+        await enrolling(hall, "wrong")
+    code = await code_for(hall, "c-3po")
+    refusal = (await enrolling(hall, code)).refusal()
+    assert "too many failures" in refusal["reason"]
+    assert refusal["retry_after"] > 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_enrolment_that_can_not_be_put_on_record_does_not_spend_the_code(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both or neither."""
+    code = await code_for(hall, "c-3po")
+
+    def full(*_: object, **__: object) -> None:
+        raise Unavailable("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(queries, "append_audit", full)
+        refusal = (await enrolling(hall, code)).refusal()
+    assert (refusal["code"], refusal["retry_after"]) == ("unavailable", 5)
+    assert (await enrolling(hall, code)).hears()[0]["op"] == "enrolled"
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,15 @@ from typing import Any
 import pytest
 import pytest_twisted
 
+from relay_db import queries
 from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json, encode_sample, encode_video
-from relay_server.edges.robot_roles import REPLACE_SECONDS
+from relay_server import limiter
+from relay_server.edges.robot_roles import FLAPPING_SECONDS, MOST_PATIENCE
 from relay_server.edges.robots import PINGS
-from tests.relay_server.edges.robot_ends import FINGERPRINT, KEY, Hall
+from relay_server.journal import BURST
+from relay_server.registry import REPLACE_SECONDS
+from tests.relay_server.edges.robot_ends import FINGERPRINT, KEY, Hall, until
 
 # --- registering ------------------------------------------------------------------------------------------
 
@@ -54,6 +58,67 @@ async def test_unknown_robots_and_wrong_keys_are_told_the_same(hall: Hall) -> No
     assert all(each == told[0] for each in told)
     assert told[0]["reason"].startswith("this key is not accepted for this robot")
     assert hall.presence is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_fails_too_often_is_refused_before_the_database_is_asked(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten failures of one robot from one network; the right key must wait then, from elsewhere it need not."""
+    for _ in range(limiter.FAILURES):
+        robot = hall.dial()
+        robot.prove(robot.hello(), key=bytes(reversed(KEY)))
+        await robot.answered()
+        assert "not accepted" in robot.refusal()["reason"]
+    with monkeypatch.context() as patch:
+        patch.setattr(hall.store, "read", None)
+        robot = hall.dial()
+        robot.prove(robot.hello())
+        await robot.answered()
+    refusal = robot.refusal()
+    assert "too many failures" in refusal["reason"]
+    assert refusal["retry_after"] == limiter.WINDOW
+    other = hall.dial()
+    other.connection.address = "198.51.100.1"
+    assert (await other.registers())["op"] == "welcome"
+    assert len(await hall.store.read(queries.list_events, kind="robot.refused")) == limiter.FAILURES
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_key_revoked_while_its_proof_is_judged_does_not_stay(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The look for robots to cut may go by between reading the key and registering."""
+    read = hall.store.read
+
+    async def read_and_revoke(query: Any, *args: Any) -> Any:
+        found = await read(query, *args)
+        if found is not None:
+            await hall.store.write(queries.revoke_key, found.robot_id, FINGERPRINT, 1000.0)
+        return found
+
+    monkeypatch.setattr(hall.store, "read", read_and_revoke)
+    robot = hall.dial()
+    robot.prove(robot.hello())
+    await robot.answered()
+    assert robot.hears()[-1] == {"op": "bye", "reason": "the robot's key is not accepted any more"}
+    assert not robot.transport.connected
+    assert hall.presence is not None
+    assert hall.presence.control is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robots_flood_of_alerts_does_not_reach_the_database(hall: Hall) -> None:
+    """Some are kept, the rest is counted; another robot's events are kept meanwhile."""
+    robot = hall.dial()
+    await robot.registers()
+    for number in range(5000):
+        robot.says(link.Alert(level="error", text=str(number)))
+    assert robot.transport.connected
+    assert hall.journal.event("robot.online", "relay", cause="robot:other")
+    await until(lambda: hall.journal._waiting == 0)
+    kept = await hall.store.read(queries.list_events, kind="robot.alert")
+    assert len(kept) == BURST - 1
 
 
 @pytest_twisted.ensureDeferred
@@ -277,6 +342,29 @@ async def test_a_newer_link_replaces_the_older_but_not_at_once(hall: Hall) -> No
     assert not first.transport.connected
     assert hall.presence is not None
     assert hall.presence.control is third.connection
+
+
+@pytest_twisted.ensureDeferred
+async def test_two_daemons_with_one_key_flap_ever_more_slowly(hall: Hall) -> None:
+    """Each replacement doubles the wait up to a minute, and is told; a quiet time makes it short again."""
+    current = hall.dial()
+    await current.registers()
+    waits: list[int] = []
+    for _ in range(7):
+        waits.append(round((await hall.dial().registers())["retry_after"]))
+        for _ in range(waits[-1]):
+            hall.world.clock.advance(1)
+            current.says(link.Health())
+        current = hall.dial()
+        assert (await current.registers())["op"] == "welcome"
+    assert waits == [3, 6, 12, 24, 48, 60, 60]
+    events = await hall.store.read(queries.list_events, kind="robot.key_used_twice")
+    assert len(events) == 6
+    assert hall.presence is not None
+    assert hall.presence.patience == MOST_PATIENCE
+    hall.presence.registered_at -= FLAPPING_SECONDS
+    assert (await hall.dial().registers())["op"] == "welcome"
+    assert hall.presence.patience == REPLACE_SECONDS
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,101 @@
+"""Events are kept, but no more of one cause than is bearable."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import pytest_twisted
+
+from relay_db import queries
+from relay_server import journal as module
+from relay_server.journal import BURST, WAITING, Journal
+from relay_server.store import Store
+from tests.relay_server.edges.robot_ends import until
+
+
+class Time:
+    """A clock the test moves."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def time() -> Time:
+    """Some time."""
+    return Time()
+
+
+@pytest.fixture
+def journal(store: Store, time: Time) -> Journal:
+    """A journal on a real database."""
+    return Journal(store, time)
+
+
+async def kept(journal: Journal, store: Store, kind: str) -> list[dict[str, Any]]:
+    """The data of all events of a kind, oldest first."""
+    await until(lambda: journal._waiting == 0)
+    return [dict(event.data) for event in await store.read(queries.list_events, kind=kind, limit=1000)][::-1]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_burst_is_kept_and_what_comes_too_fast_is_counted(
+    journal: Journal, store: Store, time: Time
+) -> None:
+    """The count is told with the next event of that cause that is kept."""
+    results = [journal.event("x", "relay", cause="192.0.2.1", n=n) for n in range(BURST + 30)]
+    assert results == [True] * BURST + [False] * 30
+    time.now += 1
+    assert journal.event("x", "relay", cause="192.0.2.1", n=-1)
+    assert not journal.event("x", "relay", cause="192.0.2.1", n=-2)
+    assert [data["n"] for data in await kept(journal, store, "x")] == [*range(BURST), -1]
+    assert await kept(journal, store, "events.suppressed") == [{"cause": "192.0.2.1", "count": 30}]
+
+
+@pytest_twisted.ensureDeferred
+async def test_causes_do_not_disturb_each_other_but_a_network_is_one(journal: Journal, store: Store) -> None:
+    """Whoever has a network of IPv6 addresses has one bucket."""
+    for number in range(100):
+        journal.event("x", "relay", cause=f"2001:db8::{number:x}")
+    assert journal.event("y", "relay", cause="2001:db8:1::1")
+    assert journal.event("y", "relay", cause="robot:main/r2-d2")
+    assert len(await kept(journal, store, "x")) == BURST
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_clock_that_is_set_back_gives_no_events_away(
+    journal: Journal, store: Store, time: Time
+) -> None:
+    """Nor does it lock a cause out."""
+    for _ in range(BURST):
+        journal.event("x", "relay", cause="a")
+    time.now -= 500
+    assert not journal.event("x", "relay", cause="a")
+    time.now += 1
+    assert journal.event("x", "relay", cause="a")
+    assert len(await kept(journal, store, "x")) == BURST + 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_events_leave_room_for_logins_in_the_writers_queue(journal: Journal, store: Store) -> None:
+    """Many causes at once may fill only their part of it."""
+    results = [journal.event("x", "relay", cause=f"robot:{number}") for number in range(WAITING + 50)]
+    assert results == [True] * WAITING + [False] * 50
+    assert (await store.write(queries.add_user, "ann", None)).name == "ann"
+    assert len(await kept(journal, store, "x")) == WAITING
+    assert journal.event("x", "relay", cause="robot:0")
+    await until(lambda: journal._waiting == 0)
+
+
+def test_causes_are_forgotten_when_there_are_too_many(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Addresses without end fill no memory."""
+    monkeypatch.setattr(module, "CAUSES", 10)
+    monkeypatch.setattr(journal, "_write", lambda *_: None)
+    for number in range(100):
+        journal.event("x", "relay", cause=f"192.0.2.{number}")
+    assert len(journal._buckets) == 10
