@@ -18,10 +18,11 @@ from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.frames import SampleFrame
 from relay_protocol.limits import CALL_SECONDS, KIB
-from robot_client.motion import MotionDesk
+from robot_client.motion import MOTION_QOS, MotionDesk
 from robot_client.offset import Offset
 from robot_client.platforms.base import Platform, Sink, Source
 from robot_client.reactors import Clock, Timer
+from robot_client.topics import TypedTopic
 from robot_client.uplink import Uplink
 
 CHUNK = 64 * KIB
@@ -178,24 +179,33 @@ class Channel:
         if number in self._publishing:
             self._unpublish(number)
         _check_room(self._publishing, "publications")
-        sink = self._platform.advertise(message.topic, message.type, message.latch, message.qos)
-        motion = None
-        if self._motion.concerns(message.topic, message.type):
-            motion = f"{self.name}/{number}"
-            self._motion.open(motion, message.topic, message.type, sink)
-            self._log.info(
-                "{who} may drive by {topic}", who=message.source or "a client", topic=message.topic
-            )
-        self._publishing[number] = _Publishing(sink, message.topic, motion)
+        # What moves is judged by the names that are used in the end: the relay may spell them as it likes.
+        on = self._platform.resolve(message.topic, message.type)
+        if self._motion.concerns(on):
+            self._publishing[number] = publishing = self._advertise_motion(number, on)
+            self._log.info("{who} may drive by {topic}", who=message.source or "a client", topic=on.topic)
+        else:
+            sink = self._platform.advertise(*on, message.latch, message.qos)
+            self._publishing[number] = publishing = _Publishing(sink, on.topic, None)
         self._wire.say(
             link.Advertised(
                 number=number,
                 topic=message.topic,
-                type=message.type,
+                type=on.type,
                 encoding=self._platform.encoding,
-                motion=motion is not None,
+                motion=publishing.motion is not None,
             )
         )
+
+    def _advertise_motion(self, number: int, on: TypedTopic) -> _Publishing:
+        name = f"{self.name}/{number}"
+        sink = self._platform.advertise(*on, False, MOTION_QOS)
+        try:
+            self._motion.open(name, on, sink)
+        except SwitchboardError:
+            sink.close()
+            raise
+        return _Publishing(sink, on.topic, name)
 
     def _unadvertise(self, message: link.Unadvertise) -> None:
         self._unpublish(message.number)
@@ -206,7 +216,8 @@ class Channel:
             return
         if publishing.motion is not None:
             self._motion.close(publishing.motion)
-        publishing.sink.close()
+        else:
+            publishing.sink.close()
 
     def _call(self, message: link.CallService) -> None:
         id = message.id

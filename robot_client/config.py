@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,6 +12,7 @@ import msgspec
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
 from relay_protocol.link import MotionPolicy
+from robot_client.platforms.definitions import normalise
 
 ENVIRONMENT = "SWITCHBOARD_ROBOT_"
 NOT_SETTINGS = frozenset(ENVIRONMENT + name for name in ("STATE", "CONFIG", "LOG_JSON"))
@@ -18,14 +20,16 @@ NOT_SETTINGS = frozenset(ENVIRONMENT + name for name in ("STATE", "CONFIG", "LOG
 
 MOTION_TYPES = ["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
 
+_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
+
 Milliseconds = Annotated[int, msgspec.Meta(ge=50, le=10_000)]
 
 
 class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What moves the robot and when it is stopped.
 
-    :param motion_types: message types whose topics move the robot
-    :param motion_topics: further topics that do
+    :param motion_types: message types whose topics move the robot; ``package/Name`` is taken too
+    :param motion_topics: further topics that do; a leading ``/`` may be left out
     :param stop_within_ms: time from the last valid command to standing still
     :param deadline_ms: no command older than this is executed
     :param guard: whether a second process stops the robot when the daemon can't
@@ -36,6 +40,15 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     stop_within_ms: Milliseconds = STOP_WITHIN_MS
     deadline_ms: Milliseconds = COMMAND_DEADLINE_MS
     guard: bool = True
+
+    def __post_init__(self) -> None:
+        # Another spelling of a type or topic would match nothing, and switch the watchdog off in silence.
+        msgspec.structs.force_setattr(
+            self, "motion_types", [_message_type(each) for each in self.motion_types]
+        )
+        msgspec.structs.force_setattr(
+            self, "motion_topics", [_topic_name(each) for each in self.motion_topics]
+        )
 
     @property
     def policy(self) -> MotionPolicy:
@@ -73,6 +86,23 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     safety: Safety = msgspec.field(default_factory=Safety)
     ros: Ros = msgspec.field(default_factory=Ros)
     monitor: Monitor = msgspec.field(default_factory=Monitor)
+
+
+def _message_type(name: str) -> str:
+    try:
+        full = normalise(name.strip())
+    except Invalid as error:
+        raise ValueError(f"motion_types: {error}") from None
+    if "/msg/" not in full:
+        raise ValueError(f"motion_types: '{name}' is not a message type; write package/msg/Name")
+    return full
+
+
+def _topic_name(name: str) -> str:
+    full = "/" + name.strip().removeprefix("/")
+    if not _TOPIC.match(full):
+        raise ValueError(f"motion_topics: '{name}' is no topic; write /name or /namespace/name")
+    return full
 
 
 def load(path: Path | None, environment: Mapping[str, str]) -> Settings:

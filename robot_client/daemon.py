@@ -19,6 +19,7 @@ from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
 from robot_client.channel import Channel, Wire
+from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection, Dial
 from robot_client.graph_parts import parts
@@ -79,7 +80,7 @@ class Daemon:
     """Everything between the relay and one platform.
 
     :param dial: endpoints by address
-    :param now: monotonic clock, nanoseconds
+    :param now: clock of :mod:`robot_client.clocks`, nanoseconds
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Daemon:
         clock: Any,
         dial: Dial,
         agent: str,
-        now: Callable[[], int] = time.monotonic_ns,
+        now: Callable[[], int] = now_ns,
     ) -> None:
         self.motion = MotionDesk(settings.safety.policy, platform, clock, now, guard)
         self._settings = settings
@@ -132,7 +133,8 @@ class Daemon:
             if loop.running:
                 loop.stop()
         self._close_channels("the robot's daemon is leaving")
-        return self._connection.stop("the robot's daemon is leaving")
+        gone = self._connection.stop("the robot's daemon is leaving")
+        return gone.addBoth(lambda result: self.motion.finish().addCallback(lambda _: result))
 
     def alert(self, level: str, text: str) -> None:
         """Tell a person, now or when the relay can be reached again."""
@@ -150,7 +152,7 @@ class Daemon:
         self._heartbeat = welcome.heartbeat
         self._frame_limit = welcome.frame_limit
         self._connection.say(self._description())
-        self._told = self._platform.graph()
+        self._told = self._read_graph() or GraphView()
         self._tell_graph(whole(self._told))
         self._tell_health()
         while self._alerts:
@@ -257,10 +259,8 @@ class Daemon:
         self._look_for_trouble()
         if self._told is None:
             return
-        try:
-            view = self._platform.graph()
-        except Exception:  # a look that fails must not be the last one
-            self._log.failure("the graph could not be read")
+        view = self._read_graph()
+        if view is None:
             return
         changes = difference(self._told, view)
         self._told = view
@@ -271,6 +271,13 @@ class Daemon:
         for part in parts(graph):
             self._connection.say(part)
 
+    def _read_graph(self) -> GraphView | None:
+        try:
+            return self._platform.graph()
+        except Exception:  # a look that fails must not be the last one
+            self._log.failure("the graph could not be read")
+            return None
+
     def _look_for_trouble(self) -> None:
         trouble = self._platform.trouble()
         if trouble is not None and not self._troubled:
@@ -280,21 +287,34 @@ class Daemon:
         self._troubled = trouble is not None
 
     def _tell_health(self) -> None:
+        try:
+            health = self._health()
+        except Exception:  # a figure that can't be had must end neither this loop nor a registration
+            self._log.failure("the robot's health could not be told")
+            return
+        self._connection.say(health)
+
+    def _health(self) -> link.Health:
         round_trip = self._connection.round_trip
-        self._connection.say(
-            link.Health(
-                battery=self._platform.battery(),
-                cpu=self._machine.cpu(),
-                memory=self._machine.memory(),
-                rtt_ms=round(round_trip * 1000, 3) if round_trip is not None else None,
-                stale_commands=self.motion.stale_commands,
-                unguarded_commands=self.motion.unguarded_commands,
-                watchdog_stops=self.motion.watchdog_stops,
-                dropped_samples=self._platform.dropped
-                + self._dropped
-                + sum(each.channel.uplink.dropped for each in self._ends.values()),
-            )
+        return link.Health(
+            battery=self._battery(),
+            cpu=self._machine.cpu(),
+            memory=self._machine.memory(),
+            rtt_ms=round(round_trip * 1000, 3) if round_trip is not None else None,
+            stale_commands=self.motion.stale_commands,
+            unguarded_commands=self.motion.unguarded_commands,
+            watchdog_stops=self.motion.watchdog_stops,
+            dropped_samples=self._platform.dropped
+            + self._dropped
+            + sum(each.channel.uplink.dropped for each in self._ends.values()),
         )
+
+    def _battery(self) -> float | None:
+        try:
+            return self._platform.battery()
+        except Exception:
+            self._log.failure("the battery's charge could not be read")
+            return None
 
 
 def _operating_system() -> str:

@@ -11,23 +11,30 @@ import os
 import select
 import signal
 import sys
-import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import click
 import msgspec
 
-from robot_client.guard_protocol import Alive, Command, Leave, Line, Probe, Ready, Topic, decoder, encode
+from robot_client.clocks import now_ns
+from robot_client.guard_protocol import (
+    Alive,
+    Command,
+    Forget,
+    Leave,
+    Line,
+    Probe,
+    Ready,
+    Topic,
+    decoder,
+    encode,
+)
 from robot_client.ros_log import ensure_log_folder
-from robot_client.safety import GUARD_SHARE, Watchdog
+from robot_client.safety import GUARD_SHARE, MILLI, REPEAT_EVERY, REPEATS, Watchdog
+from robot_client.topics import TypedTopic
 
-MILLI = 1_000_000
 NANO = 1_000_000_000
-REPEATS = 5
-REPEAT_EVERY = 40 * MILLI
-"""A stop is said five times within 200 ms: the first ones may find a network that is just breaking."""
-
 LOOK_EVERY = 20 * MILLI
 LOOK_SELDOM = 500 * MILLI
 """How often to look whether a new publisher has found its listeners: the less the longer nobody was there."""
@@ -39,13 +46,16 @@ UNHEARD = 10 * NANO
 class Outlets(Protocol):
     """Publishers of zero."""
 
-    def open(self, topic: str, type: str) -> None:
+    def open(self, on: TypedTopic) -> None:
         """Have a publisher ready."""
 
-    def zero(self, topic: str) -> bool:
+    def close(self, on: TypedTopic) -> None:
+        """Take the publisher away, if there is one."""
+
+    def zero(self, on: TypedTopic) -> bool:
         """Publish zero; whether anybody listens."""
 
-    def heard(self, topic: str) -> bool:
+    def heard(self, on: TypedTopic) -> bool:
         """Whether anybody listens."""
 
 
@@ -61,7 +71,7 @@ class _Stop:
 class Guard:
     """Decides; pure but for the outlets.
 
-    :param now: monotonic clock, nanoseconds, the same the daemon has
+    :param now: clock of :mod:`robot_client.clocks`, nanoseconds, the same the daemon has
     """
 
     def __init__(self, within_ms: int, outlets: Outlets, now: Callable[[], int]) -> None:
@@ -69,18 +79,23 @@ class Guard:
         self._outlets = outlets
         self._now = now
         self._watchdog = Watchdog(within_ms, GUARD_SHARE)
-        self._stops: dict[str, _Stop] = {}
-        self._unready: dict[str, tuple[int, int]] = {}
-        self._ready: list[str] = []
+        self._stops: dict[TypedTopic, _Stop] = {}
+        self._unready: dict[TypedTopic, tuple[int, int]] = {}
+        self._ready: list[TypedTopic] = []
+        self._unused: set[TypedTopic] = set()
 
     def take(self, line: Line) -> bool:
         """One line from the daemon; whether it wants an answer."""
         if isinstance(line, Topic):
-            self._outlets.open(line.topic, line.type)
-            self._unready[line.topic] = (self._now(), self._now())
+            self._unused.discard(line.on)
+            self._unready[line.on] = (self._now(), self._now())
+            self._outlets.open(line.on)
+        elif isinstance(line, Forget):
+            self._unused.add(line.on)
+            self._withdraw()
         elif isinstance(line, Command):
-            self._stops.pop(line.topic, None)
-            self._watchdog.command(line.topic, "daemon", line.moving, line.at)
+            self._stops.pop(line.on, None)
+            self._watchdog.command(line.on, "daemon", line.moving, line.at)
         elif isinstance(line, Leave):
             self._watchdog.everything()
             self.leaving = True
@@ -92,7 +107,7 @@ class Guard:
         self.leaving = True
         self.act()
 
-    def take_ready(self) -> list[str]:
+    def take_ready(self) -> list[TypedTopic]:
         """Topics it has become able to stop since it was asked last."""
         ready, self._ready = self._ready, []
         return ready
@@ -102,14 +117,15 @@ class Guard:
         now = self._now()
         self._look(now)
         self._begin(self._watchdog.expired(now))
-        for topic, stop in list(self._stops.items()):
+        for on, stop in list(self._stops.items()):
             if stop.next > now:
                 continue
-            heard = self._outlets.zero(topic)
+            heard = self._zero(on)
             stop.left -= 1
             stop.next = now + REPEAT_EVERY
             if stop.left <= 0 and (heard or now >= stop.until):
-                del self._stops[topic]
+                del self._stops[on]
+        self._withdraw()
 
     def wait(self) -> float | None:
         """Seconds until :meth:`act` has something to do; ``None`` for as long as no line comes."""
@@ -125,19 +141,39 @@ class Guard:
         return self.leaving and not self._stops
 
     def _look(self, now: int) -> None:
-        for topic, (due, since) in list(self._unready.items()):
+        for on, (due, since) in list(self._unready.items()):
             if due > now:
                 continue
-            if self._outlets.heard(topic):
-                del self._unready[topic]
-                self._ready.append(topic)
+            if self._heard(on):
+                del self._unready[on]
+                self._ready.append(on)
             else:
                 pause = min(max((now - since) // 10, LOOK_EVERY), LOOK_SELDOM)
-                self._unready[topic] = (now + pause, since)
+                self._unready[on] = (now + pause, since)
 
-    def _begin(self, topics: list[str]) -> None:
-        for topic in topics:
-            self._stops[topic] = _Stop(self._now())
+    def _heard(self, on: TypedTopic) -> bool:
+        try:
+            return self._outlets.heard(on)
+        except Exception:  # no publisher yet; a former one of another type may be on its way out
+            return False
+
+    def _zero(self, on: TypedTopic) -> bool:
+        try:
+            return self._outlets.zero(on)
+        except Exception as error:  # one topic that fails must not keep the next from its stop
+            _say(f"could not stop {on}: {error}")
+            return False
+
+    def _begin(self, topics: list[TypedTopic]) -> None:
+        for on in topics:
+            self._stops[on] = _Stop(self._now())
+
+    def _withdraw(self) -> None:
+        for on in list(self._unused):
+            if on not in self._stops and not self._watchdog.moves(on):
+                self._unused.discard(on)
+                self._unready.pop(on, None)
+                self._outlets.close(on)
 
 
 class RosOutlets:
@@ -153,30 +189,40 @@ class RosOutlets:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._node: Any = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
         self._types = Types()
-        self._publishers: dict[str, tuple[Any, str]] = {}
+        self._publishers: dict[TypedTopic, Any] = {}
 
-    def open(self, topic: str, type: str) -> None:
+    def open(self, on: TypedTopic) -> None:
         """Have a publisher ready."""
-        if topic not in self._publishers:
-            publisher = self._node.create_publisher(self._types.message(type), topic, 10)
-            self._publishers[topic] = (publisher, type)
+        self._publisher(on)
 
-    def zero(self, topic: str) -> bool:
+    def close(self, on: TypedTopic) -> None:
+        """Take the publisher away."""
+        publisher = self._publishers.pop(on, None)
+        if publisher is not None:
+            self._node.destroy_publisher(publisher)
+
+    def zero(self, on: TypedTopic) -> bool:
         """Publish zero."""
-        publisher, type = self._publishers[topic]
-        publisher.publish(self._types.zero(type, self._node.get_clock().now().to_msg()))
-        return self.heard(topic)
+        self._publisher(on).publish(self._types.zero(on.type, self._node.get_clock().now().to_msg()))
+        return self.heard(on)
 
-    def heard(self, topic: str) -> bool:
+    def heard(self, on: TypedTopic) -> bool:
         """Whether DDS has matched a subscription."""
-        publisher, _ = self._publishers[topic]
-        return bool(publisher.get_subscription_count())
+        return bool(self._publisher(on).get_subscription_count())
+
+    def _publisher(self, on: TypedTopic) -> Any:
+        found = self._publishers.get(on)
+        if found is None:
+            kind = self._types.message(on.type)
+            found = self._publishers[on] = self._node.create_publisher(kind, on.topic, 10)
+        return found
 
 
-def watch(guard: Guard, inlet: int, wake: int) -> None:
+def watch(guard: Guard, inlet: int, outlet: int, wake: int) -> None:
     """Serve until the daemon is gone and the robot stands.
 
     :param inlet: descriptor the daemon writes to
+    :param outlet: descriptor the daemon reads
     :param wake: descriptor that becomes readable when this process is told to end
     """
     buffer = b""
@@ -194,29 +240,37 @@ def watch(guard: Guard, inlet: int, wake: int) -> None:
             data = os.read(inlet, 65536)
             *lines, buffer = (buffer + data).split(b"\n")
             for line in lines:
-                _serve(guard, line)
+                if _serve(guard, line):
+                    _answer(outlet, Alive())
             if not data:
                 poll.unregister(inlet)
                 if not guard.leaving:
                     guard.orphaned()
         guard.act()
-        for topic in guard.take_ready():
-            _answer(Ready(topic))
+        for on in guard.take_ready():
+            _answer(outlet, Ready(*on))
 
 
-def _serve(guard: Guard, line: bytes) -> None:
+def _serve(guard: Guard, line: bytes) -> bool:
     try:
-        if guard.take(decoder.decode(line)):
-            _answer(Alive())
+        return guard.take(decoder.decode(line))
     except msgspec.MsgspecError:
         _say("a line of the daemon made no sense")
     except Exception as error:  # a topic it can't guard must not keep it from guarding the others
         _say(f"a line of the daemon could not be followed: {error}")
+    return False
 
 
-def _answer(answer: Alive | Ready) -> None:
+def _answer(outlet: int, answer: Alive | Ready) -> None:
     with contextlib.suppress(BrokenPipeError):  # the daemon is gone; the end of the other pipe says so too
-        os.write(1, encode(answer))
+        os.write(outlet, encode(answer))
+
+
+def _own_stdout() -> int:
+    """Take standard output for answers alone: ROS can be told to log there (RCUTILS_LOGGING_USE_STDOUT)."""
+    outlet = os.dup(1)
+    os.dup2(2, 1)
+    return outlet
 
 
 def _say(text: str) -> None:
@@ -243,10 +297,11 @@ def main(node: str, within_ms: int) -> None:
     """Stop the robot when the daemon that started this can't."""
     with contextlib.suppress(PermissionError):  # a leader of its own already
         os.setsid()  # what ends the daemon's group or terminal must not end its guard
+    outlet = _own_stdout()
     wake = _wake_on_sigterm()
-    guard = Guard(within_ms, RosOutlets(node), time.monotonic_ns)
-    _answer(Alive())
-    watch(guard, 0, wake)
+    guard = Guard(within_ms, RosOutlets(node), now_ns)
+    _answer(outlet, Alive())
+    watch(guard, 0, outlet, wake)
     # Publishers are not taken down in order: Python's and DDS's farewells take longer than the stop is worth.
     os._exit(0)
 

@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import msgspec
 
+from robot_client.topics import TypedTopic
 
-class Topic(msgspec.Struct, array_like=True, tag_field="line", tag="topic", frozen=True):
-    """Commands may come on this topic; have a publisher ready."""
 
+class _OfTopic(msgspec.Struct, array_like=True, frozen=True):
     topic: str
     type: str
 
+    @property
+    def on(self) -> TypedTopic:
+        """What it is about."""
+        return TypedTopic(self.topic, self.type)
 
-class Command(msgspec.Struct, array_like=True, tag_field="line", tag="command", frozen=True):
-    """A command went out. ``at`` is the monotonic clock of the machine, nanoseconds."""
 
-    topic: str
+class Topic(_OfTopic, array_like=True, tag_field="line", tag="topic", frozen=True):
+    """Commands may come on this topic; have a publisher ready."""
+
+
+class Forget(_OfTopic, array_like=True, tag_field="line", tag="forget", frozen=True):
+    """No more commands will come on this topic; take the publisher away once the robot stands."""
+
+
+class Command(_OfTopic, array_like=True, tag_field="line", tag="command", frozen=True):
+    """A command went out. ``at`` is the clock of :mod:`robot_client.clocks`, nanoseconds."""
+
     moving: bool
     at: int
 
@@ -32,13 +44,11 @@ class Alive(msgspec.Struct, array_like=True, tag_field="line", tag="alive", froz
     """The guard's answer to a probe, and its first word."""
 
 
-class Ready(msgspec.Struct, array_like=True, tag_field="line", tag="ready", frozen=True):
+class Ready(_OfTopic, array_like=True, tag_field="line", tag="ready", frozen=True):
     """The guard's publisher has found who listens to this topic: from now on it could stop it."""
 
-    topic: str
 
-
-Line = Topic | Command | Probe | Leave
+Line = Topic | Forget | Command | Probe | Leave
 Answer = Alive | Ready
 
 decoder: msgspec.json.Decoder[Line] = msgspec.json.Decoder(Line)

@@ -7,19 +7,38 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.error import ProcessExitedAlready
 from twisted.internet.protocol import ProcessProtocol
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from robot_client.guard_protocol import Command, Leave, Line, Probe, Ready, Topic, answer_decoder, encode
+from robot_client.guard_protocol import (
+    Command,
+    Forget,
+    Leave,
+    Line,
+    Probe,
+    Ready,
+    Topic,
+    answer_decoder,
+    encode,
+)
 from robot_client.reactors import Timer
+from robot_client.topics import TypedTopic
 
 PROBE_EVERY = 5.0
+PROBE_MOVING = 1.0
+"""Seconds between probes while nothing moves, and while something does."""
+
+DOUBTFUL = 2.0
+"""Seconds a probe may wait for its answer before the guard no longer counts as able to stop anything."""
+
 SILENT = 20.0
 """Seconds without an answer after which a guard is taken for frozen; its start may take some."""
 
+MAX_LINE = 4096
 RESTART = (1.0, 30.0)
 LEAVE = 2.0
 
@@ -39,9 +58,10 @@ class GuardKeeper:
         self._within_ms = str(within_ms)
         self._started = 0
         self._process: _Process | None = None
-        self._topics: dict[str, Topic] = {}
-        self._commands: dict[str, Command] = {}
-        self._ready: set[str] = set()
+        self._topics: dict[TypedTopic, Topic] = {}
+        self._commands: dict[TypedTopic, Command] = {}
+        self._ready: set[TypedTopic] = set()
+        self._asked: float | None = None
         self._failures = 0
         self._timer: Timer | None = None
         self._left: Deferred[None] | None = None
@@ -67,7 +87,7 @@ class GuardKeeper:
         for line in lines:
             process.tell(line)
         self._heard = self._reactor.seconds()
-        self._timer = self._reactor.callLater(PROBE_EVERY, self._probe)
+        self._timer = self._reactor.callLater(self._pause, self._probe)
 
     def stop(self) -> Deferred[None]:
         """Let the guard leave; fires when it has."""
@@ -87,33 +107,50 @@ class GuardKeeper:
         """Process of the guard that lives now."""
         return self._process.transport.pid if self._process else None
 
-    def topic(self, topic: str, type: str) -> None:
+    def topic(self, on: TypedTopic) -> None:
         """Commands may come on this topic."""
-        if topic not in self._topics:
-            self._topics[topic] = line = Topic(topic, type)
+        if on not in self._topics:
+            self._topics[on] = line = Topic(*on)
             self._tell(line)
 
-    def command(self, topic: str, moving: bool, at: int) -> None:
-        """A command went out."""
-        self._commands[topic] = line = Command(topic, moving, at)
-        self._tell(line)
+    def forget(self, on: TypedTopic) -> None:
+        """No more commands will come on this topic."""
+        if self._topics.pop(on, None) is not None:
+            self._commands.pop(on, None)
+            self._ready.discard(on)
+            self._tell(Forget(*on))
 
-    def ready(self, topic: str) -> bool:
-        """Whether the guard that lives now could stop this topic."""
-        return topic in self._ready
+    def command(self, on: TypedTopic, moving: bool, at: int) -> None:
+        """A command went out."""
+        stood = not self._moving
+        self._commands[on] = line = Command(*on, moving, at)
+        self._tell(line)
+        if moving and stood and self._process is not None and self._left is None:
+            self._probe_at_once()
+
+    def ready(self, on: TypedTopic) -> bool:
+        """Whether the guard that lives now could stop this topic, as far as its answers tell."""
+        doubtful = self._asked is not None and self._reactor.seconds() - self._asked > DOUBTFUL
+        return on in self._ready and not doubtful
 
     def heard(self, line: bytes) -> None:
-        """The guard answered."""
+        """The guard answered, or something in its process wrote where it answers."""
+        try:
+            answer = answer_decoder.decode(line)
+        except msgspec.MsgspecError:
+            return
         self._heard = self._reactor.seconds()
+        self._asked = None
         self._failures = 0
-        answer = answer_decoder.decode(line)
-        if isinstance(answer, Ready):
-            self._ready.add(answer.topic)
+        # A word about a topic that was forgotten meanwhile must not count when the topic comes back.
+        if isinstance(answer, Ready) and answer.on in self._topics:
+            self._ready.add(answer.on)
 
     def lost(self, why: str) -> None:
         """The guard is gone; get another."""
         self._process = None
         self._ready.clear()
+        self._asked = None
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         self._timer = None
@@ -145,7 +182,22 @@ class GuardKeeper:
             self._process.kill()
             return
         self._process.tell(Probe())
-        self._timer = self._reactor.callLater(PROBE_EVERY, self._probe)
+        if self._asked is None:
+            self._asked = self._reactor.seconds()
+        self._timer = self._reactor.callLater(self._pause, self._probe)
+
+    def _probe_at_once(self) -> None:
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._probe()
+
+    @property
+    def _moving(self) -> bool:
+        return any(each.moving for each in self._commands.values())
+
+    @property
+    def _pause(self) -> float:
+        return PROBE_MOVING if self._moving else PROBE_EVERY
 
 
 class _Process(ProcessProtocol):
@@ -170,7 +222,8 @@ class _Process(ProcessProtocol):
 
     def outReceived(self, data: bytes) -> None:
         """It answered."""
-        *lines, self._said = (self._said + data).split(b"\n")
+        *lines, rest = (self._said + data).split(b"\n")
+        self._said = rest[-MAX_LINE:]
         for line in lines:
             self._keeper.heard(line)
 

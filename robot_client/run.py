@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import secrets
-import time
 from importlib import metadata
 from typing import Any
 
@@ -13,6 +12,7 @@ from twisted.logger import Logger
 
 from relay_protocol.errors import Unavailable
 from robot_client.backoff import Backoff
+from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection
 from robot_client.daemon import Daemon
@@ -79,14 +79,21 @@ class Runner:
         self._enrolment = enrolment
         connection = Connection(
             self._dial,
-            lambda: ControlLink(me, agent(), time.monotonic_ns),
+            lambda: ControlLink(me, agent(), now_ns),
             reactor,
             Backoff(secrets.SystemRandom().random),
             me.robot,
             enrolment.address,
         )
         self.daemon = Daemon(
-            settings, connection, self.platform, self.keeper or NoGuard(), reactor, self._dial, agent()
+            settings,
+            connection,
+            self.platform,
+            self.keeper or NoGuard(),
+            reactor,
+            self._dial,
+            agent(),
+            now_ns,
         )
         self._notifier = Notifier(reactor, os.environ, lambda: self.platform.trouble() is None)
         self._log = Logger("daemon")
@@ -109,7 +116,9 @@ class Runner:
         self._notifier.stop()
         leaving: list[Deferred[Any]] = [self.daemon.stop()]
         if self.keeper is not None:
-            leaving.append(self.keeper.stop())
+            # It watches until the last zero is said.
+            leave = self.keeper.stop
+            leaving.append(self.daemon.motion.finish().addCallback(lambda _: leave()))
         gone = DeferredList(leaving, consumeErrors=True)
         gone.addTimeout(LEAVE_SECONDS, self.reactor)
         return gone.addBoth(lambda _: self.platform.stop())

@@ -14,6 +14,7 @@ import msgspec
 from twisted.internet.defer import Deferred
 
 from relay_protocol import link
+from robot_client.topics import TypedTopic
 
 OnSample = Callable[[bytes], None]
 Entry = TypeVar("Entry", link.Topic, link.Service)
@@ -108,6 +109,12 @@ class Platform(Protocol):
 
         :param type: empty to take the topic's one type from the graph
         :param on_change: called when :attr:`Source.latched` or :attr:`Source.publishers` changed
+        """
+
+    def resolve(self, topic: str, type: str) -> TypedTopic:
+        """Name and type that :meth:`advertise` would use, however they are spelled.
+
+        :param type: empty to take the topic's one type from the graph
         """
 
     def advertise(self, topic: str, type: str, latch: bool, qos: link.QoS | None) -> Sink:

@@ -10,6 +10,8 @@ from twisted.internet.defer import Deferred, fail, succeed
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
 from robot_client.platforms.base import Facts, GraphView, Motion, OnSample, Platform
+from robot_client.platforms.definitions import normalise
+from robot_client.topics import TypedTopic
 
 TWIST = "geometry_msgs/msg/Twist"
 _HEADER = b"\0\1\0\0"
@@ -41,8 +43,12 @@ class MemorySource:
 class MemorySink:
     """A publisher; what it publishes is in :attr:`MemoryPlatform.published`."""
 
-    def __init__(self, platform: MemoryPlatform, topic: str) -> None:
+    def __init__(
+        self, platform: MemoryPlatform, topic: str, latch: bool = False, qos: link.QoS | None = None
+    ) -> None:
         self.topic = topic
+        self.latch = latch
+        self.qos = qos
         self._platform = platform
 
     def publish(self, body: bytes) -> None:
@@ -121,11 +127,17 @@ class MemoryPlatform(Platform):
         self.sources.append(source)
         return source
 
+    def resolve(self, topic: str, type: str) -> TypedTopic:
+        """Make name and type full."""
+        full = "/" + topic.removeprefix("/")
+        known = self.view.topics.get(full)
+        if not type and known is None:
+            raise Invalid(f"{topic} can't be advertised without a type")
+        return TypedTopic(full, normalise(type) if type or known is None else known.types[0])
+
     def advertise(self, topic: str, type: str, latch: bool, qos: link.QoS | None) -> MemorySink:
         """Make a recording publisher."""
-        if not type:
-            raise Invalid(f"{topic} can't be advertised without a type")
-        sink = MemorySink(self, topic)
+        sink = MemorySink(self, self.resolve(topic, type).topic, latch, qos)
         self.sinks.append(sink)
         return sink
 

@@ -17,6 +17,11 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from twisted.internet.defer import Deferred, fail
 
+try:
+    from rclpy.event_handler import PublisherEventCallbacks
+except ImportError:  # Humble
+    from rclpy.qos_event import PublisherEventCallbacks
+
 from relay_protocol import link
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from robot_client.platforms import ros2_graph, ros2_qos
@@ -33,8 +38,11 @@ from robot_client.platforms.ros2_topics import (
 )
 from robot_client.platforms.ros2_types import Types
 from robot_client.ros_log import ensure_log_folder
+from robot_client.topics import TypedTopic
 
 BATTERY = "sensor_msgs/msg/BatteryState"
+# The executor would hold on to a publisher by its events after its end, and with it to the topic's type.
+_NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 FAREWELL = 0.3
 """Seconds the last messages have to arrive when the daemon leaves; a stop is among them."""
 
@@ -139,8 +147,7 @@ class Ros2Platform(Platform):
         on_change: Callable[[], None],
     ) -> RosSource:
         """Listen to a topic, present or not yet."""
-        check_name(self._node.resolve_topic_name, topic, "topic")
-        full = topic_type(topic, type, self._node.get_topic_names_and_types())
+        topic, full = self.resolve(topic, type)
         try:
             source = RosSource(
                 self._node,
@@ -161,15 +168,32 @@ class Ros2Platform(Platform):
         self._sources.append(source)
         return source
 
+    def resolve(self, topic: str, type: str) -> TypedTopic:
+        """Expand the name; the type is what others in the graph use, else what is asked for."""
+        full = check_name(self._node.resolve_topic_name, topic, "topic")
+        theirs, ours = set(), set()
+        for each in (
+            *self._node.get_publishers_info_by_topic(full),
+            *self._node.get_subscriptions_info_by_topic(full),
+        ):
+            node = f"{each.node_namespace.rstrip('/')}/{each.node_name}"
+            if not node.startswith(self._own):
+                theirs.add(each.topic_type)
+            elif each.node_name == self._name:
+                ours.add(each.topic_type)
+        # What was commanded in vain, and the guard's readiness to stop it, must not decide for the robot's driver.
+        types = theirs or (set() if type else ours)
+        return TypedTopic(full, topic_type(full, type, sorted(types)))
+
     def advertise(self, topic: str, type: str, latch: bool, qos: link.QoS | None) -> RosSink:
         """Make a publisher."""
-        check_name(self._node.resolve_topic_name, topic, "topic")
-        full = topic_type(topic, type, self._node.get_topic_names_and_types())
+        topic, full = self.resolve(topic, type)
         kind = self._types.message(full)
+        self._lingering.give_way(topic, kind)
         listening = self._node.get_subscriptions_info_by_topic(topic)
         profile = ros2_qos.for_publisher([each.qos_profile for each in listening], latch, qos)
         try:
-            publisher = self._node.create_publisher(kind, topic, profile)
+            publisher = self._node.create_publisher(kind, topic, profile, event_callbacks=_NO_EVENTS)
         except Exception as error:
             raise Invalid(f"ROS 2 refuses to publish {topic} as {full}: {error}") from None
         sink = RosSink(publisher, self._sunk)
@@ -206,7 +230,13 @@ class Ros2Platform(Platform):
         """Charge as the first battery topic tells it."""
         if self._battery_sample is None:
             return None
-        state: Any = deserialize_message(self._battery_sample, self._types.message(BATTERY))
+        try:
+            state: Any = deserialize_message(self._battery_sample, self._types.message(BATTERY))
+        except (
+            Exception
+        ):  # any node may publish anything there; rclpy's errors differ from release to release
+            self._battery_sample = None
+            return None
         return float(state.percentage) if 0.0 <= state.percentage <= 1.0 else None
 
     def trouble(self) -> str | None:

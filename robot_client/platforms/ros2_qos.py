@@ -53,7 +53,13 @@ def for_subscription(found: Match, asked: QoS | None) -> QoSProfile:
 
 
 def for_publisher(subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | None) -> QoSProfile:
-    """The profile to publish with: reliable serves every subscriber; durable if asked or if all want it."""
+    """The profile to publish with: reliable serves every subscriber; durable if asked or if all want it.
+
+    :raises Invalid: a wish that can't be met
+    """
+    if asked is not None and asked.history == "keep_all":
+        # The reactor would wait in publish() for as long as one subscriber takes nothing.
+        raise Invalid("qos: what is published keeps the last messages (history keep_last), not all of them")
     durable = latch or (
         bool(subscribers) and all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in subscribers)
     )

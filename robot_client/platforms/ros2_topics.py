@@ -21,28 +21,27 @@ from robot_client.reactors import Clock, Timer
 LINGER = 0.5
 
 
-def check_name(resolve: Callable[[str], str], name: str, what: str) -> None:
-    """See that rclpy takes a name.
+def check_name(resolve: Callable[[str], str], name: str, what: str) -> str:
+    """See that rclpy takes a name; the full name it stands for.
 
     :param what: ``topic`` or ``service``, for the error
     :raises Invalid: it does not
     """
     try:
-        resolve(name)
+        return resolve(name)
     except Exception as error:
         reason = str(error).splitlines()[0].rstrip(".:") if str(error) else "not allowed"
         raise Invalid(f"'{name}' is no {what} name: {reason}") from None
 
 
-def topic_type(topic: str, asked: str, known: Iterable[tuple[str, list[str]]]) -> str:
+def topic_type(topic: str, asked: str, types: list[str]) -> str:
     """The type to use for a topic, which need not exist yet if its type is said.
 
     :param asked: what the client says, may be empty
-    :param known: names and types of the graph
+    :param types: types the topic has in the graph
     :raises NotFound: no type was said, and the graph has none
     :raises Invalid: the graph has another, or several
     """
-    types = next((types for each, types in known if each == topic), [])
     if asked and not types:
         return normalise(asked)
     if not types:
@@ -222,6 +221,16 @@ class Lingering:
     def take(self, publisher: Any) -> None:
         """Destroy this one in a while."""
         self._timers[publisher] = self._clock.callLater(LINGER, self._destroy, publisher)
+
+    def give_way(self, topic: str, kind: Any) -> None:
+        """Destroy those of this topic that have another type: some middleware allows one type of a topic in a process.
+
+        :param kind: class of the message
+        """
+        for publisher, timer in list(self._timers.items()):
+            if publisher.topic_name == topic and publisher.msg_type is not kind:
+                timer.cancel()
+                self._destroy(publisher)
 
     def end(self, seconds: float) -> None:
         """Destroy all, once what they said has arrived, or after ``seconds``."""

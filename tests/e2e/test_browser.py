@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from switchboard_harness import Relay, Robot, wait_for
 
 import relay_server
+from robot_client.safety import REPEATS
 
 PASSWORD = "correct horse"
 ARGUMENTS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--disable-background-networking"]
@@ -153,18 +154,21 @@ def colours(page: Page, canvas: str) -> int:
     )
 
 
-def stands_after_one_zero(house: House, page: Page, since: int) -> None:
-    """What reached the robot since then ends with exactly one zero, and it stands."""
+def stands_after_zero(house: House, page: Page, since: int) -> None:
+    """What reached the robot since then ends with zeros alone, and it stands.
+
+    The page says zero once; the robot's daemon repeats it for 200 ms, for subscribers that may have missed it.
+    """
 
     def commands() -> list[tuple[float, float]]:
         return [(each["v"], each["w"]) for each in house.robot.events("command", since)]
 
     wait_for("a zero came", lambda: commands()[-1:] == [(0, 0)], 5)
     wait_for("the robot stands", lambda: not house.robot.moving(), 5)
-    page.wait_for_timeout(700)  # proves absence: neither a further command nor a second zero
+    page.wait_for_timeout(700)  # proves absence: no further command, and no zero but the daemon's repeats
     told = commands()
     last = max(index for index, each in enumerate(told) if each != (0, 0))
-    assert told[last + 1 :] == [(0, 0)]
+    assert 1 <= len(told[last + 1 :]) <= REPEATS
 
 
 # --- coming in --------------------------------------------------------------------------------------------
@@ -223,7 +227,7 @@ def test_logging_out_closes_the_portal(open_page: OpenPage) -> None:
 
 
 def test_the_joystick_drives_and_letting_go_stops(house: House, open_page: OpenPage) -> None:
-    """The robot moves by its own record, picture and scan change; letting go brings one zero and standstill."""
+    """The robot moves by its own record, picture and scan change; letting go brings zero and standstill."""
     house.put_back()
     page = open_page("/cockpit/rover", "pilot")
     ready_to_drive(page)
@@ -235,21 +239,21 @@ def test_the_joystick_drives_and_letting_go_stops(house: House, open_page: OpenP
     for name, shown in before.items():
         wait_for(f"{name} changes", lambda name=name, shown=shown: picture(page, name) != shown)
     page.mouse.up()
-    stands_after_one_zero(house, page, since)
+    stands_after_zero(house, page, since)
     turning = [each for each in house.robot.events("command", since) if each["w"]]
     assert all(each["w"] > 0 for each in turning), "pulled to the left it turns left"
     expect(seen(page, "odom-speed")).to_have_text("0.00")
 
 
 def test_the_keyboard_drives_and_lifting_the_key_stops(house: House, open_page: OpenPage) -> None:
-    """A turns on the spot; lifting it brings one zero and standstill."""
+    """A turns on the spot; lifting it brings zero and standstill."""
     page = open_page("/cockpit/rover", "pilot")
     ready_to_drive(page)
     since = time.monotonic_ns()
     page.keyboard.down("a")
     wait_for("the robot moves", house.robot.moving)
     page.keyboard.up("a")
-    stands_after_one_zero(house, page, since)
+    stands_after_zero(house, page, since)
 
 
 def test_a_page_that_loses_the_focus_stops(house: House, open_page: OpenPage) -> None:
@@ -260,7 +264,7 @@ def test_a_page_that_loses_the_focus_stops(house: House, open_page: OpenPage) ->
     page.keyboard.down("a")
     wait_for("the robot moves", house.robot.moving)
     page.evaluate("window.dispatchEvent(new Event('blur'))")
-    stands_after_one_zero(house, page, since)
+    stands_after_zero(house, page, since)
     page.keyboard.up("a")
 
 
@@ -334,7 +338,7 @@ def test_the_page_recovers_from_a_restart_of_the_relay(house: House, open_page: 
     page.keyboard.down("a")
     wait_for("the robot moves", house.robot.moving)
     page.keyboard.up("a")
-    stands_after_one_zero(house, page, since)
+    stands_after_zero(house, page, since)
 
 
 def test_a_robot_that_goes_away_is_shown_so_and_comes_back(house: House, open_page: OpenPage) -> None:

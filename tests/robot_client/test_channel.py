@@ -12,7 +12,7 @@ from relay_protocol import link
 from relay_protocol.frames import FrameDecoder, SampleFrame
 from relay_protocol.link import MotionPolicy
 from robot_client.channel import Channel, Wire
-from robot_client.motion import MotionDesk, NoGuard
+from robot_client.motion import KEPT, MAX_TOPICS, MOTION_QOS, MotionDesk, NoGuard
 from robot_client.offset import Offset
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
@@ -56,6 +56,10 @@ class Scene:
     def frames(self) -> list[SampleFrame]:
         data = b"".join(piece for write in self.wire.writes for piece in write)
         return FrameDecoder(2**25).feed(data)  # type: ignore[return-value]
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds * 100)):
+            self.clock.advance(0.01)
 
     def drive(self, body: bytes) -> None:
         self.channel.sample(SampleFrame(5, self.now(), body))
@@ -145,6 +149,55 @@ def test_advertise_says_what_is_motion(scene: Scene) -> None:
     assert scene.ask(link.Advertise(number=6, topic="/chat", type=STRING)).motion is False
 
 
+@pytest.mark.parametrize(
+    ("topic", "type"),
+    [
+        ("/cmd_vel", "geometry_msgs/Twist"),
+        ("cmd_vel", TWIST),
+        ("/base", ""),
+        ("/arm", STRING),
+        ("arm", "std_msgs/String"),
+    ],
+)
+def test_no_spelling_leads_past_the_watchdog(topic: str, type: str) -> None:
+    """What moves the robot is told by the names the platform uses, however the relay spells them."""
+    scene = Scene()
+    scene.desk.policy = MotionPolicy(types=[TWIST], topics=["/arm"])
+    scene.platform.view = GraphView(topics={"/base": link.Topic(types=[TWIST])})
+    assert scene.ask(link.Advertise(number=5, topic=topic, type=type)).motion is True
+
+
+def test_client_has_no_say_in_how_motion_is_published(scene: Scene) -> None:
+    """Motion is reliable, volatile and short, whatever was asked; elsewhere the client is asked."""
+    wish = link.QoS(history="keep_all", durability="transient_local", reliability="best_effort")
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST, latch=True, qos=wish))
+    scene.ask(link.Advertise(number=6, topic="/chat", type=STRING, latch=True, qos=wish))
+    motion, chat = scene.platform.sinks
+    assert (motion.latch, motion.qos) == (False, MOTION_QOS)
+    assert (chat.latch, chat.qos) == (True, wish)
+
+
+def test_too_many_motion_topics_are_refused_in_words(scene: Scene) -> None:
+    """The topic over the limit is refused with the reason, and no publisher is left of it."""
+    for number in range(MAX_TOPICS):
+        scene.ask(link.Advertise(number=number, topic=f"/t{number}", type=TWIST))
+    answer = scene.ask(link.Advertise(number=99, topic="/more", type=TWIST))
+    assert isinstance(answer, link.Failed)
+    assert str(MAX_TOPICS) in answer.reason
+    assert len(scene.platform.sinks) == MAX_TOPICS
+
+
+def test_commands_from_before_an_advertisement_are_never_executed(scene: Scene) -> None:
+    """What comes before the advertisement, or between two of them, is kept nowhere."""
+    scene.drive(twist(1.0))
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    scene.channel.handle(link.Unadvertise(number=5))
+    scene.drive(twist(1.0))
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    scene.run(1)
+    assert scene.platform.published == []
+
+
 def test_plain_topics_are_not_judged_by_age(scene: Scene) -> None:
     """A message on a topic that moves nothing is published however old it is."""
     scene.ask(link.Advertise(number=6, topic="/chat", type=STRING))
@@ -164,6 +217,8 @@ def test_unadvertise_stops_the_robot(scene: Scene) -> None:
     scene.drive(twist(1.0))
     scene.channel.handle(link.Unadvertise(number=5))
     assert scene.platform.published == [("/cmd_vel", twist(1.0)), ("/cmd_vel", twist())]
+    scene.run(0.2)
+    assert scene.platform.published == [("/cmd_vel", twist(1.0))] + 5 * [("/cmd_vel", twist())]
     assert scene.platform.sinks == []
 
 
@@ -179,7 +234,9 @@ def test_end_of_the_channel_stops_and_releases_all(scene: Scene) -> None:
     told = len(scene.wire.said)
     scene.channel.close()
     assert scene.platform.published[-1] == ("/cmd_vel", twist())
+    scene.run(0.2)
     assert (scene.platform.sources, scene.platform.sinks) == ([], [])
+    scene.clock.advance(KEPT)
     assert scene.clock.getDelayedCalls() == []
     assert len(scene.wire.said) == told
 

@@ -63,3 +63,34 @@ def test_missing_file_is_said(tmp_path: Path) -> None:
     """A settings file that is not there is an error in words."""
     with pytest.raises(Invalid, match="can't be read"):
         load(tmp_path / "none.toml", {})
+
+
+def test_short_spellings_of_motion_are_made_full() -> None:
+    """A type without its middle part and a topic without its slash count as what they mean."""
+    settings = load(
+        None,
+        {
+            "SWITCHBOARD_ROBOT_SAFETY_MOTION_TYPES": "geometry_msgs/Twist",
+            "SWITCHBOARD_ROBOT_SAFETY_MOTION_TOPICS": "cmd_vel, arm/joints",
+        },
+    )
+    assert settings.safety.policy.types == ["geometry_msgs/msg/Twist"]
+    assert settings.safety.policy.topics == ["/cmd_vel", "/arm/joints"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("motion_types", "Twist"),
+        ("motion_types", "std_srvs/srv/Trigger"),
+        ("motion_topics", "cmd vel"),
+        ("motion_topics", "/cmd_vel/"),
+        ("motion_topics", "*"),
+    ],
+)
+def test_motion_that_could_match_nothing_is_refused(tmp_path: Path, key: str, value: str) -> None:
+    """A type or topic that no robot can have is refused by name: it would leave the robot without a watchdog."""
+    file = tmp_path / "robot.toml"
+    file.write_text(f'[safety]\n{key} = ["{value}"]\n')
+    with pytest.raises(Invalid, match=key):
+        load(file, {})

@@ -265,6 +265,7 @@ def test_every_loss_stops_the_robot_at_once(scene: Scene, how: str) -> None:
         "hostile frame": lambda: line.protocol.dataReceived(b"\xff\xff\xff\xff\x00"),
     }[how]()
     assert scene.platform.published[-1] == ("/cmd_vel", twist())
+    scene.run(0.5)
     assert scene.platform.sinks == []
 
 
@@ -288,7 +289,7 @@ def test_reconnecting_resumes_nothing(scene: Scene) -> None:
     line = scene.channel(control)
     line.protocol.dataReceived(frames.encode_sample(5, scene.now(), twist(1.0)))
     scene.run(1)
-    assert len(scene.platform.published) == sent
+    assert {body for _, body in scene.platform.published[sent:]} == {twist()}
 
 
 def test_alert_waits_for_the_relay(scene: Scene) -> None:
@@ -321,3 +322,45 @@ def test_stuck_middleware_is_told_once(scene: Scene) -> None:
     scene.run(1)
     alerts = [each["level"] for each in control.heard() if each["op"] == "alert"]
     assert alerts == ["error", "info"]
+
+
+def test_battery_that_can_not_be_read_ends_nothing(scene: Scene) -> None:
+    """A platform that throws over its battery costs the charge, not the registration and not the health to come."""
+
+    def broken() -> float | None:
+        raise RuntimeError("malformed sample")
+
+    scene.platform.battery = broken  # type: ignore[method-assign]
+    heard = scene.register().heard()
+    assert "health" in [each["op"] for each in heard]
+    del scene.platform.battery
+    scene.platform.charge = 0.5
+    scene.run(4)
+    told = [each for each in scene.lines[-1].heard() if each["op"] == "health"]
+    assert told[-1]["battery"] == 0.5
+
+
+def test_graph_that_can_not_be_read_at_first_is_told_later(scene: Scene) -> None:
+    """A robot whose graph throws is registered all the same, and tells it when it can be read."""
+    view = scene.platform.graph
+
+    def broken() -> GraphView:
+        raise RuntimeError("no graph")
+
+    scene.platform.graph = broken  # type: ignore[method-assign]
+    control = scene.register()
+    assert "health" in control.ops()
+    scene.platform.graph = view  # type: ignore[method-assign]
+    scene.run(1)
+    assert any("/talker" in each["nodes"] for each in control.heard() if each["op"] == "graph")
+
+
+def test_daemon_that_leaves_says_every_zero_first(scene: Scene) -> None:
+    """Leaving is done when the last of the five zeros went out."""
+    scene.driving(scene.register())
+    left: list[Any] = []
+    scene.daemon.stop().addCallback(left.append)
+    assert left == []
+    scene.run(0.5)
+    assert left == [None]
+    assert scene.platform.published[1:] == 5 * [("/cmd_vel", twist())]

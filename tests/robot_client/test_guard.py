@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from robot_client.guard import Guard
-from robot_client.guard_protocol import Command, Leave, Probe, Topic, decoder, encode
+from robot_client.guard_protocol import Alive, Command, Forget, Leave, Probe, Topic, decoder, encode
+from robot_client.topics import TypedTopic
 
 MS = 1_000_000
+TWIST = "geometry_msgs/msg/Twist"
+CMD = TypedTopic("/cmd_vel", TWIST)
+STAMPED = TypedTopic("/cmd_vel", "geometry_msgs/msg/TwistStamped")
 
 
 class Outlets:
     def __init__(self) -> None:
-        self.opened: list[str] = []
-        self.zeros: list[tuple[int, str]] = []
+        self.open_now: set[TypedTopic] = set()
+        self.zeros: list[tuple[int, TypedTopic]] = []
         self.listened = True
         self.scene: Scene
 
-    def open(self, topic: str, type: str) -> None:
-        self.opened.append(topic)
+    def open(self, on: TypedTopic) -> None:
+        self.open_now.add(on)
 
-    def zero(self, topic: str) -> bool:
-        self.zeros.append((self.scene.now // MS, topic))
+    def close(self, on: TypedTopic) -> None:
+        self.open_now.discard(on)
+
+    def zero(self, on: TypedTopic) -> bool:
+        self.zeros.append((self.scene.now // MS, on))
         return self.listened
 
-    def heard(self, topic: str) -> bool:
+    def heard(self, on: TypedTopic) -> bool:
         return self.listened
 
 
@@ -34,12 +44,12 @@ class Scene:
         self.outlets = Outlets()
         self.outlets.scene = self
         self.guard = Guard(500, self.outlets, lambda: self.now)
-        self.guard.take(Topic("/cmd_vel", "geometry_msgs/msg/Twist"))
+        self.guard.take(Topic(*CMD))
         self.guard.act()
-        assert self.guard.take_ready() == ["/cmd_vel"]
+        assert self.guard.take_ready() == [CMD]
 
     def move(self, moving: bool = True) -> None:
-        self.guard.take(Command("/cmd_vel", moving, self.now))
+        self.guard.take(Command(*CMD, moving, self.now))
 
     def run(self, ms: int) -> None:
         """Let time pass as the loop does: sleep as long as the guard says, then act."""
@@ -116,8 +126,10 @@ def test_leaving_in_order_says_nothing(scene: Scene) -> None:
     assert scene.outlets.zeros == []
 
 
-@pytest.mark.parametrize("line", [Topic("/a", "b"), Command("/a", True, 5), Probe(), Leave()])
-def test_lines_come_out_as_they_went_in(line: Topic | Command | Probe | Leave) -> None:
+@pytest.mark.parametrize(
+    "line", [Topic("/a", "b"), Forget("/a", "b"), Command("/a", "b", True, 5), Probe(), Leave()]
+)
+def test_lines_come_out_as_they_went_in(line: Topic | Forget | Command | Probe | Leave) -> None:
     """Every line survives the pipe."""
     assert decoder.decode(encode(line)) == line
     assert encode(line).endswith(b"\n")
@@ -126,12 +138,76 @@ def test_lines_come_out_as_they_went_in(line: Topic | Command | Probe | Leave) -
 def test_a_topic_is_ready_once_somebody_listens(scene: Scene) -> None:
     """The guard says which topics it could stop: those its publisher has found a listener for, each once."""
     scene.outlets.listened = False
-    scene.guard.take(Topic("/other", "geometry_msgs/msg/Twist"))
+    scene.guard.take(Topic("/other", TWIST))
     scene.run(100)
     assert scene.guard.take_ready() == []
     scene.outlets.listened = True
     scene.run(100)
-    assert scene.guard.take_ready() == ["/other"]
+    assert scene.guard.take_ready() == [TypedTopic("/other", TWIST)]
     scene.run(100)
     assert scene.guard.take_ready() == []
     assert scene.guard.wait() is None
+
+
+def test_the_type_commanded_last_is_the_one_stopped(scene: Scene) -> None:
+    """A topic commanded as Twist after it was opened as TwistStamped is stopped as Twist."""
+    scene.guard.take(Topic(*STAMPED))
+    scene.move()
+    scene.guard.orphaned()
+    assert {on for _, on in scene.outlets.zeros} == {CMD}
+
+
+def test_forgotten_topic_costs_no_publisher(scene: Scene) -> None:
+    """The publisher of a topic nobody commands any more is taken away."""
+    scene.guard.take(Forget(*CMD))
+    scene.guard.act()
+    assert scene.outlets.open_now == set()
+
+
+def test_topic_that_moves_is_stopped_before_it_is_forgotten(scene: Scene) -> None:
+    """A daemon that could not stop a topic and forgets it leaves the stop to the guard."""
+    scene.move()
+    scene.guard.take(Forget(*CMD))
+    scene.guard.act()
+    assert scene.outlets.open_now == {CMD}
+    scene.run(1000)
+    assert len(scene.outlets.zeros) == 5
+    assert scene.outlets.open_now == set()
+
+
+def test_topic_that_comes_back_is_not_forgotten(scene: Scene) -> None:
+    """A topic commanded again before it could be forgotten keeps its publisher."""
+    scene.move()
+    scene.guard.take(Forget(*CMD))
+    scene.guard.take(Topic(*CMD))
+    scene.run(1000)
+    assert scene.outlets.open_now == {CMD}
+
+
+def test_topic_that_can_not_be_stopped_does_not_keep_the_next_from_it(scene: Scene) -> None:
+    """A publisher that fails leaves the other topics their zeros."""
+    scene.guard.take(Topic(*STAMPED))
+    scene.guard.take(Command(*STAMPED, True, scene.now))
+    scene.move()
+    honest = scene.outlets.zero
+
+    def broken(on: TypedTopic) -> bool:
+        if on == STAMPED:
+            raise RuntimeError("no publisher")
+        return honest(on)
+
+    scene.outlets.zero = broken  # type: ignore[method-assign]
+    scene.guard.orphaned()
+    assert [on for _, on in scene.outlets.zeros] == [CMD]
+
+
+def test_answers_have_their_output_for_themselves() -> None:
+    """What else is written to standard output, by ROS for one, goes to the log and not between the answers."""
+    program = (
+        "import os; from robot_client import guard; from robot_client.guard_protocol import Alive\n"
+        "outlet = guard._own_stdout()\n"
+        "os.write(1, b'noise'); guard._answer(outlet, Alive())"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert found.stdout == encode(Alive())
+    assert b"noise" in found.stderr

@@ -9,8 +9,11 @@ from twisted.internet.error import ProcessTerminated
 from twisted.internet.task import Clock
 from twisted.python.failure import Failure
 
-from robot_client.guard_protocol import Alive, Command, Leave, Probe, Ready, Topic, decoder, encode
-from robot_client.guarding import PROBE_EVERY, SILENT, GuardKeeper
+from robot_client.guard_protocol import Alive, Command, Forget, Leave, Probe, Ready, Topic, decoder, encode
+from robot_client.guarding import DOUBTFUL, PROBE_EVERY, PROBE_MOVING, SILENT, GuardKeeper
+from robot_client.topics import TypedTopic
+
+CMD = TypedTopic("/cmd_vel", "T")
 
 
 class Process:
@@ -67,21 +70,21 @@ def scene() -> Scene:
 
 def test_guard_is_told_of_topics_and_commands(scene: Scene) -> None:
     """Each topic is told once, each command as it goes."""
-    scene.keeper.topic("/cmd_vel", "T")
-    scene.keeper.topic("/cmd_vel", "T")
-    scene.keeper.command("/cmd_vel", True, 5)
-    assert scene.process.lines == [Topic("/cmd_vel", "T"), Command("/cmd_vel", True, 5)]
+    scene.keeper.topic(CMD)
+    scene.keeper.topic(CMD)
+    scene.keeper.command(CMD, True, 5)
+    assert scene.process.lines == [Topic(*CMD), Command(*CMD, True, 5), Probe()]
 
 
 def test_dead_guard_is_replaced_and_brought_up_to_date(scene: Scene) -> None:
     """A second later there is another guard that knows the topics and who moves; a person is told."""
-    scene.keeper.topic("/cmd_vel", "T")
-    scene.keeper.command("/cmd_vel", True, 5)
+    scene.keeper.topic(CMD)
+    scene.keeper.command(CMD, True, 5)
     scene.process.end()
     assert len(scene.alerts) == 1
     scene.reactor.advance(1.0)
     assert len(scene.reactor.processes) == 2
-    assert scene.process.lines == [Topic("/cmd_vel", "T"), Command("/cmd_vel", True, 5)]
+    assert scene.process.lines == [Topic(*CMD), Command(*CMD, True, 5)]
 
 
 def test_guard_that_can_not_live_is_not_started_all_the_time(scene: Scene) -> None:
@@ -130,13 +133,74 @@ def test_guard_that_stays_is_ended(scene: Scene) -> None:
     assert scene.process.signals == ["KILL"]
 
 
+def answer(scene: Scene, *answers: Alive | Ready) -> None:
+    scene.process.protocol.outReceived(b"".join(map(encode, answers)))
+
+
 def test_a_topic_is_ready_when_the_guard_says_so_and_not_after_its_end(scene: Scene) -> None:
     """Only a guard that lives counts; its words may come in pieces."""
-    said = encode(Alive()) + encode(Ready("/cmd_vel"))
+    scene.keeper.topic(CMD)
+    said = encode(Alive()) + encode(Ready(*CMD))
     scene.process.protocol.outReceived(said[:12])
-    assert not scene.keeper.ready("/cmd_vel")
+    assert not scene.keeper.ready(CMD)
     scene.process.protocol.outReceived(said[12:])
-    assert scene.keeper.ready("/cmd_vel")
-    assert not scene.keeper.ready("/other")
+    assert scene.keeper.ready(CMD)
+    assert not scene.keeper.ready(TypedTopic("/other", "T"))
     scene.process.end()
-    assert not scene.keeper.ready("/cmd_vel")
+    assert not scene.keeper.ready(CMD)
+
+
+def test_each_type_of_a_topic_is_ready_for_itself(scene: Scene) -> None:
+    """A guard that could stop a topic by one type is told of another, and can't stop it by that one yet."""
+    stamped = TypedTopic("/cmd_vel", "Stamped")
+    scene.keeper.topic(stamped)
+    answer(scene, Ready(*stamped))
+    scene.keeper.topic(CMD)
+    assert scene.process.lines == [Topic(*stamped), Topic(*CMD)]
+    assert not scene.keeper.ready(CMD)
+
+
+def test_forgotten_topic_is_told_and_not_ready(scene: Scene) -> None:
+    """A topic given up is no longer ready, also when the guard's word of it comes late; a new guard hears nothing."""
+    scene.keeper.topic(CMD)
+    scene.keeper.command(CMD, False, 5)
+    answer(scene, Ready(*CMD))
+    scene.keeper.forget(CMD)
+    answer(scene, Ready(*CMD))
+    assert scene.process.lines[-1] == Forget(*CMD)
+    scene.keeper.topic(CMD)
+    assert not scene.keeper.ready(CMD)
+    scene.keeper.forget(CMD)
+    scene.process.end()
+    scene.reactor.advance(1.0)
+    assert scene.process.lines == []
+
+
+@pytest.mark.parametrize(
+    "noise", [b"[INFO] [1700000000.0] [guard]: hello\n", b"\xff\xfe\n", b"[]\n\n", b"{" * 99999]
+)
+def test_noise_in_front_of_an_answer_is_passed_over(scene: Scene, noise: bytes) -> None:
+    """What is no answer on the guard's output neither raises nor hides the answers behind it."""
+    scene.keeper.topic(CMD)
+    scene.process.protocol.outReceived(noise)
+    scene.process.protocol.outReceived(b"\n" + encode(Ready(*CMD)))
+    assert scene.keeper.ready(CMD)
+    assert scene.process.signals == []
+
+
+def test_frozen_guard_is_not_relied_on_while_anything_moves(scene: Scene) -> None:
+    """While something moves the guard is asked every second, and two seconds without an answer take its word back."""
+    scene.keeper.topic(CMD)
+    answer(scene, Ready(*CMD))
+    for _ in range(5):
+        scene.keeper.command(CMD, True, 5)
+        answer(scene, Alive())
+        scene.reactor.advance(PROBE_MOVING)
+        assert scene.process.lines[-1] == Probe()
+        assert scene.keeper.ready(CMD)
+    scene.reactor.advance(DOUBTFUL)
+    assert scene.keeper.ready(CMD)
+    scene.reactor.advance(0.1)
+    assert not scene.keeper.ready(CMD)
+    answer(scene, Alive())
+    assert scene.keeper.ready(CMD)

@@ -359,3 +359,36 @@ def test_idle_guard_costs_nothing(drive: Drive) -> None:
     time.sleep(2.0)
     assert sum(drive.guard.cpu_times()[:2]) - before < 0.2
     assert os.getsid(drive.guard.pid) != os.getsid(drive.process.pid)
+
+
+def test_frozen_guard_lets_nothing_move(drive: Drive) -> None:
+    """While the guard is frozen commands are held back, so that the robot stands; when it is back they pass again."""
+    drive.drive()
+    drive.guard.suspend()
+    try:
+        held_back = time.monotonic() + PATIENCE
+        while not drive.channel.sample(5, GO) and drive.node.heard("/cmd_vel")[-1]["x"] != 0.0:
+            assert time.monotonic() < held_back
+            time.sleep(0.05)
+        stood = len(drive.node.heard("/cmd_vel"))
+        for _ in range(10):
+            drive.channel.sample(5, GO)
+            time.sleep(0.05)
+        assert {each["x"] for each in drive.node.heard("/cmd_vel")[stood:]} <= {0.0}
+    finally:
+        drive.guard.resume()
+    until(lambda: drive.channel.sample(5, GO) or drive.node.heard("/cmd_vel")[-1]["x"] != 0.0)
+
+
+def test_wrong_type_before_the_driver_is_up_does_no_harm(drive: Drive) -> None:
+    """A topic advertised with the wrong type is driven by the right one later, and the guard can stop it."""
+    drive.channel.say(link.Advertise(number=6, topic="/base", type="geometry_msgs/msg/TwistStamped"))
+    assert drive.channel.expect(link.Advertised).motion
+    drive.channel.say(link.Unadvertise(number=6))
+    drive.node.do("listen", "/base", "twist")
+    drive.channel.say(link.Advertise(number=7, topic="base", type="geometry_msgs/Twist"))
+    assert drive.channel.expect(link.Advertised).motion
+    until(lambda: drive.channel.sample(7, GO) or drive.node.heard("/base"))
+    drive.process.kill()
+    until(lambda: drive.node.heard("/base")[-1]["x"] == 0.0)
+    until(lambda: not drive.guard.is_running())

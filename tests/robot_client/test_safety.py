@@ -7,8 +7,10 @@ import pytest
 from relay_protocol.link import MotionPolicy
 from robot_client.offset import Offset
 from robot_client.safety import DAEMON_SHARE, GUARD_SHARE, Freshness, Watchdog, freshness, is_motion
+from robot_client.topics import TypedTopic
 
 MS = 1_000_000
+CMD = TypedTopic("/cmd_vel", "T")
 
 
 @pytest.fixture
@@ -44,18 +46,18 @@ def test_without_an_offset_nothing_is_fresh() -> None:
 def test_motion_is_by_type_or_by_name() -> None:
     """A topic moves the robot if its type or its name is in the policy."""
     policy = MotionPolicy(types=["geometry_msgs/msg/Twist"], topics=["/arm"])
-    assert is_motion(policy, "/any", "geometry_msgs/msg/Twist")
-    assert is_motion(policy, "/arm", "x/msg/Y")
-    assert not is_motion(policy, "/other", "x/msg/Y")
+    assert is_motion(policy, TypedTopic("/any", "geometry_msgs/msg/Twist"))
+    assert is_motion(policy, TypedTopic("/arm", "x/msg/Y"))
+    assert not is_motion(policy, TypedTopic("/other", "x/msg/Y"))
 
 
 def test_silence_stops_once() -> None:
     """A moving topic is named when its time is over, once."""
     dog = Watchdog(500, DAEMON_SHARE)
-    dog.command("/cmd_vel", "a", True, 100 * MS)
+    dog.command(CMD, "a", True, 100 * MS)
     assert dog.due() == 500 * MS
     assert dog.expired(499 * MS) == []
-    assert dog.expired(500 * MS) == ["/cmd_vel"]
+    assert dog.expired(500 * MS) == [CMD]
     assert dog.expired(900 * MS) == []
     assert dog.due() is None
 
@@ -63,8 +65,8 @@ def test_silence_stops_once() -> None:
 def test_standing_topic_needs_no_stop() -> None:
     """After a command of zero nothing is due."""
     dog = Watchdog(500, DAEMON_SHARE)
-    dog.command("/cmd_vel", "a", True, 0)
-    dog.command("/cmd_vel", "a", False, 10 * MS)
+    dog.command(CMD, "a", True, 0)
+    dog.command(CMD, "a", False, 10 * MS)
     assert dog.due() is None
     assert dog.everything() == []
 
@@ -72,11 +74,11 @@ def test_standing_topic_needs_no_stop() -> None:
 def test_only_the_driver_leaving_stops() -> None:
     """A publication that leaves stops its topic only if the last command was its own."""
     dog = Watchdog(500, DAEMON_SHARE)
-    dog.command("/cmd_vel", "a", True, 0)
-    dog.command("/cmd_vel", "b", True, 10 * MS)
-    assert not dog.release("/cmd_vel", "a")
-    assert dog.release("/cmd_vel", "b")
-    assert not dog.release("/cmd_vel", "b")
+    dog.command(CMD, "a", True, 0)
+    dog.command(CMD, "b", True, 10 * MS)
+    assert not dog.release(CMD, "a")
+    assert dog.release(CMD, "b")
+    assert not dog.release(CMD, "b")
 
 
 def test_guard_is_later_than_the_daemon_and_in_time() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import pytest_twisted
+import rclpy
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
@@ -19,6 +20,7 @@ from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailab
 from robot_client.platforms.base import GraphView, Motion
 from robot_client.platforms.ros2 import Ros2Platform
 from robot_client.platforms.ros2_types import introspected
+from robot_client.topics import TypedTopic
 from tests.robot_client.ros import Peer, domain
 
 STRING = "std_msgs/msg/String"
@@ -46,7 +48,7 @@ def executor(request: pytest.FixtureRequest) -> str:
 
 
 def make(executor: str) -> Ros2Platform:
-    made = Ros2Platform(reactor, "switchboard_test", executor=executor)
+    made = Ros2Platform(reactor, "switchboard_test", guard="switchboard_guard_test", executor=executor)
     made.start()
     return made
 
@@ -256,6 +258,41 @@ async def test_what_is_not_there_is_said(ros: Ros2Platform, peer: Peer) -> None:
         ros.definition("std_msgs/msg/Nothing")
 
 
+def publishers(ros: Ros2Platform, topic: str) -> list[str]:
+    return [each.node_name for each in ros._node.get_publishers_info_by_topic(topic)]
+
+
+@pytest_twisted.ensureDeferred
+async def test_own_publishers_and_the_guards_do_not_decide_the_type(ros: Ros2Platform, peer: Peer) -> None:
+    """What a client advertised with the wrong type, and its guard with it, does not keep the right one out."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    guard = rclpy.create_node("switchboard_guard_test", context=context)
+    try:
+        sink = ros.advertise("/base", STAMPED, False, None)
+        assert ros.resolve("/base", "") == TypedTopic("/base", STAMPED)
+        guard.create_publisher(TwistStamped, "/base", 10)
+        await until(lambda: "switchboard_guard_test" in publishers(ros, "/base"))
+        sink.close()
+        peer.do("listen", "/base", "twist")
+        await until(lambda: ros._node.get_subscriptions_info_by_topic("/base"))
+        assert ros.resolve("base", "geometry_msgs/Twist") == TypedTopic("/base", TWIST)
+        right = ros.advertise("/base", TWIST, False, None)
+        await until(lambda: right.publish(ros.zero(TWIST)) or peer.heard("/base"))
+        with pytest.raises(Invalid, match=r"geometry_msgs/msg/Twist on this robot"):
+            ros.advertise("/base", STAMPED, False, None)
+        right.close()
+    finally:
+        guard.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+def test_publisher_that_could_block_is_refused(ros: Ros2Platform) -> None:
+    """A publisher that keeps all would make the daemon wait for its slowest subscriber; it is refused in words."""
+    with pytest.raises(Invalid, match="keep_last"):
+        ros.advertise("/all", STRING, False, link.QoS(history="keep_all"))
+
+
 @pytest_twisted.ensureDeferred
 async def test_graph_has_others_and_not_us(ros: Ros2Platform, peer: Peer) -> None:
     """The graph names the ends of every topic and service, without our own node and what it alone made."""
@@ -287,6 +324,12 @@ async def test_battery_is_found(ros: Ros2Platform, peer: Peer) -> None:
     peer.do("battery", "/battery_state", 0.75)
     await until(lambda: ros.graph() and ros.battery() is not None)
     assert ros.battery() == pytest.approx(0.75)
+
+
+def test_malformed_battery_sample_is_no_charge(ros: Ros2Platform, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A battery message that is none is passed over."""
+    monkeypatch.setattr(ros, "_battery_sample", b"\0\1\0\0\xff")
+    assert ros.battery() is None
 
 
 def test_definition_has_all_parts_and_hash(ros: Ros2Platform) -> None:
