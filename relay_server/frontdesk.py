@@ -15,11 +15,11 @@ from relay_server.access import Access, Permit, Principal
 from relay_server.auth import Authenticator, BadCredentials, TooManyTries
 from relay_server.channel import Channels
 from relay_server.clock import Clock
-from relay_server.edges.origins import Origins
 from relay_server.freshness import Freshness
 from relay_server.journal import Journal
 from relay_server.local import RelayNode
 from relay_server.local.node import milliseconds
+from relay_server.origins import Origins
 from relay_server.registry import Presence, Registry
 from relay_server.session import ClientTransport, Session, Timing
 from relay_server.store import Store

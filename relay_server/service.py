@@ -31,7 +31,6 @@ from relay_server.config import Endpoint, Settings
 from relay_server.edges.admin import AdminSocket
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
-from relay_server.edges.origins import Origins
 from relay_server.edges.robot_roles import Opening, RobotHall
 from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
 from relay_server.edges.site import Portal, RelaySite, Robots, Root
@@ -40,6 +39,7 @@ from relay_server.folder import DataFolder
 from relay_server.frontdesk import FrontDesk
 from relay_server.journal import Journal
 from relay_server.metrics import RelayCollector, registry_of
+from relay_server.origins import Origins
 from relay_server.registry import Registry
 from relay_server.session import Timing
 from relay_server.store import Store

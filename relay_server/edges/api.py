@@ -23,8 +23,8 @@ from relay_protocol.limits import TICKET_SECONDS
 from relay_server.access import Principal
 from relay_server.auth import SESSION_SECONDS, BadCredentials, TooManyTries
 from relay_server.clock import Clock, cancel
-from relay_server.edges.origins import Origins
 from relay_server.edges.site import problem
+from relay_server.origins import Origins
 
 T = TypeVar("T")
 

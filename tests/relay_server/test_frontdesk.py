@@ -14,9 +14,9 @@ from relay_protocol.errors import NotFound, Refused
 from relay_server import closing, limiter, passwords
 from relay_server.access import Access, BadCredentials, Principal
 from relay_server.auth import Authenticator, TooManyTries
-from relay_server.edges.origins import Origins
 from relay_server.frontdesk import NO_ROBOT, FrontDesk
 from relay_server.journal import Journal
+from relay_server.origins import Origins
 from relay_server.session import Session, Timing
 from relay_server.store import Store
 from tests.relay_server.memory import MemoryClient, World

@@ -19,9 +19,9 @@ from relay_server.access import BadCredentials, Principal
 from relay_server.auth import TooManyTries
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
-from relay_server.edges.origins import Origins
 from relay_server.edges.site import Portal, RelaySite, Robots, Root
 from relay_server.edges.websocket import ClientFactory
+from relay_server.origins import Origins
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 ROOT = Principal(2, "root", "main", True, 2, None)

@@ -6,7 +6,7 @@ import pytest
 
 from relay_protocol.errors import Invalid, Refused
 from relay_server.edges.caps import AddressCap
-from relay_server.edges.origins import Origins
+from relay_server.origins import Origins
 
 
 def taken(origins: Origins, origin: str | None, host: str) -> bool:
