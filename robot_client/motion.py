@@ -156,7 +156,7 @@ class MotionDesk:
 
     def command(self, source: str, body: bytes, stamp: int, offset: Offset) -> bool:
         """Publish one command if it is fresh and sane; whether it was."""
-        on, sink = self._outlets[source]
+        on = self._outlets[source].on
         now = self._now()
         if freshness(stamp, now, offset, self.policy.deadline_ms) is not Freshness.FRESH:
             self.stale_commands += 1
@@ -172,7 +172,6 @@ class MotionDesk:
         else:
             self._hold_back(on)
             return False
-        self._tracks[on].speaker = sink
         self._schedule()
         return True
 
@@ -211,6 +210,7 @@ class MotionDesk:
         sink.publish(body)
         self._watchdog.command(on, source, True, now)
         track = self._tracks[on]
+        track.speaker = sink
         if track.zeros:
             track.rest()
             self._settle(on)
@@ -220,10 +220,11 @@ class MotionDesk:
         sink.publish(body)
         moved = self._watchdog.moves(on)
         self._watchdog.command(on, source, False, now)
+        track = self._tracks[on]
+        track.speaker = sink
         if moved:
-            self._tracks[on].speaker = sink
             self._repeat(on)
-        elif not self._tracks[on].zeros:
+        elif not track.zeros:
             self._guard.command(on, False, now)
 
     def _hold_back(self, on: TypedTopic) -> None:
@@ -249,8 +250,9 @@ class MotionDesk:
     def _zero(self, on: TypedTopic, why: str) -> bool:
         speaker = self._tracks[on].speaker
         try:
-            if speaker is not None:
-                speaker.publish(self._platform.zero(on.type))
+            if speaker is None:
+                raise Unavailable("its publisher is gone")
+            speaker.publish(self._platform.zero(on.type))
         except Exception as error:  # one topic that fails must not keep the next from its stop
             self._log.error(
                 "could not stop {topic} ({why}): {error}", topic=on.topic, why=why, error=str(error)
