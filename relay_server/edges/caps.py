@@ -1,27 +1,63 @@
-"""How many connections one address may hold."""
+"""How many connections one network may hold, and how many strangers may be here at a time."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
+
+from relay_server.limiter import network_of
+
+STRANGERS = 2000
+"""Connections of all the world that have not proved who they are."""
+
+
+class Place:
+    """A place among the strangers, given back when somebody is known or gone, whichever is first.
+
+    :param give_back: called once
+    """
+
+    def __init__(self, give_back: Callable[[], None]) -> None:
+        self._give_back: Callable[[], None] | None = give_back
+
+    def give_back(self) -> None:
+        """The place is free again; a second time does nothing."""
+        give_back, self._give_back = self._give_back, None
+        if give_back is not None:
+            give_back()
 
 
 class AddressCap:
-    """Counts connections per address.
+    """Counts connections per network (see :func:`relay_server.limiter.network_of`), and strangers.
 
-    :param most: connections one address may hold at a time
+    :param most: connections one network may hold at a time
+    :param strangers: connections of all networks that have not proved who they are
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, strangers: int = STRANGERS) -> None:
         self._most = most
+        self._strangers = strangers
         self._counts: Counter[str] = Counter()
 
     def enter(self, address: str) -> bool:
         """Count one more; False when that is one too many. Either way :meth:`leave` must follow."""
-        self._counts[address] += 1
-        return self._counts[address] <= self._most
+        network = network_of(address)
+        self._counts[network] += 1
+        return self._counts[network] <= self._most
 
     def leave(self, address: str) -> None:
         """One less."""
-        self._counts[address] -= 1
-        if self._counts[address] <= 0:
-            del self._counts[address]
+        network = network_of(address)
+        self._counts[network] -= 1
+        if self._counts[network] <= 0:
+            del self._counts[network]
+
+    def stranger(self) -> Place | None:
+        """A place for one more who is not known yet; ``None`` when there is none."""
+        if self._strangers <= 0:
+            return None
+        self._strangers -= 1
+        return Place(self._back)
+
+    def _back(self) -> None:
+        self._strangers += 1

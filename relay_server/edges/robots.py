@@ -23,7 +23,7 @@ from relay_protocol import limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
 from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, encode_sample
 from relay_server.clock import Clock, Timer, cancel, looping
-from relay_server.edges.caps import AddressCap
+from relay_server.edges.caps import AddressCap, Place
 from relay_server.outbox import Outbox
 
 PINGS = 256
@@ -82,6 +82,7 @@ class RobotConnection(TwistedProtocol):
         self._decoder = FrameDecoder(limits.HANDSHAKE_FRAME)
         self._role: Role | None = first_role(self)
         self._deadline: Timer | None = None
+        self._place: Place | None = None
         self._unproven_bytes = 0
         self._waiting: deque[Frame] = deque()
         self._busy = False
@@ -102,6 +103,10 @@ class RobotConnection(TwistedProtocol):
         self.transport.registerProducer(_Flow(self._outbox), True)
         if not self._cap.enter(self.address):
             self.refuse(link.Refused(reason="too many connections from your address", retry_after=10.0))
+            return
+        self._place = self._cap.stranger()
+        if self._place is None:
+            self.refuse(link.Refused(reason="too many robots dial at the same time", retry_after=10.0))
             return
         self._deadline = self._clock.callLater(limits.UNPROVEN_SECONDS, self._too_late)
 
@@ -124,6 +129,7 @@ class RobotConnection(TwistedProtocol):
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """The connection is gone."""
         self._cap.leave(self.address)
+        self._known()
         cancel(self._aborting)
         self._end(reason.getErrorMessage())
 
@@ -166,6 +172,7 @@ class RobotConnection(TwistedProtocol):
         """The robot is known; from now on the connection has this role, heartbeats run both ways."""
         self._role = role
         self._decoder.limit = frame_limit
+        self._known()
         self._stop_deadline()
         self._beating.start(self.timing.heartbeat, now=True)
 
@@ -283,6 +290,10 @@ class RobotConnection(TwistedProtocol):
             self._give_up(waiting)
         if role is not None:
             role.lost(reason)
+
+    def _known(self) -> None:
+        if self._place is not None:
+            self._place.give_back()
 
     def _stop_deadline(self) -> None:
         cancel(self._deadline)

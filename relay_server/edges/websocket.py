@@ -24,7 +24,7 @@ from relay_server import closing
 from relay_server.access import Principal
 from relay_server.auth import BadCredentials
 from relay_server.clock import Clock, Timer, cancel
-from relay_server.edges.caps import AddressCap
+from relay_server.edges.caps import AddressCap, Place
 from relay_server.frontdesk import Admission
 from relay_server.session import ClientTransport, Session
 
@@ -86,6 +86,7 @@ class ClientProtocol(WebSocketServerProtocol):
         self._early: list[bytes] = []
         self._early_bytes = 0
         self._deadline: Timer | None = None
+        self._place: Place | None = None
         self._asking = False
         self._open = False
         self._opened_ns = 0
@@ -96,6 +97,7 @@ class ClientProtocol(WebSocketServerProtocol):
         """The site has handed over a connection that asked to become a websocket."""
         super().connectionMade()
         self._take_at_most(limits.UNPROVEN_BYTES)
+        self._place = self.factory.cap.stranger()
         # One for handshake and auth together; a session ends it.
         self._deadline = self.factory.clock.callLater(limits.UNPROVEN_SECONDS, self._nobody)
 
@@ -132,6 +134,8 @@ class ClientProtocol(WebSocketServerProtocol):
         try:
             if not self.factory.gate.accepting:
                 raise Unavailable("the relay is going down; connect again in a moment")
+            if self._place is None:
+                raise Unavailable("too many clients connect at the same time; try again in a moment")
             principal, chosen = await self._identify(request)
             if principal is not None:
                 self._admission = await self.factory.gate.admit(principal, self._robot, self._address())
@@ -196,6 +200,7 @@ class ClientProtocol(WebSocketServerProtocol):
         assert self._admission is not None
         admission, self._admission = self._admission, None
         self._stop_deadline()
+        self._known()
         self._take_at_most(limits.CLIENT_MESSAGE)
         self._session = self.factory.gate.open(admission, self, self._opened_ns)
         self._session.start()
@@ -269,6 +274,7 @@ class ClientProtocol(WebSocketServerProtocol):
     def connectionLost(self, reason: Any = connectionDone) -> None:
         """The connection that began as an HTTP request is gone."""
         self.factory.cap.leave(self._address())
+        self._known()
         self._stop_deadline()
         super().connectionLost(reason)
 
@@ -321,6 +327,10 @@ class ClientProtocol(WebSocketServerProtocol):
         """The transport takes bytes again."""
         if self._session is not None:
             self._session.resume()
+
+    def _known(self) -> None:
+        if self._place is not None:
+            self._place.give_back()
 
     def _stop_deadline(self) -> None:
         cancel(self._deadline)

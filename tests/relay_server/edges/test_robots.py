@@ -247,6 +247,22 @@ def test_connections_of_one_address_are_capped(hall: Hall) -> None:
     assert hall.dial().transport.connected
 
 
+@pytest_twisted.ensureDeferred
+async def test_strangers_are_capped_whatever_their_addresses(hall: Hall) -> None:
+    """The one too many is told to come back; a robot that proves itself makes room, one that leaves too."""
+    hall.cap._strangers = 2
+    first, second = hall.dial(), hall.dial()
+    refusal = hall.dial().refusal()
+    assert "too many robots" in refusal["reason"]
+    assert refusal["retry_after"] == 10
+    assert (await first.registers())["op"] == "welcome"
+    assert hall.dial().transport.connected
+    first.breaks()
+    assert not hall.dial().transport.connected
+    second.breaks()
+    assert hall.dial().transport.connected
+
+
 # --- registered -------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits
 from relay_server import closing
+from relay_server.edges.caps import AddressCap
 from tests.relay_server.edges.websocket_client import AUTH, Client, MemoryGate
 
 
@@ -205,6 +206,22 @@ def test_long_reasons_are_cut_to_what_a_close_frame_holds(gate: MemoryGate) -> N
     assert client.core.close_rcvd is not None
     assert client.core.close_rcvd.reason == "ü" * 61
     assert not client.transport.connected
+
+
+def test_strangers_are_capped_whatever_their_addresses(gate: MemoryGate) -> None:
+    """The one too many is told to come back; whoever proves itself, or leaves, makes room."""
+    cap = AddressCap(50, strangers=2)
+    first, second = Client(gate, cap=cap), Client(gate, cap=cap)
+    assert Client(gate, cap=cap, Authorization="Bearer good").status == 503
+    first.says(AUTH)
+    assert Client(gate, cap=cap, Authorization="Bearer good").status == 101
+    third = Client(gate, cap=cap)
+    assert third.status == 101
+    assert Client(gate, cap=cap).status == 503
+    for client in (first, second, third):
+        client.transport.connected = False
+        client.end.connectionLost(Failure(ConnectionDone()))
+    assert [Client(gate, cap=cap).status for _ in range(3)] == [101, 101, 503]
 
 
 # --- before the session -----------------------------------------------------------------------------------

@@ -148,11 +148,16 @@ class Client:
     """
 
     def __init__(
-        self, gate: MemoryGate, path: str = "/robots/rover", tail: bytes = b"", **headers: str
+        self,
+        gate: MemoryGate,
+        path: str = "/robots/rover",
+        tail: bytes = b"",
+        cap: AddressCap | None = None,
+        **headers: str,
     ) -> None:
         self.eof = False
         self.clock = Clock()
-        self.cap = AddressCap(5)
+        self.cap = cap or AddressCap(5)
         self.cap.enter("192.168.1.1")
         factory = ClientFactory(self.clock, lambda: round(self.clock.seconds() * 1e9), gate, self.cap)
         self.transport = Transport()
