@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 from sqlalchemy import Select, delete, insert, select, update
@@ -17,6 +18,12 @@ from relay_protocol.identity import PUBLIC_KEY_BYTES, check_robot_name
 
 LIVE_KEYS = 2
 """Keys of a robot that are good at a time: the one in use, and the one it changes to."""
+
+_PAIRS = 500
+"""Keys asked for in one statement."""
+
+_ROUTES = frozenset({"stream"})
+"""Names that would be taken for another address of the relay's HTTP interface."""
 
 _REFUSED = (
     "the robot's name or the enrolment code is wrong, or the code was used or has expired; ask for a new one"
@@ -44,6 +51,8 @@ def add_robot(s: Session, name: str, description: str = "", realm: str = DEFAULT
     :raises NotFound: no such realm
     """
     check_robot_name(name)
+    if name in _ROUTES:
+        raise Invalid(f"a robot can't be called '{name}': that is an address of the relay itself")
     label(description, "description of a robot")
     realm = findable(realm)
     if find_robot(s, name, realm) is not None:
@@ -141,6 +150,22 @@ def robot_key(
         )
     ).one_or_none()
     return None if row is None else RobotKeyRecord(*row)
+
+
+def live_keys(s: Session, pairs: Collection[tuple[int, str]]) -> set[tuple[int, str]]:
+    """Which of these keys are live.
+
+    :param pairs: a robot's number and the fingerprint of its key, each
+    """
+    found: set[tuple[int, str]] = set()
+    asked = list(pairs)
+    for first in range(0, len(asked), _PAIRS):
+        robots = {robot_id for robot_id, _ in asked[first : first + _PAIRS]}
+        query = select(RobotKey.robot_id, RobotKey.fingerprint).where(
+            RobotKey.robot_id.in_(robots), RobotKey.retired.is_(None)
+        )
+        found.update((robot_id, fingerprint) for robot_id, fingerprint in s.execute(query))
+    return found & set(asked)
 
 
 def list_keys(s: Session, robot_id: int) -> list[KeyRecord]:

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_db.queries import RobotKeyRecord, RobotRecord
+from relay_db.queries import RobotKeyRecord, RobotRecord, robots
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.identity import fingerprint
 
@@ -47,6 +47,42 @@ def test_a_robot_name_that_cannot_be_is_refused(database: Database, name: str) -
     """Names are part of URLs."""
     with database.begin() as s, pytest.raises(Invalid, match="a robot's name"):
         queries.add_robot(s, name)
+
+
+def test_a_robot_is_not_called_like_an_address_of_the_relay(database: Database) -> None:
+    """Its own page would be out of reach."""
+    with database.begin() as s, pytest.raises(Invalid, match="can't be called 'stream'"):
+        queries.add_robot(s, "stream")
+
+
+def test_live_keys_of_many_robots_are_asked_for_at_once(
+    database: Database, rover: RobotRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unknown, retired and other robots' keys are not among them."""
+    monkeypatch.setattr(robots, "_PAIRS", 2)
+    with database.begin() as s:
+        fleet = [rover, *(queries.add_robot(s, f"robot-{number}") for number in range(4))]
+        pairs = set()
+        for number, robot in enumerate(fleet):
+            for old in (0, 1):
+                key = bytes([number, old]) * 16
+                _enrol(s, robot, key)
+                pairs.add((robot.id, fingerprint(key)))
+        retired = (rover.id, fingerprint(bytes([0, 1]) * 16))
+        queries.revoke_key(s, *retired, now=9.0)
+        queries.remove_robot(s, fleet[4].id)
+        live = {pair for pair in pairs if pair != retired and pair[0] != fleet[4].id}
+        strange = {
+            (rover.id, "ffff"),
+            (999, fingerprint(KEY)),
+            (fleet[1].id, fingerprint(bytes(32))),
+            (1, "x\0"),
+        }
+        assert queries.live_keys(s, pairs | strange) == live
+        assert queries.live_keys(s, []) == set()
+        assert queries.live_keys(s, [(rover.id, fingerprint(bytes(32)))]) == {
+            (rover.id, fingerprint(bytes(32)))
+        }
 
 
 def test_a_robot_name_is_taken_once(database: Database, rover: RobotRecord) -> None:
