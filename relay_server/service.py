@@ -214,16 +214,23 @@ class Relay:
         if revision == self._revision:
             return
         await self._access.refresh()
-        for robot in self._registry:
-            control = robot.control
-            if control is not None:
-                record = await self._store.read(queries.robot_key, robot.name, robot.key)
-                if robot.control is control and (record is None or record.robot_id != robot.robot_id):
-                    self.log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
-                    control.close("the robot's key is not accepted any more")
+        await self._check_robots()
         # Only now: had anything above failed, the next look would have to do it again.
         self._revision = revision
         self._registry.changed()
+
+    async def _check_robots(self) -> None:
+        """Cut robots whose key was revoked, forget those that were removed."""
+        links = [(robot, robot.control) for robot in self._registry]
+        keys = {(robot.robot_id, robot.key) for robot, control in links if control is not None}
+        live = await self._store.read(queries.live_keys, keys)
+        there = {record.id for record in await self._store.read(queries.list_robots)}
+        for robot, control in links:
+            if robot.robot_id not in there:
+                self._registry.forget(robot.robot_id)
+            elif control is not None and robot.control is control and (robot.robot_id, robot.key) not in live:
+                self.log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
+                control.close("the robot's key is not accepted any more")
 
     async def _poll_once(self) -> None:
         self._access.expire()

@@ -373,3 +373,17 @@ def test_a_relay_on_postgresql_does_the_daily_round(postgres: str, tmp_path: Pat
             assert not (relay.data / "switchboard.db").exists()
     assert "Traceback" not in relay.log
     assert "postgres" not in relay.log
+
+
+def test_a_robot_that_is_removed_is_cut_and_forgotten(tmp_path: Path) -> None:
+    """The command line removes it: its link ends, nobody sees it any more, and its key opens nothing."""
+    relay = Relay(tmp_path)
+    robot = Robot(relay, "rover")
+    try:
+        relay.cli("robot", "remove", "rover", "--yes")
+        wait_for("the robot is forgotten", lambda: relay.cli("status")["robots"] == [], 5)
+        wait_for("it is told", lambda: "not accepted" in robot.daemon.log.read_text(), 30)
+        assert relay.cli("status")["robots"] == []
+    finally:
+        robot.stop()
+        relay.stop()
