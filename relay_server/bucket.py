@@ -10,7 +10,7 @@ class TokenBucket:
 
     :param rate: tokens a second
     :param burst: tokens it holds at most
-    :param seconds: a monotonic clock
+    :param seconds: a clock; one that is set back stands still for the bucket
     """
 
     def __init__(self, rate: float, burst: float, seconds: Callable[[], float]) -> None:
@@ -23,7 +23,7 @@ class TokenBucket:
     def take(self) -> bool:
         """Whether one more may pass now; if so it is counted."""
         now = self._seconds()
-        self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate)
+        self._tokens = min(self._burst, self._tokens + max(0.0, now - self._at) * self._rate)
         self._at = now
         if self._tokens < 1:
             return False

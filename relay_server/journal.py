@@ -11,6 +11,7 @@ from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_db import queries
+from relay_server.bucket import TokenBucket
 from relay_server.limiter import network_of
 from relay_server.store import Store
 
@@ -26,9 +27,8 @@ WAITING = 128
 
 
 @dataclass
-class _Bucket:
-    tokens: float
-    at: float
+class _Cause:
+    bucket: TokenBucket
     suppressed: int = 0
 
 
@@ -43,7 +43,7 @@ class Journal:
     def __init__(self, store: Store, wall: Callable[[], float]) -> None:
         self._store = store
         self._wall = wall
-        self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
+        self._causes: OrderedDict[str, _Cause] = OrderedDict()
         self._waiting = 0
 
     def event(
@@ -62,30 +62,27 @@ class Journal:
         :returns: whether it is kept. What is not is counted, and told with the next of the same cause.
         """
         cause = network_of(cause)
-        bucket = self._bucket(cause)
-        if bucket.tokens < 1 or self._waiting >= WAITING:
-            if not bucket.suppressed:
+        known = self._known(cause)
+        if self._waiting >= WAITING or not known.bucket.take():
+            if not known.suppressed:
                 self.log.warn("{cause} causes too many events; some are not kept", cause=cause)
-            bucket.suppressed += 1
+            known.suppressed += 1
             return False
-        bucket.tokens -= 1
-        suppressed, bucket.suppressed = bucket.suppressed, 0
+        suppressed, known.suppressed = known.suppressed, 0
         if suppressed:
             self.log.warn("{count} events caused by {cause} were not kept", count=suppressed, cause=cause)
             self._write("events.suppressed", "relay", {"cause": cause, "count": suppressed})
         self._write(kind, source, data, robot_id, user_id)
         return True
 
-    def _bucket(self, cause: str) -> _Bucket:
-        now = self._wall()
-        bucket = self._buckets.setdefault(cause, _Bucket(BURST, now))
-        self._buckets.move_to_end(cause)
-        while len(self._buckets) > CAUSES:
-            self._buckets.popitem(last=False)
-        # Wall clocks may be set back: that is no time gone by.
-        bucket.tokens = min(BURST, bucket.tokens + max(0.0, now - bucket.at) * RATE)
-        bucket.at = now
-        return bucket
+    def _known(self, cause: str) -> _Cause:
+        known = self._causes.get(cause)
+        if known is None:
+            known = self._causes[cause] = _Cause(TokenBucket(RATE, BURST, self._wall))
+        self._causes.move_to_end(cause)
+        while len(self._causes) > CAUSES:
+            self._causes.popitem(last=False)
+        return known
 
     def _write(
         self,

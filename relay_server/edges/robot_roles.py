@@ -104,9 +104,11 @@ class Opening:
     async def _prove(self, hello: link.Hello, proof: link.Prove) -> None:
         hall, connection = self._hall, self._connection
         signature = link.from_base64(proof.signature, "the signature")
-        if self._over_limit(hello.robot):
+        # By robot and key: strangers in its network who only know its name can't lock the robot itself out.
+        claimed = f"{hello.robot}#{hello.key}"
+        if self._over_limit(claimed):
             return
-        with self._counted(hello.robot, "robot.refused"):
+        with self._counted(claimed, "robot.refused"):
             record = await hall.store.read(queries.robot_key, hello.robot, hello.key)
             if record is None or not identity.verify(
                 record.public_key, hall.relay, hello.robot, self._nonce, signature

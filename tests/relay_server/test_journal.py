@@ -98,4 +98,4 @@ def test_causes_are_forgotten_when_there_are_too_many(
     monkeypatch.setattr(journal, "_write", lambda *_: None)
     for number in range(100):
         journal.event("x", "relay", cause=f"192.0.2.{number}")
-    assert len(journal._buckets) == 10
+    assert len(journal._causes) == 10
