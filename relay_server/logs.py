@@ -9,6 +9,8 @@ from typing import TextIO, cast
 
 from twisted.logger import ILogObserver, LogEvent, LogLevel, formatEvent, globalLogBeginner
 
+from relay_protocol.text import inert
+
 _QUIET = (
     "autobahn",
     "txaio",
@@ -50,13 +52,6 @@ def _line(event: LogEvent, level: str, namespace: str, text: str, as_json: bool)
         entry = {"time": stamp, "level": level, "logger": namespace, "message": text}
         # Pure ASCII: whatever shows the log, nothing in it drives a terminal.
         return json.dumps(entry).replace("\x7f", "\\u007f") + "\n"
-    return f"{stamp} {level:<8} {inert(text)}\n"
-
-
-def inert(text: str) -> str:
-    """Text with its control characters spelled out, so that it can't drive a terminal. Line breaks are indented."""
-    safe = "".join(
-        each if each.isprintable() or each == "\n" else each.encode("unicode_escape").decode()
-        for each in text
-    )
-    return safe.replace("\n", "\n    ")
+    # Our own tracebacks have lines; nobody else's text can make one up.
+    lines = "\n    ".join(inert(each) for each in text.split("\n"))
+    return f"{stamp} {level:<8} {lines}\n"

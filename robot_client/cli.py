@@ -16,11 +16,11 @@ from twisted.python.failure import Failure
 
 from relay_protocol.errors import Invalid, SwitchboardError
 from relay_protocol.identity import check_robot_name
+from relay_protocol.text import inert
 from robot_client import config, logs
 from robot_client.enrolling import enroll as hand_in
 from robot_client.identity import Enrolment, StateFolder
 from robot_client.run import Runner, agent
-from robot_client.text import inert
 from robot_client.tls import endpoint, is_loopback, split_address
 
 state_option = click.option(

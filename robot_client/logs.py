@@ -19,7 +19,10 @@ from twisted.logger import (
 )
 from zope.interface import implementer  # type: ignore[import-untyped]
 
-from robot_client.text import inert
+from relay_protocol.text import inert
+
+LONGEST = 2000
+"""Characters of one log line."""
 
 
 @implementer(ILogObserver)
@@ -83,4 +86,4 @@ def _text(event: LogEvent) -> str:
         where = traceback.extract_tb(failure.getTracebackObject())
         steps = " < ".join(f"{each.filename.rpartition('/')[2]}:{each.lineno}" for each in reversed(where))
         text += f": {failure.type.__name__}: {failure.getErrorMessage()} [{steps}]"
-    return inert(text)
+    return inert(text, LONGEST)

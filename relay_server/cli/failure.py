@@ -7,7 +7,7 @@ from typing import IO, Any
 import click
 
 from relay_protocol.errors import SwitchboardError, Unavailable
-from relay_server.cli.text import inert
+from relay_protocol.text import inert
 
 REFUSED = 1
 USAGE = 2

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from relay_server.cli.text import inert
+from relay_protocol.text import inert
 
 _PIPE_WIDTH = 4096
 """Columns of a table that goes into a pipe: nothing is cut or wrapped there."""

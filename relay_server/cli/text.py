@@ -1,4 +1,4 @@
-"""Text for a terminal: what others supplied does nothing there but be read."""
+"""Moments and spans of time for people."""
 
 from __future__ import annotations
 
@@ -10,14 +10,6 @@ from relay_protocol.errors import Invalid
 _DURATION = re.compile(r"([0-9]{1,9})([smhdw])\Z")
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
 _LONGEST = 10 * 365 * 86400
-
-
-def inert(text: str) -> str:
-    """The text with control, bidirectional and other unprintable characters written as escapes."""
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
-        for character in text
-    )
 
 
 def moment(at: float | None) -> str:

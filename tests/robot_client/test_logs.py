@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from robot_client.logs import LineObserver
-from robot_client.text import LONGEST, inert
+from relay_protocol.text import inert
+from robot_client.logs import LONGEST, LineObserver
 
 
 @given(st.text())
 def test_inert_text_can_do_nothing(text: str) -> None:
     """Whatever goes in, what comes out is printable, on one line and bounded."""
-    assert inert(text).isprintable()
-    assert len(inert(text)) <= 10 * LONGEST + 1
+    assert inert(text, LONGEST).isprintable()
+    assert len(inert(text, LONGEST)) <= 10 * LONGEST + 1
 
 
 def test_escape_sequences_are_shown() -> None:

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from relay_server.cli.text import duration, inert, moment
+from relay_protocol.text import inert
+from relay_server.cli.text import duration, moment
 
 
 def _answer(**robot: Any) -> dict[str, Any]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-LONGEST = 2000
 
-
-def inert(text: str) -> str:
-    """Text without line breaks, control or invisible characters, at most :data:`LONGEST` long.
+def inert(text: str, longest: int | None = None) -> str:
+    """Text with line breaks, control, bidirectional and other invisible characters written as escapes.
 
     Escape sequences would act on a terminal, line breaks would forge log lines.
+
+    :param longest: characters after which it is cut
     """
-    if len(text) > LONGEST:
-        text = text[:LONGEST] + "…"
+    if longest is not None and len(text) > longest:
+        text = text[:longest] + "…"
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else _escaped(each) for each in text)
