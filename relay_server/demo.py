@@ -140,6 +140,8 @@ class Fleet:
             command,
             input=code.encode(),
             capture_output=True,
+            # Ctrl-C is for the demo, which ends the rest in order.
+            start_new_session=True,
             timeout=ENROL_SECONDS,
             check=False,
         )

@@ -51,13 +51,16 @@ def run_demo(folder: Path, http: Endpoint, robots: Endpoint) -> int:
 
     reactor.addSystemEventTrigger("before", "shutdown", lambda: deferToThread(fleet.stop))
     try:
-        code = run(Settings(data=folder, database=url, http=http, robots=robots), ready)
+        code = run(Settings(data=folder, database=url, http=http, robots=robots), ready, hangup_ends=True)
     finally:
         fleet.stop()
         database.close()
         log.close()
     if failed:
-        click.echo(f"The demo failed: {failed[0]}. Logs are in {folder}.", err=True)
+        click.echo(f"The demo failed: {failed[0]}", err=True)
+        for path in [folder / "relay.log", *sorted((folder / "logs").glob("*.log"))]:
+            for line in path.read_text(errors="replace").splitlines()[-5:]:
+                click.echo(f"  {path.name}: {line}", err=True)
     return code or bool(failed)
 
 

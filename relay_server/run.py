@@ -14,7 +14,7 @@ from twisted.internet.error import CannotListenError
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.config import Settings
 from relay_server.service import Relay
 
@@ -22,18 +22,19 @@ STOP_SECONDS = 8.0
 log = Logger()
 
 
-def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
+def run(settings: Settings, ready: Callable[[Relay, str | None], None], *, hangup_ends: bool = False) -> int:
     """Serve until SIGTERM or SIGINT.
 
     :param ready: called once everything listens, with the first login link if nobody can log in yet
-    :returns: exit code; 1 when it could not start, said on stderr in words
+    :param hangup_ends: whether SIGHUP ends it too; else it reads the TLS certificate again
+    :returns: exit code; 1 when it could not start, 3 when the database or folder can't be had; said on stderr
     """
     reactor = monotonic_reactor()
     try:
         relay = Relay(reactor, settings)
     except SwitchboardError as error:
         sys.stderr.write(f"switchboard: {error}\n")
-        return 1
+        return _code_of(error)
     failed: list[int] = []
     stuck: list[str] = []
 
@@ -43,7 +44,7 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
 
     def wrong(failure: Failure) -> None:
         sys.stderr.write(f"switchboard: {_sentence(failure)}\n")
-        failed.append(1)
+        failed.append(_code_of(failure.value))
         reactor.stop()
 
     def unfinished(failure: Failure) -> None:
@@ -59,7 +60,8 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
 
     reactor.callWhenRunning(start)
     reactor.addSystemEventTrigger("before", "shutdown", stopping)
-    signal.signal(signal.SIGHUP, lambda *_: reactor.callFromThread(relay.reload_tls))
+    on_hangup = reactor.stop if hangup_ends else relay.reload_tls
+    signal.signal(signal.SIGHUP, lambda *_: reactor.callFromThread(on_hangup))
     reactor.run()
     code = failed[0] if failed else 0
     if stuck:
@@ -68,6 +70,10 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None]) -> int:
         sys.stdout.flush()
         os._exit(code)
     return code
+
+
+def _code_of(error: BaseException | None) -> int:
+    return 3 if isinstance(error, Unavailable) else 1
 
 
 def monotonic_reactor() -> Any:

@@ -201,7 +201,9 @@ class Relay:
 
     @property
     def url(self) -> str:
-        """Where people go."""
+        """Where people go: the first origin that was listed, else where the relay listens."""
+        if self.settings.origins:
+            return self.settings.origins[0].rstrip("/")
         host = self.settings.http.host
         shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104
         return f"{self.settings.scheme}://{shown}:{self.http_port}"
@@ -280,6 +282,8 @@ class Relay:
             "uptime_s": round(time.monotonic() - self._started, 1),
             "http_port": self.http_port,
             "robots_port": self.robots_port,
+            "robots_loopback": self.settings.robots.loopback,
+            "tls": self.settings.tls,
             "robots": self._desk.status() if self._desk else [],
         }
 

@@ -40,6 +40,10 @@ CHANGES_A_SECOND = 50.0
 CHANGES_AT_ONCE = 1000.0
 """Subscriptions, advertisements and their ends one client may ask for; messages and calls are not counted."""
 
+LINES_A_SECOND = 1.0
+LINES_AT_ONCE = 20.0
+"""Lines of the log one client's refusals may cause."""
+
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
 
@@ -122,6 +126,7 @@ class Session:
         self._calls: set[Deferred[None]] = set()
         self._call_bytes = 0
         self._changes = TokenBucket(CHANGES_A_SECOND, CHANGES_AT_ONCE, clock.seconds)
+        self._noise = TokenBucket(LINES_A_SECOND, LINES_AT_ONCE, clock.seconds)
         self._malformed = 0
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
@@ -243,10 +248,12 @@ class Session:
 
     def _refuse(self, operation: rosbridge.ClientOp, error: SwitchboardError) -> None:
         self.refusals += 1
-        what = type(operation).__name__
-        self.log.info(
-            "client {number}: {what} refused: {reason}", number=self.number, what=what, reason=str(error)
-        )
+        if self._noise.take():
+            # No more of one client than a disk can bear; all are counted in /relay/status.
+            what = type(operation).__name__
+            self.log.info(
+                "client {number}: {what} refused: {reason}", number=self.number, what=what, reason=str(error)
+            )
         self.tell("error", str(error), operation.id)
         if isinstance(operation, rosbridge.CallService):
             self._answer(operation, False, jsontext.encode(str(error)))

@@ -45,7 +45,7 @@ def in_words(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@click.group()
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="robot-switchboard", message="%(version)s")
 def main() -> None:
     """Bring this robot to a Switchboard relay."""

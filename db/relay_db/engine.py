@@ -23,7 +23,7 @@ class Database:
 
     :param url: ``sqlite:///FILE`` (created with its folder, for its owner only) or ``postgresql://…``
     :raises Invalid: a URL of another kind, or PostgreSQL without its driver
-    :raises Unavailable: the file can't be made
+    :raises Unavailable: the file can't be made or used
     """
 
     writers: int

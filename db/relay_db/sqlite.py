@@ -57,21 +57,13 @@ def _prepare(path: Path) -> None:
         for each in (path, Path(f"{path}-wal"), Path(f"{path}-shm")):
             if each.exists() and each.stat().st_mode & _OTHERS:
                 each.chmod(each.stat().st_mode & 0o770)
-        if _wants_wal(path):
-            with closing(sqlite3.connect(path, timeout=BUSY_SECONDS, isolation_level=None)) as raw:
+        # By SQLite alone: whoever else opens and closes the file drops all locks this process has on it
+        # (https://www.sqlite.org/howtocorrupt.html, 2.2), and the next process believes it is alone.
+        with closing(sqlite3.connect(path, timeout=BUSY_SECONDS, isolation_level=None)) as raw:
+            if raw.execute("PRAGMA journal_mode").fetchone() != ("wal",):
                 raw.execute("PRAGMA journal_mode = WAL")
     finally:
         os.close(folder)
-
-
-def _wants_wal(path: Path) -> bool:
-    """Whether a file is new, or a database with a rollback journal, as a restored dump has it.
-
-    Byte 18 of the header tells (https://www.sqlite.org/fileformat.html, 1.3.3).
-    """
-    with path.open("rb") as file:
-        header = file.read(20)
-    return not header or (header.startswith(b"SQLite format 3\0") and header[18:20] != b"\2\2")
 
 
 def _configure(raw: sqlite3.Connection, record: Any) -> None:

@@ -49,3 +49,9 @@ class LazyGroup(click.Group):
             return super().invoke(ctx)
         except SwitchboardError as error:
             raise Failure.of(error) from error
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith(("relay_", "robot_")):
+                raise
+            raise Failure(
+                f"this needs the server's packages ({error.name} is missing): install the extra 'server'"
+            ) from error

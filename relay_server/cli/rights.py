@@ -53,7 +53,7 @@ def grant(
 ) -> None:
     """Give USER or GROUP a right on ROBOT; it replaces the one they have there.
 
-    A viewer may subscribe, an operator also publish and call, an owner also change rights. Patterns are
+    A viewer may subscribe, an operator also publish and call, an owner do everything. Patterns are
     operation:resource with subscribe, publish, call, provide, manage or *, and wildcards in the resource.
     """
     with app.change() as change:

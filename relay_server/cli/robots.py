@@ -120,25 +120,27 @@ def _tell_code(app: App, found: queries.RobotRecord, new: str, as_json: bool, *b
     if as_json:
         tell(True, answer)
         return
-    command = ["switchboard-robot", "enroll", "--relay", _relay_address(app), "--robot", found.name]
-    command += ["--code", new, "--state", f"/var/lib/switchboard-robot/{found.name}"]
+    address, tls = _relay_address(app)
+    command = ["switchboard-robot", "enroll", "--relay", address, *(["--tls"] if tls else [])]
+    command += ["--robot", found.name, "--code", "-", "--state", "/var/lib/switchboard-robot/state"]
     tell(
         False,
         answer,
         *before,
         f"Enrolment code: {new} (good once, for {duration(ENROLMENT_SECONDS)})",
-        "On the robot, run:",
+        "On the robot, run this and type the code in (an argument would be seen in the list of processes):",
         f"  {shlex.join(command)}",
     )
 
 
-def _relay_address(app: App) -> str:
-    """Where robots dial: this machine, and the port of the relay that runs here, if one does."""
+def _relay_address(app: App) -> tuple[str, bool]:
+    """Where robots dial, and whether by TLS: this machine, as the relay that runs here says, if one does."""
     try:
-        port = ask_status(app.data).get("robots_port", _ROBOTS_PORT)
+        status = ask_status(app.data)
     except Unavailable:
-        port = _ROBOTS_PORT
-    return f"{socket.gethostname()}:{port}"
+        status = {}
+    host = "127.0.0.1" if status.get("robots_loopback") else socket.gethostname()
+    return f"{host}:{status.get('robots_port', _ROBOTS_PORT)}", bool(status.get("tls"))
 
 
 def _live_keys(known: list[queries.KeyRecord]) -> int:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.command(
     epilog=examples(
         "switchboard serve --data /var/lib/switchboard --http 0.0.0.0:9090 --robots 0.0.0.0:9091 \\",
-        "    --tls-cert chain.pem --tls-key key.pem --origin https://robots.example.org",
+        "    --tls-cert chain.pem --tls-key key.pem --origin https://robots.example.org:9090",
         "switchboard serve --http 127.0.0.1:0 --robots 127.0.0.1:0",
     )
 )
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     "origins",
     multiple=True,
     metavar="URL",
-    help="Origin under which people open the portal, as https://robots.example.org. May be repeated.",
+    help="Origin under which people open the portal, as https://robots.example.org:9090. May be repeated.",
 )
 @click.option("--name", default="", help="Name robots sign for; made up once when not given.")
 @click.option("--heartbeat", default=2.0, show_default=True, help="Seconds between pings on robot links.")
@@ -101,6 +101,9 @@ def serve(
 
 def _ready(relay: Relay, link: str | None) -> None:
     if link is not None:
-        click.echo(f"Nobody can log in yet. Open this once, within an hour, as 'admin':\n  {link}")
+        click.echo(
+            f"Nobody can log in yet. Open this once, within an hour, as 'admin' "
+            f"(for a password: switchboard user passwd admin):\n  {link}"
+        )
     click.echo(f"READY http={relay.http_port} robots={relay.robots_port}")
     sys.stdout.flush()

@@ -13,7 +13,11 @@ from typing import IO, Any
 import click
 
 from robot_client.ros_log import ensure_log_folder
-from robot_client.sim.worlds import WORLDS
+
+try:
+    from robot_client.sim.worlds import WORLDS
+except ModuleNotFoundError as error:
+    raise SystemExit(f"switchboard-sim: {error.name} is missing; install the extra 'sim'") from None
 
 _LONGEST_SPIN = 0.1
 """Seconds; how long a signal may wait to be seen."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sqlite3
 import stat
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -127,9 +129,8 @@ def test_a_file_that_is_no_database_is_told_in_words(sqlite_url: str, tmp_path: 
     path = tmp_path / "data" / "switchboard.db"
     path.parent.mkdir()
     path.write_bytes(b"a letter to aunt Emma\n" * 100)
-    database = Database(sqlite_url)
     with pytest.raises(Unavailable, match="no SQLite database"):
-        database.upgrade()
+        Database(sqlite_url)
     assert path.read_bytes() == b"a letter to aunt Emma\n" * 100
 
 
@@ -139,3 +140,28 @@ def test_a_folder_that_cannot_be_made_is_told_in_words(tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match="can't be used") as caught:
         Database(f"sqlite:///{tmp_path}/taken/switchboard.db")
     assert str(tmp_path) not in str(caught.value)
+
+
+def test_a_second_database_in_one_process_costs_the_first_no_lock(sqlite_url: str) -> None:
+    """Another process finds the first one's locks and leaves its write-ahead log alone."""
+    first = Database(sqlite_url)
+    first.upgrade()
+    with first.begin() as session:
+        queries.add_user(session, "before", None)
+    second = Database(sqlite_url)
+    with second.reading() as session:
+        assert len(queries.list_users(session)) == 1
+    program = (
+        "import sys; from relay_db.engine import Database; from relay_db import queries\n"
+        "database = Database(sys.argv[1])\n"
+        "with database.begin() as session: queries.add_user(session, 'elsewhere', None)\n"
+        "database.close()"
+    )
+    subprocess.run([sys.executable, "-c", program, sqlite_url], check=True, timeout=60)
+    with first.begin() as session:
+        queries.add_user(session, "after", None)
+    third = Database(sqlite_url)
+    with third.reading() as session:
+        assert {each.name for each in queries.list_users(session)} == {"before", "elsewhere", "after"}
+    for each in (first, second, third):
+        each.close()

@@ -48,16 +48,18 @@ def test_people_get_the_exact_command(cli: Any) -> None:
     assert options == {
         "--relay": f"{socket.gethostname()}:9091",
         "--robot": "rover",
-        "--code": code,
-        "--state": "/var/lib/switchboard-robot/rover",
+        "--code": "-",
+        "--state": "/var/lib/switchboard-robot/state",
     }
     _enrol(cli, "rover", code)
 
 
 def test_the_command_names_the_port_of_the_running_relay(live: Any, relay: Any) -> None:
-    """A relay that runs here is asked where robots dial."""
+    """A relay that runs here is asked where robots dial, and whether by TLS."""
     relay.answer = (200, b'{"robots_port": 12345}')
     assert f" --relay {socket.gethostname()}:12345 " in live.ok("robot", "add", "rover")
+    relay.answer = (200, b'{"robots_port": 12345, "robots_loopback": true, "tls": true}')
+    assert " --relay 127.0.0.1:12345 --tls " in live.ok("robot", "add", "rover2")
 
 
 def test_a_new_code_voids_the_one_before(cli: Any) -> None:

@@ -185,7 +185,7 @@ export class Cockpit {
     if (this.linkState === 'ended') return this.ending?.words ?? 'The connection is closed.'
     if (this.robotState === 'offline') return 'The robot is offline.'
     if (this.level === 'viewer') {
-      return 'You watch as a viewer. To drive you need the level operator; an owner of this robot can give it to you.'
+      return 'You watch as a viewer. To drive you need the level operator; whoever runs this relay can give it to you.'
     }
     if (this.linkState !== 'open' || this.level === null) return 'Waiting for the connection.'
     if (this.motion === null) {
