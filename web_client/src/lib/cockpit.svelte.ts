@@ -57,7 +57,10 @@ export class Cockpit {
   readonly level = $derived(this.status?.level ?? this.robot?.level ?? null)
   readonly robotState = $derived(this.status?.state ?? this.robot?.state ?? null)
   readonly clients = $derived(this.status?.clients ?? this.robot?.clients ?? [])
-  readonly battery = $derived(this.status?.health?.battery ?? this.robot?.battery ?? null)
+  readonly offline = $derived(this.robotState === 'offline')
+  /** How the robot said it is; nothing while it is away, for that would be how it was. */
+  readonly health = $derived(this.offline ? null : (this.status?.health ?? null))
+  readonly battery = $derived(this.offline ? null : (this.health?.battery ?? this.robot?.battery ?? null))
   readonly motion = $derived(this.topicFor('motion'))
   readonly lost = $derived(this.lostMs !== null && this.nowMs - this.lostMs > LOSS_SHOWN_MS)
   readonly latencyStale = $derived(
@@ -110,6 +113,12 @@ export class Cockpit {
 
   candidates(role: Role): TopicInfo[] {
     return ofType(this.topics, TYPES[role])
+  }
+
+  /** Why a panel has no topic to show. */
+  missing(what: string): string {
+    if (this.offline) return 'The robot is offline.'
+    return this.topicsKnown ? `This robot publishes no ${what}.` : 'Waiting for the list of topics.'
   }
 
   topicFor(role: Role): TopicInfo | null {
@@ -239,7 +248,12 @@ export class Cockpit {
 
   private take(status: RelayStatus): void {
     this.status = status
-    this.legs.relayRobot = status.rtt_ms?.relay_robot ?? this.legs.relayRobot
+    if (status.state === 'offline') {
+      this.legs.relayRobot = null
+      this.legs.clientRobot = null
+    } else {
+      this.legs.relayRobot = status.rtt_ms?.relay_robot ?? this.legs.relayRobot
+    }
     if (this.driving && this.blocked !== null) this.drive.stop('not_allowed')
   }
 
@@ -260,6 +274,8 @@ export class Cockpit {
       )
       const found = answer.topics.map((name, i) => ({ name, type: answer.types[i] ?? '' }))
       found.sort((a, b) => a.name.localeCompare(b.name))
+      // A robot that has just gone has no topics; what it had is what the panels wait for.
+      if (this.topics.length > 0 && found.every((topic) => topic.name.startsWith('/relay/'))) return
       // The same list anew would restart every subscription that depends on it.
       if (JSON.stringify(found) !== JSON.stringify(this.topics)) this.topics = found
       this.topicsKnown = true
