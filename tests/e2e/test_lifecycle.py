@@ -6,6 +6,7 @@ import contextlib
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -273,6 +274,13 @@ def test_the_demo_works_for_all_three_logins_and_leaves_nothing_behind(tmp_path:
             assert client.until(op="publish")["msg"]["twist"]["twist"]["linear"]["x"] == 0
         with enter(port, cookies["driver"], "robot-one") as client:
             moves_in_odometry(client)
+            administer(tmp_path / "demo", "user", "list")
+            administer(tmp_path / "demo", "right", "revoke", "driver", "robot-one")
+            with pytest.raises(ConnectionClosed):
+                while True:
+                    client.receive(5)
+        assert robots_of(port, log_in(port, "driver", logins["driver"])) == {}
+        assert "login" in administer(tmp_path / "demo", "audit", "list", "--json")
         family = [
             psutil.Process(demo.popen.pid),
             *psutil.Process(demo.popen.pid).children(recursive=True),
@@ -294,6 +302,12 @@ def test_the_demo_works_for_all_three_logins_and_leaves_nothing_behind(tmp_path:
     log = (tmp_path / "demo" / "relay.log").read_text()
     assert "Traceback" not in log + demo.log.read_text()
     assert not any(password in log for password in logins.values())
+
+
+def administer(data: Path, *arguments: str) -> str:
+    """An admin command on a folder whose relay runs; what it prints."""
+    command = [str(BIN / "switchboard"), "--data", str(data), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
 
 
 def log_in(port: int, user: str, password: str) -> str:
