@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sized
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
@@ -42,16 +42,14 @@ class _Publishing(NamedTuple):
     """Name of the publication at the motion desk, if it moves the robot."""
 
 
-class Wire:
+class Wire(Protocol):
     """What a channel needs of its link."""
 
     def say(self, message: link.Message) -> None:
         """Send a message; it is never dropped."""
-        raise NotImplementedError
 
     def write(self, frames: list[bytes]) -> None:
         """Send sample frames; may pause the uplink."""
-        raise NotImplementedError
 
 
 class Channel:
@@ -310,11 +308,11 @@ def _check_room(table: Sized, what: str) -> None:
         raise _Again(f"this channel has {MAX_OPEN} {what} open; end some first")
 
 
-_HANDLERS: dict[type, Callable[[Channel, link.Message], None]] = {
-    link.Subscribe: Channel._subscribe,  # type: ignore[dict-item]
-    link.Unsubscribe: Channel._unsubscribe,  # type: ignore[dict-item]
-    link.Advertise: Channel._advertise,  # type: ignore[dict-item]
-    link.Unadvertise: Channel._unadvertise,  # type: ignore[dict-item]
-    link.CallService: Channel._call,  # type: ignore[dict-item]
-    link.GetType: Channel._get_type,  # type: ignore[dict-item]
+_HANDLERS: dict[type, Callable[[Channel, Any], None]] = {
+    link.Subscribe: Channel._subscribe,
+    link.Unsubscribe: Channel._unsubscribe,
+    link.Advertise: Channel._advertise,
+    link.Unadvertise: Channel._unadvertise,
+    link.CallService: Channel._call,
+    link.GetType: Channel._get_type,
 }
