@@ -13,6 +13,7 @@ from relay_protocol.errors import FrameTooLarge, MalformedMessage
 JSON = 0
 SAMPLE = 1
 VIDEO = 2
+PART = 3
 
 _LENGTH = struct.Struct("!I")
 _HEAD = struct.Struct("!IB")

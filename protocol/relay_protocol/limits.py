@@ -27,6 +27,18 @@ GRAPH_ENDS = 1024
 TYPE_TEXTS = 16 * MIB
 """Most characters of type definitions taken from one robot."""
 
+INTERFACES = 8192
+"""Most names of types a robot tells of at once."""
+
+PARTS_BYTES = 2 * ROBOT_FRAME
+"""Most bytes of samples that have come in part only, over one link."""
+
+FRAGMENTS = 16
+"""Most messages a client may have sent in part only."""
+
+FRAGMENT_SECONDS = 10.0
+"""A message of which a fragment is missing for so long is given up."""
+
 LABEL = 255
 """Longest fact a robot tells of itself (host, agent, …), in characters."""
 

@@ -175,6 +175,7 @@ class Describe(Message, frozen=True, kw_only=True):
     :param platform: ``ros2``, ``mqtt``, …
     :param distro: ROS distribution, e.g. ``jazzy``
     :param started: Unix time the daemon started, seconds
+    :param sim_time: the robot's time is what ``/clock`` says (``use_sim_time``)
     :param extra: anything else worth showing, text by text
     """
 
@@ -184,6 +185,7 @@ class Describe(Message, frozen=True, kw_only=True):
     os: Label = ""
     agent: Label = ""
     started: float = 0.0
+    sim_time: bool = False
     motion: MotionPolicy = msgspec.field(default_factory=MotionPolicy)
     extra: Annotated[dict[Label, Label], Meta(max_length=limits.FACTS)] = msgspec.field(default_factory=dict)
 
@@ -321,24 +323,127 @@ class Unadvertise(Message, frozen=True, kw_only=True):
     number: int
 
 
-class CallService(Message, frozen=True, kw_only=True):
-    """Relay: call a service. Arguments are ``cdr`` (base64) or, for a robot without CDR, ``args``.
+class AdvertiseService(Message, frozen=True, kw_only=True):
+    """Relay: offer this service to the graph; calls of it come back as ``call_service``.
 
-    :param timeout: seconds the robot waits for the answer
+    :param source: who offers it, for the robot's own log
     """
 
-    id: str
     service: str
     type: str
-    timeout: float
-    cdr: str | None = None
-    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    source: str = ""
+
+
+class UnadvertiseService(Message, frozen=True, kw_only=True):
+    """Relay: nobody offers it any more. Calls under way end without an answer."""
+
+    service: str
+
+
+class AdvertiseAction(Message, frozen=True, kw_only=True):
+    """Relay: offer this action to the graph; goals come back as ``send_action_goal``. ``source`` as above."""
+
+    action: str
+    type: str
+    source: str = ""
+
+
+class UnadvertiseAction(Message, frozen=True, kw_only=True):
+    """Relay: nobody offers it any more. Goals under way are aborted."""
+
+    action: str
 
 
 class GetType(Message, frozen=True, kw_only=True):
     """Relay: send the definition of a type, say ``sensor_msgs/msg/Joy`` or ``std_srvs/srv/Trigger``."""
 
     type: str
+
+
+class GetInterfaces(Message, frozen=True, kw_only=True):
+    """Relay: send the names of all types the robot could tell the definition of."""
+
+
+# --- channel link, both ways: whoever offers a service or an action is called ---
+
+
+class CallService(Message, frozen=True, kw_only=True):
+    """Call a service. Arguments are ``cdr`` (base64) or, for a robot without CDR, ``args``.
+
+    :param id: chosen by the caller; the answer carries it
+    :param timeout: seconds the caller waits for the answer; 0 when it did not say
+    """
+
+    id: Label
+    service: Name
+    type: Name
+    timeout: float = 0.0
+    cdr: str | None = None
+    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+
+
+class ServiceResponse(Message, frozen=True, kw_only=True):
+    """The answer to ``call_service``; ``reason`` when ``result`` is false.
+
+    ROS 2 has no way to tell a caller that a service failed: a robot that gets ``result`` false lets its caller
+    wait in vain.
+    """
+
+    id: Label
+    result: bool
+    cdr: str | None = None
+    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
+
+
+class SendActionGoal(Message, frozen=True, kw_only=True):
+    """Pursue a goal. It is answered by exactly one ``action_result``, after any number of ``action_feedback``.
+
+    :param id: chosen by the asker; everything about this goal carries it
+    :param feedback: whether the asker wants ``action_feedback``
+    """
+
+    id: Label
+    action: Name
+    type: Name
+    feedback: bool = False
+    cdr: str | None = None
+    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+
+
+class CancelActionGoal(Message, frozen=True, kw_only=True):
+    """The asker wants the goal no more. Its ``action_result`` still comes, also when it ended otherwise."""
+
+    id: Label
+
+
+class ActionFeedback(Message, frozen=True, kw_only=True):
+    """How far the goal has come, by the one who pursues it."""
+
+    id: Label
+    cdr: str | None = None
+    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+
+
+class ActionResult(Message, frozen=True, kw_only=True):
+    """The goal is over.
+
+    :param status: of ``action_msgs/msg/GoalStatus``: 4 succeeded, 5 canceled, 6 aborted; 0 when it never began
+    :param result: whether there is a result, in ``cdr`` or ``values``; else ``reason`` says why not
+    """
+
+    id: Label
+    status: int
+    result: bool
+    cdr: str | None = None
+    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        _cut(self, "reason")
 
 
 # --- channel link, robot to relay ---
@@ -385,17 +490,24 @@ class Failed(Message, frozen=True, kw_only=True):
         _cut(self, "ref")
 
 
-class ServiceResponse(Message, frozen=True, kw_only=True):
-    """Robot: the answer to ``call_service``; ``reason`` when ``result`` is false."""
+class AdvertisedService(Message, frozen=True, kw_only=True):
+    """Robot: the service stands; ``type`` is the full name of its type."""
 
-    id: Label
-    result: bool
-    cdr: str | None = None
-    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
-    reason: str = ""
+    service: Name
+    type: Name
 
-    def __post_init__(self) -> None:
-        _cut(self, "reason")
+
+class AdvertisedAction(Message, frozen=True, kw_only=True):
+    """Robot: the action stands; ``type`` is the full name of its type."""
+
+    action: Name
+    type: Name
+
+
+class Interfaces(Message, frozen=True, kw_only=True):
+    """Robot: the answer to ``get_interfaces``, full names in order."""
+
+    types: Annotated[list[Name], Meta(max_length=limits.INTERFACES)]
 
 
 class TypeDefinition(Message, frozen=True, kw_only=True):
@@ -420,8 +532,40 @@ OpeningReply = Challenge | Welcome | Enrolled | Joined | Refused
 
 RobotControl = Describe | Graph | Health | Alert | Ping | Pong | Bye
 RelayControl = OpenChannel | CloseChannel | Ping | Pong | Bye
-RobotChannel = Subscribed | Advertised | Failed | ServiceResponse | TypeDefinition | Ping | Pong | Bye
-RelayChannel = Subscribe | Unsubscribe | Advertise | Unadvertise | CallService | GetType | Ping | Pong | Bye
+BothChannel = (
+    CallService
+    | ServiceResponse
+    | SendActionGoal
+    | CancelActionGoal
+    | ActionFeedback
+    | ActionResult
+    | Ping
+    | Pong
+    | Bye
+)
+RobotChannel = (
+    Subscribed
+    | Advertised
+    | AdvertisedService
+    | AdvertisedAction
+    | Failed
+    | TypeDefinition
+    | Interfaces
+    | BothChannel
+)
+RelayChannel = (
+    Subscribe
+    | Unsubscribe
+    | Advertise
+    | Unadvertise
+    | AdvertiseService
+    | UnadvertiseService
+    | AdvertiseAction
+    | UnadvertiseAction
+    | GetType
+    | GetInterfaces
+    | BothChannel
+)
 
 opening_decoder: msgspec.json.Decoder[Opening] = msgspec.json.Decoder(Opening)
 opening_reply_decoder: msgspec.json.Decoder[OpeningReply] = msgspec.json.Decoder(OpeningReply)

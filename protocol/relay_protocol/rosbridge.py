@@ -87,6 +87,61 @@ class UnadvertiseService(Message, frozen=True, kw_only=True):
     id: Id = None
 
 
+class AdvertiseAction(Message, frozen=True, kw_only=True):
+    action: str
+    type: str
+    id: Id = None
+
+
+class UnadvertiseAction(Message, frozen=True, kw_only=True):
+    action: str
+    id: Id = None
+
+
+class SendActionGoal(Message, frozen=True, kw_only=True):
+    """:param feedback: whether ``action_feedback`` is wanted"""
+
+    action: str
+    action_type: str = ""
+    id: Id = None
+    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    feedback: bool = False
+    fragment_size: int | None = None
+    compression: str = "none"
+
+
+class CancelActionGoal(Message, frozen=True, kw_only=True):
+    action: str
+    id: Id = None
+
+
+class ActionFeedback(Message, frozen=True, kw_only=True):
+    """From a client that offers the action."""
+
+    action: str
+    id: Id = None
+    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+
+
+class ActionResult(Message, frozen=True, kw_only=True):
+    """From a client that offers the action; ``status`` is of ``action_msgs/msg/GoalStatus``."""
+
+    action: str
+    id: Id = None
+    status: int | None = None
+    result: bool = True
+    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+
+
+class Fragment(Message, frozen=True, kw_only=True):
+    """A part of the text of one message; ``num`` counts from 0 to ``total`` - 1."""
+
+    id: str | int
+    data: str
+    num: int
+    total: int
+
+
 class SetLevel(Message, frozen=True, kw_only=True, tag="set_level"):
     level: str
     id: Id = None
@@ -115,6 +170,13 @@ ClientOp = (
     | ServiceResponse
     | AdvertiseService
     | UnadvertiseService
+    | AdvertiseAction
+    | UnadvertiseAction
+    | SendActionGoal
+    | CancelActionGoal
+    | ActionFeedback
+    | ActionResult
+    | Fragment
     | SetLevel
     | Auth
 )
@@ -137,10 +199,48 @@ def publish(topic: str, body: bytes) -> bytes:
 
 def service_response(service: str, id: Id, result: bool, values: bytes) -> bytes:
     """A ``service_response`` towards a client; ``values`` is JSON, a string when ``result`` is false."""
-    head = b'{"op":"service_response","service":' + jsontext.encode(service)
-    if id is not None:
-        head += b',"id":' + jsontext.encode(id)
-    return head + b',"result":' + (b"true" if result else b"false") + b',"values":' + values + b"}"
+    return _object("service_response", service=service, id=id) + _result(result, values)
+
+
+def call_service(service: str, id: str, type_name: str, args: bytes) -> bytes:
+    """A ``call_service`` towards the client that offers the service; ``args`` is JSON."""
+    return _object("call_service", service=service, id=id, type=type_name) + b',"args":' + args + b"}"
+
+
+def send_action_goal(action: str, id: str, type_name: str, args: bytes, feedback: bool) -> bytes:
+    """A ``send_action_goal`` towards the client that offers the action; ``args`` is JSON."""
+    head = _object("send_action_goal", action=action, id=id, action_type=type_name)
+    return head + b',"args":' + args + b',"feedback":' + _truth(feedback) + b"}"
+
+
+def cancel_action_goal(action: str, id: str) -> bytes:
+    """A ``cancel_action_goal`` towards the client that pursues the goal."""
+    return _object("cancel_action_goal", action=action, id=id) + b"}"
+
+
+def action_feedback(action: str, id: Id, values: bytes) -> bytes:
+    """An ``action_feedback`` towards the client that sent the goal; ``values`` is JSON."""
+    return _object("action_feedback", action=action, id=id) + b',"values":' + values + b"}"
+
+
+def action_result(action: str, id: Id, status: int, result: bool, values: bytes) -> bytes:
+    """The ``action_result`` towards the client that sent the goal; ``values`` is JSON, a string on failure."""
+    return _object("action_result", action=action, id=id, status=status) + _result(result, values)
+
+
+def _object(op: str, **fields: Any) -> bytes:
+    """An object without its closing brace; fields that are ``None`` are left out."""
+    return jsontext.encode({"op": op, **{name: each for name, each in fields.items() if each is not None}})[
+        :-1
+    ]
+
+
+def _result(result: bool, values: bytes) -> bytes:
+    return b',"result":' + _truth(result) + b',"values":' + values + b"}"
+
+
+def _truth(value: bool) -> bytes:
+    return b"true" if value else b"false"
 
 
 def status(level: str, text: str, id: Id = None) -> bytes:

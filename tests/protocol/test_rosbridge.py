@@ -50,7 +50,7 @@ def test_absent_arguments_are_told_from_null() -> None:
 
 def test_an_unknown_op_is_told_with_those_known() -> None:
     """The error names the op and what would have been right."""
-    with pytest.raises(MalformedMessage, match=r"unknown op 'subscrbe'; known are advertise, .*unsubscribe"):
+    with pytest.raises(MalformedMessage, match=r"unknown op 'subscrbe'; known are action_feedback, .*unsubscribe"):
         rosbridge.decode(b'{"op":"subscrbe","topic":"/a"}')
 
 

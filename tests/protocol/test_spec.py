@@ -64,6 +64,13 @@ def test_the_version_and_the_words_of_rights_are_the_codes() -> None:
         (f"`service_response`'s `id` | {limits.LABEL} characters", 255),
         (f"`encodings` | {limits.FACTS}", 64),
         (f"`text` of an alert), `ref` | {limits.WORDS} characters", 4096),
+        (f"names of types in `interfaces` | {limits.INTERFACES}", 8192),
+        (f"one link, unfinished | {limits.PARTS_BYTES // limits.MIB} MiB", 32),
+        (
+            f"one client, unfinished | {limits.FRAGMENTS}, {limits.CLIENT_MESSAGE // limits.MIB} MiB together, "
+            f"{limits.FRAGMENT_SECONDS:g} s",
+            10,
+        ),
         (f"frame to a robot | {limits.COMMAND_FRAME // limits.MIB} MiB", 4),
         (f"message and frame from a client | {limits.CLIENT_MESSAGE // limits.MIB} MiB", 1),
         (f"{limits.UNPROVEN_SECONDS:g} s, {limits.UNPROVEN_BYTES // limits.KIB} KiB", 64),
