@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Prepares .venv and what lives beside it. Each stage remembers what it was done for, so a second run is instant.
-#   scripts/setup.sh [python] [web] [interfaces] [browser]      (all, if none is named)
+#   scripts/setup.sh [python] [web] [interfaces] [fixtures] [browser]      (all, if none is named)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -132,25 +132,34 @@ stage_web() {
 
 # --- ROS interfaces that no wheel brings ------------------------------------------------------------------------
 
-stage_interfaces() {
-    local wanted
-    [ -f scripts/build_interfaces.py ] || return 0
-    wanted=$(find scripts/build_interfaces.py scripts/interfaces -type f -print0 | LC_ALL=C sort -z |
-        xargs -0 cat | fingerprint -)
-    done_for interfaces "$wanted" && return
+# build_packages <stamp> <what> <consequence when it can't be done> <folder>...
+build_packages() {
+    local stamp=$1 what=$2 without=$3 wanted
+    shift 3
+    wanted=$(find scripts/build_interfaces.py "$@" -type f -print0 | LC_ALL=C sort -z | xargs -0 cat | fingerprint -)
+    done_for "$stamp" "$wanted" && return
     if ! $venv/bin/python -c 'import rosidl_generator_py' 2>/dev/null; then
-        say "no ROS 2 wheels for this machine: nothing is built, your own ROS brings tf2_msgs"
+        say "no ROS 2 wheels for this machine: $what not built; $without"
         return
     fi
     if ! command -v gcc >/dev/null || ! command -v g++ >/dev/null; then
-        say "no gcc and g++: tf2_msgs is not built, the simulated robot publishes no /tf (apt install g++)"
+        say "no gcc and g++: $what not built; $without (apt install g++)"
         return
     fi
-    if run "ROS interfaces (tf2_msgs)" $venv/bin/python scripts/build_interfaces.py scripts/interfaces/tf2_msgs; then
-        note_done interfaces "$wanted"
+    if run "ROS interfaces ($what)" $venv/bin/python scripts/build_interfaces.py "$@"; then
+        note_done "$stamp" "$wanted"
     else
-        say "going on without tf2_msgs: the simulated robot publishes no /tf"
+        say "going on without $what: $without"
     fi
+}
+
+stage_interfaces() {
+    build_packages interfaces tf2_msgs 'the simulated robot publishes no /tf' scripts/interfaces/*
+}
+
+# Packages for the tests alone: one of every kind of field, and the examples every ROS 2 has.
+stage_fixtures() {
+    build_packages fixtures 'packages for the tests' 'tests of services and actions fail' tests/interfaces/*
 }
 
 # --- A browser for the browser tests ----------------------------------------------------------------------------
@@ -173,10 +182,11 @@ for stage in "${@:-all}"; do
             stage_python
             stage_web
             stage_interfaces
+            stage_fixtures
             stage_browser
             ;;
-        python | web | interfaces | browser) "stage_$stage" ;;
-        *) fail "there is no stage '$stage'; there are python, web, interfaces and browser" ;;
+        python | web | interfaces | fixtures | browser) "stage_$stage" ;;
+        *) fail "there is no stage '$stage'; there are python, web, interfaces, fixtures and browser" ;;
     esac
 done
 if [ $((SECONDS - began)) -gt 2 ]; then
