@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Hashable
 from operator import attrgetter
+from typing import Any, Protocol
 
 from relay_protocol.limits import MIB
 
@@ -18,13 +19,22 @@ CONTROL_MESSAGES = 1024
 CONTROL_BYTES = 2 * MIB
 
 
+class Parcel(Protocol):
+    """A sample that is made ready for the wire only when its turn comes."""
+
+    size: int
+
+    def open(self, key: Any) -> bytes | None:
+        """What goes on the wire for this key; ``None`` when nothing can."""
+
+
 class _Queue:
     """Samples of one topic that wait, each with the moment it came."""
 
     __slots__ = ("bytes", "samples")
 
     def __init__(self) -> None:
-        self.samples: deque[tuple[float, bytes]] = deque()
+        self.samples: deque[tuple[float, int, bytes | Parcel]] = deque()
         self.bytes = 0
 
 
@@ -71,10 +81,10 @@ class Outbox:
             key = next(iter(self._data))
             queue = self._data.pop(key)
             self._forget_stale(queue)
-            message = self._take(queue)
+            parcel = self._take(queue)
             if queue.samples:
                 self._data[key] = queue
-            self._write(message)
+            self._put(key, parcel)
 
     def close(self) -> None:
         """Nothing is written any more; what waited is let go."""
@@ -96,21 +106,22 @@ class Outbox:
             self.close()
             self._overflow()
 
-    def data(self, key: Hashable, message: bytes, depth: int = DATA_PER_TOPIC) -> None:
+    def data(self, key: Hashable, parcel: bytes | Parcel, depth: int = DATA_PER_TOPIC) -> None:
         """Send a sample of a topic; the oldest give way when they pile up.
 
-        :param key: the topic
-        :param depth: most samples of this topic that may wait
+        :param key: the topic, and what a :class:`Parcel` is opened with
+        :param depth: most samples of this topic that may wait, at least one
         """
         if self._closed:
             return
         if self.paused_since is None:
-            self._write(message)
+            self._put(key, parcel)
             return
+        size = len(parcel) if isinstance(parcel, bytes) else parcel.size
         queue = self._data.setdefault(key, _Queue())
-        queue.samples.append((self._seconds(), message))
-        queue.bytes += len(message)
-        self._data_bytes += len(message)
+        queue.samples.append((self._seconds(), size, parcel))
+        queue.bytes += size
+        self._data_bytes += size
         while len(queue.samples) > max(depth, 1):
             self._drop_oldest(queue)
         if self._data_bytes > DATA_BYTES:
@@ -120,6 +131,11 @@ class Outbox:
             self._drop_oldest(queue)
         if not queue.samples:
             del self._data[key]
+
+    def _put(self, key: Hashable, parcel: bytes | Parcel) -> None:
+        message = parcel if isinstance(parcel, bytes) else parcel.open(key)
+        if message is not None:
+            self._write(message)
 
     def forget(self, key: Hashable) -> None:
         """Let go of what waits of this topic."""
@@ -147,8 +163,8 @@ class Outbox:
         self._take(queue)
         self.dropped += 1
 
-    def _take(self, queue: _Queue) -> bytes:
-        _, message = queue.samples.popleft()
-        queue.bytes -= len(message)
-        self._data_bytes -= len(message)
-        return message
+    def _take(self, queue: _Queue) -> bytes | Parcel:
+        _, size, parcel = queue.samples.popleft()
+        queue.bytes -= size
+        self._data_bytes -= size
+        return parcel

@@ -7,7 +7,8 @@ from twisted.logger import Logger
 from relay_protocol import link
 from relay_protocol.errors import Invalid, Refused
 from relay_server.channel.definitions import Definitions
-from relay_server.channel.topics import Listener, Phase, TopicUplink
+from relay_server.channel.listener import Listener
+from relay_server.channel.topics import Phase, TopicUplink
 from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire, resolve
 
 

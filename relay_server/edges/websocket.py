@@ -12,7 +12,6 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
 from autobahn.twisted.websocket import WebSocketServerFactory, WebSocketServerProtocol
-from autobahn.websocket.protocol import WebSocketProtocol
 from autobahn.websocket.types import ConnectionDeny, ConnectionRequest
 from twisted.internet.defer import Deferred
 from twisted.internet.protocol import connectionDone
@@ -295,11 +294,10 @@ class ClientProtocol(WebSocketServerProtocol):
 
     # --- ClientTransport ----------------------------------------------------------------------------------
 
-    def send(self, message: bytes) -> None:
-        """One text message. The peer may have begun to close: then nobody reads it."""
+    def send(self, frames: bytes) -> None:
+        """Whole frames. The peer may have begun to close: then nobody reads them."""
         if self.state == self.STATE_OPEN:
-            # sendMessage would refuse what is over the limit for what comes in.
-            self.sendFrame(opcode=WebSocketProtocol.MESSAGE_TYPE_TEXT, payload=message)
+            self.transport.write(frames)
 
     def ping(self, payload: bytes) -> None:
         """A websocket ping."""

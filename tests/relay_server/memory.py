@@ -60,6 +60,21 @@ def words(cdr: bytes) -> str:
     return cdr[8 : 8 + int.from_bytes(cdr[4:8], "little") - 1].decode()
 
 
+def messages_in(frames: bytes) -> list[tuple[int, bytes]]:
+    """First byte and payload of each websocket frame of a server."""
+    found, at = [], 0
+    while at < len(frames):
+        first, length = frames[at], frames[at + 1]
+        wide = {126: 2, 127: 8}.get(length, 0)
+        at += 2 + wide
+        length = int.from_bytes(frames[at - wide : at], "big") if wide else length
+        payload = frames[at : at + length]
+        assert len(payload) == length, "a frame is cut short"
+        found.append((first, payload))
+        at += length
+    return found
+
+
 class MemoryLink:
     """A robot's link as the relay writes to it."""
 
@@ -106,10 +121,10 @@ class MemoryClient:
         self.pings: list[bytes] = []
         self.closed: tuple[int, str] | None = None
 
-    def send(self, message: bytes) -> None:
-        """Keep it; a closed websocket takes nothing."""
+    def send(self, frames: bytes) -> None:
+        """Keep what is in the frames; a closed websocket takes nothing."""
         assert self.closed is None, "sent after the close"
-        self.sent.append(message)
+        self.sent += [payload for _, payload in messages_in(frames)]
 
     def ping(self, payload: bytes) -> None:
         """Keep it; the test answers."""

@@ -196,5 +196,5 @@ def test_a_handler_of_ours_that_breaks_is_answered_without_internals(
     async def broken(session: Any, args: Any) -> Any:
         raise RuntimeError("the secret of our insides")
 
-    monkeypatch.setitem(viewer.session._local._services, "/relay/ping", broken)  # type: ignore[attr-defined]
+    monkeypatch.setitem(viewer.session.calling._local._services, "/relay/ping", broken)  # type: ignore[attr-defined]
     assert ask(viewer, "/relay/ping") == "the relay failed on this call; its log tells more"

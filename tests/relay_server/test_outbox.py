@@ -203,7 +203,7 @@ def test_the_account_of_waiting_bytes_never_drifts(steps: list[tuple[str, int, i
             box.forget(values[0])
         else:
             receiver.now += values[0]
-        waiting = sum(len(each) for queue in box._data.values() for _, each in queue.samples)
+        waiting = sum(size for queue in box._data.values() for _, size, _ in queue.samples)
         assert box.waiting_bytes == waiting + sum(map(len, box._control))
         assert all(queue.samples for queue in box._data.values())
         assert waiting <= 2 * module.DATA_BYTES

@@ -9,9 +9,9 @@ import pytest
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server import closing
-from relay_server import session as module
 from relay_server.channel import subscriptions
-from relay_server.session import normal_type
+from relay_server.session import calling, listening, normal_type
+from relay_server.session import core as module
 from tests.relay_server.memory import STRING, TEXTS, TWIST, Person, World, text
 
 
@@ -94,7 +94,7 @@ def test_operations_that_are_not_served_are_refused_in_words(world: World) -> No
     person.says("dance")
     person.says("subscribe", topic="/x", type=STRING, compression="cbor")
     first, second, third = person.hears("status")
-    assert first["msg"] == "services offered by clients are not carried to robots by this relay"
+    assert first["msg"] == "'advertise_service' is not carried to robots by this relay"
     assert second["msg"].startswith("unknown op 'dance'")
     assert (third["level"], third["msg"]) == (
         "warning",
@@ -328,7 +328,7 @@ def test_types_in_the_habit_of_ros_1_are_understood() -> None:
 
 def test_the_number_of_topics_of_one_client_is_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it has goes on."""
-    monkeypatch.setattr(module, "SUBSCRIPTIONS", 2)
+    monkeypatch.setattr(listening, "SUBSCRIPTIONS", 2)
     person = world.person()
     person.says("set_level", level="error")
     for topic in ("/a", "/b", "/c", "/a"):
@@ -364,7 +364,7 @@ def test_changes_faster_than_any_program_needs_are_refused(world: World) -> None
 
 def test_arguments_of_calls_that_wait_are_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """What calls keep in memory is given back when they end."""
-    monkeypatch.setattr(module, "CALL_BYTES", 100)
+    monkeypatch.setattr(calling, "CALL_BYTES", 100)
     world.robot_comes()
     person = world.person()
     world.robot_joins()
@@ -373,4 +373,4 @@ def test_arguments_of_calls_that_wait_are_bounded(world: World, monkeypatch: pyt
         person.says("call_service", service="/reset", args={"x": "y" * 60})
     assert "too large together" in told(person)[0]
     person.session.end()
-    assert person.session._call_bytes == 0
+    assert person.session.calling._bytes == 0

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
-from relay_server import session as session_module
 from relay_server.channel import calls as module
+from relay_server.session import calling as session_module
 from tests.relay_server.memory import TRIGGER, Person, World
 
 YES = b"\x00\x01\x00\x00\x01\x00\x00\x00\x03\x00\x00\x00ok\x00"
@@ -93,7 +93,7 @@ def test_a_robot_that_never_defines_the_type_lets_nobody_hang(world: World) -> N
         world.clock.advance(1)
     (reply,) = person.hears("service_response")
     assert reply["result"] is False
-    assert not person.session._calls
+    assert not person.session.calling._calls
 
 
 def test_a_lost_robot_ends_its_calls(world: World) -> None:
@@ -160,7 +160,7 @@ def test_calls_of_a_client_that_leaves_give_their_places_back(world: World) -> N
         for _ in range(session_module.CALLS):
             person.says("call_service", service="/reset", timeout=3600)
         person.session.end()
-        assert not person.session._calls
+        assert not person.session.calling._calls
     world.link.take(link.CallService)
     keeper.says("call_service", service="/reset", id="mine")
     answer(world)

@@ -6,6 +6,7 @@ from typing import Any
 
 from relay_protocol import link
 from relay_protocol.rights import Level
+from relay_server.channel import listener as listener_module
 from relay_server.channel import topics as module
 from tests.relay_server.memory import GRAPH, STRING, Person, World, text
 
@@ -104,7 +105,7 @@ def test_absurd_numbers_of_one_client_hurt_nobody(world: World) -> None:
         {"throttle_rate": 1e300, "queue_length": -3},
         {"throttle_rate": 1e300, "queue_length": -(10**30)},
     )
-    assert world.link.all(link.Subscribe)[0].throttle_ms == module.THROTTLE_SECONDS * 1000
+    assert world.link.all(link.Subscribe)[0].throttle_ms == listener_module.THROTTLE_SECONDS * 1000
     odd.session.pause()
     other.says("subscribe", topic="/chatter", throttle_rate=-5, id=10**30)
     for word in ("a", "b"):
@@ -116,10 +117,10 @@ def test_subscriptions_of_one_client_to_one_topic_are_bounded(world: World) -> N
     """By id they could fill the memory; the refused one has no effect."""
     _, (person,) = watching(world, {"throttle_rate": 100, "id": "first"})
     person.says("set_level", level="error")
-    for number in range(module.ASKS):
+    for number in range(listener_module.ASKS):
         person.says("subscribe", topic="/chatter", throttle_rate=100, id=number)
     assert "at most 64" in person.hears("status")[0]["msg"]
-    assert person.session._listeners["/chatter"].throttle == 0.1
+    assert person.session.listening._listeners["/chatter"].throttle == 0.1
 
 
 def test_late_joiners_get_the_latched_samples_of_every_publisher(world: World) -> None:
@@ -220,7 +221,7 @@ def test_a_sample_nobody_takes_is_not_converted(world: World) -> None:
     world.channel.sample(number, text("sent"))
     sample = world.channel.subscriptions._numbers[number].sample(text("waits"), world.robot.types)
     assert sample is not None
-    assert sample._encoded is None
+    assert sample._json is None
 
 
 def test_a_topic_has_one_type(world: World) -> None:

@@ -11,7 +11,7 @@ from twisted.internet.error import ConnectionDone
 from twisted.python.failure import Failure
 
 from relay_protocol import limits
-from relay_server import closing
+from relay_server import closing, wsframe
 from relay_server.edges.caps import AddressCap
 from tests.relay_server.edges.websocket_client import AUTH, Client, MemoryGate
 
@@ -175,14 +175,14 @@ def test_samples_for_a_client_that_is_closing_are_let_go(gate: MemoryGate) -> No
     """They come from a robot that serves others: nothing may break there."""
     client = Client(gate, Authorization="Bearer good")
     send: Callable[[bytes], None] = gate.sessions[0].transport.send
-    send(b'{"n":1}')
+    send(wsframe.text(b'{"n":1}'))
     client.transport.loseConnection = lambda: None  # type: ignore[method-assign]
     client.core.send_close(1000)
     client.run()
-    send(b'{"n":2}')
+    send(wsframe.text(b'{"n":2}'))
     client.transport.connected = False
     client.end.connectionLost(Failure(ConnectionDone()))
-    send(b'{"n":3}')
+    send(wsframe.text(b'{"n":3}'))
     assert client.heard == [b'{"n":1}']
     assert gate.sessions[0].got == ["start", "end"]
 
@@ -247,7 +247,7 @@ def test_a_session_takes_and_sends_larger_messages(gate: MemoryGate) -> None:
     client.says("x" * limits.CLIENT_MESSAGE)
     assert len(gate.sessions[0].got[-1]) == limits.CLIENT_MESSAGE
     picture = b"y" * (limits.CLIENT_MESSAGE + 1)
-    gate.sessions[0].transport.send(picture)
+    gate.sessions[0].transport.send(wsframe.text(picture))
     client.run()
     assert client.heard == [picture]
     client.end.dataReceived(frame_head(limits.CLIENT_MESSAGE + 1))

@@ -1,7 +1,6 @@
-"""One connected client of one robot: what it may, what it subscribed to, what it offers.
+"""One connected client: who it is, and where each of its messages goes.
 
-Bytes come in as whole websocket messages and go out the same way; every message is judged here before anything
-else sees it.
+Bytes come in as whole websocket messages and go out as frames; every message is judged before anything else sees it.
 """
 
 from __future__ import annotations
@@ -11,31 +10,27 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
 
 from relay_protocol import jsontext, rosbridge
-from relay_protocol.errors import PeerError, Refused, SwitchboardError, Unavailable
-from relay_protocol.limits import MIB
+from relay_protocol.errors import PeerError, Refused, SwitchboardError
 from relay_protocol.rights import Level, Operation
-from relay_protocol.ros.definition import normalise
 from relay_server import closing
 from relay_server.access import Permit
 from relay_server.bucket import TokenBucket
-from relay_server.channel import Channel, resolve
-from relay_server.channel.publications import HELD_SECONDS
-from relay_server.channel.topics import Listener
+from relay_server.channel import Channel
+from relay_server.channel.listener import Listener
+from relay_server.channel.sample import Sample
 from relay_server.clock import Clock, looping
+from relay_server.forms import PLAIN, Form, frames
 from relay_server.freshness import Freshness
-from relay_server.outbox import Outbox
+from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
+from relay_server.session.calling import Calling
+from relay_server.session.listening import Listening
+from relay_server.session.publishing import Publishing
 
 LEVELS = {"info": 0, "warning": 1, "error": 2, "none": 3}
-SUBSCRIPTIONS = 1024
-CALLS = 256
-CALL_BYTES = 2 * MIB
-"""Arguments of calls that wait, over all of them."""
-
 CHANGES_A_SECOND = 50.0
 CHANGES_AT_ONCE = 1000.0
 """Subscriptions, advertisements and their ends one client may ask for; messages and calls are not counted."""
@@ -53,8 +48,8 @@ _numbers = itertools.count(1)
 class ClientTransport(Protocol):
     """The websocket under a session."""
 
-    def send(self, message: bytes) -> None:
-        """One text message."""
+    def send(self, frames: bytes) -> None:
+        """One or more whole websocket frames, see :mod:`relay_server.wsframe`."""
 
     def ping(self, payload: bytes) -> None:
         """A websocket ping."""
@@ -113,25 +108,22 @@ class Session:
         self.channel = channel
         self.address = address
         self.since = since
-        self.stale_commands = 0
         self.refusals = 0
         self._clock = clock
         self._transport = transport
-        self._local = local
         self._freshness = freshness
         self._timing = timing
         self._ended = ended
         self._level = LEVELS["none"]
-        self._listeners: dict[str, Listener] = {}
-        self._calls: set[Deferred[None]] = set()
-        self._call_bytes = 0
         self._changes = TokenBucket(CHANGES_A_SECOND, CHANGES_AT_ONCE, clock.seconds)
         self._noise = TokenBucket(LINES_A_SECOND, LINES_AT_ONCE, clock.seconds)
         self._malformed = 0
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
         self._pinging = looping(clock, self._ping)
-        self._telling = looping(clock, self._publish_local)
+        self.listening = Listening(self, clock, local)
+        self.publishing = Publishing(self, freshness)
+        self.calling = Calling(self, local)
         permit.on_change = self._rights_changed
         permit.on_revoke = self._revoked
 
@@ -144,6 +136,11 @@ class Session:
     def name(self) -> str:
         """The user's name."""
         return self.permit.principal.name
+
+    @property
+    def stale_commands(self) -> int:
+        """Commands dropped because they could have been too old."""
+        return self.publishing.stale_commands
 
     @property
     def rtt(self) -> float | None:
@@ -168,14 +165,10 @@ class Session:
             return
         self._closed = True
         self.outbox.close()
-        for loop in (self._pinging, self._telling):
-            if loop.running:
-                loop.stop()
-        for listener in self._listeners.values():
-            listener.close()
-        # Nobody is left to hear the answers, and their places are wanted by others.
-        for call in list(self._calls):
-            call.cancel()
+        if self._pinging.running:
+            self._pinging.stop()
+        self.listening.end()
+        self.calling.end()
         self.channel.detach(self)
         self._ended(self)
 
@@ -213,12 +206,12 @@ class Session:
         try:
             handler = _HANDLERS.get(type(operation))
             if handler is None:
-                raise Refused("services offered by clients are not carried to robots by this relay")
+                raise Refused(f"'{operation.__struct_config__.tag}' is not carried to robots by this relay")
             if type(operation) in _CHANGES and not self._changes.take():
                 raise Refused(f"too many changes at once; at most {CHANGES_A_SECOND:g} a second are followed")
             handler(self, operation)
         except SwitchboardError as error:
-            self._refuse(operation, error)
+            self.refuse(operation, error)
 
     def pong(self, payload: bytes) -> None:
         """The client answered a ping."""
@@ -234,19 +227,24 @@ class Session:
 
     # --- to the client ------------------------------------------------------------------------------------
 
-    def deliver(self, topic: str, payload: bytes, depth: int) -> None:
-        """Queue a sample of a topic."""
-        if depth:
-            self.outbox.data(topic, payload, depth)
-        else:
-            self.outbox.data(topic, payload)
+    def deliver(self, listener: Listener, parcel: Sample | bytes) -> None:
+        """Queue a message of a topic: a sample, opened when its turn comes, or frames."""
+        self.outbox.data(listener, parcel, listener.depth or DATA_PER_TOPIC)
+
+    def say(self, message: bytes, form: Form = PLAIN) -> None:
+        """Queue a message that must not be lost.
+
+        :param message: JSON
+        """
+        self.outbox.control(frames(message, form))
 
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """A status, if the client asked for that level (roslibpy breaks on any it did not ask for)."""
         if LEVELS[level] >= self._level and self._level < LEVELS["none"]:
-            self.outbox.control(rosbridge.status(level, text, id))
+            self.say(rosbridge.status(level, text, id))
 
-    def _refuse(self, operation: rosbridge.ClientOp, error: SwitchboardError) -> None:
+    def refuse(self, operation: rosbridge.ClientOp, error: SwitchboardError) -> None:
+        """Tell the client that something it asked for is not done, and why."""
         self.refusals += 1
         if self._noise.take():
             # No more of one client than a disk can bear; all are counted in /relay/status.
@@ -256,149 +254,13 @@ class Session:
             )
         self.tell("error", str(error), operation.id)
         if isinstance(operation, rosbridge.CallService):
-            self._answer(operation, False, jsontext.encode(str(error)))
+            self.calling.answer(operation, False, jsontext.encode(str(error)))
 
-    def _answer(self, call: rosbridge.CallService, result: bool, values: bytes) -> None:
-        self.outbox.control(rosbridge.service_response(call.service, call.id, result, values))
-
-    def _judge(self, operation: Operation, resource: str) -> None:
+    def judge(self, operation: Operation, resource: str) -> None:
+        """:raises Refused: the client may not do this to that resource of the robot, with the reason"""
         verdict = self.permit.judge(operation, resource)
         if not verdict.allowed:
             raise Refused(verdict.reason)
-
-    # --- topics out ---------------------------------------------------------------------------------------
-
-    def _subscribe(self, ask: rosbridge.Subscribe) -> None:
-        topic = resolve(ask.topic)
-        self._judge(Operation.SUBSCRIBE, topic)
-        if ask.compression not in ("none", ""):
-            self.tell(
-                "warning", f"compression {ask.compression} is not served; {topic} comes as plain JSON", ask.id
-            )
-        listener = self._listeners.get(topic)
-        if listener is None:
-            if len(self._listeners) >= SUBSCRIPTIONS:
-                raise Refused(f"at most {SUBSCRIPTIONS} topics can be subscribed on one connection")
-            listener = Listener(self._clock, self, ask.topic)
-        if self._local.topic(topic) is not None:
-            listener.add(ask)
-            self._listeners[topic] = listener
-            if not self._telling.running:
-                self._telling.start(1.0, now=True)
-            return
-        self.channel.subscriptions.check(topic, normal_type(ask.type))
-        listener.add(ask)
-        self.channel.subscriptions.add(self, listener, normal_type(ask.type), ask.qos)
-        self._listeners[topic] = listener
-
-    def _unsubscribe(self, ask: rosbridge.Unsubscribe) -> None:
-        topic = resolve(ask.topic)
-        listener = self._listeners.get(topic)
-        if listener is None:
-            return
-        if ask.id is not None and listener.remove(ask.id):
-            if self._local.topic(topic) is None:
-                self.channel.subscriptions.add(self, listener, "", None)
-            return
-        self._drop(topic)
-
-    def _drop(self, topic: str) -> None:
-        listener = self._listeners.pop(topic)
-        listener.close()
-        self.outbox.forget(listener.name)
-        self.channel.subscriptions.remove(self, topic)
-
-    def _publish_local(self) -> None:
-        makers = [(name, self._local.topic(name)) for name in self._listeners]
-        for name, make in makers:
-            if make is not None:
-                body = jsontext.encode(make(self))
-                listener = self._listeners[name]
-                self.deliver(listener.name, rosbridge.publish(listener.name, body), 1)
-        if not any(make for _, make in makers):
-            self._telling.stop()
-
-    # --- topics in ----------------------------------------------------------------------------------------
-
-    def _advertise(self, ask: rosbridge.Advertise) -> None:
-        self._judge(Operation.PUBLISH, resolve(ask.topic))
-        self.channel.publications.advertise(self, ask, normal_type(ask.type))
-
-    def _unadvertise(self, ask: rosbridge.Unadvertise) -> None:
-        self.channel.publications.unadvertise(self, resolve(ask.topic), ask.id)
-
-    def _publish(self, ask: rosbridge.Publish) -> None:
-        topic = resolve(ask.topic)
-        self._judge(Operation.PUBLISH, topic)
-        if self.robot.control is None:
-            raise Unavailable(f"robot {self.robot.name} is offline; the message was dropped")
-        publication = self.channel.publications.get(self, topic, normal_type(ask.type))
-        good_for = HELD_SECONDS
-        if self.robot.is_motion(topic, publication.type):
-            age_ms = self._freshness.age() / 1e6
-            deadline_ms = self.robot.description.motion.deadline_ms
-            if age_ms > deadline_ms:
-                self.stale_commands += 1
-                self.tell(
-                    "warning",
-                    f"a command to {topic} was dropped: it may be {age_ms:.0f} ms old, by the last ping "
-                    f"answered; the robot takes none older than {deadline_ms} ms",
-                    ask.id,
-                )
-                return
-            good_for = (deadline_ms - age_ms) / 1000
-
-        def failed(reason: str) -> None:
-            self.tell("error", reason, ask.id)
-
-        stamp = self._freshness.not_before
-        self.channel.publications.publish(self, publication, bytes(ask.msg), stamp, failed, good_for)
-
-    # --- services -----------------------------------------------------------------------------------------
-
-    def _call(self, ask: rosbridge.CallService) -> None:
-        service = resolve(ask.service)
-        if len(self._calls) >= CALLS:
-            raise Refused(f"{CALLS} calls of this connection are waiting already")
-        raw = bytes(ask.args or b"")
-        size = len(raw)
-        if self._call_bytes + size > CALL_BYTES:
-            raise Refused(
-                "the arguments of the calls that wait already are too large together; wait for answers"
-            )
-        local = self._local.service(service)
-        if local is None:
-            self._judge(Operation.CALL, service)
-            answer: Awaitable[bytes] = self.channel.call(
-                service, normal_type(ask.type, "srv"), raw, ask.timeout
-            )
-        else:
-            args = jsontext.decode_any(raw) if raw else {}
-            answer = self._call_local(local, args)
-        running = Deferred.fromCoroutine(self._finish(ask, answer))
-        self._calls.add(running)
-        self._call_bytes += size
-        running.addErrback(self._unexpected, ask)
-        running.addBoth(self._call_ended, running, size)
-
-    def _call_ended(self, _: Any, running: Deferred[None], size: int) -> None:
-        self._calls.discard(running)
-        self._call_bytes -= size
-
-    async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
-        return jsontext.encode(await local(self, args))
-
-    async def _finish(self, ask: rosbridge.CallService, answer: Awaitable[bytes]) -> None:
-        try:
-            self._answer(ask, True, await answer)
-        except SwitchboardError as error:
-            self._refuse(ask, error)
-
-    def _unexpected(self, failure: Any, ask: rosbridge.CallService) -> None:
-        if self._closed and failure.check(CancelledError):
-            return
-        self.log.failure("a call of {service} failed", failure, service=ask.service)
-        self._answer(ask, False, jsontext.encode("the relay failed on this call; its log tells more"))
 
     # --- the rest -----------------------------------------------------------------------------------------
 
@@ -431,11 +293,7 @@ class Session:
         self.close(closing.TOO_SLOW, "replies pile up; read faster")
 
     def _rights_changed(self) -> None:
-        for topic in list(self._listeners):
-            verdict = self.permit.judge(Operation.SUBSCRIBE, topic)
-            if not verdict.allowed:
-                self._drop(topic)
-                self.tell("error", f"unsubscribed from {topic}: {verdict.reason}")
+        self.listening.rights_changed()
         self.channel.publications.forget_denied(self, self.permit)
         if self._pinging.running:
             self._pinging.interval = self._ping_interval()
@@ -443,17 +301,6 @@ class Session:
     def _revoked(self, reason: str) -> None:
         code = closing.FORBIDDEN if "right" in reason else closing.UNAUTHENTICATED
         self.close(code, reason)
-
-
-def normal_type(name: str | None, kind: str = "msg") -> str:
-    """ROS 1 habit ``pkg/Name`` becomes ``pkg/msg/Name`` (or ``srv``); empty stays empty.
-
-    :raises Invalid: no type name
-    """
-    if not name:
-        return ""
-    package, slash, rest = name.partition("/")
-    return normalise(f"{package}/{kind}/{rest}" if slash and "/" not in rest else name)
 
 
 _CHANGES = {
@@ -465,12 +312,12 @@ _CHANGES = {
 }
 
 _HANDLERS: dict[type, Callable[[Session, Any], None]] = {
-    rosbridge.Subscribe: Session._subscribe,
-    rosbridge.Unsubscribe: Session._unsubscribe,
-    rosbridge.Advertise: Session._advertise,
-    rosbridge.Unadvertise: Session._unadvertise,
-    rosbridge.Publish: Session._publish,
-    rosbridge.CallService: Session._call,
+    rosbridge.Subscribe: lambda session, ask: session.listening.subscribe(ask),
+    rosbridge.Unsubscribe: lambda session, ask: session.listening.unsubscribe(ask),
+    rosbridge.Advertise: lambda session, ask: session.publishing.advertise(ask),
+    rosbridge.Unadvertise: lambda session, ask: session.publishing.unadvertise(ask),
+    rosbridge.Publish: lambda session, ask: session.publishing.publish(ask),
+    rosbridge.CallService: lambda session, ask: session.calling.call(ask),
     rosbridge.SetLevel: Session._set_level,
     rosbridge.Auth: Session._auth,
 }

@@ -1,0 +1,88 @@
+"""Services a client calls, of the robot and of the relay: each call is answered exactly once."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from twisted.internet.defer import CancelledError, Deferred
+
+from relay_protocol import jsontext, rosbridge
+from relay_protocol.errors import Refused, SwitchboardError
+from relay_protocol.limits import MIB
+from relay_protocol.rights import Operation
+from relay_server.channel import resolve
+from relay_server.session.names import normal_type
+
+if TYPE_CHECKING:
+    from relay_server.session.core import LocalNode, Session
+
+CALLS = 256
+CALL_BYTES = 2 * MIB
+"""Arguments of calls that wait, over all of them."""
+
+
+class Calling:
+    """The calls of one session that wait for their answers."""
+
+    def __init__(self, session: Session, local: LocalNode) -> None:
+        self._session = session
+        self._local = local
+        self._calls: set[Deferred[None]] = set()
+        self._bytes = 0
+        self._ended = False
+
+    def end(self) -> None:
+        """Nobody is left to hear the answers, and their places are wanted by others."""
+        self._ended = True
+        for call in list(self._calls):
+            call.cancel()
+
+    def call(self, ask: rosbridge.CallService) -> None:
+        """Call a service of the robot, or one of the relay's own."""
+        service = resolve(ask.service)
+        if len(self._calls) >= CALLS:
+            raise Refused(f"{CALLS} calls of this connection are waiting already")
+        raw = bytes(ask.args or b"")
+        size = len(raw)
+        if self._bytes + size > CALL_BYTES:
+            raise Refused(
+                "the arguments of the calls that wait already are too large together; wait for answers"
+            )
+        local = self._local.service(service)
+        if local is None:
+            self._session.judge(Operation.CALL, service)
+            answer: Awaitable[bytes] = self._session.channel.call(
+                service, normal_type(ask.type, "srv"), raw, ask.timeout
+            )
+        else:
+            args = jsontext.decode_any(raw) if raw else {}
+            answer = self._call_local(local, args)
+        running = Deferred.fromCoroutine(self._finish(ask, answer))
+        self._calls.add(running)
+        self._bytes += size
+        running.addErrback(self._unexpected, ask)
+        running.addBoth(self._call_ended, running, size)
+
+    def answer(self, call: rosbridge.CallService, result: bool, values: bytes) -> None:
+        """Answer one call; ``values`` is JSON, a string when ``result`` is false."""
+        self._session.say(rosbridge.service_response(call.service, call.id, result, values))
+
+    def _call_ended(self, _: Any, running: Deferred[None], size: int) -> None:
+        self._calls.discard(running)
+        self._bytes -= size
+
+    async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
+        return jsontext.encode(await local(self._session, args))
+
+    async def _finish(self, ask: rosbridge.CallService, answer: Awaitable[bytes]) -> None:
+        try:
+            self.answer(ask, True, await answer)
+        except SwitchboardError as error:
+            self._session.refuse(ask, error)
+
+    def _unexpected(self, failure: Any, ask: rosbridge.CallService) -> None:
+        if self._ended and failure.check(CancelledError):
+            return
+        self._session.log.failure("a call of {service} failed", failure, service=ask.service)
+        self.answer(ask, False, jsontext.encode("the relay failed on this call; its log tells more"))

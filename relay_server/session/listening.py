@@ -1,0 +1,106 @@
+"""What a client listens to: topics of the robot, and those of the relay itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from relay_protocol import jsontext, rosbridge
+from relay_protocol.errors import Refused
+from relay_protocol.rights import Operation
+from relay_server.channel import resolve
+from relay_server.channel.listener import Listener
+from relay_server.clock import Clock, looping
+from relay_server.forms import frames
+from relay_server.session.names import normal_type
+
+if TYPE_CHECKING:
+    from relay_server.session.core import LocalNode, Session
+
+SUBSCRIPTIONS = 1024
+"""Topics one connection may have subscribed."""
+
+TELL_SECONDS = 1.0
+"""How often the relay publishes its own topics."""
+
+
+class Listening:
+    """The subscriptions of one session."""
+
+    def __init__(self, session: Session, clock: Clock, local: LocalNode) -> None:
+        self._session = session
+        self._clock = clock
+        self._local = local
+        self._listeners: dict[str, Listener] = {}
+        self._telling = looping(clock, self._publish_local)
+
+    def end(self) -> None:
+        """The client is gone."""
+        if self._telling.running:
+            self._telling.stop()
+        for listener in self._listeners.values():
+            listener.close()
+
+    def subscribe(self, ask: rosbridge.Subscribe) -> None:
+        """One more subscription; several of one topic are merged."""
+        session = self._session
+        topic = resolve(ask.topic)
+        session.judge(Operation.SUBSCRIBE, topic)
+        if ask.compression not in ("none", ""):
+            session.tell(
+                "warning", f"compression {ask.compression} is not served; {topic} comes as plain JSON", ask.id
+            )
+        listener = self._listeners.get(topic)
+        if listener is None:
+            if len(self._listeners) >= SUBSCRIPTIONS:
+                raise Refused(f"at most {SUBSCRIPTIONS} topics can be subscribed on one connection")
+            listener = Listener(self._clock, session, ask.topic)
+        if self._local.topic(topic) is not None:
+            listener.add(ask)
+            self._listeners[topic] = listener
+            if not self._telling.running:
+                self._telling.start(TELL_SECONDS, now=True)
+            return
+        subscriptions = session.channel.subscriptions
+        subscriptions.check(topic, normal_type(ask.type))
+        listener.add(ask)
+        subscriptions.add(session, listener, normal_type(ask.type), ask.qos)
+        self._listeners[topic] = listener
+
+    def unsubscribe(self, ask: rosbridge.Unsubscribe) -> None:
+        """One subscription less, or none of a topic any more."""
+        topic = resolve(ask.topic)
+        listener = self._listeners.get(topic)
+        if listener is None:
+            return
+        if ask.id is not None and listener.remove(ask.id):
+            if self._local.topic(topic) is None:
+                self._session.channel.subscriptions.add(self._session, listener, "", None)
+            return
+        self._drop(topic)
+
+    def rights_changed(self) -> None:
+        """What the client may not hear any more ends."""
+        for topic in list(self._listeners):
+            verdict = self._session.permit.judge(Operation.SUBSCRIBE, topic)
+            if not verdict.allowed:
+                self._drop(topic)
+                self._session.tell("error", f"unsubscribed from {topic}: {verdict.reason}")
+
+    def _drop(self, topic: str) -> None:
+        listener = self._listeners.pop(topic)
+        listener.close()
+        self._session.outbox.forget(listener)
+        self._session.channel.subscriptions.remove(self._session, topic)
+
+    def _publish_local(self) -> None:
+        makers: list[tuple[str, Callable[[Session], dict[str, Any]] | None]] = [
+            (name, self._local.topic(name)) for name in self._listeners
+        ]
+        for name, make in makers:
+            if make is not None:
+                body = jsontext.encode(make(self._session))
+                listener = self._listeners[name]
+                self._session.deliver(listener, frames(rosbridge.publish(listener.name, body), listener.form))
+        if not any(make for _, make in makers):
+            self._telling.stop()

@@ -1,0 +1,19 @@
+"""Frames of websocket messages, as Autobahn and websockets read them."""
+
+from __future__ import annotations
+
+import pytest
+from websockets.frames import Opcode
+from websockets.protocol import CLIENT, OPEN, Protocol
+
+from relay_server import wsframe
+
+
+@pytest.mark.parametrize("length", [0, 1, 125, 126, 127, 65535, 65536, 70000])
+def test_a_message_is_read_back_whole(length: int) -> None:
+    """At and around every length at which the head changes its form (RFC 6455 section 5.2)."""
+    payload = bytes(index % 128 for index in range(length))
+    reader = Protocol(CLIENT, state=OPEN, max_size=None)
+    reader.receive_data(wsframe.text(payload) + wsframe.binary(payload))
+    read = [(frame.opcode, bytes(frame.data), frame.fin) for frame in reader.events_received()]
+    assert read == [(Opcode.TEXT, payload, True), (Opcode.BINARY, payload, True)]
