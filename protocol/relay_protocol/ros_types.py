@@ -1,14 +1,17 @@
-"""The types of one robot: their definitions, and conversion of messages between CDR and JSON.
+"""The types of one robot: their definitions, and conversion of messages between CDR, JSON and CBOR.
 
-JSON has rosbridge's form: arrays of bytes are base64, NaN and infinity are ``null``. For the relay only; a
-robot passes CDR on unread.
+JSON has rosbridge's form: arrays of bytes are base64, NaN and infinity are ``null``. So has CBOR: arrays of
+numbers are typed arrays (RFC 8746). For the relay only; a robot passes CDR on unread.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import Any
 
+import cbor2
+import msgspec
 import orjson
 
 from relay_protocol import jsontext
@@ -17,10 +20,10 @@ from relay_protocol.limits import COMMAND_FRAME, MIB, TYPE_TEXTS
 from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
 from relay_protocol.ros.reader import ReaderFactory
 from relay_protocol.ros.typedefs import typedef
-from relay_protocol.ros.writer import Mismatch, Write, WriterFactory, as_invalid
+from relay_protocol.ros.writer import Mismatch, WriterFactory, as_invalid
 
-_LITTLE = b"\x00\x01"
-_BIG = b"\x00\x00"
+_ORDERS = {b"\x00\x01": "<", b"\x00\x00": ">"}
+"""Byte order of the numbers by the first two bytes of a message."""
 _WRITTEN_HEAD = b"\x00\x01\x00\x00"
 _LARGEST_BODY = COMMAND_FRAME - 17
 """What is left of a frame after kind, number, stamp and encapsulation header."""
@@ -30,25 +33,97 @@ _TYPES_OF_A_ROBOT = 4096
 Body = bytes | dict[str, Any]
 
 
+Reader = Callable[[bytes], bytes]
+"""Takes CDR with its header; gives the message in JSON or CBOR. Raises :class:`Invalid`."""
+
+Writer = Callable[[Any, int], bytes]
+"""Takes JSON (text as bytes, or decoded) and the present time (ns since 1970); gives CDR with its header.
+Raises :class:`Invalid`."""
+
+
 class _Compiled:
     """All types of one text. Readers and writers are built when first needed, and then kept."""
 
     def __init__(self, type_name: str, text: str) -> None:
         self.definitions: dict[str, Definition] = parse(type_name, text)
         self._writers = WriterFactory(self.definitions)
-        self._readers = {
-            _LITTLE: ReaderFactory(self.definitions, "<"),
-            _BIG: ReaderFactory(self.definitions, ">"),
-        }
+        self._factories: dict[tuple[str, str], ReaderFactory] = {}
+        self._made: dict[tuple[str, str], Reader] = {}
+        self._made_writers: dict[tuple[str, bool], Writer] = {}
 
-    def reader(self, encapsulation: bytes) -> ReaderFactory:
-        factory = self._readers.get(encapsulation)
-        if factory is None:
+    def reader(self, name: str, form: str) -> Reader:
+        """What turns a message of this type into ``form``."""
+        found = self._made.get((name, form))
+        if found is None:
+            found = self._made[name, form] = self._reader(name, form)
+        return found
+
+    def _reader(self, name: str, form: str) -> Reader:
+        encode = _ENCODERS[form]
+
+        def read(cdr: bytes) -> bytes:
+            if len(cdr) < 4:
+                raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
+            try:
+                return encode(self._factory(cdr[:2], form).read(name, cdr))
+            except Invalid as error:
+                raise Invalid(f"{name}: {error}") from None
+
+        return read
+
+    def _factory(self, encapsulation: bytes, form: str) -> ReaderFactory:
+        order = _ORDERS.get(encapsulation)
+        if order is None:
             raise Invalid(f"bytes 0 and 1 are {encapsulation.hex()}; plain CDR has 0001 or 0000")
-        return factory
+        found = self._factories.get((order, form))
+        if found is None:
+            found = self._factories[order, form] = ReaderFactory(self.definitions, order, form == "cbor")
+        return found
 
-    def writer(self, type_name: str) -> Write:
-        return self._writers.writer(type_name)
+    def writer(self, name: str, checked: bool) -> Writer:
+        """What turns JSON into a message of this type."""
+        found = self._made_writers.get((name, checked))
+        if found is None:
+            found = self._made_writers[name, checked] = self._writer(name, checked)
+        return found
+
+    def _writer(self, name: str, checked: bool) -> Writer:
+        decode = _decode_checked if checked else jsontext.decode_any
+
+        def write(body: Any, now_ns: int) -> bytes:
+            try:
+                value = decode(body) if type(body) is bytes else body
+            except MalformedMessage as error:
+                raise Invalid(f"{name}: {error}") from None
+            out = bytearray()
+            try:
+                self._writers.writer(name)(out, value, now_ns)
+            except Mismatch as error:
+                raise as_invalid(name, error) from None
+            if len(out) > _LARGEST_BODY:
+                raise Invalid(
+                    f"{name}: the message has {len(out)} bytes; a robot takes at most {_LARGEST_BODY}"
+                )
+            return _WRITTEN_HEAD + out
+
+        return write
+
+
+def _decode_checked(text: bytes) -> Any:
+    try:
+        return _ANY.decode(text)
+    except (msgspec.DecodeError, RecursionError, ValueError) as error:
+        raise MalformedMessage(f"the message is not JSON: {error}") from None
+
+
+_ANY: msgspec.json.Decoder[Any] = msgspec.json.Decoder()
+
+
+def _json(value: Any) -> bytes:
+    return orjson.dumps(value, None, orjson.OPT_SERIALIZE_NUMPY)
+
+
+_ENCODERS: dict[str, Callable[[Any], bytes]] = {"json": _json, "cbor": cbor2.dumps}
 
 
 class _Shared:
@@ -125,23 +200,40 @@ class TypeRegistry:
             raise NotFound(f"the definition of {type_name} is not known")
         return text
 
+    def reader(self, type_name: str, form: str) -> Reader:
+        """What turns messages of this type from a robot into ``form``: the fast way for many of them.
+
+        It stays right until the robot sends another definition of the type; then ask anew.
+
+        :param form: ``json`` or ``cbor``
+        :raises NotFound: the type is not registered
+        """
+        name, compiled = self._find(type_name)
+        return compiled.reader(name, form)
+
+    def writer(self, type_name: str, checked: bool = False) -> Writer:
+        """What turns JSON into messages of this type for a robot; see :meth:`reader`.
+
+        :param checked: text that is given to it was looked at by :func:`relay_protocol.jsontext.check_text`
+            before, as part of a larger message
+        :raises NotFound: the type is not registered
+        """
+        name, compiled = self._find(type_name)
+        return compiled.writer(name, checked)
+
     def to_json(self, type_name: str, cdr: bytes) -> bytes:
         """A message from a robot as compact JSON.
 
-        :param cdr: with its four-byte encapsulation header, little or big endian
+        :param cdr: with its four-byte encapsulation header, little or big endian. Bytes left over are no
+            error: rclpy counts gaps before empty sequences that it does not write, and pads the end.
         :raises NotFound: the type is not registered
         :raises Invalid: the bytes are no message of this type
         """
-        name, compiled = self._find(type_name)
-        if len(cdr) < 4:
-            raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
-        try:
-            value = compiled.reader(cdr[:2]).read(name, cdr[4:])
-        except Invalid as error:
-            raise Invalid(f"{name}: {error}") from None
-        # Bytes left over are no error: rclpy's serialize_message counts gaps before empty sequences that it
-        # does not write, and pads the end.
-        return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
+        return self.reader(type_name, "json")(cdr)
+
+    def to_cbor(self, type_name: str, cdr: bytes) -> bytes:
+        """A message from a robot as CBOR; see :meth:`to_json`. NaN and infinity stay what they are."""
+        return self.reader(type_name, "cbor")(cdr)
 
     def from_json(self, type_name: str, body: Body, now_ns: int) -> bytes:
         """A message for a robot as CDR with its header, little endian.
@@ -151,8 +243,7 @@ class TypeRegistry:
         :raises NotFound: the type is not registered
         :raises Invalid: it does not fit the type; the sentence names the field
         """
-        name, compiled = self._find(type_name)
-        return self._write(name, compiled, _decoded(name, body), now_ns)
+        return self.writer(type_name)(body, now_ns)
 
     def args_from_json(self, type_name: str, body: Body | list[Any] | None, now_ns: int) -> bytes:
         """A service request as CDR, from an object or from a list of arguments in order.
@@ -163,13 +254,18 @@ class TypeRegistry:
         :raises Invalid: see :meth:`from_json`
         """
         name, compiled = self._find(self._request_of(type_name))
-        value = None if body == b"" else _decoded(name, body)
+        value = None if body == b"" else body
+        if isinstance(value, bytes):
+            try:
+                value = jsontext.decode_any(value)
+            except MalformedMessage as error:
+                raise Invalid(f"{name}: {error}") from None
         if isinstance(value, list):
             fields = compiled.definitions[name].fields
             if len(value) > len(fields):
                 raise Invalid(f"{name} has {len(fields)} arguments, not {len(value)}")
             value = {field.name: part for field, part in zip(fields, value, strict=False)}
-        return self._write(name, compiled, {} if value is None else value, now_ns)
+        return compiled.writer(name, False)({} if value is None else value, now_ns)
 
     def zero(self, type_name: str) -> bytes:
         """The message in which every field has its default."""
@@ -205,22 +301,3 @@ class TypeRegistry:
         if compiled is None:
             raise NotFound(f"the definition of {name} is not known")
         return name, compiled
-
-    def _write(self, name: str, compiled: _Compiled, value: Any, now_ns: int) -> bytes:
-        out = bytearray()
-        try:
-            compiled.writer(name)(out, value, now_ns)
-        except Mismatch as error:
-            raise as_invalid(name, error) from None
-        if len(out) > _LARGEST_BODY:
-            raise Invalid(f"{name}: the message has {len(out)} bytes; a robot takes at most {_LARGEST_BODY}")
-        return _WRITTEN_HEAD + out
-
-
-def _decoded(name: str, body: Any) -> Any:
-    if not isinstance(body, bytes):
-        return body
-    try:
-        return jsontext.decode_any(body)
-    except MalformedMessage as error:
-        raise Invalid(f"{name}: {error}") from None

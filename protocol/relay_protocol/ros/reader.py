@@ -1,5 +1,6 @@
-"""CDR to values that JSON can hold: one reader per type and byte order, built once out of closures.
+"""CDR to values that JSON or CBOR can hold: one reader per type and byte order, built once out of closures.
 
+These take every message there can be; what is usual goes a faster way (:mod:`relay_protocol.ros.generated`).
 Neighbouring numbers are read by one :class:`struct.Struct`. CDR aligns each number to its own size,
 counted from the start of the body, so a run of numbers has eight layouts, one per remainder of its
 position. Lengths are checked against the bytes that are left before anything is made of them.
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy
 import pybase64
+from cbor2 import CBORTag
 
 from relay_protocol.errors import Invalid
 from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, Primitive, Shape
@@ -23,8 +25,17 @@ from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, P
 MAX_ELEMENTS = 250_000
 """Most messages and strings in the sequences of one message. An object takes far more memory than its bytes."""
 
+TYPED_ARRAYS = {"B": 64, "H": 69, "I": 70, "Q": 71, "b": 72, "h": 77, "i": 78, "q": 79, "f": 85, "d": 86}
+"""CBOR's tags of typed arrays, little endian, by the letter of the number (RFC 8746 section 2.1)."""
+
 Read = Callable[[bytes, int], "tuple[Any, int]"]
-"""Takes the body and a position; gives the value and the position after it."""
+"""Takes the message with its head and a position; gives the value and the position after it."""
+
+Convert = Callable[[bytes, int, int], Any]
+"""Takes the message, a position and a count of numbers; gives what stands for them."""
+
+HEAD = 4
+"""Bytes of the encapsulation header; positions for alignment count from behind it."""
 
 
 class Reader(NamedTuple):
@@ -59,26 +70,28 @@ class ReaderFactory:
     """Builds readers for the types of one text.
 
     :param order: byte order of the messages, ``<`` or ``>``
+    :param cbor: values are for CBOR, not for JSON: arrays of numbers are typed arrays
     """
 
-    def __init__(self, definitions: dict[str, Definition], order: str) -> None:
+    def __init__(self, definitions: dict[str, Definition], order: str, cbor: bool = False) -> None:
         self._definitions = definitions
         self._order = order
+        self._cbor = cbor
         self._u32 = struct.Struct(order + "I").unpack_from
         self._readers: dict[str, Reader] = {}
         self._room = 0
 
-    def read(self, name: str, body: bytes) -> Any:
-        """One message as values for JSON.
+    def read(self, name: str, cdr: bytes) -> Any:
+        """One message as values.
 
-        :param body: CDR without its encapsulation header
+        :param cdr: with its encapsulation header, which is not looked at
         :raises Invalid: it is no message of this type
         """
         self._room = MAX_ELEMENTS
         try:
-            return self.reader(name).read(body, 0)[0]
+            return self.reader(name).read(cdr, HEAD)[0]
         except struct.error:
-            raise Invalid(f"the message ends too early, after {len(body)} bytes") from None
+            raise Invalid(f"the message ends too early, after {len(cdr)} bytes") from None
 
     def reader(self, name: str) -> Reader:
         """The reader of one message type."""
@@ -112,7 +125,8 @@ class ReaderFactory:
 
     def _run(self, run: Run) -> Read:
         names = [field.name for field in run.fields]
-        choices = [(codec.unpack_from, size) for codec, size in layouts(run.primitives, self._order)]
+        by_place = [(codec.unpack_from, size) for codec, size in layouts(run.primitives, self._order)]
+        choices = [by_place[position - HEAD & 7] for position in range(8)]
 
         def read(data: bytes, position: int) -> tuple[Any, int]:
             unpack, size = choices[position & 7]
@@ -175,7 +189,7 @@ class ReaderFactory:
         """Arrays of numbers; those of bytes become base64."""
         u32, size = self._u32, primitive.size
         fixed = kind.length if kind.shape is Shape.ARRAY else None
-        convert = _bytes_to_text if kind.base in BYTES else _converter(primitive, self._order)
+        convert = self._converter(kind, primitive)
 
         def read(data: bytes, position: int) -> tuple[Any, int]:
             if fixed is None:
@@ -185,13 +199,18 @@ class ReaderFactory:
             else:
                 count = fixed
             if count:
-                position += -position % size
+                position += (HEAD - position) % size
             end = position + count * size
             if end > len(data):
                 raise Invalid(f"an array of {count} at byte {position} is longer than the message")
             return convert(data, position, count), end
 
         return read
+
+    def _converter(self, kind: FieldType, primitive: Primitive) -> Convert:
+        if self._cbor:
+            return _typed_array(primitive, self._order)
+        return _bytes_to_text if kind.base in BYTES else _numbers(primitive, self._order)
 
     def _string(self) -> Read:
         u32 = self._u32
@@ -267,7 +286,7 @@ def _bytes_to_text(data: bytes, position: int, count: int) -> str:
 _NATIVE = "<" if sys.byteorder == "little" else ">"
 
 
-def _converter(primitive: Primitive, order: str) -> Callable[[bytes, int, int], Any]:
+def _numbers(primitive: Primitive, order: str) -> Convert:
     if primitive.code == "?":
         # Any byte but 0 is true; numpy's bool takes only 0 and 1.
         return lambda data, position, count: numpy.frombuffer(data[position : position + count], "u1") != 0
@@ -279,5 +298,19 @@ def _converter(primitive: Primitive, order: str) -> Callable[[bytes, int, int], 
             return []
         numbers = numpy.frombuffer(data, dtype, count, position)
         return numbers if order == _NATIVE else numbers.astype(native)
+
+    return convert
+
+
+def _typed_array(primitive: Primitive, order: str) -> Convert:
+    if primitive.code == "?":
+        return lambda data, position, count: [byte != 0 for byte in data[position : position + count]]
+    tag, size = TYPED_ARRAYS[primitive.code], primitive.size
+
+    def convert(data: bytes, position: int, count: int) -> Any:
+        numbers = data[position : position + count * size]
+        if order == ">" and size > 1:
+            numbers = numpy.frombuffer(numbers, f"u{size}").byteswap().tobytes()
+        return CBORTag(tag, numbers)
 
     return convert
