@@ -1,0 +1,76 @@
+"""In what form a client wants its messages: plain JSON, PNG or CBOR, whole or in fragments (SPEC section 1.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from relay_protocol import rosbridge
+from relay_server import wsframe
+
+COMPRESSIONS = ("none", "png", "cbor", "cbor-raw")
+
+LEAST_FRAGMENT = 64
+"""Smallest fragments a client can ask for, bytes of ``data``."""
+
+
+class Form(NamedTuple):
+    """What a client asked for.
+
+    :param compression: ``none``, ``png``, ``cbor`` or ``cbor-raw``
+    :param fragment_size: bytes of a fragment's ``data``; 0 for whole messages
+    """
+
+    compression: str = "none"
+    fragment_size: int = 0
+
+
+PLAIN = Form()
+
+
+class Asking(Protocol):
+    """``subscribe``, ``call_service`` and ``send_action_goal``: operations that say in what form they want answers."""
+
+    @property
+    def id(self) -> rosbridge.Id: ...
+
+    @property
+    def compression(self) -> str: ...
+
+    @property
+    def fragment_size(self) -> int | None: ...
+
+
+Tell = Callable[[str, str, rosbridge.Id], None]
+"""Takes the level, the words and the id of a ``status``; see :meth:`relay_server.session.Session.tell`."""
+
+
+def asked(ask: Asking, tell: Tell, *, topic: bool = False) -> Form:
+    """The form a client asks for. What can't be had is told, and the nearest that can be had is taken.
+
+    :param tell: called with what differs from what was asked for
+    :param topic: whether samples of a topic are asked for: only they can come as ``cbor-raw``
+    """
+    compression = ask.compression or "none"
+    if compression not in COMPRESSIONS:
+        tell(
+            "error",
+            f"compression '{compression[:20]}' is none of {', '.join(COMPRESSIONS)}; plain JSON is sent",
+            ask.id,
+        )
+        compression = "none"
+    if compression == "cbor-raw" and not topic:
+        compression = "cbor"
+    size = max(0, ask.fragment_size or 0)
+    if 0 < size < LEAST_FRAGMENT:
+        tell("warning", f"fragments of {size} bytes are too small; they have {LEAST_FRAGMENT}", ask.id)
+        size = LEAST_FRAGMENT
+    return Form(compression, size)
+
+
+def frames(message: bytes, form: Form) -> bytes:
+    """The websocket frames of one message.
+
+    :param message: JSON
+    """
+    return wsframe.text(message)

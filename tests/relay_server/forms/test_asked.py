@@ -1,0 +1,63 @@
+"""What form a client asks for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from relay_protocol import rosbridge
+from relay_server import forms
+from relay_server.forms import Form
+
+
+def asked(topic: bool = False, **fields: Any) -> tuple[Form, list[tuple[str, str, rosbridge.Id]]]:
+    """The form of a question, and what was told about it."""
+    told: list[tuple[str, str, rosbridge.Id]] = []
+    ask: forms.Asking
+    if topic:
+        ask = rosbridge.Subscribe(topic="/scan", id="q", **fields)
+    else:
+        ask = rosbridge.CallService(service="/reset", id="q", **fields)
+    return forms.asked(ask, lambda *words: told.append(words), topic=topic), told
+
+
+def test_nothing_asked_is_plain():
+    """Who asks for nothing gets plain JSON, whole."""
+    assert asked() == (forms.PLAIN, [])
+
+
+@pytest.mark.parametrize("compression", ["none", "png", "cbor", "cbor-raw"])
+def test_known_compressions(compression):
+    """Each compression of the protocol can be had for topics."""
+    assert asked(topic=True, compression=compression) == (Form(compression), [])
+
+
+def test_raw_is_for_topics():
+    """An answer has no time of arrival: cbor-raw counts as cbor there."""
+    assert asked(compression="cbor-raw") == (Form("cbor"), [])
+
+
+def test_unknown_compression():
+    """An unknown compression is an error that names the known ones, and plain JSON is sent."""
+    form, [(level, words, id)] = asked(compression="zip")
+    assert (form, level, id) == (forms.PLAIN, "error", "q")
+    assert "'zip'" in words and "cbor-raw" in words
+
+
+@pytest.mark.parametrize("size", [None, 0, -5])
+def test_no_fragments(size):
+    """No size, zero and less mean whole messages."""
+    assert asked(fragment_size=size) == (forms.PLAIN, [])
+
+
+def test_small_fragments():
+    """Fragments smaller than the least are raised to it, and the client is warned."""
+    form, [(level, words, _)] = asked(fragment_size=10)
+    assert (form, level) == (Form("none", 64), "warning")
+    assert "64" in words
+
+
+def test_a_good_size_is_taken():
+    """A sensible size is taken as it is."""
+    assert asked(fragment_size=1000) == (Form("none", 1000), [])
