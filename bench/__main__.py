@@ -1,0 +1,96 @@
+"""``python -m bench [measurement …]``: measure, print one table, keep the figures."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import subprocess
+import sys
+import time
+import traceback
+from pathlib import Path
+
+from bench import RESULTS, ROOT
+from bench.report import Options, Row, Unavailable, load, save, show
+
+MEASUREMENTS = {
+    "hop": "relay, one hop, against websockify",
+    "latency": "one-way time against HAProxy",
+    "fanout": "one topic to 500 clients against a loop in C",
+    "codec": "CDR to JSON and back against rosbridge's way",
+    "viewers": "what one viewer and fifty cost the robot",
+    "idle": "memory of an idle client",
+    "endtoend": "LaserScan to ten viewers against rosbridge's way",
+    "crowd": "fifty clients of mixed speed, and one that breaks every rule",
+    "soak": "a minute of load: nothing is lost",
+    "standstill": "from a fault to standstill",
+}
+
+
+def commit() -> str:
+    """What was measured."""
+    done = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip()
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    names = "\n".join(f"  {name:<11} {what}" for name, what in MEASUREMENTS.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m bench",
+        description="Measure Switchboard beside its alternatives.",
+        epilog=f"measurements (all, if none is named):\n{names}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("names", nargs="*", metavar="measurement", choices=[*MEASUREMENTS, []])
+    parser.add_argument("--quick", action="store_true", help="tiny counts: does it run? figures say nothing")
+    parser.add_argument("--seconds", type=float, help="length of 'crowd' and 'soak'")
+    parser.add_argument(
+        "--json", type=Path, help="where figures go (bench/results/latest.json when all was measured)"
+    )
+    parser.add_argument("--plot", type=Path, help="where a picture of the ratios goes (SVG)")
+    return parser.parse_args()
+
+
+def measure(names: list[str], options: Options) -> tuple[list[Row], dict[str, str], dict[str, float]]:
+    """Run measurements in turn; rows, what is missing and why, the machine's load before each."""
+    rows: list[Row] = []
+    missing: dict[str, str] = {}
+    loads: dict[str, float] = {}
+    for name in names:
+        loads[name] = round(load(), 2)
+        began = time.monotonic()
+        print(f"--- {name}: {MEASUREMENTS[name]} (load {loads[name]:.1f})", flush=True)
+        try:
+            rows += importlib.import_module(f"bench.{name}").run(options)
+        except Unavailable as error:
+            missing[name] = str(error)
+        except Exception as error:
+            traceback.print_exc()
+            missing[name] = f"failed: {error!r}"
+        print(f"    {name} took {time.monotonic() - began:.0f} s", flush=True)
+    return rows, missing, loads
+
+
+def main() -> int:
+    """Measure and tell; the code is 1 when a measurement failed, not when a bar is missed."""
+    asked = arguments()
+    names = asked.names or list(MEASUREMENTS)
+    rows, missing, loads = measure(names, Options(asked.quick, asked.seconds))
+    show(rows, missing)
+    target = asked.json or (RESULTS / "latest.json" if not asked.names and not asked.quick else None)
+    if target is not None:
+        save(target, rows, missing, loads, commit())
+        print(f"figures: {target}")
+    if asked.plot is not None:
+        from bench.plot import plot
+
+        plot(rows, asked.plot)
+        print(f"picture: {asked.plot}")
+    return int(any(reason.startswith("failed") for reason in missing.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,106 @@
+"""The parts in C: the plain fan-out loop that is compared with, and clients that cost next to nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from bench import BUILD, ROOT
+from bench.report import Unavailable
+
+SOURCES = ROOT / "bench" / "native"
+
+
+def program(name: str) -> Path:
+    """A program of ``bench/native``, compiled when its source is newer.
+
+    :raises Unavailable: there is no C compiler here
+    """
+    source, built = SOURCES / f"{name}.c", BUILD / name
+    if built.exists() and built.stat().st_mtime > source.stat().st_mtime:
+        return built
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise Unavailable("no C compiler (Debian: apt install gcc libc6-dev)")
+    BUILD.mkdir(parents=True, exist_ok=True)
+    fresh = built.with_suffix(f".{os.getpid()}")
+    subprocess.run([compiler, "-O2", "-Wall", "-o", str(fresh), str(source), "-lm"], check=True)
+    fresh.replace(built)
+    return built
+
+
+class Native:
+    """One of these programs, running. It ends with its standard input."""
+
+    def __init__(self, name: str, *arguments: str) -> None:
+        self.popen = subprocess.Popen(
+            [str(program(name)), *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.ready = self.line().split()
+        if self.ready[:1] != ["READY"]:
+            self.stop()
+            raise AssertionError(f"{name} did not start; see above")
+
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        return self.popen.pid
+
+    def line(self) -> str:
+        """The next line it prints."""
+        assert self.popen.stdout is not None
+        return self.popen.stdout.readline()
+
+    def stop(self) -> None:
+        """End and reap it."""
+        assert self.popen.stdin is not None and self.popen.stdout is not None
+        self.popen.stdin.close()
+        try:
+            self.popen.wait(5)
+        except subprocess.TimeoutExpired:
+            self.popen.kill()
+            self.popen.wait(5)
+        self.popen.stdout.close()
+
+
+class Receivers(Native):
+    """Websocket clients, see ``bench/native/receivers.c``.
+
+    :param folder: where the files with what they send are put
+    :param head: the HTTP request that opens a websocket
+    :param frames: what each sends then, masked frames
+    :param rate: bytes a second each reads; 0 all, -1 none
+    :param again: whether who is cut comes again
+    """
+
+    _serial = 0
+
+    def __init__(
+        self,
+        folder: Path,
+        port: int,
+        count: int,
+        head: bytes,
+        frames: bytes = b"",
+        *,
+        rate: float = 0,
+        again: bool = False,
+    ) -> None:
+        Receivers._serial += 1
+        head_file, frames_file = (folder / f"{kind}-{Receivers._serial}" for kind in ("head", "frames"))
+        head_file.write_bytes(head)
+        frames_file.write_bytes(frames)
+        super().__init__(
+            "receivers", str(port), str(count), str(head_file), str(frames_file), str(rate), str(int(again))
+        )
+
+    def report(self) -> dict[str, Any]:
+        """What has come since the report before."""
+        assert self.popen.stdin is not None
+        self.popen.stdin.write("\n")
+        self.popen.stdin.flush()
+        return dict(json.loads(self.line()))
