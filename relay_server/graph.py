@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from relay_protocol import limits
 from relay_protocol.errors import MalformedMessage
@@ -20,10 +20,24 @@ _STRING = 56
 Entry = TypeVar("Entry", Topic, Service)
 
 
+class Ends(NamedTuple):
+    """What the relay's own node does in a robot's graph for its clients; the robot leaves it out of what it tells.
+
+    Each is a name and its type.
+    """
+
+    publishes: tuple[tuple[str, str], ...] = ()
+    subscribes: tuple[tuple[str, str], ...] = ()
+    services: tuple[tuple[str, str], ...] = ()
+    actions: tuple[tuple[str, str], ...] = ()
+
+
 class GraphMirror:
     """Names, types and ends of a robot's topics, services, actions and nodes, as the robot last told."""
 
     def __init__(self) -> None:
+        self.version = 0
+        """Another one after every change."""
         self.topics: dict[str, Topic] = {}
         self.services: dict[str, Service] = {}
         self.actions: dict[str, Service] = {}
@@ -35,6 +49,7 @@ class GraphMirror:
 
         :raises MalformedMessage: the whole would take more memory than one robot gets
         """
+        self.version += 1
         if graph.full:
             self.clear()
         self._take(self.topics, graph.topics)
@@ -71,6 +86,7 @@ class GraphMirror:
 
     def clear(self) -> None:
         """Nothing is known any more."""
+        self.version += 1
         self.topics.clear()
         self.services.clear()
         self.actions.clear()
@@ -86,6 +102,11 @@ class GraphMirror:
         """The type of a service, ``None`` when it does not exist."""
         service = self.services.get(name)
         return service.types[0] if service and service.types else None
+
+    def action_type(self, name: str) -> str | None:
+        """The type of an action, ``None`` when it does not exist."""
+        action = self.actions.get(name)
+        return action.types[0] if action and action.types else None
 
 
 def _size(name: str, entry: Topic | Service | None = None) -> int:

@@ -45,6 +45,9 @@ class Watcher(Protocol):
     def graph_changed(self) -> None:
         """The mirror of its graph has changed."""
 
+    def described(self) -> None:
+        """It has told facts about itself."""
+
 
 @dataclass
 class Presence:
@@ -150,6 +153,13 @@ class Registry:
         robot.graph.apply(graph)
         for watcher in list(robot.watchers):
             watcher.graph_changed()
+
+    def described(self, robot: Presence, description: link.Describe) -> None:
+        """The robot told facts about itself."""
+        robot.description = description
+        for watcher in list(robot.watchers):
+            watcher.described()
+        self.changed()
 
     def forget(self, robot_id: int) -> None:
         """The robot was removed; its links are closed."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from twisted.internet.defer import Deferred, fail, succeed
 
 from relay_protocol import link
-from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_server.channel.wire import Wire
 
 
@@ -65,7 +65,7 @@ class Definitions:
     def refused(self, type_name: str, reason: str) -> None:
         """The robot does not have the type."""
         waiting = self._asked.pop(type_name, [])
-        self._fail(waiting, Invalid(f"type {type_name}: {reason}"))
+        self._fail(waiting, NotFound(f"type {type_name}: {reason}"))
         self._unusable(type_name, reason)
 
     def reset(self) -> None:

@@ -14,10 +14,13 @@ from relay_protocol import limits, link
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.channel.calls import GRACE, Calls, call_seconds
 from relay_server.channel.definitions import Definitions
+from relay_server.channel.interfaces import Interfaces
 from relay_server.channel.publications import Publications
+from relay_server.channel.robot_clock import RobotClock
 from relay_server.channel.subscriptions import Subscriptions
 from relay_server.channel.wire import ChannelLink, Member, Wire
 from relay_server.clock import Clock, Timer, cancel
+from relay_server.graph import Ends
 from relay_server.registry import Presence
 
 T = TypeVar("T")
@@ -95,7 +98,6 @@ class Channel:
         self._linger = linger
         self._issue_ticket = issue_ticket
         self._closed = closed
-        self._wall_ns = wall_ns
         self.state = State.NEW
         self.members: set[Member] = set()
         self._timer: Timer | None = None
@@ -105,8 +107,12 @@ class Channel:
         self.wire = Wire(clock, robot)
         definitions = Definitions(self.wire, self._typed, self._untypeable)
         self._definitions = definitions
+        self._interfaces = Interfaces(self.wire)
         self.subscriptions = Subscriptions(self.wire, definitions)
-        self.publications = Publications(clock, self.wire, definitions, wall_ns)
+        self._robot_clock = RobotClock(clock, self.wire, self.subscriptions, wall_ns)
+        self.now_ns = self._robot_clock.now_ns
+        """The robot's time, nanoseconds."""
+        self.publications = Publications(clock, self.wire, definitions, self.now_ns)
         self._calls = Calls(clock, self.wire, definitions)
         robot.watchers.append(self)
 
@@ -151,7 +157,7 @@ class Channel:
 
         async def work() -> bytes:
             await self._open()
-            return await self._calls.call(service, type_name, args, seconds, self._wall_ns())
+            return await self._calls.call(service, type_name, args, seconds, self.now_ns())
 
         # One second more than the call itself has: its own words are the better ones.
         return await self._within(seconds + 2 * GRACE, work())
@@ -198,6 +204,18 @@ class Channel:
 
         await self._within(limits.CALL_SECONDS, work())
 
+    async def interfaces(self) -> list[str]:
+        """The full names of all types the robot can tell the definition of.
+
+        :raises Unavailable: the robot is offline, or does not tell them
+        """
+
+        async def work() -> list[str]:
+            await self._open()
+            return await self._interfaces.names()
+
+        return await self._within(limits.CALL_SECONDS, work())
+
     async def _within(self, seconds: float, work: Coroutine[Deferred[Any], Any, T]) -> T:
         """Whatever the robot leaves out, nobody waits longer than this for it."""
         running = Deferred.fromCoroutine(work)
@@ -235,6 +253,15 @@ class Channel:
         self.subscriptions.graph_changed()
         self.publications.graph_changed()
 
+    def described(self) -> None:
+        """The robot told facts about itself."""
+        if self.state is State.OPEN:
+            self._robot_clock.follow()
+
+    def ends(self) -> Ends:
+        """What the robot has in its graph for our members."""
+        return Ends(self.publications.active(), self.subscriptions.active())
+
     def joined(self, channel_link: ChannelLink) -> None:
         """The robot has come with our ticket."""
         if self.state is not State.OPENING:
@@ -262,6 +289,8 @@ class Channel:
         reason = message.reason
         if message.what == "get_type":
             self._definitions.refused(message.ref, reason)
+        elif message.what == "get_interfaces":
+            self._interfaces.refused(reason)
         elif message.ref.isdecimal():
             refuse = {"subscribe": self.subscriptions.refused, "advertise": self.publications.refused}
             if message.what in refuse:
@@ -306,6 +335,7 @@ class Channel:
         self._timer = self._clock.callLater(JOIN_SECONDS, self._happen, Event.LATE)
 
     def _enter_open(self) -> None:
+        self._robot_clock.follow()
         self.subscriptions.opened()
         self.publications.opened()
         self._tell_waiting(None)
@@ -318,6 +348,8 @@ class Channel:
         self.publications.lost()
         self.wire.asks.reset()
         self._definitions.reset()
+        self._interfaces.reset()
+        self._robot_clock.lost()
         self._calls.lost()
 
     def _end(self) -> None:
@@ -340,6 +372,7 @@ _HANDLERS: dict[type, Callable[[Channel, Any], None]] = {
     link.Subscribed: lambda channel, message: channel.subscriptions.subscribed(message),
     link.Advertised: lambda channel, message: channel.publications.advertised(message),
     link.ServiceResponse: lambda channel, message: channel._calls.answered(message),
+    link.Interfaces: lambda channel, message: channel._interfaces.told(message),
     link.TypeDefinition: lambda channel, message: channel._definitions.add(message),
     link.Failed: lambda channel, message: channel._failed(message),
 }

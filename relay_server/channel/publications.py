@@ -101,6 +101,10 @@ class Publications:
                 self._ask(publication)
         return publication
 
+    def active(self) -> tuple[tuple[str, str], ...]:
+        """Topics the robot has a publisher on for us, with their types."""
+        return tuple((each.topic, each.type) for each in self._topics.values() if each.phase is Phase.ACTIVE)
+
     def publish(
         self,
         member: Member,

@@ -27,6 +27,11 @@ class Sample:
         self._frames: dict[tuple[str, Form], bytes] = {}
         self.failure: str = ""
 
+    @property
+    def body(self) -> bytes:
+        """The message as the robot sent it."""
+        return self._body
+
     def open(self, listener: Listener) -> bytes | None:
         """The websocket frames for a client that listens so; ``None`` when it can't be converted."""
         key = (listener.name, listener.form)

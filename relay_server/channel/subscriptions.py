@@ -49,6 +49,12 @@ class Subscriptions:
         if newcomer:
             uplink.replay(listener)
 
+    def active(self) -> tuple[tuple[str, str], ...]:
+        """Topics the robot is subscribed to for us, with their types."""
+        return tuple(
+            (uplink.topic, uplink.type) for uplink in self._topics.values() if uplink.phase is Phase.ACTIVE
+        )
+
     def check(self, topic: str, type_name: str) -> str:
         """The type a topic has already, or none; see :meth:`add` for what is refused."""
         uplink = self._topics.get(topic)

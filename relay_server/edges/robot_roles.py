@@ -286,8 +286,7 @@ class Control:
             self._robot.health = message
             self._hall.registry.changed()
         elif isinstance(message, link.Describe):
-            self._robot.description = message
-            self._hall.registry.changed()
+            self._hall.registry.described(self._robot, message)
         elif isinstance(message, link.Alert):
             self._alert(message.level[:20], message.text[:500])
         elif isinstance(message, (link.Ping, link.Pong)):
