@@ -48,7 +48,11 @@ def twist_message(topic: str, size: int) -> bytes:
 
 @dataclass
 class Hop:
-    """A way to measure: what is sent, by whom, how much, and how it is known to have come."""
+    """A way to measure: what is sent, by whom, and how it is known to have come.
+
+    :param window: messages under way at most; with ``single`` one
+    :param receiver: where it arrives
+    """
 
     sender: End
     message: bytes
@@ -56,6 +60,7 @@ class Hop:
     pid: int
     window: int
     single: bool = False
+    receiver: End | None = None
 
     def run(self, loop: Loop, total: int) -> float:
         """Microseconds of processor time per message."""
@@ -113,14 +118,16 @@ class Ground:
         """Client to robot."""
         robot = self.robots[encoding]
         sender = self.clients[encoding]
-        return Hop(sender, text_frame(message), lambda: robot.received, self.pid, window, single)
+        return Hop(
+            sender, text_frame(message), lambda: robot.received, self.pid, window, single, robot.channel
+        )
 
     def to_client(self, encoding: str, size: int, window: int, *, single: bool = False) -> Hop:
         """Robot to client."""
         robot, client = self.robots[encoding], self.clients[encoding]
         sample = self._sample(robot, size)
         assert robot.channel is not None
-        return Hop(robot.channel, sample, lambda: client.messages, self.pid, window, single)
+        return Hop(robot.channel, sample, lambda: client.messages, self.pid, window, single, client)
 
 
 @contextlib.contextmanager

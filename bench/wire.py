@@ -118,7 +118,23 @@ class WebEnd(End):
 
     def __init__(self, loop: Loop, port: int, path: str, token: str = "") -> None:
         connection = socket.create_connection(("127.0.0.1", port), timeout=30)
+        self.begin(connection, path, token)
+        self._open(loop, connection)
+
+    @classmethod
+    def begin(cls, connection: socket.socket, path: str, token: str = "") -> socket.socket:
+        """Ask for a websocket on a connection; :meth:`opened` takes the answer."""
         connection.sendall(handshake(path, token))
+        return connection
+
+    @classmethod
+    def opened(cls, loop: Loop, connection: socket.socket) -> WebEnd:
+        """The client on a connection that was asked to become a websocket."""
+        made = cls.__new__(cls)
+        made._open(loop, connection)
+        return made
+
+    def _open(self, loop: Loop, connection: socket.socket) -> None:
         answer = b""
         while b"\r\n\r\n" not in answer:
             data = connection.recv(4096)
@@ -126,7 +142,7 @@ class WebEnd(End):
             answer += data
         head, _, rest = answer.partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 101"), head
-        super().__init__(loop, connection)
+        End.__init__(self, loop, connection)
         self.payload_bytes = 0
         self.last = b""
         self._buffer = bytearray()
