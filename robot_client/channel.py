@@ -5,29 +5,25 @@ Everything a channel opened ends with it.
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sized
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
-from twisted.python.failure import Failure
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.frames import SampleFrame
-from relay_protocol.limits import CALL_SECONDS, KIB
+from robot_client.calls import Calls
+from robot_client.goals import Goals, refusal
 from robot_client.motion import MOTION_QOS, MotionDesk
+from robot_client.offers import OfferedActions, OfferedServices
 from robot_client.offset import Offset
 from robot_client.platforms.base import Platform, Sink, Source
-from robot_client.reactors import Clock, Timer
+from robot_client.reactors import Clock
+from robot_client.sending import Sending
 from robot_client.topics import TypedTopic
-from robot_client.uplink import Uplink
-
-CHUNK = 64 * KIB
-MAX_OPEN = 1000
-"""Subscriptions, publications and pending calls of each kind on one channel."""
+from robot_client.wire import Wire, check_room
 
 
 class _Listening(NamedTuple):
@@ -40,16 +36,6 @@ class _Publishing(NamedTuple):
     topic: str
     motion: str | None
     """Name of the publication at the motion desk, if it moves the robot."""
-
-
-class Wire(Protocol):
-    """What a channel needs of its link."""
-
-    def say(self, message: link.Message) -> None:
-        """Send a message; it is never dropped."""
-
-    def write(self, frames: list[bytes]) -> None:
-        """Send sample frames; may pause the uplink."""
 
 
 class Channel:
@@ -71,26 +57,45 @@ class Channel:
         wall: Callable[[], int] = time.time_ns,
     ) -> None:
         self.name = name
-        self.uplink = Uplink(clock.seconds, frame_limit)
         self._wire = wire
         self._offset = offset
         self._platform = platform
         self._motion = motion
-        self._clock = clock
         self._wall = wall
+        self._sending = Sending(wire, clock, frame_limit)
+        self.uplink = self._sending.uplink
         self._listening: dict[int, _Listening] = {}
         self._publishing: dict[int, _Publishing] = {}
-        self._calls: dict[str, Deferred[None]] = {}
-        self._flush: Timer | None = None
-        self._release: Timer | None = None
+        self._calls = Calls(wire, platform, frame_limit)
+        self._goals = Goals(wire, platform, frame_limit)
+        self._services = OfferedServices(wire, platform, frame_limit)
+        self._actions = OfferedActions(wire, platform, frame_limit)
         self._log = Logger("channel")
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            link.Subscribe: self._subscribe,
+            link.Unsubscribe: lambda message: self._unlisten(message.number),
+            link.Advertise: self._advertise,
+            link.Unadvertise: lambda message: self._unpublish(message.number),
+            link.CallService: self._calls.call,
+            link.SendActionGoal: self._goals.begin,
+            link.CancelActionGoal: self._goals.cancel,
+            link.AdvertiseService: self._services.advertise,
+            link.UnadvertiseService: self._services.withdraw,
+            link.ServiceResponse: self._services.answer,
+            link.AdvertiseAction: self._actions.advertise,
+            link.UnadvertiseAction: self._actions.withdraw,
+            link.ActionFeedback: self._actions.feedback,
+            link.ActionResult: self._actions.result,
+            link.GetType: self._get_type,
+            link.GetInterfaces: self._get_interfaces,
+        }
 
     # --- from the relay ------------------------------------------------------------------------------------
 
     def handle(self, message: link.Message) -> None:
         """Do what one message asks; what can't be done is answered in words."""
         try:
-            _HANDLERS[type(message)](self, message)
+            self._handlers[type(message)](message)
         except SwitchboardError as error:
             self._fail(message, str(error))
         except Exception:
@@ -117,11 +122,22 @@ class Channel:
             self._unpublish(number)
         for number in list(self._listening):
             self._unlisten(number)
-        for call in list(self._calls.values()):
-            call.cancel()
-        for timer in (self._flush, self._release):
-            if timer is not None and timer.active():
-                timer.cancel()
+        for part in (self._services, self._actions, self._goals, self._calls, self._sending):
+            part.close()
+
+    def flush(self) -> None:
+        """Write what waits, as far as the transport takes it."""
+        self._sending.flush()
+
+    def pause(self) -> None:
+        """The transport is full."""
+        self._goals.pause()
+        self._sending.pause()
+
+    def resume(self) -> None:
+        """The transport has room again."""
+        self._goals.resume()
+        self._sending.resume()
 
     # --- requests ------------------------------------------------------------------------------------------
 
@@ -131,9 +147,9 @@ class Channel:
             self.uplink.open(message.number, message.throttle_ms / 1000, known.source.latched)
             self._listening[message.number] = _Listening(known.source, message)
             self._confirm(message.number)
-            self._arm_release()
+            self._sending.arm()
             return
-        _check_room(self._listening, "subscriptions")
+        check_room(self._listening, "subscriptions")
         number = message.number
         source = self._platform.subscribe(
             message.topic,
@@ -163,9 +179,6 @@ class Channel:
             )
         )
 
-    def _unsubscribe(self, message: link.Unsubscribe) -> None:
-        self._unlisten(message.number)
-
     def _unlisten(self, number: int) -> None:
         listening = self._listening.pop(number, None)
         if listening is not None:
@@ -176,7 +189,7 @@ class Channel:
         number = message.number
         if number in self._publishing:
             self._unpublish(number)
-        _check_room(self._publishing, "publications")
+        check_room(self._publishing, "publications")
         # What moves is judged by the names that are used in the end: the relay may spell them as it likes.
         on = self._platform.resolve(message.topic, message.type)
         if self._motion.concerns(on):
@@ -205,9 +218,6 @@ class Channel:
             raise
         return _Publishing(sink, on.topic, name)
 
-    def _unadvertise(self, message: link.Unadvertise) -> None:
-        self._unpublish(message.number)
-
     def _unpublish(self, number: int) -> None:
         publishing = self._publishing.pop(number, None)
         if publishing is None:
@@ -217,102 +227,35 @@ class Channel:
         else:
             publishing.sink.close()
 
-    def _call(self, message: link.CallService) -> None:
-        id = message.id
-        if id in self._calls:
-            raise _Again(f"a call with the id '{id}' is under way")
-        _check_room(self._calls, "calls")
-        if message.cdr is None:
-            raise _Again(f"the arguments of {message.service} must come as CDR")
-        request = link.from_base64(message.cdr, "cdr")
-        timeout = message.timeout if 0 < message.timeout < math.inf else CALL_SECONDS
-        answer = self._platform.call(message.service, message.type, request, timeout)
-        done = answer.addCallbacks(
-            lambda body: self._wire.say(link.ServiceResponse(id=id, result=True, cdr=link.to_base64(body))),
-            lambda failure: self._call_failed(message, failure),
-        )
-        self._calls[id] = done
-        done.addBoth(lambda _: self._calls.pop(id, None) and None)
-
-    def _call_failed(self, message: link.CallService, failure: Failure) -> None:
-        if isinstance(failure.value, CancelledError):
-            return
-        if isinstance(failure.value, SwitchboardError):
-            self._fail(message, failure.getErrorMessage())
-            return
-        self._log.failure("a call of {service} failed", failure, service=message.service)
-        self._fail(message, "the robot could not make this call; its log says why")
-
     def _get_type(self, message: link.GetType) -> None:
         self._wire.say(self._platform.definition(message.type))
+
+    def _get_interfaces(self, message: link.GetInterfaces) -> None:
+        self._wire.say(link.Interfaces(types=self._platform.interfaces()))
 
     def _fail(self, message: link.Message, reason: str) -> None:
         if isinstance(message, link.CallService):
             self._wire.say(link.ServiceResponse(id=message.id, result=False, reason=reason))
-            return
-        ref = getattr(message, "type" if isinstance(message, link.GetType) else "number", "")
-        what = link.lower_tag(type(message).__name__)
-        self._wire.say(link.Failed(what=what, ref=str(ref), reason=reason))
-
-    # --- samples -------------------------------------------------------------------------------------------
+        elif isinstance(message, link.SendActionGoal):
+            self._wire.say(refusal(message, reason))
+        else:
+            what = link.lower_tag(type(message).__name__)
+            ref = getattr(message, _REFERENCE.get(type(message), "number"), "")
+            self._wire.say(link.Failed(what=what, ref=str(ref), reason=reason))
 
     def _sampled(self, number: int, body: bytes) -> None:
-        self.uplink.offer(number, self._wall(), body)
-        if self._flush is None and self.uplink.waiting:
-            # Zero seconds: after all samples of this turn of the reactor, so they share a write.
-            self._flush = self._clock.callLater(0, self.flush)
-        self._arm_release()
-
-    def flush(self) -> None:
-        """Write what waits, as far as the transport takes it."""
-        if self._flush is not None and self._flush.active():
-            self._flush.cancel()
-        self._flush = None
-        while chunk := self.uplink.take(CHUNK):
-            self._wire.write(chunk)
-        if self.uplink.paused:
-            self.uplink.trim()
-
-    def pause(self) -> None:
-        """The transport is full."""
-        self.uplink.paused = True
-
-    def resume(self) -> None:
-        """The transport has room again."""
-        self.uplink.paused = False
-        self.flush()
-
-    def _arm_release(self) -> None:
-        due = self.uplink.next_due()
-        if self._release is not None and self._release.active():
-            if due is not None and self._release.getTime() <= due:
-                return
-            self._release.cancel()
-        self._release = None
-        if due is not None:
-            self._release = self._clock.callLater(max(0.0, due - self._clock.seconds()), self._let_go)
-
-    def _let_go(self) -> None:
-        self._release = None
-        self.uplink.release()
-        self.flush()
-        self._arm_release()
+        self._sending.offer(number, self._wall(), body)
 
 
-class _Again(SwitchboardError):
-    """A request of the right form that this channel can't take."""
-
-
-def _check_room(table: Sized, what: str) -> None:
-    if len(table) >= MAX_OPEN:
-        raise _Again(f"this channel has {MAX_OPEN} {what} open; end some first")
-
-
-_HANDLERS: dict[type, Callable[[Channel, Any], None]] = {
-    link.Subscribe: Channel._subscribe,
-    link.Unsubscribe: Channel._unsubscribe,
-    link.Advertise: Channel._advertise,
-    link.Unadvertise: Channel._unadvertise,
-    link.CallService: Channel._call,
-    link.GetType: Channel._get_type,
+_REFERENCE: dict[type, str] = {
+    link.GetType: "type",
+    link.AdvertiseService: "service",
+    link.UnadvertiseService: "service",
+    link.AdvertiseAction: "action",
+    link.UnadvertiseAction: "action",
+    link.CancelActionGoal: "id",
+    link.ServiceResponse: "id",
+    link.ActionFeedback: "id",
+    link.ActionResult: "id",
 }
+"""What tells which request failed; of topics it is the number."""

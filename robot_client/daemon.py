@@ -18,7 +18,7 @@ from twisted.python.failure import Failure
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
-from robot_client.channel import Channel, Wire
+from robot_client.channel import Channel
 from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection, Dial
@@ -29,6 +29,7 @@ from robot_client.motion import GuardFeed, MotionDesk
 from robot_client.platforms.base import GraphView, Platform, difference, whole
 from robot_client.tls import explain
 from robot_client.transport import LinkLost, LinkProtocol
+from robot_client.wire import Wire
 
 ALERTS_KEPT = 32
 MAX_CHANNELS = 64

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, get_args
 
 import msgspec
 
@@ -274,6 +274,9 @@ class ControlLink(Link):
     }
 
 
+_REQUESTS = tuple((State.OPEN, each) for each in get_args(link.RelayChannel) if each not in _EVERYWHERE)
+
+
 class ChannelLink(Link):
     """A link for one channel, joined by ticket.
 
@@ -310,12 +313,7 @@ class ChannelLink(Link):
 
     _table: ClassVar[Table] = {
         (State.JOINING, link.Joined): _on_joined,
-        (State.OPEN, link.Subscribe): _on_request,
-        (State.OPEN, link.Unsubscribe): _on_request,
-        (State.OPEN, link.Advertise): _on_request,
-        (State.OPEN, link.Unadvertise): _on_request,
-        (State.OPEN, link.CallService): _on_request,
-        (State.OPEN, link.GetType): _on_request,
+        **dict.fromkeys(_REQUESTS, _on_request),
     }
     _decoders: ClassVar[dict[State, msgspec.json.Decoder[Any]]] = {
         State.JOINING: link.opening_reply_decoder,

@@ -17,6 +17,15 @@ from relay_protocol import link
 from robot_client.topics import TypedTopic
 
 OnSample = Callable[[bytes], None]
+OnCall = Callable[[bytes, Callable[[bytes], None]], None]
+"""Takes a request and what its answer is to be given to, which raises :class:`Invalid` for bytes that are none."""
+
+NEVER_BEGAN = 0
+SUCCEEDED = 4
+CANCELED = 5
+ABORTED = 6
+"""How a goal ended, as in ``action_msgs/msg/GoalStatus``."""
+
 Entry = TypeVar("Entry", link.Topic, link.Service)
 
 
@@ -73,6 +82,59 @@ class Sink(Protocol):
         """Take the publisher away."""
 
 
+class Offer(Protocol):
+    """A service or action the daemon offers."""
+
+    type: str
+
+    def close(self) -> None:
+        """Offer it no more: calls get no answer, goals are aborted."""
+
+
+class ServedGoal(Protocol):
+    """A goal from the graph that somebody at the relay pursues."""
+
+    def feedback(self, body: bytes) -> None:
+        """Publish how far it has come.
+
+        :raises Invalid: the bytes are no feedback of the action's type
+        """
+
+    def finish(self, status: int, body: bytes | None) -> None:
+        """End it; what is neither :data:`SUCCEEDED` nor a :data:`CANCELED` that was asked for is an abort.
+
+        :param body: the result, ``None`` for an empty one
+        :raises Invalid: the bytes are no result of the action's type; the goal goes on
+        """
+
+
+OnGoal = Callable[[bytes, ServedGoal], None]
+OnCancel = Callable[[ServedGoal], None]
+
+
+class Outcome(NamedTuple):
+    """How a goal of ours ended.
+
+    :param status: one of the four above
+    :param body: the result, ``None`` if there is none
+    :param reason: why there is none
+    """
+
+    status: int
+    body: bytes | None
+    reason: str = ""
+
+
+class Goal(Protocol):
+    """A goal that an action of the robot pursues for us."""
+
+    result: Deferred[Outcome]
+    """Fires once in every case."""
+
+    def cancel(self) -> None:
+        """Want it no more, however far it is; :attr:`result` still comes."""
+
+
 class Platform(Protocol):
     """One robot's middleware."""
 
@@ -123,8 +185,27 @@ class Platform(Protocol):
     def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
         """Call a service once; fails with a sentence. Cancelling the result gives the call up."""
 
+    def serve(self, service: str, type: str, on_call: OnCall) -> Offer:
+        """Offer a service; its calls come one after the other and are answered in any order."""
+
+    def act(self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel) -> Offer:
+        """Offer an action; every goal is accepted.
+
+        :param on_cancel: told of a goal nobody wants any more
+        """
+
+    def pursue(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> Goal:
+        """Have an action of the robot pursue a goal.
+
+        :param type: empty to take the action's one type from the graph
+        :param on_feedback: ``None`` when nobody wants to know
+        """
+
     def definition(self, type: str) -> link.TypeDefinition:
         """The text of a type and all it contains."""
+
+    def interfaces(self) -> list[str]:
+        """Full names of all types that :meth:`definition` knows, sorted."""
 
     def judge(self, type: str, body: bytes) -> Motion:
         """What this command would do."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from relay_protocol.errors import Invalid, NotFound
-from relay_protocol.limits import TYPE_DEFINITION
+from relay_protocol.limits import INTERFACES, NAME, TYPE_DEFINITION
 
 RULE = "=" * 80
 _TYPE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)\Z")
@@ -44,13 +44,13 @@ Lookup = Callable[[str], str | None]
 def normalise(name: str, kind: str = "msg") -> str:
     """A type's full name: ``std_msgs/String`` is short for ``std_msgs/msg/String``.
 
-    :param kind: ``msg`` or ``srv``, what a short name means
+    :param kind: ``msg``, ``srv`` or ``action``, what a short name means
     :raises Invalid: no type name
     """
     if name.count("/") == 1:
         name = name.replace("/", f"/{kind}/")
     if not _TYPE_NAME.match(name):
-        raise Invalid(f"'{name}' is no type; write package/msg/Name or package/srv/Name")
+        raise Invalid(f"'{name}' is no type; write package/{kind}/Name")
     return name
 
 
@@ -64,6 +64,30 @@ def prefixes() -> list[Path]:
         if entry.endswith(("site-packages", "dist-packages")) and len(parents) > 2:
             found.append(parents[2])
     return list(dict.fromkeys(found))
+
+
+def all_names(where: Iterable[Path]) -> list[str]:
+    """Full names of all types that are installed, sorted, at most as many as can be told.
+
+    The resource index of ament names the types of a package too of which only Python knows the fields; a package
+    that is not in the index is found by its files.
+    """
+    found: set[str] = set()
+    for prefix in where:
+        for listing in prefix.glob("share/ament_index/resource_index/rosidl_interfaces/*"):
+            found.update(f"{listing.name}/{each}" for each in _read_lines(listing))
+        for kind in ("msg", "srv", "action"):
+            paths = prefix.glob(f"share/*/{kind}/*.{kind}")
+            found.update(f"{each.parent.parent.name}/{kind}/{each.name}" for each in paths)
+    names = {name.rpartition(".")[0] for name in found if name.endswith((".msg", ".srv", ".action", ".idl"))}
+    return sorted(name for name in names if len(name) <= NAME and _TYPE_NAME.match(name))[:INTERFACES]
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError):
+        return []
 
 
 def installed(name: str, where: Iterable[Path], suffix: str = "") -> str | None:

@@ -9,7 +9,19 @@ from twisted.internet.defer import Deferred, fail, succeed
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.platforms.base import Facts, GraphView, Motion, OnSample, Platform
+from robot_client.platforms.base import (
+    ABORTED,
+    NEVER_BEGAN,
+    Facts,
+    GraphView,
+    Motion,
+    OnCall,
+    OnCancel,
+    OnGoal,
+    OnSample,
+    Outcome,
+    Platform,
+)
 from robot_client.platforms.definitions import normalise
 from robot_client.topics import TypedTopic
 
@@ -60,6 +72,102 @@ class MemorySink:
         self._platform.sinks.remove(self)
 
 
+class MemoryService:
+    """A service offered to nobody; :meth:`call` stands for a caller."""
+
+    def __init__(self, platform: MemoryPlatform, name: str, type: str, on_call: OnCall) -> None:
+        self.type = type
+        self.answers: list[bytes] = []
+        self._platform = platform
+        self._name = name
+        self._on_call = on_call
+
+    def call(self, body: bytes) -> None:
+        """Call it; what is answered comes to :attr:`answers`."""
+        self._on_call(body, self._answer)
+
+    def close(self) -> None:
+        """Offer it no more."""
+        del self._platform.offered[self._name]
+
+    def _answer(self, body: bytes) -> None:
+        if not body.startswith(_HEADER):
+            raise Invalid(f"the bytes are no response of type {self.type}")
+        self.answers.append(body)
+
+
+class MemoryServedGoal:
+    """A goal of :meth:`MemoryAction.send`."""
+
+    def __init__(self, action: MemoryAction) -> None:
+        self.said: list[bytes] = []
+        self.end: tuple[int, bytes | None] | None = None
+        self._action = action
+
+    def feedback(self, body: bytes) -> None:
+        """Record it."""
+        if not body.startswith(_HEADER):
+            raise Invalid(f"the bytes are no feedback of type {self._action.type}")
+        self.said.append(body)
+
+    def finish(self, status: int, body: bytes | None) -> None:
+        """Record the end."""
+        if body is not None and not body.startswith(_HEADER):
+            raise Invalid(f"the bytes are no result of type {self._action.type}")
+        self.end = self.end or (status, body)
+
+    def cancel(self) -> None:
+        """Be the one who wants it no more."""
+        self._action.on_cancel(self)
+
+
+class MemoryAction:
+    """An action offered to nobody; :meth:`send` stands for one who wants something."""
+
+    def __init__(
+        self, platform: MemoryPlatform, name: str, type: str, on_goal: OnGoal, on_cancel: OnCancel
+    ) -> None:
+        self.type = type
+        self.on_cancel = on_cancel
+        self.goals: list[MemoryServedGoal] = []
+        self._platform = platform
+        self._name = name
+        self._on_goal = on_goal
+
+    def send(self, body: bytes) -> MemoryServedGoal:
+        """Give it a goal."""
+        goal = MemoryServedGoal(self)
+        self.goals.append(goal)
+        self._on_goal(body, goal)
+        return goal
+
+    def close(self) -> None:
+        """Offer it no more; goals are aborted."""
+        for goal in self.goals:
+            goal.finish(ABORTED, None)
+        del self._platform.acted[self._name]
+
+
+class MemoryGoal:
+    """A goal of ours; what becomes of it is set by :meth:`feed` and :attr:`result`."""
+
+    def __init__(self, action: str, body: bytes, on_feedback: OnSample | None) -> None:
+        self.result: Deferred[Outcome] = Deferred()
+        self.action = action
+        self.body = body
+        self.cancelled = False
+        self._on_feedback = on_feedback
+
+    def feed(self, body: bytes) -> None:
+        """Tell how far it is, if anybody wants to know."""
+        if self._on_feedback is not None:
+            self._on_feedback(body)
+
+    def cancel(self) -> None:
+        """Note that nobody wants it."""
+        self.cancelled = True
+
+
 Service = Callable[[bytes], "bytes | Deferred[bytes]"]
 
 
@@ -77,6 +185,10 @@ class MemoryPlatform(Platform):
         self.sinks: list[MemorySink] = []
         self.published: list[tuple[str, bytes]] = []
         self.services: dict[str, Service] = {}
+        self.actions: set[str] = set()
+        self.goals: list[MemoryGoal] = []
+        self.offered: dict[str, MemoryService] = {}
+        self.acted: dict[str, MemoryAction] = {}
         self.definitions: dict[str, str] = {}
         self.charge: float | None = None
         self.running = False
@@ -148,6 +260,33 @@ class MemoryPlatform(Platform):
             return fail(NotFound(f"there is no service {service} on this robot"))
         result = function(request)
         return result if isinstance(result, Deferred) else succeed(result)
+
+    def serve(self, service: str, type: str, on_call: OnCall) -> MemoryService:
+        """Offer a service."""
+        if service in self.services or service in self.offered:
+            raise Invalid(f"the robot has the service {service} already")
+        offer = self.offered[service] = MemoryService(self, service, normalise(type, "srv"), on_call)
+        return offer
+
+    def act(self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel) -> MemoryAction:
+        """Offer an action."""
+        if action in self.actions or action in self.acted:
+            raise Invalid(f"the robot has the action {action} already")
+        full = normalise(type, "action")
+        offer = self.acted[action] = MemoryAction(self, action, full, on_goal, on_cancel)
+        return offer
+
+    def pursue(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> MemoryGoal:
+        """Begin a goal that the one who set the action ends."""
+        made = MemoryGoal(action, goal, on_feedback)
+        self.goals.append(made)
+        if action not in self.actions:
+            made.result.callback(Outcome(NEVER_BEGAN, None, f"the action {action} can't be reached"))
+        return made
+
+    def interfaces(self) -> list[str]:
+        """The types set."""
+        return sorted(self.definitions)
 
     def definition(self, type: str) -> link.TypeDefinition:
         """The text set for a type."""

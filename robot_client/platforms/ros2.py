@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import platform as machine
+import time
 from collections.abc import Callable
 from importlib import metadata
 from typing import Any
@@ -25,13 +26,27 @@ except ImportError:  # Humble
 from relay_protocol import link
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from robot_client.platforms import ros2_graph, ros2_qos
-from robot_client.platforms.base import Facts, GraphView, Motion, OnSample, Platform
+from robot_client.platforms.base import (
+    Facts,
+    GraphView,
+    Motion,
+    OnCall,
+    OnCancel,
+    OnGoal,
+    OnSample,
+    Platform,
+)
+from robot_client.platforms.definitions import normalise
+from robot_client.platforms.ros2_actions import RosAction
 from robot_client.platforms.ros2_calls import Calls
 from robot_client.platforms.ros2_executor import Hop, Spinner, make_executor
+from robot_client.platforms.ros2_goals import Goals, RosGoal
+from robot_client.platforms.ros2_services import RosService
 from robot_client.platforms.ros2_topics import (
     Lingering,
     RosSink,
     RosSource,
+    action_type,
     check_name,
     service_type,
     topic_type,
@@ -72,12 +87,15 @@ class Ros2Platform(Platform):
         self._hop = Hop(reactor.callFromThread)
         self._sources: list[RosSource] = []
         self._sinks: list[RosSink] = []
+        self._services: dict[str, RosService] = {}
+        self._actions: dict[str, RosAction] = {}
         self._battery: RosSource | None = None
         self._battery_sample: bytes | None = None
         self._context: Any = None
         self._node: Any = None
         self._spinner: Any = None
         self._calls: Any = None
+        self._goals: Any = None
         self._lingering: Any = None
 
     @property
@@ -99,6 +117,7 @@ class Ros2Platform(Platform):
             raise Unavailable(f"ROS 2 does not start: {error}") from error
         self._lingering = Lingering(self._node, self._reactor)
         self._calls = Calls(self._node, self._hop, self._types, self._reactor)
+        self._goals = Goals(self._node, self._hop, self._spinner, self._types, self._reactor)
         self._spinner.start()
 
     def stop(self) -> None:
@@ -110,6 +129,15 @@ class Ros2Platform(Platform):
             source.close()
         for sink in list(self._sinks):
             sink.close()
+        for service in list(self._services.values()):
+            service.close()
+        for action in self._actions.values():
+            action.close()
+        if self._goals.close() or self._actions:
+            time.sleep(FAREWELL)  # cancels and aborts leave by the executor's thread
+        self._goals.leave()
+        for action in list(self._actions.values()):
+            action.go()
         self._spinner.stop()
         self._lingering.end(FAREWELL)
         self._node.destroy_node()
@@ -133,6 +161,7 @@ class Ros2Platform(Platform):
         for source in list(self._sources):
             source.refresh()
         self._calls.sweep()
+        self._goals.sweep()
         view = ros2_graph.read(self._node, self._own)
         if self._want_battery:
             self._find_battery(view)
@@ -214,9 +243,83 @@ class Ros2Platform(Platform):
             return fail(error)
         return call
 
+    def serve(self, service: str, type: str, on_call: OnCall) -> RosService:
+        """Offer a service."""
+        full = check_name(self._node.resolve_service_name, service, "service")
+        self._check_free(f"service {service}", full, full in self._services)
+        name = normalise(type, "srv")
+        kind = self._types.service(name)
+        try:
+            offer = RosService(
+                self._node,
+                self._hop,
+                self._spinner,
+                full,
+                name,
+                kind,
+                on_call,
+                self._withdrawn,
+            )
+        except Exception as error:
+            raise Invalid(f"ROS 2 refuses the service {service} as {name}: {error}") from None
+        self._services[full] = offer
+        return offer
+
+    def act(self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel) -> RosAction:
+        """Offer an action."""
+        full = check_name(self._node.resolve_topic_name, action, "action")
+        former = self._actions.get(full)
+        self._check_free(f"action {action}", full + ros2_graph.GOAL, former is not None and not former.closed)
+        name = normalise(type, "action")
+        kind = self._types.action(name)
+        if former is not None:
+            former.go()
+        try:
+            offer = RosAction(
+                self._node,
+                self._hop,
+                self._spinner,
+                self._reactor,
+                full,
+                name,
+                kind,
+                on_goal,
+                on_cancel,
+                self._gone,
+            )
+        except Exception as error:
+            raise Invalid(f"ROS 2 refuses the action {action} as {name}: {error}") from None
+        self._actions[full] = offer
+        return offer
+
+    def _withdrawn(self, service: RosService) -> None:
+        del self._services[service.name]
+
+    def _gone(self, action: RosAction) -> None:
+        if self._actions.get(action.name) is action:
+            del self._actions[action.name]
+
+    def _check_free(self, what: str, service: str, ours: bool) -> None:
+        if ours:
+            raise Invalid(f"somebody at the relay offers the {what} already")
+        other = ros2_graph.provider(self._node, service, self._name)
+        if other is not None:
+            raise Invalid(f"the robot has the {what} already: {other} offers it")
+
+    def pursue(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> RosGoal:
+        """Have an action pursue a goal."""
+        full = check_name(self._node.resolve_topic_name, action, "action")
+        name = action_type(full, type, self._node.get_service_names_and_types())
+        begun: RosGoal = self._goals.pursue(full, name, goal, on_feedback)
+        return begun
+
     def definition(self, type: str) -> link.TypeDefinition:
         """The text of a type and all it contains."""
         return self._types.definition(type)
+
+    def interfaces(self) -> list[str]:
+        """Names of all types that are installed."""
+        return self._types.names()
 
     def judge(self, type: str, body: bytes) -> Motion:
         """What this command would do."""

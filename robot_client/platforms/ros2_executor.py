@@ -51,6 +51,10 @@ class Spinner:
         self._served = clock()
         self._thread = threading.Thread(target=self._turn, name="ros2-executor", daemon=True)
         self._timer = node.create_timer(1.0, self._beat)
+        self._work: deque[tuple[Callable[..., Any], tuple[Any, ...]]] = deque()
+        self._lock = threading.Lock()
+        self._scheduled = False
+        self._log = Logger("ros2")
         executor.add_node(node)
 
     def start(self) -> None:
@@ -64,7 +68,32 @@ class Spinner:
         if self._thread.is_alive():
             self._thread.join(2.0)
         if not self._thread.is_alive():
+            self._do_all()
             self._executor.shutdown()
+
+    def do(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """Have a function called in the executor's thread, in order; from any thread.
+
+        What rclpy keeps of requests under way may only be touched there: an answer taken while another thread has sent
+        the request and not yet noted its number is thrown away.
+        """
+        with self._lock:
+            self._work.append((function, arguments))
+            if self._scheduled or self._stop.is_set():
+                return
+            self._scheduled = True
+        # One task for all: the single-threaded executor runs tasks in no order.
+        self._executor.create_task(self._do_all)
+
+    def _do_all(self) -> None:
+        with self._lock:
+            work, self._work = self._work, deque()
+            self._scheduled = False
+        for function, arguments in work:
+            try:
+                function(*arguments)
+            except Exception:
+                self._log.failure("ROS 2 could not do what was asked of it")
 
     def trouble(self) -> str | None:
         """A sentence when callbacks have not been served for :data:`STUCK_SECONDS`."""
@@ -77,14 +106,13 @@ class Spinner:
         self._served = self._clock()
 
     def _turn(self) -> None:
-        log = Logger("ros2")
         while not self._stop.is_set():
             try:
                 self._executor.spin_once(timeout_sec=TURN)
             except Exception:
                 if self._stop.is_set():
                     return
-                log.failure("a ROS callback failed")
+                self._log.failure("a ROS callback failed")
                 time.sleep(TURN)  # an executor that fails at once each time must not take the processor
 
 

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 from relay_protocol import link
 from robot_client.platforms.base import GraphView
 
-_GOAL = "/_action/send_goal"
-_GOAL_TYPE = "_SendGoal"
+GOAL = "/_action/send_goal"
+"""What the service is called that takes an action's goals."""
+GOAL_TYPE = "_SendGoal"
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 
@@ -78,14 +79,37 @@ def _split(
     actions: dict[str, link.Service] = {}
     for name, by_type in services.items():
         providers = sorted(set().union(*by_type.values()))
-        if name.endswith(_GOAL):
-            action = name[: -len(_GOAL)]
-            types = sorted(type[: -len(_GOAL_TYPE)] for type in by_type if type.endswith(_GOAL_TYPE))
+        if name.endswith(GOAL):
+            action = name[: -len(GOAL)]
+            types = sorted(type[: -len(GOAL_TYPE)] for type in by_type if type.endswith(GOAL_TYPE))
             if types and not hidden(action):
                 actions[action] = link.Service(types=types, providers=providers)
         elif not hidden(name):
             plain[name] = link.Service(types=sorted(by_type), providers=providers)
     return plain, actions
+
+
+def provider(node: Any, service: str, own: str) -> str | None:
+    """Which node provides a service, the full name; ``None`` if no other does.
+
+    Asked node by node: the list of all services has those too that somebody only waits for.
+
+    :param node: an rclpy node
+    :param own: name of our own node, which doesn't count
+    """
+    for name, namespace in node.get_node_names_and_namespaces():
+        if name == own:
+            continue
+        if service in _served(node, name, namespace):
+            return f"{namespace.rstrip('/')}/{name}"
+    return None
+
+
+def _served(node: Any, name: str, namespace: str) -> set[str]:
+    try:
+        return {each for each, _ in node.get_service_names_and_types_by_node(name, namespace)}
+    except Exception:  # the node left between two questions
+        return set()
 
 
 def hidden(name: str) -> bool:

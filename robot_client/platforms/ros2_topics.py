@@ -15,6 +15,7 @@ from robot_client.platforms import ros2_qos
 from robot_client.platforms.base import OnSample
 from robot_client.platforms.definitions import normalise
 from robot_client.platforms.ros2_executor import Hop
+from robot_client.platforms.ros2_graph import GOAL, GOAL_TYPE
 from robot_client.platforms.ros2_types import Types
 from robot_client.reactors import Clock, Timer
 
@@ -24,7 +25,7 @@ LINGER = 0.5
 def check_name(resolve: Callable[[str], str], name: str, what: str) -> str:
     """See that rclpy takes a name; the full name it stands for.
 
-    :param what: ``topic`` or ``service``, for the error
+    :param what: ``topic``, ``service`` or ``action``, for the error
     :raises Invalid: it does not
     """
     try:
@@ -55,6 +56,22 @@ def service_type(service: str, asked: str, known: Iterable[tuple[str, list[str]]
     if not types:
         raise NotFound(f"there is no service {service} on this robot")
     return _one_of(types, asked, f"service {service}", "srv")
+
+
+def action_type(action: str, asked: str, known: Iterable[tuple[str, list[str]]]) -> str:
+    """The type to use for an action, which may not be seen yet if its type is said; see :func:`topic_type`."""
+    types = sorted(
+        type[: -len(GOAL_TYPE)]
+        for name, types in known
+        if name == action + GOAL
+        for type in types
+        if type.endswith(GOAL_TYPE)
+    )
+    if asked and not types:
+        return normalise(asked, "action")
+    if not types:
+        raise NotFound(f"there is no action {action} on this robot")
+    return _one_of(types, asked, f"action {action}", "action")
 
 
 def _one_of(types: list[str], asked: str, what: str, kind: str) -> str:

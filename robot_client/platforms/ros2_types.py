@@ -15,6 +15,7 @@ from robot_client.platforms import definitions
 from robot_client.platforms.base import Motion
 
 HEADER = "std_msgs/Header"
+_OF = {"msg": "messages", "srv": "services", "action": "actions"}
 
 
 class Types:
@@ -24,6 +25,7 @@ class Types:
         self._classes: dict[str, Any] = {}
         self._definitions: dict[str, link.TypeDefinition] = {}
         self._prefixes = definitions.prefixes()
+        self._names: list[str] | None = None
 
     def message(self, name: str) -> Any:
         """The class of a message type.
@@ -39,13 +41,20 @@ class Types:
         """
         return self._class(name, "srv")
 
+    def action(self, name: str) -> Any:
+        """The class of an action type.
+
+        :raises NotFound: it is not installed
+        """
+        return self._class(name, "action")
+
     def _class(self, name: str, kind: str) -> Any:
         found = self._classes.get(name)
         if found is None:
             full = definitions.normalise(name, kind)
             package, has, short = full.split("/")
             if has != kind:
-                raise Invalid(f"{name} is not a {'message' if kind == 'msg' else 'service'} type")
+                raise Invalid(f"{name} is no type of {_OF[kind]}")
             found = self._classes[name] = _load(package, kind, short, full)
         return found
 
@@ -63,6 +72,12 @@ class Types:
             )
             self._definitions[full] = known
         return known
+
+    def names(self) -> list[str]:
+        """Full names of all types whose definition can be told, sorted; looked for once."""
+        if self._names is None:
+            self._names = definitions.all_names(self._prefixes)
+        return self._names
 
     def _text(self, name: str) -> str | None:
         text = definitions.installed(name, self._prefixes)
@@ -89,6 +104,19 @@ class Types:
         if message.get_fields_and_field_types().get("header") == HEADER:
             message.header.stamp = stamp
         return bytes(serialize_message(message))
+
+
+def parse(body: bytes, kind: Any, what: str) -> Any:
+    """The message in these bytes.
+
+    :param kind: its class
+    :param what: what it must be, for the error
+    :raises Invalid: the bytes are none
+    """
+    try:
+        return deserialize_message(body, kind)
+    except Exception:  # rclpy names its errors differently from release to release
+        raise Invalid(f"the bytes are no {what}") from None
 
 
 def _load(package: str, kind: str, short: str, name: str) -> Any:

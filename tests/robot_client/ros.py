@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from twisted.internet import reactor, task
+
 PATIENCE = 20.0
 
 
@@ -31,6 +33,14 @@ def domain() -> Iterator[dict[str, str]]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+async def until(true: Callable[[], Any], timeout: float = PATIENCE) -> None:
+    """Let the reactor turn until something is so."""
+    deadline = time.monotonic() + timeout
+    while not true():
+        assert time.monotonic() < deadline, f"waited {timeout} s in vain"
+        await task.deferLater(reactor, 0.02)
 
 
 class Peer:
@@ -66,6 +76,16 @@ class Peer:
         """What came on a topic so far."""
         return [each for each in list(self.record) if each.get("topic") == topic]
 
+    def told(self, what: str, name: str) -> list[dict[str, Any]]:
+        """What was told of something so far."""
+        return [each for each in list(self.record) if each.get(what) == name]
+
+    def kill(self) -> None:
+        """End it at once, as a crash would."""
+        self._process.kill()
+        self._process.wait()
+        self._finish()
+
     def until(self, true: Callable[[], Any], timeout: float = PATIENCE) -> None:
         deadline = time.monotonic() + timeout
         while not true():
@@ -75,12 +95,19 @@ class Peer:
 
     def close(self) -> None:
         assert self._process.stdin is not None
+        if self._process.stdin.closed:
+            return
         self._process.stdin.close()
         try:
             self._process.wait(5)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._finish()
+
+    def _finish(self) -> None:
         self._reader.join(5)
+        assert self._process.stdin is not None
         assert self._process.stdout is not None
+        self._process.stdin.close()
         self._process.stdout.close()

@@ -9,7 +9,10 @@ import threading
 import time
 
 import rclpy
+from example_interfaces.action import Fibonacci
+from example_interfaces.srv import AddTwoInts
 from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -80,6 +83,86 @@ def listen(topic: str, kind: str) -> None:
         "string": (String, string),
     }[kind]
     ends["<" + topic] = node.create_subscription(type, topic, function, 10)
+
+
+def call(service: str, a: int, b: int) -> None:
+    """Ask for a sum; the answer, if one comes, is told."""
+    client = ends.setdefault("call " + service, node.create_client(AddTwoInts, service))
+    assert client.wait_for_service(20)
+    future = client.call_async(AddTwoInts.Request(a=a, b=b))
+    future.add_done_callback(lambda future: tell(answer=service, a=a, sum=future.result().sum))
+
+
+def act(action: str, kind: str) -> None:
+    """Serve Fibonacci; ``kind`` says what becomes of goals."""
+
+    def count(goal: object) -> Fibonacci.Result:
+        tell(began=action, order=goal.request.order)
+        sequence = [0, 1]
+        while len(sequence) < goal.request.order:
+            sequence.append(sequence[-1] + sequence[-2])
+            goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
+        canceled = kind == "forever"
+        if kind == "abort":
+            goal.abort()
+        elif kind == "forever":
+            while not goal.is_cancel_requested:
+                time.sleep(0.02)
+                goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
+            goal.canceled()
+        else:
+            goal.succeed()
+        tell(ended=action, canceled=canceled)
+        return Fibonacci.Result(sequence=sequence)
+
+    def judge(goal: object) -> GoalResponse:
+        if kind == "late":
+            time.sleep(1.0)
+        return GoalResponse.REJECT if kind == "reject" else GoalResponse.ACCEPT
+
+    ends[action] = ActionServer(
+        node,
+        Fibonacci,
+        action,
+        count,
+        goal_callback=judge,
+        cancel_callback=lambda goal: CancelResponse.ACCEPT,
+        callback_group=ReentrantCallbackGroup(),
+    )
+
+
+def unact(action: str) -> None:
+    ends.pop(action).destroy()
+
+
+def send(action: str, order: int) -> None:
+    """Want a goal pursued; all that comes of it is told."""
+    client = ends.setdefault("send " + action, ActionClient(node, Fibonacci, action))
+    assert client.wait_for_server(20)
+    future = client.send_goal_async(
+        Fibonacci.Goal(order=order),
+        feedback_callback=lambda message: tell(feedback=action, sequence=list(message.feedback.sequence)),
+    )
+
+    def taken(future: object) -> None:
+        handle = ends["goal " + action] = future.result()
+        tell(taken=action, accepted=handle.accepted)
+        if handle.accepted:
+            handle.get_result_async().add_done_callback(done)
+
+    def done(future: object) -> None:
+        tell(
+            result=action,
+            order=order,
+            status=future.result().status,
+            sequence=list(future.result().result.sequence),
+        )
+
+    future.add_done_callback(taken)
+
+
+def cancel(action: str) -> None:
+    ends["goal " + action].cancel_goal_async()
 
 
 def publishers(topic: str) -> None:

@@ -2,67 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import get_args
 
 import pytest
 from twisted.internet.defer import Deferred
-from twisted.internet.task import Clock
 
 from relay_protocol import link
-from relay_protocol.frames import FrameDecoder, SampleFrame
+from relay_protocol.frames import SampleFrame
 from relay_protocol.link import MotionPolicy
-from robot_client.channel import Channel, Wire
-from robot_client.motion import KEPT, MAX_TOPICS, MOTION_QOS, MotionDesk, NoGuard
-from robot_client.offset import Offset
+from robot_client.motion import KEPT, MAX_TOPICS, MOTION_QOS
 from robot_client.platforms.base import GraphView
-from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
-
-STRING = "std_msgs/msg/String"
-
-
-class Recorder(Wire):
-    def __init__(self) -> None:
-        self.said: list[Any] = []
-        self.writes: list[list[bytes]] = []
-
-    def say(self, message: link.Message) -> None:
-        self.said.append(message)
-
-    def write(self, frames: list[bytes]) -> None:
-        self.writes.append(frames)
-
-
-class Scene:
-    def __init__(self) -> None:
-        self.clock = Clock()
-        self.clock.advance(100)
-        self.platform = MemoryPlatform(GraphView(topics={"/chat": link.Topic(types=[STRING])}))
-        self.wire = Recorder()
-        self.offset = Offset()
-        self.offset.add(self.now(), self.now(), self.now())
-        policy = MotionPolicy(types=[TWIST])
-        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, NoGuard())
-        self.channel = Channel(
-            "c1", self.wire, self.offset, self.platform, self.desk, self.clock, 2**24, wall=lambda: 777
-        )
-
-    def now(self) -> int:
-        return round(self.clock.seconds() * 1e9)
-
-    def ask(self, message: link.Message) -> Any:
-        self.channel.handle(message)
-        return self.wire.said[-1] if self.wire.said else None
-
-    def frames(self) -> list[SampleFrame]:
-        data = b"".join(piece for write in self.wire.writes for piece in write)
-        return FrameDecoder(2**25).feed(data)  # type: ignore[return-value]
-
-    def run(self, seconds: float) -> None:
-        for _ in range(round(seconds * 100)):
-            self.clock.advance(0.01)
-
-    def drive(self, body: bytes) -> None:
-        self.channel.sample(SampleFrame(5, self.now(), body))
+from robot_client.platforms.memory import TWIST, twist
+from tests.robot_client.scene import STRING, Scene
 
 
 @pytest.fixture
@@ -287,3 +238,15 @@ def test_type_definition_or_words(scene: Scene) -> None:
     assert scene.ask(link.GetType(type=STRING)) == link.TypeDefinition(type=STRING, text="string data\n")
     answer = scene.ask(link.GetType(type="a/msg/B"))
     assert (answer.what, answer.ref) == ("get_type", "a/msg/B")
+
+
+def test_interfaces_are_told(scene: Scene) -> None:
+    """The names of all types there are come in order."""
+    scene.platform.definitions = {"b/msg/B": "", "a/srv/A": ""}
+    assert scene.ask(link.GetInterfaces()) == link.Interfaces(types=["a/srv/A", "b/msg/B"])
+
+
+def test_every_request_of_the_contract_is_known(scene: Scene) -> None:
+    """The channel has a handler for all that the relay may ask."""
+    told = {link.Ping, link.Pong, link.Bye}
+    assert set(scene.channel._handlers) == set(get_args(link.RelayChannel)) - told

@@ -9,6 +9,7 @@ import pytest
 from relay_protocol.errors import Invalid, NotFound
 from robot_client.platforms.definitions import (
     RULE,
+    all_names,
     contained,
     full_text,
     installed,
@@ -101,3 +102,25 @@ def test_ament_prefixes_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """The robot's own ROS is asked before the Python environment."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/ws/install")
     assert [str(each) for each in prefixes()[:2]] == ["/opt/ros/jazzy", "/ws/install"]
+
+
+def test_action_has_its_three_parts() -> None:
+    """An action's text keeps both dividing lines, and what its parts contain follows."""
+    texts = {**TEXTS, "a/action/Go": "Inner to\n---\nb/Far end\n---\nfloat64 left\n"}
+    text = full_text("a/action/Go", texts.get)
+    assert text.startswith("Inner to\n---\nb/Far end\n---\nfloat64 left\n" + RULE)
+    assert "MSG: a/Inner\n" in text
+    assert "MSG: b/Far\n" in text
+
+
+def test_all_names_are_found(tmp_path: Path) -> None:
+    """Types are known by their files and by the resource index, each once, in order; other files are none."""
+    share = tmp_path / "share"
+    for name in ("b/msg/Two.msg", "b/msg/Two.idl", "b/msg/README.md", "a/action/Go.action", "c/cmake/x.srv"):
+        (share / name).parent.mkdir(parents=True, exist_ok=True)
+        (share / name).write_text("")
+    index = share / "ament_index" / "resource_index" / "rosidl_interfaces"
+    index.mkdir(parents=True)
+    (index / "b").write_text("msg/Two.idl\nmsg/Two.msg\nmsg/Idl.idl\nsrv/../../x.srv\n")
+    (index / "broken").write_bytes(b"\xff")
+    assert all_names([tmp_path, tmp_path / "nowhere"]) == ["a/action/Go", "b/msg/Idl", "b/msg/Two"]

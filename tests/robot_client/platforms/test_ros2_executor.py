@@ -90,3 +90,48 @@ def test_executor_that_serves_nothing_is_noticed() -> None:
     assert "served nothing" in str(spinner.trouble())
     node.beat()
     assert spinner.trouble() is None
+
+
+class Tasks:
+    """An executor that runs its tasks when told, the newest first, as rclpy's does."""
+
+    def __init__(self) -> None:
+        self.tasks: list[Callable[[], None]] = []
+
+    def add_node(self, node: object) -> None:
+        pass
+
+    def create_task(self, task: Callable[[], None]) -> None:
+        self.tasks.append(task)
+
+    def turn(self) -> None:
+        while self.tasks:
+            self.tasks.pop()()
+
+
+class Timers:
+    def create_timer(self, period: float, beat: Callable[[], None]) -> None:
+        pass
+
+
+def test_work_for_the_executor_is_done_in_order() -> None:
+    """What is given to the executor's thread is done there in the order it came, by one task."""
+    tasks, done = Tasks(), list[int]()
+    spinner = Spinner(tasks, Timers())
+    for number in range(5):
+        spinner.do(done.append, number)
+    assert len(tasks.tasks) == 1
+    tasks.turn()
+    spinner.do(done.append, 5)
+    tasks.turn()
+    assert done == [0, 1, 2, 3, 4, 5]
+
+
+def test_work_that_fails_costs_no_other() -> None:
+    """A request that ROS refuses does not lose those behind it."""
+    tasks, done = Tasks(), list[int]()
+    spinner = Spinner(tasks, Timers())
+    spinner.do(lambda: 1 / 0)
+    spinner.do(done.append, 1)
+    tasks.turn()
+    assert done == [1]

@@ -1,0 +1,65 @@
+"""Calls of the robot's services that the relay asks for on one channel."""
+
+from __future__ import annotations
+
+import math
+
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError
+from relay_protocol.limits import CALL_SECONDS
+from robot_client.platforms.base import Platform
+from robot_client.wire import NotNow, Wire, arguments, check_room, to_cdr
+
+
+class Calls:
+    """The calls under way.
+
+    :param frame_limit: largest frame the relay takes, bytes
+    """
+
+    def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
+        self._wire = wire
+        self._platform = platform
+        self._limit = frame_limit
+        self._calls: dict[str, Deferred[None]] = {}
+        self._log = Logger("channel")
+
+    def call(self, message: link.CallService) -> None:
+        """Begin one; it is always answered.
+
+        :raises SwitchboardError: it can't be begun
+        """
+        id = message.id
+        if id in self._calls:
+            raise NotNow(f"a call with the id '{id}' is under way")
+        check_room(self._calls, "calls")
+        request = arguments(message.cdr, message.service)
+        timeout = message.timeout if 0 < message.timeout < math.inf else CALL_SECONDS
+        answer = self._platform.call(message.service, message.type, request, timeout)
+        done = answer.addCallback(lambda body: self._answer(message, body))
+        done.addErrback(lambda failure: self._failed(message, failure))
+        self._calls[id] = done
+        done.addBoth(lambda _: self._calls.pop(id, None) and None)
+
+    def close(self) -> None:
+        """Give up all."""
+        for call in list(self._calls.values()):
+            call.cancel()
+
+    def _answer(self, message: link.CallService, body: bytes) -> None:
+        cdr = to_cdr(body, self._limit, f"the answer of {message.service}")
+        self._wire.say(link.ServiceResponse(id=message.id, result=True, cdr=cdr))
+
+    def _failed(self, message: link.CallService, failure: Failure) -> None:
+        if isinstance(failure.value, CancelledError):
+            return
+        if isinstance(failure.value, SwitchboardError):
+            reason = failure.getErrorMessage()
+        else:
+            self._log.failure("a call of {service} failed", failure, service=message.service)
+            reason = "the robot could not make this call; its log says why"
+        self._wire.say(link.ServiceResponse(id=message.id, result=False, reason=reason))

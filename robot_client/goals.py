@@ -1,0 +1,123 @@
+"""Goals that the relay asks the robot's actions to pursue, on one channel."""
+
+from __future__ import annotations
+
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError
+from robot_client.platforms.base import ABORTED, NEVER_BEGAN, Goal, Outcome, Platform
+from robot_client.wire import Wire, arguments, check_room, to_cdr
+
+
+class Goals:
+    """The goals under way; each ends in exactly one ``action_result``.
+
+    While the link takes nothing, only the newest feedback of each goal is kept: it is the one kind of JSON message
+    that comes as often as somebody else likes.
+
+    :param frame_limit: largest frame the relay takes, bytes
+    """
+
+    def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
+        self._wire = wire
+        self._platform = platform
+        self._limit = frame_limit
+        self._goals: dict[str, Goal] = {}
+        self._paused = False
+        self._held: dict[str, link.ActionFeedback] = {}
+        self._closed = False
+        self._log = Logger("channel")
+
+    def begin(self, message: link.SendActionGoal) -> None:
+        """Pursue one.
+
+        :raises SwitchboardError: it can't be begun
+        """
+        id = message.id
+        if id in self._goals:
+            # An action_result of this id would end the goal that is under way.
+            reason = f"a goal with the id '{id}' is under way"
+            self._wire.say(link.Failed(what="send_action_goal", ref=id, reason=reason))
+            return
+        check_room(self._goals, "goals")
+        goal = self._platform.pursue(
+            message.action,
+            message.type,
+            arguments(message.cdr, message.action),
+            (lambda body: self._feedback(id, message.action, body)) if message.feedback else None,
+        )
+        self._goals[id] = goal
+        goal.result.addCallbacks(
+            lambda outcome: self._ended(message, outcome), lambda failure: self._failed(message, failure)
+        )
+
+    def cancel(self, message: link.CancelActionGoal) -> None:
+        """The relay wants it no more; one that has ended already is passed over."""
+        goal = self._goals.get(message.id)
+        if goal is not None:
+            goal.cancel()
+
+    def pause(self) -> None:
+        """The link takes nothing."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """The link takes messages again."""
+        self._paused = False
+        held, self._held = self._held, {}
+        for message in held.values():
+            self._wire.say(message)
+
+    def close(self) -> None:
+        """Nobody wants any of them now."""
+        self._closed = True
+        self._held.clear()
+        for goal in list(self._goals.values()):
+            goal.cancel()
+        self._goals.clear()
+
+    def _feedback(self, id: str, action: str, body: bytes) -> None:
+        if id not in self._goals:
+            return
+        try:
+            message = link.ActionFeedback(id=id, cdr=to_cdr(body, self._limit, f"feedback of {action}"))
+        except SwitchboardError as error:
+            self._log.warn("feedback is left out: {reason}", reason=str(error))
+            return
+        if self._paused:
+            self._held[id] = message
+        else:
+            self._wire.say(message)
+
+    def _ended(self, message: link.SendActionGoal, outcome: Outcome) -> None:
+        if outcome.body is None:
+            self._say_end(message.id, outcome.status, None, outcome.reason)
+            return
+        try:
+            cdr = to_cdr(outcome.body, self._limit, f"the result of {message.action}")
+        except SwitchboardError as error:
+            self._say_end(message.id, outcome.status, None, str(error))
+            return
+        self._say_end(message.id, outcome.status, cdr, "")
+
+    def _failed(self, message: link.SendActionGoal, failure: Failure) -> None:
+        self._log.failure("a goal of {action} failed", failure, action=message.action)
+        self._say_end(message.id, ABORTED, None, "the robot lost this goal; its log says why")
+
+    def _say_end(self, id: str, status: int, cdr: str | None, reason: str) -> None:
+        self._goals.pop(id, None)
+        feedback = self._held.pop(id, None)
+        if self._closed:
+            return
+        if feedback is not None:
+            self._wire.say(feedback)
+        self._wire.say(
+            link.ActionResult(id=id, status=status, result=cdr is not None, cdr=cdr, reason=reason)
+        )
+
+
+def refusal(message: link.SendActionGoal, reason: str) -> link.ActionResult:
+    """The answer to a goal that could not be begun."""
+    return link.ActionResult(id=message.id, status=NEVER_BEGAN, result=False, reason=reason)

@@ -1,0 +1,219 @@
+"""Services and actions that clients of the relay offer to the robot's graph, on one channel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from typing import NamedTuple
+
+from twisted.logger import Logger
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError
+from relay_protocol.limits import MIB
+from robot_client.platforms.base import ABORTED, SUCCEEDED, Offer, Platform, ServedGoal
+from robot_client.wire import MAX_OPEN, NotNow, Wire, arguments, check_room, to_cdr
+
+PENDING_BYTES = 32 * MIB
+"""Requests that wait for a client's answer, all together."""
+
+
+class _Asked(NamedTuple):
+    service: str
+    answer: Callable[[bytes], None]
+    size: int
+
+
+class OfferedServices:
+    """Services of this channel; ROS has no answer for a call that fails, so that is told to the log alone.
+
+    :param frame_limit: largest frame the relay takes, bytes
+    """
+
+    def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
+        self._wire = wire
+        self._platform = platform
+        self._limit = frame_limit
+        self._offers: dict[str, Offer] = {}
+        self._calls: dict[str, _Asked] = {}
+        self._size = 0
+        self._ids = count(1)
+        self._log = Logger("channel")
+
+    def advertise(self, message: link.AdvertiseService) -> None:
+        """Offer one.
+
+        :raises SwitchboardError: it can't be offered
+        """
+        service = message.service
+        if service in self._offers:
+            raise NotNow(f"this channel offers the service {service} already")
+        check_room(self._offers, "services")
+        offer = self._platform.serve(
+            service, message.type, lambda body, answer: self._called(service, body, answer)
+        )
+        self._offers[service] = offer
+        self._log.info("{who} offers the service {name}", who=message.source or "a client", name=service)
+        self._wire.say(link.AdvertisedService(service=service, type=offer.type))
+
+    def withdraw(self, message: link.UnadvertiseService) -> None:
+        """Offer it no more; its callers get no answer."""
+        offer = self._offers.pop(message.service, None)
+        if offer is None:
+            return
+        offer.close()
+        for id, call in list(self._calls.items()):
+            if call.service == message.service:
+                self._forget(id)
+
+    def answer(self, message: link.ServiceResponse) -> None:
+        """Pass a client's answer on; one that is too late is passed over."""
+        call = self._forget(message.id)
+        if call is None:
+            return
+        if not message.result:
+            self._unanswered(call.service, message.reason or "the client gave no reason")
+            return
+        try:
+            call.answer(arguments(message.cdr, call.service))
+        except SwitchboardError as error:
+            self._unanswered(call.service, str(error))
+
+    def close(self) -> None:
+        """Offer nothing more."""
+        for offer in self._offers.values():
+            offer.close()
+        self._offers.clear()
+        self._calls.clear()
+        self._size = 0
+
+    def _called(self, service: str, body: bytes, answer: Callable[[bytes], None]) -> None:
+        if len(self._calls) >= MAX_OPEN or self._size + len(body) > PENDING_BYTES:
+            self._unanswered(service, f"{len(self._calls)} calls wait for their answers already")
+            return
+        try:
+            cdr = to_cdr(body, self._limit, f"a request to {service}")
+        except SwitchboardError as error:
+            self._unanswered(service, str(error))
+            return
+        id = f"s{next(self._ids)}"
+        self._calls[id] = _Asked(service, answer, len(body))
+        self._size += len(body)
+        self._wire.say(link.CallService(id=id, service=service, type=self._offers[service].type, cdr=cdr))
+
+    def _forget(self, id: str) -> _Asked | None:
+        call = self._calls.pop(id, None)
+        if call is not None:
+            self._size -= call.size
+        return call
+
+    def _unanswered(self, service: str, reason: str) -> None:
+        self._log.warn("a call of {service} gets no answer: {reason}", service=service, reason=reason)
+
+
+class _Pursued(NamedTuple):
+    action: str
+    goal: ServedGoal
+
+
+class OfferedActions:
+    """Actions of this channel, and the goals the graph gave them.
+
+    :param frame_limit: largest frame the relay takes, bytes
+    """
+
+    def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
+        self._wire = wire
+        self._platform = platform
+        self._limit = frame_limit
+        self._offers: dict[str, Offer] = {}
+        self._goals: dict[str, _Pursued] = {}
+        self._ids: dict[ServedGoal, str] = {}
+        self._next = count(1)
+        self._log = Logger("channel")
+
+    def advertise(self, message: link.AdvertiseAction) -> None:
+        """Offer one.
+
+        :raises SwitchboardError: it can't be offered
+        """
+        action = message.action
+        if action in self._offers:
+            raise NotNow(f"this channel offers the action {action} already")
+        check_room(self._offers, "actions")
+        offer = self._platform.act(
+            action, message.type, lambda body, goal: self._asked(action, body, goal), self._unwanted
+        )
+        self._offers[action] = offer
+        self._log.info("{who} offers the action {name}", who=message.source or "a client", name=action)
+        self._wire.say(link.AdvertisedAction(action=action, type=offer.type))
+
+    def withdraw(self, message: link.UnadvertiseAction) -> None:
+        """Offer it no more; its goals are aborted."""
+        offer = self._offers.pop(message.action, None)
+        if offer is None:
+            return
+        for id, pursued in list(self._goals.items()):
+            if pursued.action == message.action:
+                self._forget(id)
+        offer.close()
+
+    def feedback(self, message: link.ActionFeedback) -> None:
+        """Publish how far a goal has come."""
+        pursued = self._goals.get(message.id)
+        if pursued is None:
+            return  # it ended while this was on its way
+        try:
+            pursued.goal.feedback(arguments(message.cdr, f"feedback of {pursued.action}"))
+        except SwitchboardError as error:
+            self._log.warn("feedback of {action} is left out: {why}", action=pursued.action, why=str(error))
+
+    def result(self, message: link.ActionResult) -> None:
+        """End a goal."""
+        pursued = self._forget(message.id)
+        if pursued is None:
+            return
+        action, goal = pursued
+        try:
+            if message.result:
+                goal.finish(message.status, arguments(message.cdr, f"the result of {action}"))
+                return
+            reason = message.reason or "the client gave no reason"
+        except SwitchboardError as error:
+            reason = str(error)
+        self._log.warn("a goal of {action} ends without a result: {reason}", action=action, reason=reason)
+        # Nobody can have succeeded without a result.
+        goal.finish(ABORTED if message.status == SUCCEEDED else message.status, None)
+
+    def close(self) -> None:
+        """Offer nothing more; all goals are aborted."""
+        self._goals.clear()
+        self._ids.clear()
+        for offer in self._offers.values():
+            offer.close()
+        self._offers.clear()
+
+    def _asked(self, action: str, body: bytes, goal: ServedGoal) -> None:
+        try:
+            check_room(self._goals, "goals")
+            cdr = to_cdr(body, self._limit, f"a goal for {action}")
+        except SwitchboardError as error:
+            self._log.warn("a goal of {action} is aborted: {reason}", action=action, reason=str(error))
+            goal.finish(ABORTED, None)
+            return
+        id = f"g{next(self._next)}"
+        self._goals[id] = _Pursued(action, goal)
+        self._ids[goal] = id
+        type = self._offers[action].type
+        self._wire.say(link.SendActionGoal(id=id, action=action, type=type, feedback=True, cdr=cdr))
+
+    def _unwanted(self, goal: ServedGoal) -> None:
+        id = self._ids.get(goal)
+        if id is not None:
+            self._wire.say(link.CancelActionGoal(id=id))
+
+    def _forget(self, id: str) -> _Pursued | None:
+        pursued = self._goals.pop(id, None)
+        if pursued is not None:
+            del self._ids[pursued.goal]
+        return pursued

@@ -1,0 +1,276 @@
+"""Goals the ROS 2 platform has actions of the robot pursue: never blocking, each ending in exactly one outcome."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.action import ActionClient
+from rclpy.serialization import serialize_message
+from twisted.internet.defer import Deferred
+
+from relay_protocol.errors import Unavailable
+from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, OnSample, Outcome
+from robot_client.platforms.ros2_executor import Hop, Spinner
+from robot_client.platforms.ros2_types import Types, parse
+from robot_client.reactors import Clock, Timer
+
+LOOK = 0.02
+"""Seconds between looks for an action whose client was just made."""
+
+APPEAR = 1.0
+"""Seconds an action has to be reached."""
+
+WATCH = 0.25
+GONE = 1.0
+"""Seconds the server of a goal may be out of reach before the goal is given up."""
+
+UNHEARD = 5.0
+"""Seconds a server has to take a goal that nobody wants any more."""
+
+IDLE = 30.0
+MAX_GOALS = 2000
+"""Goals at a time, those among them that nobody waits for any more."""
+
+_STATUS = "/_action/status"
+_ENDS = frozenset((SUCCEEDED, CANCELED, ABORTED))
+
+
+class Goals:
+    """All goals of one node.
+
+    :param clock: timers and seconds
+    """
+
+    def __init__(self, node: Any, hop: Hop, spinner: Spinner, types: Types, clock: Clock) -> None:
+        self.node = node
+        self.hop = hop
+        self.spinner = spinner
+        self.clock = clock
+        self._types = types
+        self._clients: dict[tuple[str, str], _Client] = {}
+        self._watching: Timer | None = None
+
+    def pursue(self, action: str, type: str, body: bytes, on_feedback: OnSample | None) -> RosGoal:
+        """Begin one; see :meth:`robot_client.platforms.base.Platform.pursue`."""
+        kind = self._types.action(type)
+        message = parse(body, kind.Goal, f"goal of type {type}")
+        if sum(len(each.goals) for each in self._clients.values()) >= MAX_GOALS:
+            raise Unavailable(f"{MAX_GOALS} goals are under way on this robot; wait until some end")
+        client = self._clients.get((action, type))
+        if client is None:
+            client = self._clients[action, type] = _Client(ActionClient(self.node, kind, action), action)
+        goal = RosGoal(self, client, message, on_feedback)
+        client.goals.add(goal)
+        if self._watching is None:
+            self._watching = self.clock.callLater(WATCH, self._watch)
+        goal.begin()
+        return goal
+
+    def sweep(self) -> None:
+        """Destroy the clients nobody used for a while."""
+        now = self.clock.seconds()
+        for key, client in list(self._clients.items()):
+            if not client.goals and now - client.used > IDLE:
+                del self._clients[key]
+                self.spinner.do(client.ros.destroy)
+
+    def close(self) -> bool:
+        """Cancel and give up everything; whether anything was under way."""
+        goals = [goal for client in self._clients.values() for goal in client.goals]
+        for goal in goals:
+            goal.abandon("the robot is shutting down")
+        if self._watching is not None and self._watching.active():
+            self._watching.cancel()
+        return bool(goals)
+
+    def leave(self) -> None:
+        """Destroy all clients."""
+        for client in self._clients.values():
+            self.spinner.do(client.ros.destroy)
+        self._clients.clear()
+
+    def servers(self, action: str) -> frozenset[bytes]:
+        """Who serves an action, by identities that a server that was started anew does not share."""
+        return frozenset(
+            bytes(bytearray(each.endpoint_gid))
+            for each in self.node.get_publishers_info_by_topic(action + _STATUS)
+        )
+
+    def _watch(self) -> None:
+        self._watching = None
+        for client in self._clients.values():
+            if client.goals:
+                servers = self.servers(client.action)
+                for goal in list(client.goals):
+                    goal.check(servers)
+        if any(client.goals for client in self._clients.values()):
+            self._watching = self.clock.callLater(WATCH, self._watch)
+
+
+class _Client:
+    """What goals for one action share."""
+
+    def __init__(self, ros: Any, action: str) -> None:
+        self.ros = ros
+        self.action = action
+        self.goals: set[RosGoal] = set()
+        self.used = 0.0
+
+
+class _State(enum.Enum):
+    LOOKING = "looking for the server"
+    ASKED = "waiting for the server to take it"
+    RUNNING = "taken"
+    ENDED = "ended"
+
+
+class RosGoal:
+    """One goal, from looking for its server to its end; see :class:`robot_client.platforms.base.Goal`."""
+
+    def __init__(self, goals: Goals, client: _Client, message: Any, on_feedback: OnSample | None) -> None:
+        self.result: Deferred[Outcome] = Deferred()
+        self._goals = goals
+        self._client = client
+        self._message = message
+        self._on_feedback = on_feedback
+        self._state = _State.LOOKING
+        self._unwanted = False
+        self._handle: Any = None
+        self._servers: frozenset[bytes] = frozenset()
+        self._since = self._seen = goals.clock.seconds()
+        self._pending: list[Any] = []
+
+    def begin(self) -> None:
+        """Look for the server; give it the goal once it is there."""
+        if self._state is not _State.LOOKING:
+            return
+        action = self._client.action
+        if self._client.ros.server_is_ready():
+            self._state = _State.ASKED
+            self._servers = self._goals.servers(action)
+            self._seen = self._goals.clock.seconds()
+            self._goals.spinner.do(self._send)
+        elif self._goals.clock.seconds() - self._since > APPEAR:
+            self._end(NEVER_BEGAN, f"the action {action} can't be reached; its node is gone or silent")
+        else:
+            self._goals.clock.callLater(LOOK, self.begin)
+
+    def cancel(self) -> None:
+        """Want it no more; a server that has not taken it yet is told as soon as it has."""
+        if self._unwanted or self._state is _State.ENDED:
+            return
+        self._unwanted = True
+        self._since = self._goals.clock.seconds()
+        if self._state is _State.LOOKING:
+            self._end(NEVER_BEGAN, "the goal was cancelled before it began")
+        elif self._state is _State.RUNNING:
+            self._goals.spinner.do(self._handle.cancel_goal_async)
+
+    def abandon(self, reason: str) -> None:
+        """Cancel it and don't wait."""
+        self.cancel()
+        self._end(NEVER_BEGAN if self._handle is None else ABORTED, reason)
+
+    def check(self, servers: frozenset[bytes]) -> None:
+        """Give up when the server it was given to has gone, even if another one has come.
+
+        :param servers: those of the action now
+        """
+        if self._state not in (_State.ASKED, _State.RUNNING):
+            return
+        now, action = self._goals.clock.seconds(), self._client.action
+        if self._servers & servers or (not self._servers and servers):
+            self._seen = now
+        if now - self._seen > GONE:
+            if self._state is _State.ASKED:
+                self._end(NEVER_BEGAN, f"the action {action} vanished before it took the goal")
+            else:
+                self._end(ABORTED, f"the action {action} vanished before the goal ended")
+        elif self._unwanted and self._state is _State.ASKED and now - self._since > UNHEARD:
+            self._end(NEVER_BEGAN, f"the action {action} did not answer, and the goal was cancelled")
+
+    # --- in the executor's thread
+
+    def _send(self) -> None:
+        tell = self._fed if self._on_feedback is not None else None
+        try:
+            future = self._client.ros.send_goal_async(self._message, feedback_callback=tell)
+        except Exception as error:
+            self._goals.hop.put(self._failed, str(error))
+            return
+        self._pending.append(future)
+        future.add_done_callback(self._guarded(self._taken))
+
+    def _taken(self, future: Any) -> None:
+        handle = future.result()
+        if handle.accepted:
+            result = handle.get_result_async()
+            self._pending.append(result)
+            result.add_done_callback(self._guarded(self._done))
+        self._goals.hop.put(self._answered, handle)
+
+    def _done(self, future: Any) -> None:
+        response = future.result()
+        body = bytes(serialize_message(response.result))
+        self._goals.hop.put(self._arrived, (response.status, body))
+
+    def _fed(self, message: Any) -> None:
+        body = bytes(serialize_message(message.feedback))
+        self._goals.hop.put(self._feed, body, len(body))
+
+    def _guarded(self, step: Callable[[Any], None]) -> Callable[[Any], None]:
+        def run(future: Any) -> None:
+            if future.cancelled():
+                return
+            try:
+                step(future)
+            except Exception as error:
+                self._goals.hop.put(self._failed, str(error))
+
+        return run
+
+    def _forget(self) -> None:
+        for future in self._pending:
+            if not future.done():
+                future.cancel()  # rclpy would keep it for ever
+
+    # --- in the reactor's thread
+
+    def _answered(self, handle: Any) -> None:
+        if self._state is _State.ENDED:
+            if handle.accepted:  # given up, and taken after all: nobody would ever end it
+                self._goals.spinner.do(handle.cancel_goal_async)
+        elif not handle.accepted:
+            self._end(NEVER_BEGAN, f"the action {self._client.action} rejected the goal")
+        else:
+            self._state, self._handle = _State.RUNNING, handle
+            if self._unwanted:
+                self._goals.spinner.do(handle.cancel_goal_async)
+
+    def _feed(self, body: bytes) -> None:
+        if self._state is not _State.ENDED and self._on_feedback is not None:
+            self._on_feedback(body)
+
+    def _arrived(self, found: tuple[int, bytes]) -> None:
+        status, body = found
+        if status in _ENDS:
+            self._end(status, "", body)
+        else:
+            self._end(ABORTED, f"the action {self._client.action} does not know the goal any more")
+
+    def _failed(self, reason: str) -> None:
+        status = NEVER_BEGAN if self._handle is None else ABORTED
+        self._end(status, f"the goal for {self._client.action} failed: {reason}")
+
+    def _end(self, status: int, reason: str, body: bytes | None = None) -> None:
+        if self._state is _State.ENDED:
+            return
+        waiting = self._state is _State.ASKED
+        self._state = _State.ENDED
+        self._client.goals.discard(self)
+        self._client.used = self._goals.clock.seconds()
+        if not waiting:  # else it is heard out, to be cancelled if it is taken after all
+            self._goals.spinner.do(self._forget)
+        self.result.callback(Outcome(status, body, reason))

@@ -1,0 +1,74 @@
+"""When samples are written: batched, as far as the transport takes them, held ones when their time has come."""
+
+from __future__ import annotations
+
+from relay_protocol.limits import KIB
+from robot_client.reactors import Clock, Timer
+from robot_client.uplink import Uplink
+from robot_client.wire import Wire
+
+CHUNK = 64 * KIB
+
+
+class Sending:
+    """The uplink of one channel, with its timers.
+
+    :param frame_limit: largest frame the relay takes, bytes
+    """
+
+    def __init__(self, wire: Wire, clock: Clock, frame_limit: int) -> None:
+        self.uplink = Uplink(clock.seconds, frame_limit)
+        self._wire = wire
+        self._clock = clock
+        self._flush: Timer | None = None
+        self._release: Timer | None = None
+
+    def offer(self, number: int, stamp: int, body: bytes) -> None:
+        """Take one sample; see :meth:`robot_client.uplink.Uplink.offer`."""
+        self.uplink.offer(number, stamp, body)
+        if self._flush is None and self.uplink.waiting:
+            # Zero seconds: after all samples of this turn of the reactor, so they share a write.
+            self._flush = self._clock.callLater(0, self.flush)
+        self.arm()
+
+    def flush(self) -> None:
+        """Write what waits, as far as the transport takes it."""
+        if self._flush is not None and self._flush.active():
+            self._flush.cancel()
+        self._flush = None
+        while chunk := self.uplink.take(CHUNK):
+            self._wire.write(chunk)
+        if self.uplink.paused:
+            self.uplink.trim()
+
+    def pause(self) -> None:
+        """The transport is full."""
+        self.uplink.paused = True
+
+    def resume(self) -> None:
+        """The transport has room again."""
+        self.uplink.paused = False
+        self.flush()
+
+    def close(self) -> None:
+        """Write no more."""
+        for timer in (self._flush, self._release):
+            if timer is not None and timer.active():
+                timer.cancel()
+
+    def arm(self) -> None:
+        """See that the next sample held back by a throttle goes when it is due."""
+        due = self.uplink.next_due()
+        if self._release is not None and self._release.active():
+            if due is not None and self._release.getTime() <= due:
+                return
+            self._release.cancel()
+        self._release = None
+        if due is not None:
+            self._release = self._clock.callLater(max(0.0, due - self._clock.seconds()), self._let_go)
+
+    def _let_go(self) -> None:
+        self._release = None
+        self.uplink.release()
+        self.flush()
+        self.arm()

@@ -1,0 +1,62 @@
+"""What the parts of a channel need of its link, and the bounds they share."""
+
+from __future__ import annotations
+
+from collections.abc import Sized
+from typing import Protocol
+
+from relay_protocol import link
+from relay_protocol.errors import Invalid, SwitchboardError
+
+MAX_OPEN = 1000
+"""Subscriptions, publications, calls, goals and offers of each kind on one channel."""
+
+_AROUND = 2048
+"""Room for everything in a message but its ``cdr``: names and id are at most 255 characters each."""
+
+
+class Wire(Protocol):
+    """What a channel needs of its link."""
+
+    def say(self, message: link.Message) -> None:
+        """Send a message; it is never dropped."""
+
+    def write(self, frames: list[bytes]) -> None:
+        """Send sample frames; may pause the uplink."""
+
+
+class NotNow(SwitchboardError):
+    """A request of the right form that this channel can't take."""
+
+
+def check_room(table: Sized, what: str) -> None:
+    """See that one more of a kind may be open.
+
+    :param what: the kind, in the plural
+    :raises NotNow: there are :data:`MAX_OPEN`
+    """
+    if len(table) >= MAX_OPEN:
+        raise NotNow(f"this channel has {MAX_OPEN} {what} open; end some first")
+
+
+def arguments(cdr: str | None, what: str) -> bytes:
+    """The bytes of a request.
+
+    :param what: what they are for, for the errors
+    :raises SwitchboardError: there are none, or they are not base64
+    """
+    if cdr is None:
+        raise NotNow(f"the arguments of {what} must come as CDR")
+    return link.from_base64(cdr, "cdr")
+
+
+def to_cdr(body: bytes, frame_limit: int, what: str) -> str:
+    """Bytes for the ``cdr`` of a message.
+
+    :param frame_limit: largest frame the relay takes, bytes
+    :param what: what they are, for the error
+    :raises Invalid: the message would be larger than the relay takes, which costs the whole link
+    """
+    if (len(body) + 2) // 3 * 4 + _AROUND > frame_limit:
+        raise Invalid(f"{what} has {len(body)} bytes, more than fit into one message to the relay")
+    return link.to_base64(body)

@@ -1,0 +1,187 @@
+"""Actions the platform offers to a real graph, with either executor."""
+
+from __future__ import annotations
+
+import pytest
+import pytest_twisted
+from example_interfaces.action import Fibonacci
+from rclpy.serialization import deserialize_message, serialize_message
+from twisted.internet import reactor, task
+
+from relay_protocol.errors import Invalid, NotFound
+from robot_client.platforms.base import ABORTED, CANCELED, SUCCEEDED, Offer, ServedGoal
+from robot_client.platforms.ros2 import Ros2Platform
+from tests.robot_client.ros import Peer, until
+
+FIBONACCI = "example_interfaces/action/Fibonacci"
+
+
+def result(*sequence: int) -> bytes:
+    return bytes(serialize_message(Fibonacci.Result(sequence=sequence)))
+
+
+def feedback(*sequence: int) -> bytes:
+    return bytes(serialize_message(Fibonacci.Feedback(sequence=sequence)))
+
+
+class Client:
+    """Somebody at the relay who pursues goals."""
+
+    def __init__(self, ros: Ros2Platform, action: str) -> None:
+        self.orders: list[int] = []
+        self.goals: list[ServedGoal] = []
+        self.unwanted: list[ServedGoal] = []
+        self.offer: Offer = ros.act(action, "example_interfaces/Fibonacci", self.take, self.unwanted.append)
+
+    def take(self, body: bytes, goal: ServedGoal) -> None:
+        self.orders.append(deserialize_message(body, Fibonacci.Goal).order)
+        self.goals.append(goal)
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_is_pursued(ros: Ros2Platform, peer: Peer) -> None:
+    """A node's goal comes as CDR; feedback reaches the node in order, and the result with its status."""
+    client, action = Client(ros, "/pursued"), "/pursued"
+    assert client.offer.type == FIBONACCI
+    peer.record.clear()
+    peer.do("send", action, 5)
+    await until(lambda: client.goals)
+    assert client.orders == [5]
+    for number in range(5):
+        client.goals[0].feedback(feedback(*range(number)))
+    await until(lambda: len(peer.told("feedback", action)) == 5)  # the result would overtake it
+    client.goals[0].finish(SUCCEEDED, result(0, 1, 1))
+    await until(lambda: peer.told("result", action))
+    assert peer.told("taken", action)[0]["accepted"] is True
+    assert [each["sequence"] for each in peer.told("feedback", action)] == [
+        [*range(each)] for each in range(5)
+    ]
+    done = peer.told("result", action)[0]
+    assert (done["status"], done["sequence"]) == (SUCCEEDED, [0, 1, 1])
+    client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_goals_are_pursued_side_by_side(ros: Ros2Platform, peer: Peer) -> None:
+    """Goals that are under way hold up neither each other nor the executor, and end in any order."""
+    client, action = Client(ros, "/many"), "/many"
+    peer.record.clear()
+    for order in range(6):
+        peer.do("send", action, order)
+    await until(lambda: len(client.goals) == 6)
+    assert ros.trouble() is None
+    by_order = dict(zip(client.orders, client.goals, strict=True))
+    for order in (3, 5, 0, 1, 4, 2):
+        by_order[order].finish(SUCCEEDED, result(order))
+        await until(
+            lambda order=order: [each for each in peer.told("result", action) if each["order"] == order]
+        )
+    assert [each["sequence"] for each in peer.told("result", action)] == [[3], [5], [0], [1], [4], [2]]
+    client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_cancel_comes_to_the_client(ros: Ros2Platform, peer: Peer) -> None:
+    """A node's wish to cancel is told to the client, whose canceled result reaches the node."""
+    client, action = Client(ros, "/cancelled"), "/cancelled"
+    peer.record.clear()
+    peer.do("send", action, 1)
+    await until(lambda: client.goals and peer.told("taken", action))
+    peer.do("cancel", action)
+    await until(lambda: client.unwanted)
+    assert client.unwanted == client.goals
+    client.goals[0].finish(CANCELED, result(7))
+    await until(lambda: peer.told("result", action))
+    done = peer.told("result", action)[0]
+    assert (done["status"], done["sequence"]) == (CANCELED, [7])
+    client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_canceled_without_being_asked_is_an_abort(ros: Ros2Platform, peer: Peer) -> None:
+    """A client that says canceled of a goal nobody cancelled, or any other status, has aborted it."""
+    client, action = Client(ros, "/given_up"), "/given_up"
+    peer.record.clear()
+    for number, status in enumerate((CANCELED, ABORTED, 0, 99)):
+        peer.do("send", action, number)
+        await until(lambda number=number: len(client.goals) > number)
+        client.goals[number].finish(status, None)
+        await until(lambda number=number: len(peer.told("result", action)) > number)
+    assert [each["status"] for each in peer.told("result", action)] == [ABORTED] * 4
+    client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_bytes_that_are_no_result_end_nothing(ros: Ros2Platform, peer: Peer) -> None:
+    """Bytes that are no feedback or result are refused in words, and the goal goes on."""
+    client, action = Client(ros, "/odd"), "/odd"
+    peer.record.clear()
+    peer.do("send", action, 1)
+    await until(lambda: client.goals)
+    with pytest.raises(Invalid, match="no feedback"):
+        client.goals[0].feedback(b"\0")
+    with pytest.raises(Invalid, match="no result"):
+        client.goals[0].finish(SUCCEEDED, b"\0\1\2")
+    client.goals[0].finish(SUCCEEDED, result(1))
+    client.goals[0].finish(ABORTED, None)
+    client.goals[0].feedback(feedback(1))
+    await until(lambda: peer.told("result", action))
+    assert peer.told("result", action)[0]["status"] == SUCCEEDED
+    client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_withdrawn_action_aborts_its_goals(ros: Ros2Platform, peer: Peer) -> None:
+    """Who waits for a goal of an action that is withdrawn hears that it was aborted; it can be offered again."""
+    client, action = Client(ros, "/withdrawn"), "/withdrawn"
+    peer.record.clear()
+    peer.do("send", action, 1)
+    await until(lambda: client.goals)
+    client.offer.close()
+    await until(lambda: peer.told("result", action))
+    assert peer.told("result", action)[0]["status"] == ABORTED
+    again = Client(ros, action)
+
+    def pursued() -> bool:
+        for goal in again.goals:
+            goal.finish(SUCCEEDED, result(2))
+        return len(peer.told("result", action)) > 1
+
+    # The former server may still take the first of them; it rejects it.
+    await until(lambda: peer.do("send", action, 2) or pursued())
+    assert peer.told("result", action)[1]["status"] == SUCCEEDED
+    again.offer.close()
+    served = ros._node.get_service_names_and_types_by_node
+    await until(lambda: not [name for name, _ in served("switchboard_test", "/") if name.startswith(action)])
+
+
+@pytest_twisted.ensureDeferred
+async def test_open_goals_cost_nothing(ros: Ros2Platform, peer: Peer) -> None:
+    """The executor's thread sleeps while a goal is pursued elsewhere."""
+    client = Client(ros, "/idle")
+    peer.do("send", "/idle", 1)
+    await until(lambda: client.goals)
+    await task.deferLater(reactor, 0.2)
+    assert ros._spinner._work == type(ros._spinner._work)()
+    assert not getattr(ros._spinner._executor, "_tasks", [])
+    client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_can_not_be_offered_is_said(ros: Ros2Platform, peer: Peer) -> None:
+    """An action another node has, one offered already, a bad name and an unknown type are refused in words."""
+    if "/robots_own" not in ros.graph().actions:
+        peer.do("act", "/robots_own", "count")
+    await until(lambda: "/robots_own" in ros.graph().actions)
+    with pytest.raises(Invalid, match="/robot/peer offers it"):
+        Client(ros, "/robots_own")
+    client = Client(ros, "/ours")
+    with pytest.raises(Invalid, match="already"):
+        Client(ros, "ours")
+    client.offer.close()
+    with pytest.raises(Invalid, match="no action name"):
+        Client(ros, "/not a name")
+    with pytest.raises(NotFound, match="no_such/action/Thing"):
+        ros.act("/free", "no_such/action/Thing", client.take, client.unwanted.append)
+    with pytest.raises(Invalid, match="no type of actions"):
+        ros.act("/free", "std_msgs/msg/String", client.take, client.unwanted.append)

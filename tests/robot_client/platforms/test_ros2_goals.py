@@ -1,0 +1,215 @@
+"""Goals the platform has actions of a real graph pursue, with either executor."""
+
+from __future__ import annotations
+
+import pytest
+import pytest_twisted
+from example_interfaces.action import Fibonacci
+from rclpy.serialization import deserialize_message, serialize_message
+from twisted.internet import reactor, task
+
+from relay_protocol.errors import Invalid, NotFound
+from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, Outcome
+from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.ros2_goals import RosGoal
+from tests.robot_client.ros import Peer, until
+
+FIBONACCI = "example_interfaces/action/Fibonacci"
+
+
+class Wanted:
+    """A goal, what was heard of it, and how it ended."""
+
+    def __init__(
+        self, ros: Ros2Platform, action: str, order: int = 5, listen: bool = True, type: str = FIBONACCI
+    ):
+        body = bytes(serialize_message(Fibonacci.Goal(order=order)))
+        self.fed: list[list[int]] = []
+        self.outcomes: list[Outcome] = []
+        self.goal: RosGoal = ros.pursue(action, type, body, self.feed if listen else None)
+        self.goal.result.addCallback(self.outcomes.append)
+
+    def feed(self, body: bytes) -> None:
+        self.fed.append(list(deserialize_message(body, Fibonacci.Feedback).sequence))
+
+    async def end(self) -> Outcome:
+        await until(lambda: self.outcomes)
+        return self.outcomes[0]
+
+
+async def serve(ros: Ros2Platform, peer: Peer, action: str, kind: str) -> None:
+    if not [each for each in peer.record if each.get("done") == "act " + action]:
+        peer.do("act", action, kind)
+        peer.record.append({"done": "act " + action})
+    await until(lambda: action in ros.graph().actions)
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_succeeds(ros: Ros2Platform, peer: Peer) -> None:
+    """A goal's feedback comes while it is pursued, and its result at the end, with the type from the graph too."""
+    await serve(ros, peer, "/count", "count")
+    for type in (FIBONACCI, "example_interfaces/Fibonacci", ""):
+        wanted = Wanted(ros, "/count", 5, type=type)
+        status, body, reason = await wanted.end()
+        assert (status, reason) == (SUCCEEDED, "")
+        assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1, 2, 3]
+        assert all(each == [0, 1, 1, 2, 3][: len(each)] for each in wanted.fed)
+
+
+@pytest_twisted.ensureDeferred
+async def test_feedback_comes_only_when_asked(ros: Ros2Platform, peer: Peer) -> None:
+    """Who does not ask for feedback gets none; who does gets it in order."""
+    await serve(ros, peer, "/forever", "forever")
+    silent, heard = Wanted(ros, "/forever", 6, listen=False), Wanted(ros, "/forever", 6)
+    await until(lambda: len(heard.fed) > 4)
+    assert all(each == [0, 1, 1, 2, 3, 5][: len(each)] for each in heard.fed)
+    assert heard.fed == sorted(heard.fed)
+    assert silent.fed == []
+    for wanted in (silent, heard):
+        wanted.goal.cancel()
+        assert (await wanted.end()).status == CANCELED
+
+
+@pytest_twisted.ensureDeferred
+async def test_cancelled_goal_ends_with_its_result(ros: Ros2Platform, peer: Peer) -> None:
+    """A goal that is cancelled while it runs ends canceled, with the result the server gave."""
+    await serve(ros, peer, "/forever", "forever")
+    wanted = Wanted(ros, "/forever", 3)
+    await until(lambda: wanted.fed)
+    wanted.goal.cancel()
+    wanted.goal.cancel()
+    status, body, _ = await wanted.end()
+    assert status == CANCELED
+    assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1]
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_can_be_cancelled_before_it_is_taken(ros: Ros2Platform, peer: Peer) -> None:
+    """A goal that is cancelled while its server still thinks about it is cancelled as soon as it is taken."""
+    await serve(ros, peer, "/late", "late")
+    first = Wanted(ros, "/late", 3)
+    await first.end()
+    wanted = Wanted(ros, "/late", 3)
+    await task.deferLater(reactor, 0.1)
+    wanted.goal.cancel()
+    assert wanted.outcomes == []
+    # This server had pursued it before it looked at the cancellation; what counts is that there is one end.
+    assert (await wanted.end()).status in (SUCCEEDED, CANCELED)
+    assert len(wanted.outcomes) == 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_cancelled_at_once_never_begins(ros: Ros2Platform, peer: Peer) -> None:
+    """A goal that is cancelled before its server was found ends at once."""
+    wanted = Wanted(ros, "/nobody_there", 3)
+    wanted.goal.cancel()
+    assert wanted.outcomes[0].status == NEVER_BEGAN
+    assert "cancelled before it began" in wanted.outcomes[0].reason
+
+
+@pytest_twisted.ensureDeferred
+async def test_rejected_goal_never_began(ros: Ros2Platform, peer: Peer) -> None:
+    """A goal the server rejects has no result, and words that say so."""
+    await serve(ros, peer, "/reject", "reject")
+    assert await Wanted(ros, "/reject").end() == Outcome(
+        NEVER_BEGAN, None, "the action /reject rejected the goal"
+    )
+
+
+@pytest_twisted.ensureDeferred
+async def test_aborted_goal_has_its_result(ros: Ros2Platform, peer: Peer) -> None:
+    """An aborted goal comes with the result the server gave."""
+    await serve(ros, peer, "/abort", "abort")
+    status, body, _ = await Wanted(ros, "/abort", 4).end()
+    assert status == ABORTED
+    assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1, 2]
+
+
+@pytest_twisted.ensureDeferred
+async def test_action_that_is_not_there_is_not_waited_for(ros: Ros2Platform) -> None:
+    """A goal for an action nobody serves ends in words after a second; without a type it can't even begin."""
+    status, body, reason = await Wanted(ros, "/nowhere").end()
+    assert (status, body) == (NEVER_BEGAN, None)
+    assert "/nowhere can't be reached" in reason
+    with pytest.raises(NotFound, match="no action /unheard"):
+        Wanted(ros, "/unheard", type="")
+
+
+@pytest_twisted.ensureDeferred
+async def test_server_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: Peer) -> None:
+    """A goal whose server is taken away ends aborted, with the reason."""
+    peer.do("act", "/doomed", "forever")
+    await until(lambda: "/doomed" in ros.graph().actions)
+    wanted = Wanted(ros, "/doomed", 3)
+    await until(lambda: wanted.fed)
+    peer.do("unact", "/doomed")
+    status, body, reason = await wanted.end()
+    assert (status, body) == (ABORTED, None)
+    assert "/doomed vanished" in reason
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_makes_no_goal_is_said(ros: Ros2Platform, peer: Peer) -> None:
+    """Another type than the action has, bytes that are no goal and a bad name are refused in words."""
+    await serve(ros, peer, "/count", "count")
+    with pytest.raises(Invalid, match="is of type example_interfaces/action/Fibonacci"):
+        Wanted(ros, "/count", type="switchboard_test_interfaces/action/Everything")
+    with pytest.raises(Invalid, match="no goal of type"):
+        ros.pursue("/count", FIBONACCI, b"\0", None)
+    with pytest.raises(Invalid, match="no action name"):
+        Wanted(ros, "/not a name")
+
+
+@pytest_twisted.ensureDeferred
+async def test_idle_clients_are_swept(ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client of an action nobody asked for in a while is taken away, not one with a goal under way."""
+    await serve(ros, peer, "/forever", "forever")
+    await serve(ros, peer, "/count", "count")
+    running = Wanted(ros, "/forever", 3)
+    await Wanted(ros, "/count").end()
+    await until(lambda: running.fed)
+    kept = ros._goals.clock
+    monkeypatch.setattr(
+        ros._goals, "clock", type("Later", (), {"seconds": lambda _: reactor.seconds() + 1e6})()
+    )
+    ros._goals.sweep()
+    monkeypatch.setattr(ros._goals, "clock", kept)
+    assert [action for action, _ in ros._goals._clients] == ["/forever"]
+    running.goal.cancel()
+    assert (await running.end()).status == CANCELED
+
+
+@pytest_twisted.ensureDeferred
+async def test_leaving_cancels_what_is_under_way(
+    executor_kind: str, environment: dict[str, str], peer: Peer
+) -> None:
+    """A daemon that leaves cancels the goals it asked for, and each has an outcome."""
+    ros = Ros2Platform(reactor, "switchboard_brief", executor=executor_kind)
+    ros.start()
+    try:
+        await serve(ros, peer, "/forever", "forever")
+        peer.record[:] = [each for each in peer.record if each.get("ended") != "/forever"]
+        wanted = Wanted(ros, "/forever", 3)
+        await until(lambda: wanted.fed)
+    finally:
+        ros.stop()
+    assert wanted.outcomes[0].status == ABORTED
+    peer.until(lambda: peer.told("ended", "/forever"))
+    assert peer.told("ended", "/forever")[0]["canceled"] is True
+
+
+def test_interfaces_of_the_robot_are_known(ros: Ros2Platform) -> None:
+    """All installed types are named, each with a definition: actions in three parts, with a hash."""
+    names = ros.interfaces()
+    assert names == sorted(set(names))
+    assert {FIBONACCI, "std_msgs/msg/String", "switchboard_test_interfaces/srv/Everything"} <= set(names)
+    for name in names:
+        assert ros.definition(name).type == name
+    found = ros.definition(FIBONACCI)
+    assert found.text == "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"
+    assert found.hash.startswith("RIHS01_")
+
+
+@pytest.fixture(params=["events", "single"])
+def executor_kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)

@@ -1,0 +1,64 @@
+"""One channel on the memory platform, and a recorder in place of its link."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.task import Clock
+
+from relay_protocol import link
+from relay_protocol.frames import FrameDecoder, SampleFrame
+from relay_protocol.link import MotionPolicy
+from robot_client.channel import Channel
+from robot_client.motion import MotionDesk, NoGuard
+from robot_client.offset import Offset
+from robot_client.platforms.base import GraphView
+from robot_client.platforms.memory import TWIST, MemoryPlatform
+from robot_client.wire import Wire
+
+STRING = "std_msgs/msg/String"
+
+
+class Recorder(Wire):
+    def __init__(self) -> None:
+        self.said: list[Any] = []
+        self.writes: list[list[bytes]] = []
+
+    def say(self, message: link.Message) -> None:
+        self.said.append(message)
+
+    def write(self, frames: list[bytes]) -> None:
+        self.writes.append(frames)
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.clock.advance(100)
+        self.platform = MemoryPlatform(GraphView(topics={"/chat": link.Topic(types=[STRING])}))
+        self.wire = Recorder()
+        self.offset = Offset()
+        self.offset.add(self.now(), self.now(), self.now())
+        policy = MotionPolicy(types=[TWIST])
+        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, NoGuard())
+        self.channel = Channel(
+            "c1", self.wire, self.offset, self.platform, self.desk, self.clock, 2**24, wall=lambda: 777
+        )
+
+    def now(self) -> int:
+        return round(self.clock.seconds() * 1e9)
+
+    def ask(self, message: link.Message) -> Any:
+        self.channel.handle(message)
+        return self.wire.said[-1] if self.wire.said else None
+
+    def frames(self) -> list[SampleFrame]:
+        data = b"".join(piece for write in self.wire.writes for piece in write)
+        return FrameDecoder(2**25).feed(data)  # type: ignore[return-value]
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds * 100)):
+            self.clock.advance(0.01)
+
+    def drive(self, body: bytes) -> None:
+        self.channel.sample(SampleFrame(5, self.now(), body))
