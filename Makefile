@@ -1,12 +1,12 @@
 # The commands people and CI use. Everything lives in .venv; nothing is installed outside, except what apt brings
-# when run as root (python3-venv, chromium).
+# when run as root (python3-venv, gcc, chromium; haproxy for bench).
 BIN := .venv/bin
 # ROS 2 would write its logs into the home directory, and not start without one.
 export ROS_LOG_DIR ?= $(CURDIR)/build/ros-log
 NPM := scripts/with-node.sh npm --silent --prefix web_client
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types web clean
+.PHONY: help setup demo test bench lint types web clean
 
 help: ## list these commands
 	@echo 'make <command>:'
@@ -22,6 +22,10 @@ demo: ## run a relay with two simulated robots and print how to log in (options:
 test: setup ## all tests: Python, ROS 2, browser, portal (options: PYTEST='-k drive')
 	$(BIN)/python -m pytest $(PYTEST)
 	$(NPM) run test
+
+bench: ## measure beside alternatives, about 15 minutes (options: BENCH='hop fanout', BENCH='--quick')
+	@scripts/setup.sh python interfaces bench
+	$(BIN)/python -m bench $(BENCH)
 
 lint: setup ## style and import rules
 	$(BIN)/ruff check .

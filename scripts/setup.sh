@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Prepares .venv and what lives beside it. Each stage remembers what it was done for, so a second run is instant.
-#   scripts/setup.sh [python] [web] [interfaces] [fixtures] [browser]      (all, if none is named)
+#   scripts/setup.sh [python] [web] [interfaces] [fixtures] [browser]      (all of these, if none is named)
+#   scripts/setup.sh bench                                                 (what 'make bench' compares with)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -132,6 +133,30 @@ stage_web() {
 
 # --- ROS interfaces that no wheel brings ------------------------------------------------------------------------
 
+has_compilers() { command -v gcc >/dev/null && command -v g++ >/dev/null; }
+
+has_headers() {
+    $venv/bin/python -c \
+        'import pathlib, sys, sysconfig; sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())'
+}
+
+# What compiling takes, installed where that may be done. Fails, and names in words what is missing, where not.
+need_compilers() {
+    local headers
+    headers=python$($venv/bin/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')-dev
+    if can_apt; then
+        has_compilers || apt_install gcc g++ || true
+        has_headers || apt_install "$headers" || true
+    fi
+    if ! has_compilers; then
+        say "no gcc and g++ (Debian, Ubuntu: apt install gcc g++)"
+        return 1
+    elif ! has_headers; then
+        say "no Python.h for $venv/bin/python (Debian, Ubuntu: apt install $headers)"
+        return 1
+    fi
+}
+
 # build_packages <stamp> <what> <consequence when it can't be done> <folder>...
 build_packages() {
     local stamp=$1 what=$2 without=$3 wanted
@@ -142,8 +167,8 @@ build_packages() {
         say "no ROS 2 wheels for this machine: $what not built; $without"
         return
     fi
-    if ! command -v gcc >/dev/null || ! command -v g++ >/dev/null; then
-        say "no gcc and g++: $what not built; $without (apt install g++)"
+    if ! need_compilers; then
+        say "$what not built: $without"
         return
     fi
     if run "ROS interfaces ($what)" $venv/bin/python scripts/build_interfaces.py "$@"; then
@@ -175,6 +200,25 @@ stage_browser() {
     fi
 }
 
+# --- What 'make bench' compares with; no other command needs it -----------------------------------------------------
+
+stage_bench() {
+    local wanted
+    stage_python
+    wanted="bench $(fingerprint setup.cfg)"
+    if ! done_for bench "$wanted"; then
+        run "Python packages for bench" \
+            $venv/bin/python -m pip install --disable-pip-version-check -e ".[$extras,bench]"
+        note_done bench "$wanted"
+    fi
+    if ! command -v cc >/dev/null && ! { can_apt && apt_install gcc libc6-dev; }; then
+        say "no C compiler: most measurements are left out (Debian, Ubuntu: apt install gcc libc6-dev)"
+    fi
+    if ! PATH="$PATH:/usr/sbin" command -v haproxy >/dev/null && ! { can_apt && apt_install haproxy; }; then
+        say "no HAProxy: 'latency' is left out (Debian, Ubuntu: apt install haproxy)"
+    fi
+}
+
 began=$SECONDS
 for stage in "${@:-all}"; do
     case $stage in
@@ -185,8 +229,8 @@ for stage in "${@:-all}"; do
             stage_fixtures
             stage_browser
             ;;
-        python | web | interfaces | fixtures | browser) "stage_$stage" ;;
-        *) fail "there is no stage '$stage'; there are python, web, interfaces, fixtures and browser" ;;
+        python | web | interfaces | fixtures | browser | bench) "stage_$stage" ;;
+        *) fail "there is no stage '$stage'; there are python, web, interfaces, fixtures, browser and bench" ;;
     esac
 done
 if [ $((SECONDS - began)) -gt 2 ]; then
