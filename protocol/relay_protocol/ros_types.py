@@ -17,6 +17,7 @@ import orjson
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
 from relay_protocol.limits import COMMAND_FRAME, MIB, TYPE_TEXTS
+from relay_protocol.ros import fast_reader
 from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
 from relay_protocol.ros.reader import ReaderFactory
 from relay_protocol.ros.typedefs import typedef
@@ -61,7 +62,7 @@ class _Compiled:
     def _reader(self, name: str, form: str) -> Reader:
         encode = _ENCODERS[form]
 
-        def read(cdr: bytes) -> bytes:
+        def slow(cdr: bytes) -> bytes:
             if len(cdr) < 4:
                 raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
             try:
@@ -69,7 +70,7 @@ class _Compiled:
             except Invalid as error:
                 raise Invalid(f"{name}: {error}") from None
 
-        return read
+        return fast_reader.generate(name, self.definitions, form, slow)
 
     def _factory(self, encapsulation: bytes, form: str) -> ReaderFactory:
         order = _ORDERS.get(encapsulation)
@@ -120,7 +121,7 @@ _ANY: msgspec.json.Decoder[Any] = msgspec.json.Decoder()
 
 
 def _json(value: Any) -> bytes:
-    return orjson.dumps(value, None, orjson.OPT_SERIALIZE_NUMPY)
+    return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
 _ENCODERS: dict[str, Callable[[Any], bytes]] = {"json": _json, "cbor": cbor2.dumps}

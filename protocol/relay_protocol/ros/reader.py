@@ -296,7 +296,8 @@ def _numbers(primitive: Primitive, order: str) -> Convert:
     def convert(data: bytes, position: int, count: int) -> Any:
         if not count:
             return []
-        numbers = numpy.frombuffer(data, dtype, count, position)
+        # A copy, because orjson takes no array whose memory is not aligned; the head moves that by 4.
+        numbers = numpy.frombuffer(data[position : position + count * dtype.itemsize], dtype)
         return numbers if order == _NATIVE else numbers.astype(native)
 
     return convert
