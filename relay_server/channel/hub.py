@@ -15,7 +15,7 @@ from relay_server.registry import Presence
 class Channels:
     """Opens channels on demand and tells robots' joining links to which one they belong.
 
-    :param new_ticket: makes an unguessable text
+    :param new_ticket: makes an unguessable text, for tickets and for what clients are asked
     :param wall_ns: Unix time in nanoseconds
     """
 
@@ -49,6 +49,7 @@ class Channels:
                 linger=self._linger,
                 issue_ticket=self._issue,
                 closed=self._forget,
+                new_id=self._new_ticket,
                 wall_ns=self._wall_ns,
             )
         return channel

@@ -12,11 +12,18 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits, link
 from relay_protocol.errors import SwitchboardError, Unavailable
-from relay_server.channel.calls import GRACE, Calls, call_seconds
+from relay_server.access import Permit
+from relay_server.channel.bodies import Bodies
+from relay_server.channel.calls import GRACE, Calls
 from relay_server.channel.definitions import Definitions
+from relay_server.channel.errands import Errands
+from relay_server.channel.goal import Asker, ClientGoal
+from relay_server.channel.goals import Goals
 from relay_server.channel.interfaces import Interfaces
+from relay_server.channel.offers import ACTIONS, SERVICES, Offers
 from relay_server.channel.publications import Publications
 from relay_server.channel.robot_clock import RobotClock
+from relay_server.channel.serving import ServedCalls, call_seconds
 from relay_server.channel.subscriptions import Subscriptions
 from relay_server.channel.wire import ChannelLink, Member, Wire
 from relay_server.clock import Clock, Timer, cancel
@@ -76,6 +83,7 @@ class Channel:
     :param linger: seconds it stays open after the last member
     :param issue_ticket: makes the ticket the robot joins with
     :param closed: called once, when it is over
+    :param new_id: makes an unguessable text
     :param wall_ns: Unix time in nanoseconds
     """
 
@@ -90,6 +98,7 @@ class Channel:
         linger: float,
         issue_ticket: Callable[[Channel], str],
         closed: Callable[[Channel], None],
+        new_id: Callable[[], str],
         wall_ns: Callable[[], int],
     ) -> None:
         self._clock = clock
@@ -113,7 +122,13 @@ class Channel:
         self.now_ns = self._robot_clock.now_ns
         """The robot's time, nanoseconds."""
         self.publications = Publications(clock, self.wire, definitions, self.now_ns)
-        self._calls = Calls(clock, self.wire, definitions)
+        bodies = Bodies(self.wire, definitions, self.now_ns)
+        errands = Errands(clock, new_id)
+        self.services = Offers(self.wire, definitions, SERVICES, errands.offer_ended)
+        self.actions = Offers(self.wire, definitions, ACTIONS, errands.offer_ended)
+        self.served = ServedCalls(clock, self.wire, bodies, self.services, errands)
+        self.goals = Goals(self.wire, bodies, self.actions, errands)
+        self._calls = Calls(clock, self.wire, bodies, self.services, self.served)
         robot.watchers.append(self)
 
     # --- members ------------------------------------------------------------------------------------------
@@ -134,8 +149,16 @@ class Channel:
         self.members.discard(member)
         self.subscriptions.forget(member)
         self.publications.forget(member)
+        self.services.forget(member)
+        self.actions.forget(member)
+        self.goals.forget(member)
         if not self.members and self._idle is None and self.state is not State.CLOSED:
             self._idle = self._clock.callLater(self._linger, self._idle_over)
+
+    def forget_denied(self, member: Member, permit: Permit) -> None:
+        """A session's rights have changed: what it may not give to the robot any more is taken back."""
+        for part in (self.publications, self.services, self.actions):
+            part.forget_denied(member, permit)
 
     def _idle_over(self) -> None:
         self._idle = None
@@ -149,7 +172,7 @@ class Channel:
         self._happen(Event.SHUT)
 
     async def call(self, service: str, type_name: str, args: bytes, timeout: float | None) -> bytes:
-        """Call a service of the robot; see :meth:`Calls.call`. Waits for the channel while it opens.
+        """Call a service on the robot; see :meth:`Calls.call`. Waits for the channel while it opens.
 
         :raises Unavailable: besides the cases there, the robot is offline
         """
@@ -157,10 +180,34 @@ class Channel:
 
         async def work() -> bytes:
             await self._open()
-            return await self._calls.call(service, type_name, args, seconds, self.now_ns())
+            return await self._calls.call(service, type_name, args, seconds)
 
         # One second more than the call itself has: its own words are the better ones.
-        return await self._within(seconds + 2 * GRACE, work())
+        return await self.within(seconds + 2 * GRACE, work())
+
+    def pursue(
+        self,
+        member: Member,
+        asker: Asker,
+        action: str,
+        type_name: str,
+        args: bytes,
+        *,
+        feedback: bool,
+    ) -> ClientGoal:
+        """Have a goal pursued; see :meth:`Goals.begin`. All that comes of it is told to ``asker``, failures too.
+
+        :param feedback: whether that is wanted
+        """
+        goal = self.goals.want(member, asker, action, feedback)
+
+        async def work() -> None:
+            await self._open()
+            await self.goals.begin(goal, type_name, args)
+
+        goal.beginning = Deferred.fromCoroutine(self.within(limits.CALL_SECONDS, work()))
+        goal.beginning.addErrback(self.goals.not_begun, goal)
+        return goal
 
     async def round_trip(self) -> float:
         """Seconds for a ping to the robot over this channel's own link.
@@ -172,7 +219,7 @@ class Channel:
             await self._open()
             return await self._ping()
 
-        return await self._within(limits.CALL_SECONDS, work())
+        return await self.within(limits.CALL_SECONDS, work())
 
     def _ping(self) -> Deferred[float]:
         """One ping serves all who ask while it is under way."""
@@ -191,18 +238,20 @@ class Channel:
             if not each.called:
                 each.errback(result) if isinstance(result, Failure) else each.callback(result)
 
-    async def definition(self, type_name: str) -> None:
+    async def definition(self, type_name: str, text: bool = False) -> None:
         """Wait until the robot's definition of a type is known.
 
-        :raises Invalid: the robot does not have it
+        :param text: wait for the robot's text of just this type; else one that contains it will do
+        :raises NotFound: the robot does not have it
+        :raises Invalid: the robot's definition is unusable
         :raises Unavailable: the robot is offline
         """
 
         async def work() -> None:
             await self._open()
-            await self._definitions.ready(type_name)
+            await self._definitions.ready(type_name, text)
 
-        await self._within(limits.CALL_SECONDS, work())
+        await self.within(limits.CALL_SECONDS, work())
 
     async def interfaces(self) -> list[str]:
         """The full names of all types the robot can tell the definition of.
@@ -214,9 +263,9 @@ class Channel:
             await self._open()
             return await self._interfaces.names()
 
-        return await self._within(limits.CALL_SECONDS, work())
+        return await self.within(limits.CALL_SECONDS, work())
 
-    async def _within(self, seconds: float, work: Coroutine[Deferred[Any], Any, T]) -> T:
+    async def within(self, seconds: float, work: Coroutine[Deferred[Any], Any, T]) -> T:
         """Whatever the robot leaves out, nobody waits longer than this for it."""
         running = Deferred.fromCoroutine(work)
         late = Unavailable(f"robot {self.robot.name} did not answer within {seconds:g} s")
@@ -252,6 +301,8 @@ class Channel:
         """The robot told of a change in its graph."""
         self.subscriptions.graph_changed()
         self.publications.graph_changed()
+        self.services.graph_changed()
+        self.actions.graph_changed()
 
     def described(self) -> None:
         """The robot told facts about itself."""
@@ -291,6 +342,11 @@ class Channel:
             self._definitions.refused(message.ref, reason)
         elif message.what == "get_interfaces":
             self._interfaces.refused(reason)
+        elif message.what == "send_action_goal":
+            self.goals.robot_refused(message.ref, reason)
+        elif message.what in (SERVICES.op, ACTIONS.op):
+            offers = self.services if message.what == SERVICES.op else self.actions
+            offers.refused(message.ref, reason)
         elif message.ref.isdecimal():
             refuse = {"subscribe": self.subscriptions.refused, "advertise": self.publications.refused}
             if message.what in refuse:
@@ -338,6 +394,8 @@ class Channel:
         self._robot_clock.follow()
         self.subscriptions.opened()
         self.publications.opened()
+        self.services.opened()
+        self.actions.opened()
         self._tell_waiting(None)
 
     def _leave_open(self, event: Event) -> None:
@@ -346,16 +404,22 @@ class Channel:
             broken.close(event.value)
         self.subscriptions.lost()
         self.publications.lost()
+        self.services.lost()
+        self.actions.lost()
         self.wire.asks.reset()
         self._definitions.reset()
         self._interfaces.reset()
         self._robot_clock.lost()
         self._calls.lost()
+        self.served.lost()
+        self.goals.lost()
 
     def _end(self) -> None:
         if self.robot.control is not None:
             self.robot.control.send(link.CloseChannel(channel=self.name))
         self._tell_waiting(Unavailable("the channel was closed"))
+        self.services.shut()
+        self.actions.shut()
         self.robot.watchers.remove(self)
         self._closed(self)
 
@@ -373,6 +437,13 @@ _HANDLERS: dict[type, Callable[[Channel, Any], None]] = {
     link.Advertised: lambda channel, message: channel.publications.advertised(message),
     link.ServiceResponse: lambda channel, message: channel._calls.answered(message),
     link.Interfaces: lambda channel, message: channel._interfaces.told(message),
+    link.CallService: lambda channel, message: channel.served.called(message),
+    link.SendActionGoal: lambda channel, message: channel.goals.graph_asks(message),
+    link.CancelActionGoal: lambda channel, message: channel.goals.graph_cancels(message),
+    link.ActionFeedback: lambda channel, message: channel.goals.robot_feedback(message),
+    link.ActionResult: lambda channel, message: channel.goals.robot_result(message),
+    link.AdvertisedService: lambda channel, message: channel.services.advertised(message.service),
+    link.AdvertisedAction: lambda channel, message: channel.actions.advertised(message.action),
     link.TypeDefinition: lambda channel, message: channel._definitions.add(message),
     link.Failed: lambda channel, message: channel._failed(message),
 }

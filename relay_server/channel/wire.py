@@ -15,7 +15,7 @@ from relay_server.clock import Clock, Timer, cancel
 from relay_server.registry import Presence
 
 NAMES = 4096
-"""Topics subscribed or advertised on one robot at a time."""
+"""Topics subscribed or advertised, and services and actions offered, on one robot at a time."""
 
 USER_TOPICS = 256
 """Topics of one robot that one user may have subscribed, and again advertised, over all connections."""
@@ -38,6 +38,9 @@ class ChannelLink(Protocol):
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Queue a sample; the newest survive."""
 
+    def newest(self, key: str, message: link.Message) -> None:
+        """Queue a message of which, under one key, only the newest must survive."""
+
     def close(self, reason: str) -> None:
         """Say ``bye`` and end the connection."""
 
@@ -56,6 +59,10 @@ class Member(Protocol):
         """Report something in words, to clients that want to hear it."""
 
 
+Key = tuple[str, int | str]
+"""What a request is about: its op, and the number or name it concerns."""
+
+
 class Ask(NamedTuple):
     """A request to the robot.
 
@@ -63,7 +70,7 @@ class Ask(NamedTuple):
     :param sent: called when it goes out
     """
 
-    key: tuple[str, int]
+    key: Key
     message: link.Message
     sent: Callable[[], None]
 
@@ -77,8 +84,8 @@ class Asks:
     def __init__(self, clock: Clock, send: Callable[[link.Message], None]) -> None:
         self._clock = clock
         self._send = send
-        self._under_way: dict[tuple[str, int], float] = {}
-        self._waiting: dict[tuple[str, int], Ask] = {}
+        self._under_way: dict[Key, float] = {}
+        self._waiting: dict[Key, Ask] = {}
         self._timer: Timer | None = None
 
     def ask(self, ask: Ask) -> None:
@@ -89,12 +96,12 @@ class Asks:
         else:
             self._put(ask)
 
-    def answered(self, key: tuple[str, int]) -> None:
+    def answered(self, key: Key) -> None:
         """The robot has answered, one way or the other."""
         if self._under_way.pop(key, None) is not None:
             self._go_on()
 
-    def withdraw(self, key: tuple[str, int]) -> bool:
+    def withdraw(self, key: Key) -> bool:
         """Don't ask any more; whether the robot knows of it already."""
         waited = self._waiting.pop(key, None) is not None
         return not waited or key in self._under_way
@@ -152,10 +159,17 @@ class Wire:
 
         :raises Invalid: too many topics are in use on this robot
         """
-        if self.names >= NAMES:
-            raise Invalid(f"more than {NAMES} topics are in use on this robot")
-        self.names += 1
+        self.take_name()
         return next(self._numbers)
+
+    def take_name(self) -> None:
+        """One more name is in use.
+
+        :raises Invalid: too many are
+        """
+        if self.names >= NAMES:
+            raise Invalid(f"more than {NAMES} names are in use on this robot")
+        self.names += 1
 
     def send(self, message: link.Message) -> None:
         """Send if there is a link; what matters is sent again when one opens."""

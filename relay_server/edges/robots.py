@@ -148,6 +148,10 @@ class RobotConnection(TwistedProtocol):
         """Queue a sample; when the robot is slow the newest survive."""
         self._outbox.data(number, encode_sample(number, stamp, body))
 
+    def newest(self, key: str, message: link.Message) -> None:
+        """Queue a message of which, under one key, only the newest must survive."""
+        self._outbox.data(key, link.frame(message), 1)
+
     def close(self, reason: str) -> None:
         """Say ``bye`` and end the connection."""
         if self._role is not None:

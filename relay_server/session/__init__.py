@@ -1,7 +1,7 @@
 """One connected client of one robot: what it may, what it listens to, publishes, calls and offers.
 
 ``core`` takes each message, judges and hands it to the desk that is concerned: ``listening``, ``publishing``,
-``calling``.
+``calling``, ``pursuing``, ``providing``.
 """
 
 from relay_server.session.core import ClientTransport, LocalNode, Session, Timing

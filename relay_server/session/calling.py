@@ -1,4 +1,4 @@
-"""Services a client calls, of the robot and of the relay: each call is answered exactly once."""
+"""Services a client calls, of the robot, of other clients and of the relay: each call is answered exactly once."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from relay_protocol.errors import Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
+from relay_server.forms import asked
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class Calling:
         service = resolve(ask.service)
         if len(self._calls) >= CALLS:
             raise Refused(f"{CALLS} calls of this connection are waiting already")
+        asked(ask, self._session.tell)
         raw = bytes(ask.args or b"")
         size = len(raw)
         if self._bytes + size > CALL_BYTES:
@@ -65,8 +67,9 @@ class Calling:
         running.addBoth(self._call_ended, running, size)
 
     def answer(self, call: rosbridge.CallService, result: bool, values: bytes) -> None:
-        """Answer one call; ``values`` is JSON, a string when ``result`` is false."""
-        self._session.say(rosbridge.service_response(call.service, call.id, result, values))
+        """Answer one call in the form it asked for; ``values`` is JSON, a string when ``result`` is false."""
+        message = rosbridge.service_response(call.service, call.id, result, values)
+        self._session.say(message, asked(call, untold))
 
     def _call_ended(self, _: Any, running: Deferred[None], size: int) -> None:
         self._calls.discard(running)
@@ -86,3 +89,7 @@ class Calling:
             return
         self._session.log.failure("a call of {service} failed", failure, service=ask.service)
         self.answer(ask, False, jsontext.encode("the relay failed on this call; its log tells more"))
+
+
+def untold(level: str, text: str, id: rosbridge.Id) -> None:
+    """What is wrong with a form was told when it was asked for."""

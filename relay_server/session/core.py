@@ -19,6 +19,7 @@ from relay_server import closing
 from relay_server.access import Permit
 from relay_server.bucket import TokenBucket
 from relay_server.channel import Channel
+from relay_server.channel.goal import Status
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Sample
 from relay_server.clock import Clock, looping
@@ -28,12 +29,14 @@ from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
 from relay_server.session.calling import Calling
 from relay_server.session.listening import Listening
+from relay_server.session.providing import Providing
 from relay_server.session.publishing import Publishing
+from relay_server.session.pursuing import Pursuing
 
 LEVELS = {"info": 0, "warning": 1, "error": 2, "none": 3}
 CHANGES_A_SECOND = 50.0
 CHANGES_AT_ONCE = 1000.0
-"""Subscriptions, advertisements and their ends one client may ask for; messages and calls are not counted."""
+"""Subscriptions, advertisements, offers and their ends one client may ask for; messages and calls are not counted."""
 
 LINES_A_SECOND = 1.0
 LINES_AT_ONCE = 20.0
@@ -124,6 +127,8 @@ class Session:
         self.listening = Listening(self, clock, local)
         self.publishing = Publishing(self, freshness)
         self.calling = Calling(self, local)
+        self.pursuing = Pursuing(self)
+        self.providing = Providing(self)
         permit.on_change = self._rights_changed
         permit.on_revoke = self._revoked
 
@@ -255,6 +260,8 @@ class Session:
         self.tell("error", str(error), operation.id)
         if isinstance(operation, rosbridge.CallService):
             self.calling.answer(operation, False, jsontext.encode(str(error)))
+        elif isinstance(operation, rosbridge.SendActionGoal):
+            self.pursuing.answer(operation, Status.NEVER_BEGAN, False, jsontext.encode(str(error)))
 
     def judge(self, operation: Operation, resource: str) -> None:
         """:raises Refused: the client may not do this to that resource of the robot, with the reason"""
@@ -294,7 +301,8 @@ class Session:
 
     def _rights_changed(self) -> None:
         self.listening.rights_changed()
-        self.channel.publications.forget_denied(self, self.permit)
+        self.pursuing.rights_changed()
+        self.channel.forget_denied(self, self.permit)
         if self._pinging.running:
             self._pinging.interval = self._ping_interval()
 
@@ -308,6 +316,10 @@ _CHANGES = {
     rosbridge.Unsubscribe,
     rosbridge.Advertise,
     rosbridge.Unadvertise,
+    rosbridge.AdvertiseService,
+    rosbridge.UnadvertiseService,
+    rosbridge.AdvertiseAction,
+    rosbridge.UnadvertiseAction,
     rosbridge.SetLevel,
 }
 
@@ -318,6 +330,15 @@ _HANDLERS: dict[type, Callable[[Session, Any], None]] = {
     rosbridge.Unadvertise: lambda session, ask: session.publishing.unadvertise(ask),
     rosbridge.Publish: lambda session, ask: session.publishing.publish(ask),
     rosbridge.CallService: lambda session, ask: session.calling.call(ask),
+    rosbridge.AdvertiseService: lambda session, ask: session.providing.advertise_service(ask),
+    rosbridge.UnadvertiseService: lambda session, ask: session.providing.unadvertise_service(ask),
+    rosbridge.ServiceResponse: lambda session, ask: session.providing.service_response(ask),
+    rosbridge.AdvertiseAction: lambda session, ask: session.providing.advertise_action(ask),
+    rosbridge.UnadvertiseAction: lambda session, ask: session.providing.unadvertise_action(ask),
+    rosbridge.ActionFeedback: lambda session, ask: session.providing.action_feedback(ask),
+    rosbridge.ActionResult: lambda session, ask: session.providing.action_result(ask),
+    rosbridge.SendActionGoal: lambda session, ask: session.pursuing.send_goal(ask),
+    rosbridge.CancelActionGoal: lambda session, ask: session.pursuing.cancel(ask),
     rosbridge.SetLevel: Session._set_level,
     rosbridge.Auth: Session._auth,
 }

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
+from relay_server.channel import bodies
 from relay_server.channel import calls as module
 from relay_server.session import calling as session_module
 from tests.relay_server.memory import TRIGGER, Person, World
@@ -181,7 +182,7 @@ def test_too_many_calls_on_one_robot_are_refused(world: World, monkeypatch: pyte
 def test_a_request_too_large_for_a_robot_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """The robot would have to cut the link of everybody."""
     person = at_work(world)
-    monkeypatch.setattr(module, "LARGEST_REQUEST", 3)
+    monkeypatch.setattr(bodies, "LARGEST", 3)
     person.says("call_service", service="/reset")
     assert "a robot takes at most 3" in person.hears("service_response")[0]["values"]
 

@@ -1,0 +1,83 @@
+"""Bodies of services and actions: as the robot speaks them (CDR, else JSON), and as JSON for clients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+from twisted.internet.defer import Deferred
+
+from relay_protocol import jsontext, limits, link
+from relay_protocol.errors import Invalid
+from relay_server.channel.definitions import Definitions
+from relay_server.channel.wire import Wire
+
+LARGEST = limits.COMMAND_FRAME // 4 * 3 - 4096
+"""Bytes of CDR that still fit a frame to a robot in base64, beside the names."""
+
+Text = msgspec.Raw | msgspec.UnsetType
+
+
+class Bodies:
+    """Turns bodies from one form into another. A part of a type is named like ``std_srvs/srv/Trigger_Request``.
+
+    :param wall_ns: Unix time in nanoseconds, for header stamps a client leaves out
+    """
+
+    def __init__(self, wire: Wire, definitions: Definitions, wall_ns: Callable[[], int]) -> None:
+        self._wire = wire
+        self._definitions = definitions
+        self._wall_ns = wall_ns
+
+    def ready(self, type_name: str) -> Deferred[None]:
+        """Fires when the parts of this type can be turned; fails in words when they never can."""
+        return self._definitions.ready(type_name)
+
+    def from_client(self, part: str, text: bytes) -> bytes:
+        """A body out of a client's JSON; fields it leaves out get their defaults.
+
+        :param text: an object, or a list of the fields in order; nothing and ``null`` are an empty object
+        :raises Invalid: it does not fit the type, or is too large for a robot
+        :raises NotFound: the type's definition is not known
+        """
+        value = jsontext.decode_any(text) if text else {}
+        if not self._wire.cdr:
+            body = jsontext.encode({} if value is None else value)
+        else:
+            body = self._wire.robot.types.args_from_json(part, value, self._wall_ns())
+        if len(body) > LARGEST:
+            raise Invalid(f"{part} has {len(body)} bytes here; a robot takes at most {LARGEST}")
+        return body
+
+    def to_client(self, part: str, body: bytes) -> bytes:
+        """A body as JSON.
+
+        :raises Invalid: the bytes are no such body
+        :raises NotFound: the type's definition is not known
+        """
+        if self._wire.cdr:
+            return self._wire.robot.types.to_json(part, body)
+        return jsontext.encode(jsontext.decode_any(body))
+
+    def from_robot(self, part: str, cdr: str | None, text: Text) -> bytes:
+        """A body out of a message of the robot, from its ``cdr`` or its ``args`` or ``values``.
+
+        :raises Invalid: it is none
+        """
+        if cdr is None:
+            return self.from_client(part, bytes(text or b""))
+        if not self._wire.cdr:
+            raise Invalid("the robot announced JSON and sent CDR")
+        return link.from_base64(cdr, "cdr")
+
+    def args(self, body: bytes) -> dict[str, Any]:
+        """A body as fields of a call or a goal for the robot."""
+        return self._fields("args", body)
+
+    def values(self, body: bytes) -> dict[str, Any]:
+        """A body as fields of an answer for the robot."""
+        return self._fields("values", body)
+
+    def _fields(self, name: str, body: bytes) -> dict[str, Any]:
+        return {"cdr": link.to_base64(body)} if self._wire.cdr else {name: msgspec.Raw(body)}

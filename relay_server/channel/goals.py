@@ -1,0 +1,276 @@
+"""Goals: asked for by clients and by the robot's graph, pursued by the robot and by clients that offer actions."""
+
+from __future__ import annotations
+
+import itertools
+
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_protocol import link, rosbridge
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_server.channel.bodies import Bodies
+from relay_server.channel.errands import Errand, Errands
+from relay_server.channel.goal import (
+    STATUSES,
+    Asker,
+    ClientGoal,
+    End,
+    Goal,
+    GraphGoal,
+    Status,
+    failed,
+    why_not_begun,
+)
+from relay_server.channel.offers import Offer, Offers, Provider
+from relay_server.channel.serving import reason_in
+from relay_server.channel.wire import Member, Wire
+
+ROBOT_GOALS = 1024
+"""Goals under way on one robot, and again goals of its graph."""
+
+
+class RobotPursuit:
+    """A goal that the robot pursues, under an id of the relay's."""
+
+    def __init__(self, id: str, goal: Goal, wire: Wire, table: dict[str, RobotPursuit]) -> None:
+        self.id = id
+        self.goal = goal
+        self._wire = wire
+        self._table = table
+
+    def cancel(self) -> None:
+        """The goal is not wanted any more."""
+        self._wire.send(link.CancelActionGoal(id=self.id))
+
+    def forget(self) -> None:
+        """Nor is its end; the robot knows its own bounds."""
+        self._table.pop(self.id, None)
+
+
+class ClientPursuit(Errand):
+    """A goal that a client pursues."""
+
+    def __init__(self, errands: Errands, offer: Offer, args: bytes, goal: Goal) -> None:
+        super().__init__(errands.new_id(), offer, args)
+        self.goal = goal
+        self._errands = errands
+
+    def cancel(self) -> None:
+        """The goal is not wanted any more."""
+        self.offer.member.say(rosbridge.cancel_action_goal(self.offer.written, self.id))
+
+    def forget(self) -> None:
+        """Nor is its end."""
+        self._errands.fade(self)
+
+    def withdrawn(self, reason: str) -> None:
+        """The client will never answer."""
+        self.goal.end(End(Status.ABORTED, None, reason))
+
+
+class Goals:
+    """All goals of one channel; the asker of each is told of its end exactly once."""
+
+    log = Logger()
+
+    def __init__(self, wire: Wire, bodies: Bodies, offers: Offers, errands: Errands) -> None:
+        self._wire = wire
+        self._bodies = bodies
+        self._offers = offers
+        self._errands = errands
+        self._ids = itertools.count(1)
+        self._at_robot: dict[str, RobotPursuit] = {}
+        self._of_graph: dict[str, GraphGoal] = {}
+        self._of_clients: set[ClientGoal] = set()
+
+    # --- clients ask --------------------------------------------------------------------------------------
+
+    def want(self, member: Member, asker: Asker, action: str, wants_feedback: bool) -> ClientGoal:
+        """A client wants a goal: the record of it, to be begun with :meth:`begin`."""
+        goal = ClientGoal(member, asker, self._bodies, action, wants_feedback)
+        self._of_clients = {each for each in self._of_clients if not each.over}
+        self._of_clients.add(goal)
+        return goal
+
+    async def begin(self, goal: ClientGoal, type_name: str, args: bytes) -> None:
+        """Have the robot, or the client that offers the action, pursue a goal.
+
+        :param type_name: as the client gave it; what the graph says wins
+        :param args: JSON, an object or a list of the fields in order; may be empty
+        :raises NotFound: no such action
+        :raises Invalid: the arguments do not fit its type
+        :raises Unavailable: the robot is lost, or whoever pursues goals has too many
+        """
+        offer = self._offers.standing(goal.action)
+        known = offer.type if offer is not None else self._wire.robot.graph.action_type(goal.action)
+        goal.type = known or type_name
+        if not goal.type:
+            raise NotFound(f"action {goal.action} does not exist on robot {self._wire.robot.name}")
+        await self._bodies.ready(goal.type)
+        body = self._bodies.from_client(f"{goal.type}_Goal", args)
+        if offer is None:
+            self._robot_pursues(goal, body)
+        else:
+            self._client_pursues(goal, offer, body)
+
+    def forget(self, member: Member) -> None:
+        """A client has gone: its goals are cancelled."""
+        for goal in list(self._of_clients):
+            if goal.member is member:
+                self._of_clients.discard(goal)
+                goal.abandon()
+
+    def _robot_pursues(self, goal: Goal, body: bytes) -> None:
+        if len(self._at_robot) >= ROBOT_GOALS:
+            raise Unavailable(f"{ROBOT_GOALS} goals are under way on this robot already")
+        if self._wire.link is None:
+            raise Unavailable(f"robot {self._wire.robot.name} is not connected")
+        pursuit = RobotPursuit(str(next(self._ids)), goal, self._wire, self._at_robot)
+        goal.pursuer = self._at_robot[pursuit.id] = pursuit
+        self._wire.send(
+            link.SendActionGoal(
+                id=pursuit.id,
+                action=goal.action,
+                type=goal.type,
+                feedback=goal.wants_feedback,
+                **self._bodies.args(body),
+            )
+        )
+
+    def _client_pursues(self, goal: Goal, offer: Offer, body: bytes) -> None:
+        self._offers.check(offer)
+        args = self._bodies.to_client(f"{offer.type}_Goal", body)
+        pursuit = ClientPursuit(self._errands, offer, args, goal)
+        self._errands.add(pursuit)
+        goal.type = offer.type
+        goal.pursuer = pursuit
+        offer.member.say(
+            rosbridge.send_action_goal(offer.written, pursuit.id, offer.type, args, goal.wants_feedback)
+        )
+
+    # --- the robot answers --------------------------------------------------------------------------------
+
+    def robot_feedback(self, message: link.ActionFeedback) -> None:
+        """How far the robot has come with a goal."""
+        pursuit = self._at_robot.get(message.id)
+        if pursuit is None:
+            return
+        goal = pursuit.goal
+        try:
+            goal.progress(self._bodies.from_robot(f"{goal.type}_Feedback", message.cdr, message.values))
+        except SwitchboardError as error:
+            self.log.warn(
+                "feedback of {action} can't be read: {reason}", action=goal.action, reason=str(error)
+            )
+
+    def robot_result(self, message: link.ActionResult) -> None:
+        """The robot is done with a goal."""
+        pursuit = self._at_robot.pop(message.id, None)
+        if pursuit is None:
+            return
+        goal, status = pursuit.goal, message.status
+        if status not in STATUSES:
+            status = Status.ABORTED
+        if not message.result:
+            goal.end(failed(status, message.reason or f"action {goal.action} failed"))
+            return
+        try:
+            body = self._bodies.from_robot(f"{goal.type}_Result", message.cdr, message.values)
+        except SwitchboardError as error:
+            goal.end(End(Status.ABORTED, None, f"the robot's result can't be read: {error}"))
+        else:
+            goal.end(End(status, body))
+
+    def robot_refused(self, id: str, reason: str) -> None:
+        """The robot can't take a goal."""
+        pursuit = self._at_robot.pop(id, None)
+        if pursuit is not None:
+            pursuit.goal.end(End(Status.NEVER_BEGAN, None, reason))
+
+    def lost(self) -> None:
+        """The link is gone: the robot has cancelled what it pursued, and nobody is left who asked over it."""
+        pursued = self._at_robot.copy()
+        self._at_robot.clear()
+        name = self._wire.robot.name
+        for pursuit in pursued.values():
+            pursuit.goal.end(End(Status.ABORTED, None, f"robot {name} lost its connection during the goal"))
+        asked, self._of_graph = self._of_graph, {}
+        for goal in asked.values():
+            goal.abandon()
+
+    # --- the graph asks -----------------------------------------------------------------------------------
+
+    def graph_asks(self, message: link.SendActionGoal) -> None:
+        """A goal for an action that a client offers."""
+        origin = self._wire.link
+        if origin is None:
+            return
+        self._of_graph = {id: goal for id, goal in self._of_graph.items() if not goal.over}
+        goal = GraphGoal(message, origin, self._bodies)
+        if message.id in self._of_graph or len(self._of_graph) >= ROBOT_GOALS:
+            goal.end(End(Status.NEVER_BEGAN, None, "the id is in use, or too many goals are under way"))
+            return
+        self._of_graph[message.id] = goal
+        goal.beginning = Deferred.fromCoroutine(self._serve(goal, message))
+        goal.beginning.addErrback(self.not_begun, goal)
+
+    def graph_cancels(self, message: link.CancelActionGoal) -> None:
+        """The graph wants a goal no more."""
+        goal = self._of_graph.get(message.id)
+        if goal is not None:
+            goal.cancel()
+
+    async def _serve(self, goal: GraphGoal, message: link.SendActionGoal) -> None:
+        offer = self._offers.standing(goal.action)
+        if offer is None:
+            raise NotFound(f"no client offers the action {goal.action}")
+        await self._bodies.ready(offer.type)
+        body = self._bodies.from_robot(f"{offer.type}_Goal", message.cdr, message.args)
+        self._client_pursues(goal, offer, body)
+
+    def not_begun(self, failure: Failure, goal: Goal) -> None:
+        """What was to begin a goal has failed."""
+        goal.end(why_not_begun(failure, goal.action))
+        if not failure.check(SwitchboardError, CancelledError):
+            self.log.failure("a goal of {action} failed", failure, action=goal.action)
+
+    # --- clients answer -----------------------------------------------------------------------------------
+
+    def client_feedback(self, member: Provider, message: rosbridge.ActionFeedback) -> None:
+        """How far a client has come with a goal.
+
+        :raises Refused: it was not asked that
+        :raises Invalid: the values do not fit the type
+        """
+        pursuit = self._errands.find(member, message.id, ClientPursuit)
+        values = bytes(message.values or b"")
+        pursuit.goal.progress(self._bodies.from_client(f"{pursuit.offer.type}_Feedback", values))
+
+    def client_result(self, member: Provider, message: rosbridge.ActionResult) -> None:
+        """A client is done with a goal.
+
+        :raises Refused: it was not asked that
+        :raises Invalid: the values do not fit the type, or the status is none; the asker is told too
+        """
+        pursuit = self._errands.find(member, message.id, ClientPursuit)
+        self._errands.remove(pursuit)
+        try:
+            end = self._end_by_client(pursuit.offer, message)
+        except SwitchboardError as error:
+            words = f"the client that offers {pursuit.offer.name} gave an unfit result: {error}"
+            pursuit.goal.end(End(Status.ABORTED, None, words))
+            raise
+        pursuit.goal.end(end)
+
+    def _end_by_client(self, offer: Offer, message: rosbridge.ActionResult) -> End:
+        status = message.status
+        if status is None:
+            status = Status.SUCCEEDED if message.result else Status.ABORTED
+        if status not in STATUSES or (message.result and status == Status.NEVER_BEGAN):
+            raise Invalid(f"status {status} is none of 4 (succeeded), 5 (canceled), 6 (aborted)")
+        text = bytes(message.values or b"")
+        if not message.result:
+            return failed(status, reason_in(text) or f"the client that offers {offer.name} could not do it")
+        return End(status, self._bodies.from_client(f"{offer.type}_Result", text))
