@@ -1,0 +1,120 @@
+"""A LaserScan at 40 Hz from ROS 2 to ten viewers: daemon and relay, against a server built like rosbridge_server.
+
+Both subscribe to the same publisher at the same time, each with ten clients, and are measured over the same seconds.
+rosbridge_server is not on the package index; what stands in for it is ``bench/rosbridge_like.py``, which is ours.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from switchboard_harness import Relay, running, wait_for
+
+from bench import ROOT
+from bench.cpu import seconds_of
+from bench.native import Receivers
+from bench.report import Options, Row, Unavailable
+from bench.robot import RealRobot
+from bench.viewers import SCAN, STREAM, TOPIC, subscribe
+from bench.wire import handshake
+
+VIEWERS = 10
+
+
+class RosbridgeLike:
+    """The stand-in, running."""
+
+    def __init__(self, environment: dict[str, str], topic: str) -> None:
+        for module in ("tornado", "ujson"):
+            if importlib.util.find_spec(module) is None:
+                raise Unavailable(f"{module} is not installed (scripts/setup.sh bench)")
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            self.port = probe.getsockname()[1]
+        self._popen = subprocess.Popen(
+            [sys.executable, "-m", "bench.rosbridge_like", str(self.port), topic],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+            cwd=ROOT,
+        )
+        assert self._popen.stdout is not None
+        if self._popen.stdout.readline().strip() != "READY":
+            self.stop()
+            raise AssertionError("the stand-in for rosbridge does not start; see above")
+
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        return self._popen.pid
+
+    def stop(self) -> None:
+        """End and reap it."""
+        assert self._popen.stdout is not None
+        self._popen.terminate()
+        try:
+            self._popen.wait(5)
+        except subprocess.TimeoutExpired:
+            self._popen.kill()
+            self._popen.wait()
+        self._popen.stdout.close()
+
+
+def run(options: Options) -> list[Row]:
+    """Some windows of time; medians of processor milliseconds a second."""
+    seconds, rounds = options.pick(1, 8), int(options.pick(1, 3))
+    found: dict[str, list[float]] = {"daemon": [], "relay": [], "rosbridge": []}
+    with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
+        folder = Path(name)
+        relay = Relay(folder)
+        stack.enter_context(running(relay))
+        assert relay.process is not None
+        robot = RealRobot(relay, "rover", [STREAM])
+        stack.enter_context(running(robot))
+        bridge = RosbridgeLike(robot.environment, TOPIC)
+        stack.enter_context(running(bridge))
+        token = robot.viewer("watcher")
+        ask = subscribe((TOPIC, SCAN, 0))
+        ours = Receivers(folder, relay.http_port, VIEWERS, handshake("/robots/rover", token), ask)
+        stack.callback(ours.stop)
+        theirs = Receivers(folder, bridge.port, VIEWERS, handshake("/"), ask)
+        stack.callback(theirs.stop)
+        for each in (ours, theirs):
+            wait_for("all viewers have something", lambda each=each: each.report()["least"] > 0, 20)
+        pids = {"daemon": robot.pid, "relay": relay.process.popen.pid, "rosbridge": bridge.pid}
+        time.sleep(seconds / 4)
+        for _ in range(rounds):
+            for each in (ours, theirs):
+                each.report()
+            begun = time.monotonic()
+            before = {name: seconds_of(pid, children=True) for name, pid in pids.items()}
+            time.sleep(seconds)
+            for name, pid in pids.items():
+                used = seconds_of(pid, children=True) - before[name]
+                found[name].append(used * 1000 / (time.monotonic() - begun))
+            least = [each.report()["least"] for each in (ours, theirs)]
+            assert min(least) >= 0.9 * seconds * STREAM["rate"] - 5, f"viewers got {least} samples"
+    spent = {name: statistics.median(each) for name, each in found.items()}
+    row = Row(
+        "endtoend",
+        f"LaserScan 40 Hz to {VIEWERS} viewers: daemon + relay",
+        "ms/s",
+        spent["daemon"] + spent["relay"],
+        spent["rosbridge"],
+        "rosbridge-like server (stand-in)",
+        0.1,
+        note=f"daemon {spent['daemon']:.1f} ms/s on the robot, relay {spent['relay']:.1f} ms/s elsewhere; the "
+        "stand-in runs on the robot",
+    )
+    print(
+        f"    daemon {spent['daemon']:.1f}, relay {spent['relay']:.1f}, stand-in {row.other:.1f} ms/s",
+        flush=True,
+    )
+    return [row]
