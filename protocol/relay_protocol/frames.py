@@ -9,6 +9,7 @@ import struct
 from typing import NamedTuple
 
 from relay_protocol.errors import FrameTooLarge, MalformedMessage
+from relay_protocol.limits import PARTS_BYTES
 
 JSON = 0
 SAMPLE = 1
@@ -19,9 +20,17 @@ _LENGTH = struct.Struct("!I")
 _HEAD = struct.Struct("!IB")
 _SAMPLE_HEAD = struct.Struct("!IBIQ")
 _NUMBERED = struct.Struct("!IQ")
+_PART_HEAD = struct.Struct("!IBIQII")
+_PART = struct.Struct("!IQII")
 
 MAX_U32 = 2**32 - 1
 MAX_U64 = 2**64 - 1
+
+SAMPLE_HEAD = 13
+"""Kind, number and stamp of a sample, counted by the length of its frame."""
+
+UNFINISHED = 1024
+"""Most samples that have come in part only, over one link."""
 
 
 class JsonFrame(NamedTuple):
@@ -53,6 +62,7 @@ class VideoFrame(NamedTuple):
 
 
 Frame = JsonFrame | SampleFrame | VideoFrame
+"""What a stream is cut into; parts of a sample (kind 3) come out as the sample they make."""
 
 
 def encode_json(body: bytes) -> bytes:
@@ -70,8 +80,17 @@ def encode_video(number: int, stamp: int, body: bytes) -> bytes:
     return _SAMPLE_HEAD.pack(len(body) + 13, VIDEO, number, stamp) + body
 
 
+def encode_part(number: int, stamp: int, total: int, offset: int, piece: bytes) -> bytes:
+    """The frame around one part of a sample; see :class:`SampleFrame`.
+
+    :param total: bytes of the whole message
+    :param offset: bytes of it that went before
+    """
+    return _PART_HEAD.pack(len(piece) + 21, PART, number, stamp, total, offset) + piece
+
+
 class FrameDecoder:
-    """Cuts a byte stream into frames.
+    """Cuts a byte stream into frames, and joins parts of samples.
 
     :param limit: largest length field accepted, bytes; it may be raised once the peer has proved itself
     """
@@ -79,17 +98,20 @@ class FrameDecoder:
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._buffer = bytearray()
+        self._parts = _Parts()
 
     @property
     def buffered(self) -> int:
-        """Bytes of an unfinished frame held back."""
-        return len(self._buffer)
+        """Bytes of an unfinished frame and of unfinished samples held back."""
+        return len(self._buffer) + self._parts.size
 
     def feed(self, data: bytes) -> list[Frame]:
         """Take bytes as they come off the wire; return the frames they complete.
 
-        :raises FrameTooLarge: a length over :attr:`limit`, seen before its body is awaited
-        :raises MalformedMessage: an empty frame, an unknown kind, a sample too short for its head
+        :raises FrameTooLarge: a length over :attr:`limit`, seen before its body is awaited; a sample in parts that
+            would be over it, or too much of such samples
+        :raises MalformedMessage: an empty frame, an unknown kind, a sample too short for its head, parts that don't
+            follow each other
         """
         buffer = self._buffer
         buffer += data
@@ -107,11 +129,80 @@ class FrameDecoder:
             end = start + 4 + length
             if end > have:
                 break
-            frames.append(_parse(buffer, start + 4, end))
+            if buffer[start + 4] == PART:
+                sample = self._parts.join(buffer, start + 4, end, self.limit)
+                if sample is not None:
+                    frames.append(sample)
+            else:
+                frames.append(_parse(buffer, start + 4, end))
             start = end
         if start:
             del buffer[:start]
         return frames
+
+
+class _Unfinished(NamedTuple):
+    stamp: int
+    total: int
+    body: bytearray
+
+
+class _Parts:
+    """Samples of one link that have come in part only; memory grows with what came, not with what was announced."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._unfinished: dict[int, _Unfinished] = {}
+
+    def join(self, buffer: bytearray, start: int, end: int, limit: int) -> SampleFrame | None:
+        """Take one part; return the sample it completes."""
+        if end - start < 22:
+            raise MalformedMessage(
+                "a part of a sample needs 20 bytes of head, and at least one of the sample"
+            )
+        number, stamp, total, offset = _PART.unpack_from(buffer, start + 1)
+        if total > limit - SAMPLE_HEAD:
+            raise FrameTooLarge(
+                f"a sample of {total} bytes was announced; at most {limit - SAMPLE_HEAD} are taken here"
+            )
+        size = end - start - 21
+        body = (
+            self._begin(number, stamp, total) if offset == 0 else self._follow(number, stamp, total, offset)
+        )
+        if offset + size > total:
+            raise MalformedMessage(f"parts of sample {number} are longer than its {total} bytes")
+        if offset + size == total:
+            self._drop(number)
+            body += memoryview(buffer)[start + 21 : end]
+            return SampleFrame(number, stamp, bytes(body))
+        self.size += size
+        if self.size > min(PARTS_BYTES, 2 * limit) or len(self._unfinished) > UNFINISHED:
+            raise FrameTooLarge(
+                f"{len(self._unfinished)} samples of {self.size} bytes are unfinished; that is too much"
+            )
+        body += memoryview(buffer)[start + 21 : end]
+        return None
+
+    def _begin(self, number: int, stamp: int, total: int) -> bytearray:
+        self._drop(number)
+        body = bytearray()
+        self._unfinished[number] = _Unfinished(stamp, total, body)
+        return body
+
+    def _follow(self, number: int, stamp: int, total: int, offset: int) -> bytearray:
+        known = self._unfinished.get(number)
+        if known is None:
+            raise MalformedMessage(f"the parts of sample {number} begin at byte {offset}, not at 0")
+        if (known.stamp, known.total) != (stamp, total):
+            raise MalformedMessage(f"the parts of sample {number} belong to different samples")
+        if len(known.body) != offset:
+            raise MalformedMessage(f"byte {len(known.body)} of sample {number} must be next, not {offset}")
+        return known.body
+
+    def _drop(self, number: int) -> None:
+        known = self._unfinished.pop(number, None)
+        if known is not None:
+            self.size -= len(known.body)
 
 
 def _parse(buffer: bytearray, start: int, end: int) -> Frame:
@@ -119,9 +210,11 @@ def _parse(buffer: bytearray, start: int, end: int) -> Frame:
     if kind == JSON:
         return JsonFrame(bytes(buffer[start + 1 : end]))
     if kind in (SAMPLE, VIDEO):
-        if end - start < 13:
+        if end - start < SAMPLE_HEAD:
             raise MalformedMessage(f"a frame of kind {kind} needs 12 bytes of number and stamp")
         number, stamp = _NUMBERED.unpack_from(buffer, start + 1)
         body = bytes(buffer[start + 13 : end])
         return SampleFrame(number, stamp, body) if kind == SAMPLE else VideoFrame(number, stamp, body)
-    raise MalformedMessage(f"frame kind {kind} is not known; 0 is JSON, 1 a sample, 2 a picture")
+    raise MalformedMessage(
+        f"frame kind {kind} is not known; 0 is JSON, 1 a sample, 2 a picture, 3 a part of a sample"
+    )

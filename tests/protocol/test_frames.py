@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import pairwise
+from random import Random
 
 import pytest
 from hypothesis import given
@@ -86,7 +88,7 @@ def test_the_limit_can_be_raised_between_frames() -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [b"\0\0\0\0", b"\0\0\0\x01\x03", b"\0\0\0\x0c\x01" + bytes(11), b"\0\0\0\x01\x02"]
+    "data", [b"\0\0\0\0", b"\0\0\0\x01\x04", b"\0\0\0\x0c\x01" + bytes(11), b"\0\0\0\x01\x02"]
 )
 def test_malformed_frames_are_refused(data: bytes) -> None:
     """No kind, an unknown kind, and a sample or picture without number and stamp are faults of the peer."""
@@ -100,4 +102,76 @@ def test_an_unfinished_frame_waits() -> None:
     assert decoder.feed(b"\0\0\0\x05\0ab") == []
     assert decoder.buffered == 7
     assert decoder.feed(b"cd") == [JsonFrame(b"abcd")]
+    assert decoder.buffered == 0
+
+
+PARTED = st.tuples(U32, U64, st.binary(min_size=1, max_size=60))
+
+
+def in_parts(number: int, stamp: int, body: bytes, size: int) -> list[bytes]:
+    """A sample as frames of parts."""
+    return [
+        frames.encode_part(number, stamp, len(body), start, body[start : start + size])
+        for start in range(0, len(body), size)
+    ]
+
+
+@given(
+    st.lists(PARTED, max_size=6, unique_by=lambda sample: sample[0]),
+    st.integers(1, 70),
+    st.randoms(use_true_random=False),
+    st.lists(st.integers(0, 10_000), max_size=12),
+)
+def test_parts_make_the_samples_they_came_from(
+    sent: list[tuple[int, int, bytes]], size: int, random: Random, cuts: list[int]
+) -> None:
+    """Samples in parts come out whole, whatever stands between their parts and however the stream is cut."""
+    waiting = [in_parts(*sample, size) for sample in sent]
+    stream = b""
+    while waiting:
+        each = random.choice(waiting)
+        stream += each.pop(0) + frames.encode_json(b"between")
+        waiting = [each for each in waiting if each]
+    decoder = FrameDecoder(limit=1000)
+    got = [frame for piece in pieces(stream, cuts) for frame in decoder.feed(piece)]
+    samples = [frame for frame in got if isinstance(frame, SampleFrame)]
+    assert sorted(samples) == sorted(SampleFrame(*sample) for sample in sent)
+    assert decoder.buffered == 0
+
+
+def test_memory_grows_with_what_came() -> None:
+    """A large sample that was announced takes no memory before its bytes are there."""
+    decoder = FrameDecoder(limit=2**24)
+    tracemalloc.start()
+    decoder.feed(frames.encode_part(1, 0, 2**23, 0, b"a"))
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert used < 100_000
+    assert decoder.buffered == 1
+
+
+def test_unfinished_samples_are_bounded_in_number_and_size() -> None:
+    """Many samples that are begun and never finished, and much of few, break the contract."""
+    decoder = FrameDecoder(limit=2**24)
+    for number in range(frames.UNFINISHED):
+        decoder.feed(frames.encode_part(number, 0, 9, 0, b"a"))
+    with pytest.raises(FrameTooLarge, match="unfinished"):
+        decoder.feed(frames.encode_part(5000, 0, 9, 0, b"a"))
+    decoder = FrameDecoder(limit=2**24)
+    part = bytes(2**23)
+    for number in range(4):
+        decoder.feed(frames.encode_part(number, 0, 2**23 + 1, 0, part))
+    with pytest.raises(FrameTooLarge, match="33554433 bytes are unfinished"):
+        decoder.feed(frames.encode_part(4, 0, 9, 0, b"a"))
+
+
+def test_finished_samples_make_room() -> None:
+    """What is finished, or begun anew, counts no more."""
+    decoder = FrameDecoder(limit=1000)
+    for stamp in range(50):
+        decoder.feed(frames.encode_part(1, stamp, 900, 0, bytes(800)))
+        assert decoder.buffered == 800
+    for number in range(50):
+        for part in in_parts(number, 0, bytes(900), 800):
+            decoder.feed(part)
     assert decoder.buffered == 0
