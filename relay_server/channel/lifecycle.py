@@ -326,9 +326,12 @@ class Channel:
         if self.wire.link is channel_link:
             self._happen(Event.LINK_LOST)
 
-    def sample(self, number: int, body: bytes) -> None:
-        """A sample came over the channel's link."""
-        self.subscriptions.sample(number, body)
+    def sample(self, number: int, body: bytes, stamp: int = 0) -> None:
+        """A sample came over the channel's link.
+
+        :param stamp: when it reached the robot, nanoseconds since 1970
+        """
+        self.subscriptions.sample(number, body, stamp)
 
     def message(self, message: link.RobotChannel) -> None:
         """A message came over the channel's link."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from relay_protocol import rosbridge
 from relay_protocol.errors import Refused
-from relay_server.channel.sample import Sample
+from relay_server.channel.sample import Flaw, Sample, Wish
 from relay_server.clock import Clock, Timer
-from relay_server.forms import PLAIN
+from relay_server.forms import PLAIN, Form
 
 THROTTLE_SECONDS = 3600.0
 """Longest throttle; a client that asks for more gets this."""
@@ -16,74 +16,116 @@ THROTTLE_SECONDS = 3600.0
 ASKS = 64
 """Subscriptions of one client to one topic, merged into one listener."""
 
+_LEVELS = {Flaw.BROKEN: "error", Flaw.NOT_CDR: "error", Flaw.TOO_LARGE: "warning"}
+
 
 class Receiver(Protocol):
     """A session, as a topic's listeners use it."""
 
-    def deliver(self, listener: Listener, parcel: Sample | bytes) -> None:
+    def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Queue a sample for the client."""
+
+    def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
+        """Report something in words, to clients that want to hear it."""
+
+
+class Asked(NamedTuple):
+    """One subscription, and the form it asks for."""
+
+    ask: rosbridge.Subscribe
+    form: Form
 
 
 class Listener:
     """One client's interest in one topic: its subscriptions merged, as rosbridge does.
 
-    :param name: the topic as the client writes it
+    :param topic: its full name
     """
 
-    def __init__(self, clock: Clock, receiver: Receiver, name: str) -> None:
+    def __init__(self, clock: Clock, receiver: Receiver, topic: str) -> None:
         self._clock = clock
         self._receiver = receiver
-        self.name = name
+        self.topic = topic
         self.throttle = 0.0
         """Least seconds between two samples: the least any of the subscriptions asks for."""
         self.depth = 0
         """Samples that may wait for this client; 0 leaves it to the relay."""
-        self.form = PLAIN
-        self._asks: dict[rosbridge.Id, rosbridge.Subscribe] = {}
-        self._next_at = 0.0
+        self.wish = Wish((topic,), PLAIN)
+        """The names the topic is subscribed by, latest compression and least size of fragments."""
+        self._asks: dict[tuple[str, rosbridge.Id], Asked] = {}
+        self._told: set[Flaw] = set()
+        self._sent_at = -THROTTLE_SECONDS
         self._waiting: Sample | None = None
         self._timer: Timer | None = None
 
-    def add(self, ask: rosbridge.Subscribe) -> None:
-        """One more subscription, or another one under the same id.
+    @property
+    def raw(self) -> bool:
+        """Whether samples are wanted as the robot sends them, so that their type need not be known."""
+        return self.wish.form.compression == "cbor-raw"
+
+    def add(self, ask: rosbridge.Subscribe, form: Form = PLAIN) -> None:
+        """One more subscription, or another one under the same name and id.
 
         :raises Refused: too many on this topic
         """
-        if ask.id not in self._asks and len(self._asks) >= ASKS:
+        key = (ask.topic, ask.id)
+        if key not in self._asks and len(self._asks) >= ASKS:
             raise Refused(f"at most {ASKS} subscriptions to one topic can be held on one connection")
-        self._asks[ask.id] = ask
+        # The latest is the last, also when it replaces one.
+        self._asks.pop(key, None)
+        self._asks[key] = Asked(ask, form)
+        self._told.clear()
         self._merge()
 
-    def remove(self, id: rosbridge.Id) -> bool:
-        """One subscription less; whether any are left."""
-        self._asks.pop(id, None)
-        self._merge()
+    def remove(self, name: str, id: rosbridge.Id) -> bool:
+        """One subscription less; whether any are left.
+
+        :param name: the topic as the client writes it. Another spelling than in ``subscribe`` will do.
+        """
+        if self._asks.pop((name, id), None) is None:
+            for key in [key for key in self._asks if key[1] == id]:
+                del self._asks[key]
+        if self._asks:
+            self._merge()
         return bool(self._asks)
 
     def _merge(self) -> None:
-        asks = self._asks.values()
-        least = min((ask.throttle_rate for ask in asks), default=0.0) / 1000
+        asks = [each.ask for each in self._asks.values()]
+        forms = [each.form for each in self._asks.values()]
+        least = min(ask.throttle_rate for ask in asks) / 1000
         self.throttle = min(max(0.0, least), THROTTLE_SECONDS)
-        self.depth = max(0, max((ask.queue_length for ask in asks), default=0))
+        self.depth = max(0, max(ask.queue_length for ask in asks))
+        size = min((form.fragment_size for form in forms if form.fragment_size), default=0)
+        names = tuple(dict.fromkeys(ask.topic for ask in asks))
+        self.wish = Wish(names, Form(forms[-1].compression, size))
+        if self._timer is not None:
+            self._timer.cancel()
+            self._wait()
 
     def offer(self, sample: Sample) -> None:
         """A new sample. Within the throttle the newest waits, so the last of a burst always arrives."""
         throttle = self.throttle
         if throttle:
             now = self._clock.seconds()
-            if now < self._next_at:
+            if now < self._sent_at + throttle:
                 self._waiting = sample
                 if self._timer is None:
-                    self._timer = self._clock.callLater(self._next_at - now, self._due)
+                    self._wait()
                 return
-            self._next_at = now + throttle
+            self._sent_at = now
         # What waited under a longer throttle is older than this one.
         self.close()
-        self._send(sample)
+        self._receiver.deliver(self, sample)
 
     def replay(self, sample: Sample) -> None:
         """A latched sample for a late joiner; each is of another publisher, so no throttle drops any."""
-        self._send(sample)
+        self._receiver.deliver(self, sample)
+
+    def complain(self, flaw: Flaw, words: str) -> None:
+        """Tell the client why it does not get what it asked for: once, until it asks again."""
+        if flaw not in self._told:
+            self._told.add(flaw)
+            self._receiver.tell(_LEVELS[flaw], f"{self.topic}: {words}")
 
     def close(self) -> None:
         """Stop; nothing more is sent."""
@@ -92,12 +134,13 @@ class Listener:
             self._timer = None
         self._waiting = None
 
+    def _wait(self) -> None:
+        left = self._sent_at + self.throttle - self._clock.seconds()
+        self._timer = self._clock.callLater(max(0.0, left), self._due)
+
     def _due(self) -> None:
         self._timer = None
         sample, self._waiting = self._waiting, None
         if sample is not None:
-            self._next_at = self._clock.seconds() + self.throttle
-            self._send(sample)
-
-    def _send(self, sample: Sample) -> None:
-        self._receiver.deliver(self, sample)
+            self._sent_at = self._clock.seconds()
+            self._receiver.deliver(self, sample)

@@ -2,62 +2,181 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+import cbor2
 
 from relay_protocol import jsontext, limits, rosbridge
 from relay_protocol.errors import Invalid, SwitchboardError
-from relay_protocol.ros_types import TypeRegistry
-from relay_server.forms import Form, frames
+from relay_protocol.limits import KIB
+from relay_protocol.ros_types import Reader, TypeRegistry
+from relay_server import wsframe
+from relay_server.forms import Form, cbor, divided, png
 
 if TYPE_CHECKING:
     from relay_server.channel.listener import Listener
 
+_SPARE = 64 * KIB
+"""What is made ready of one sample may take four times its size, and so much more; it can be made again."""
 
-class Sample:
-    """One message from the robot. It is converted only if somebody takes it, and then once for all who want it so."""
 
-    __slots__ = ("_body", "_convert", "_frames", "_json", "failure", "size")
+class Wish(NamedTuple):
+    """What a client wants to get of each sample.
 
-    def __init__(self, body: bytes, convert: Callable[[bytes], bytes]) -> None:
-        self._body = body
-        self._convert = convert
-        self.size = len(body)
-        self._json: bytes | None = None
-        self._frames: dict[tuple[str, Form], bytes] = {}
-        self.failure: str = ""
+    :param names: the topic as the client writes it; one message goes under each
+    """
+
+    names: tuple[str, ...]
+    form: Form
+
+
+class Flaw(enum.Enum):
+    """Why a client does not get a sample as it wants it."""
+
+    BROKEN = "broken"
+    NOT_CDR = "not cdr"
+    TOO_LARGE = "too large"
+
+
+class Ready(NamedTuple):
+    """What is made of a sample for one wish.
+
+    :param frames: websocket frames; ``None`` when it can't be converted
+    :param flaw: what the client is to be told, once, and ``words`` for it
+    """
+
+    frames: bytes | None
+    flaw: Flaw | None = None
+    words: str = ""
+
+
+class Converter:
+    """What turns the samples of one topic into JSON and CBOR.
+
+    It stays right until the type's definition is replaced.
+
+    :param encoding: of the samples, ``cdr`` or ``json``
+    :param failed: called with the words for each sample that can't be converted
+    """
+
+    def __init__(
+        self, types: TypeRegistry, type_name: str, encoding: str, failed: Callable[[str], None]
+    ) -> None:
+        self._types = types
+        self._type = type_name
+        self.cdr = encoding == "cdr"
+        self.failed = failed
+        self._readers: dict[str, Reader] = {}
 
     @property
-    def body(self) -> bytes:
-        """The message as the robot sent it."""
-        return self._body
+    def knows(self) -> bool:
+        """Whether all that this takes is known."""
+        return not self.cdr or self._types.knows(self._type)
+
+    def convert(self, language: str, body: bytes) -> bytes:
+        """A sample's body in ``json`` or ``cbor``.
+
+        :raises SwitchboardError: it is no message of this type, or the type is not known
+        """
+        reader = self._readers.get(language)
+        if reader is None:
+            found = self._types.reader(self._type, language) if self.cdr else _ANEW[language]
+            reader = self._readers[language] = found
+        return reader(body)
+
+
+class Sample:
+    """One message from the robot. It is converted only if somebody takes it, and then once for all who want it so.
+
+    :param body: as the robot sent it
+    :param stamp: when it reached the robot, nanoseconds since 1970
+    """
+
+    __slots__ = ("_bodies", "_converter", "_pictures", "_ready", "_ready_bytes", "_stamp", "body", "size")
+
+    def __init__(self, body: bytes, stamp: int, converter: Converter) -> None:
+        self.body = body
+        self._stamp = stamp
+        self._converter = converter
+        self.size = len(body)
+        self._bodies: dict[str, bytes | SwitchboardError] = {}
+        self._pictures: dict[str, bytes] = {}
+        self._ready: dict[Wish, Ready] = {}
+        self._ready_bytes = 0
 
     def open(self, listener: Listener) -> bytes | None:
         """The websocket frames for a client that listens so; ``None`` when it can't be converted."""
-        key = (listener.name, listener.form)
-        found = self._frames.get(key)
+        ready = self._ready.get(listener.wish)
+        if ready is None:
+            ready = self._make(listener.wish)
+            self._keep(listener.wish, ready)
+        if ready.flaw is not None:
+            listener.complain(ready.flaw, ready.words)
+        return ready.frames
+
+    def _make(self, wish: Wish) -> Ready:
+        compression = wish.form.compression
+        language = "cbor" if compression == "cbor" else "json"
+        flaw, words = None, ""
+        if compression == "cbor-raw":
+            if self._converter.cdr:
+                language = compression
+            else:
+                flaw, words = Flaw.NOT_CDR, "its messages are JSON, not CDR, so cbor-raw is plain JSON here"
+        body = self._in(language)
+        if isinstance(body, SwitchboardError):
+            return Ready(None, Flaw.BROKEN, f"a message can't be converted: {body}")
+        if language != "json":
+            return Ready(b"".join(wsframe.binary(cbor.publish(name, body)) for name in wish.names))
+        texts = [rosbridge.publish(name, body) for name in wish.names]
+        if compression == "png":
+            if len(body) <= png.MOST:
+                texts = [self._picture(name, text) for name, text in zip(wish.names, texts, strict=True)]
+            else:
+                flaw = Flaw.TOO_LARGE
+                words = f"messages longer than {png.MOST} bytes are not sent as PNG but as plain JSON"
+        return Ready(b"".join(divided(each, wish.form.fragment_size) for each in texts), flaw, words)
+
+    def _in(self, language: str) -> bytes | SwitchboardError:
+        found = self._bodies.get(language)
         if found is None:
-            if self._json is None:
-                if self.failure:
-                    return None
-                try:
-                    self._json = self._convert(self._body)
-                except SwitchboardError as error:
-                    self.failure = str(error)
-                    return None
-            found = self._frames[key] = frames(rosbridge.publish(listener.name, self._json), listener.form)
+            found = self._bodies[language] = self._converted(language)
         return found
 
+    def _converted(self, language: str) -> bytes | SwitchboardError:
+        if language == "cbor-raw":
+            return cbor.raw(self._stamp, self.body)
+        try:
+            return self._converter.convert(language, self.body)
+        except SwitchboardError as error:
+            self._converter.failed(str(error))
+            return error
 
-def converter(types: TypeRegistry, type_name: str, encoding: str) -> Callable[[bytes], bytes]:
-    """What turns a sample's body into JSON."""
-    if encoding == "json":
-        return _json_anew
-    return lambda body: types.to_json(type_name, body)
+    def _picture(self, name: str, text: bytes) -> bytes:
+        found = self._pictures.get(name)
+        if found is None:
+            found = self._pictures[name] = png.encode(text)
+        return found
+
+    def _keep(self, wish: Wish, ready: Ready) -> None:
+        """Latched samples stay for long: what was made ready of them must not grow with what clients think of."""
+        self._ready[wish] = ready
+        self._ready_bytes += len(ready.frames or b"")
+        while self._ready_bytes > 4 * self.size + _SPARE and len(self._ready) > 1:
+            gone = self._ready.pop(next(iter(self._ready)))
+            self._ready_bytes -= len(gone.frames or b"")
 
 
-def _json_anew(body: bytes) -> bytes:
-    """A robot's own JSON, decoded and written anew: what goes out is well-formed whatever came in."""
+def _decoded(body: bytes) -> object:
     if len(body) > limits.JSON_BODY:
         raise Invalid(f"JSON of {len(body)} bytes; a sample in JSON may have {limits.JSON_BODY}")
-    return jsontext.encode(jsontext.decode_any(body))
+    return jsontext.decode_any(body)
+
+
+_ANEW: dict[str, Reader] = {
+    "json": lambda body: jsontext.encode(_decoded(body)),
+    "cbor": lambda body: cbor2.dumps(_decoded(body)),
+}
+"""A robot's own JSON, decoded and written anew: what goes out is well-formed whatever came in."""

@@ -9,7 +9,7 @@ from relay_protocol.errors import Invalid, Refused
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.listener import Listener
 from relay_server.channel.topics import Phase, TopicUplink
-from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire, resolve
+from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire
 
 
 class Subscriptions:
@@ -23,30 +23,44 @@ class Subscriptions:
         self._topics: dict[str, TopicUplink] = {}
         self._numbers: dict[int, TopicUplink] = {}
 
-    def add(self, member: Member, listener: Listener, type_name: str, qos: link.QoS | None) -> None:
+    def add(self, member: Member, listener: Listener, type_name: str | None, qos: link.QoS | None) -> None:
         """A client wants a topic, or wants it otherwise than before.
 
-        :param type_name: empty when the client leaves it to the graph
+        :param type_name: empty when the client leaves it to the graph, ``None`` when it is as before
         :raises Invalid: the topic has another type; nobody knows its type; too many topics
         :raises Refused: the user has too many topics of this robot subscribed
         """
-        topic = resolve(listener.name)
-        has = self.check(topic, type_name)
+        topic = listener.topic
+        has = self.check(topic, type_name or "")
         uplink = self._topics.get(topic)
         if uplink is None or member not in uplink.listeners:
             self._check_room(member)
         if uplink is None:
-            uplink = TopicUplink(self._wire.number(), topic, has or type_name, qos)
+            uplink = TopicUplink(
+                self._wire.number(),
+                topic,
+                has or type_name or "",
+                qos,
+                lambda: self._wire.robot.types,
+                self._broken,
+            )
+            uplink.certain = bool(has)
             self._topics[topic] = self._numbers[uplink.number] = uplink
-        newcomer = member not in uplink.listeners
-        uplink.listeners[member] = listener
+        served_before = uplink.serves(member)
+        uplink.join(member, listener, type_name)
+        if not uplink.type and type_name:
+            uplink.retype(type_name)
+        if not uplink.serves(member):
+            member.tell(
+                "warning",
+                f"subscribe {topic}: it does not exist yet, and another client says that its type is "
+                f"{uplink.type}; messages come if it turns out to be {type_name}",
+            )
         if uplink.phase in (Phase.WAITING, Phase.FAILED):
-            uplink.type = uplink.type or type_name
             self._ask(uplink)
             return
-        if uplink.least_throttle_ms() != uplink.throttle_ms:
-            self._send(uplink)
-        if newcomer:
+        self._follow_throttle(uplink)
+        if not served_before and uplink.serves(member):
             uplink.replay(listener)
 
     def active(self) -> tuple[tuple[str, str], ...]:
@@ -56,14 +70,25 @@ class Subscriptions:
         )
 
     def check(self, topic: str, type_name: str) -> str:
-        """The type a topic has already, or none; see :meth:`add` for what is refused."""
+        """The type a topic has for certain, or none; see :meth:`add` for what is refused.
+
+        What other clients say of a topic that the robot does not have yet, binds nobody.
+        """
         uplink = self._topics.get(topic)
-        has = (uplink.type if uplink else "") or self._wire.robot.graph.topic_type(topic) or ""
-        if has and type_name and type_name != has:
-            raise Invalid(f"topic {topic} has the type {has}, not {type_name}")
-        if uplink is None and not has and not type_name and self._wire.link is not None:
+        types = self._types_of(topic)
+        if uplink is not None and uplink.certain:
+            if type_name in types and type_name != uplink.type:
+                raise Invalid(f"topic {topic} has several types; it is subscribed as {uplink.type} now")
+            types = [uplink.type]
+        if types and type_name and type_name not in types:
+            raise Invalid(f"topic {topic} has the type {' or '.join(types)}, not {type_name}")
+        if uplink is None and not types and not type_name and self._wire.link is not None:
             raise Invalid(f"topic {topic} does not exist; give its type to wait for it")
-        return has
+        return type_name if type_name in types else next(iter(types), "")
+
+    def _types_of(self, topic: str) -> list[str]:
+        found = self._wire.robot.graph.topics.get(topic)
+        return found.types if found is not None else []
 
     def _check_room(self, member: Member) -> None:
         mine = sum(
@@ -77,17 +102,21 @@ class Subscriptions:
     def remove(self, member: Member, topic: str) -> None:
         """A client wants a topic no more; the robot stops sending it after the last."""
         uplink = self._topics.get(topic)
-        if uplink is None or uplink.listeners.pop(member, None) is None:
+        if uplink is None or not uplink.leave(member):
             return
         if not uplink.listeners:
+            self._unsubscribe(uplink)
             del self._topics[topic]
             del self._numbers[uplink.number]
             self._wire.names -= 1
-            known = self._wire.asks.withdraw(("subscribe", uplink.number))
-            if known and uplink.phase in (Phase.ASKED, Phase.ACTIVE):
-                self._wire.send(link.Unsubscribe(number=uplink.number))
-        elif uplink.phase is not Phase.WAITING and uplink.least_throttle_ms() != uplink.throttle_ms:
-            self._send(uplink)
+        elif uplink.served:
+            self._follow_throttle(uplink)
+        elif uplink.certain:
+            self._unsubscribe(uplink)
+        else:
+            # Nobody is left who said this type: it was a guess, and the next one has another.
+            self._retype(uplink, next(iter(uplink.wanted.values())))
+            self._ask(uplink)
 
     def forget(self, member: Member) -> None:
         """A client has gone."""
@@ -97,17 +126,20 @@ class Subscriptions:
     def opened(self) -> None:
         """The robot is there: ask for everything that is wanted."""
         for uplink in list(self._topics.values()):
+            self._settle(uplink)
             self._ask(uplink)
 
     def lost(self) -> None:
         """The robot's side is gone."""
         for uplink in self._topics.values():
+            uplink.certain = False
             uplink.reset()
 
     def graph_changed(self) -> None:
-        """What waited for a topic to appear may go on."""
+        """What waited for a topic to appear may go on; a topic that has another type now is followed."""
         topics = self._wire.robot.graph.topics
         for uplink in list(self._topics.values()):
+            self._settle(uplink)
             if uplink.phase in (Phase.WAITING, Phase.FAILED) and uplink.topic in topics:
                 self._ask(uplink)
 
@@ -115,7 +147,7 @@ class Subscriptions:
         """A definition has come: samples that waited for it can be converted."""
         for uplink in list(self._topics.values()):
             if uplink.type == type_name:
-                uplink.typed(self._wire.robot.types)
+                uplink.typed()
 
     def subscribed(self, message: link.Subscribed) -> None:
         """The robot has subscribed."""
@@ -123,6 +155,8 @@ class Subscriptions:
         uplink = self._numbers.get(message.number)
         if uplink is not None:
             uplink.activate(message.type, message.encoding, message.latched, message.publishers)
+            if message.publishers:
+                self._know(uplink, message.type)
             if message.encoding == "cdr":
                 self._definitions.want(message.type)
 
@@ -137,34 +171,84 @@ class Subscriptions:
             member.tell("error", f"subscribe {uplink.topic}: {reason}")
 
     def type_refused(self, type_name: str, reason: str) -> None:
-        """A type is not to be had: its topics can't be shown."""
+        """A type is not to be had: its topics can't be shown, but to those who want them as they are."""
         for uplink in self._topics.values():
             if uplink.type == type_name:
-                for member in list(uplink.listeners):
-                    member.tell("error", f"subscribe {uplink.topic}: {reason}")
+                for member, listener in list(uplink.listeners.items()):
+                    if uplink.serves(member) and not listener.raw:
+                        member.tell("error", f"subscribe {uplink.topic}: {reason}")
 
-    def sample(self, number: int, body: bytes) -> None:
+    def sample(self, number: int, body: bytes, stamp: int) -> None:
         """A sample from the robot; one of a subscription given back already is let go."""
         uplink = self._numbers.get(number)
-        if uplink is None:
+        if uplink is not None:
+            uplink.sample(body, stamp)
+
+    def _broken(self, uplink: TopicUplink, reason: str) -> None:
+        self.log.warn(
+            "a sample of {topic} from {robot} can't be converted: {failure}",
+            topic=uplink.topic,
+            robot=self._wire.robot.name,
+            failure=reason,
+        )
+
+    # --- the type of a topic ------------------------------------------------------------------------------
+
+    def _settle(self, uplink: TopicUplink) -> None:
+        """See what type the topic has by the robot's graph."""
+        types = self._types_of(uplink.topic)
+        if not types:
+            uplink.certain = False
             return
-        sample = uplink.sample(body, self._wire.robot.types)
-        if sample is not None and sample.failure and not uplink.failures:
-            self.log.warn(
-                "a sample of {topic} from {robot} can't be converted: {failure}",
-                topic=uplink.topic,
-                robot=self._wire.robot.name,
-                failure=sample.failure,
+        if uplink.type not in types:
+            said = (wanted for wanted in uplink.wanted.values() if wanted in types)
+            self._retype(uplink, next(said, types[0]))
+        self._know(uplink, uplink.type)
+
+    def _know(self, uplink: TopicUplink, type_name: str) -> None:
+        """The robot has the topic with this type: tell those who say another."""
+        if uplink.certain:
+            return
+        uplink.certain = True
+        for member, wanted in uplink.mistaken():
+            member.tell(
+                "error",
+                f"subscribe {uplink.topic}: it has the type {type_name}, not {wanted}; "
+                f"subscribe with {type_name} to get it",
             )
-        uplink.failures += bool(sample is not None and sample.failure)
+        if not uplink.served:
+            self._unsubscribe(uplink)
+
+    def _retype(self, uplink: TopicUplink, type_name: str) -> None:
+        """Let the topic begin anew with another type, under a number of its own: samples may be under way."""
+        self._unsubscribe(uplink)
+        del self._numbers[uplink.number]
+        self._wire.names -= 1
+        uplink.number = self._wire.number()
+        self._numbers[uplink.number] = uplink
+        uplink.certain = False
+        uplink.retype(type_name)
+
+    # --- what the robot is asked --------------------------------------------------------------------------
 
     def _ask(self, uplink: TopicUplink) -> None:
-        uplink.type = uplink.type or self._wire.robot.graph.topic_type(uplink.topic) or ""
-        if self._wire.link is None or not uplink.type:
+        if not uplink.type:
+            uplink.retype(next(iter(self._types_of(uplink.topic)), ""))
+        if self._wire.link is None or not uplink.type or not uplink.served:
             return
         self._definitions.want(uplink.type)
-        uplink.phase = Phase.ASKED
+        uplink.asked()
         self._send(uplink)
+
+    def _unsubscribe(self, uplink: TopicUplink) -> None:
+        known = self._wire.asks.withdraw(("subscribe", uplink.number))
+        if known and uplink.phase in (Phase.ASKED, Phase.ACTIVE):
+            self._wire.send(link.Unsubscribe(number=uplink.number))
+        uplink.reset()
+
+    def _follow_throttle(self, uplink: TopicUplink) -> None:
+        if uplink.phase is not Phase.WAITING and uplink.least_throttle_ms() != uplink.throttle_ms:
+            self._send(uplink)
 
     def _send(self, uplink: TopicUplink) -> None:
         uplink.throttle_ms = uplink.least_throttle_ms()

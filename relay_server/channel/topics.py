@@ -11,7 +11,7 @@ from relay_protocol import limits, rosbridge
 from relay_protocol.link import QoS
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.listener import Listener
-from relay_server.channel.sample import Sample, converter
+from relay_server.channel.sample import Converter, Sample
 from relay_server.channel.wire import Member
 
 LATCHED_KEPT = 64
@@ -34,68 +34,156 @@ class Phase(enum.Enum):
 class TopicUplink:
     """A topic the relay subscribes to on the robot, once, for all its listeners.
 
-    :param type_name: as the first client gave it, or from the graph; empty when nobody knows it yet
+    :param type_name: empty when nobody knows it yet
+    :param types: gives what is known of the robot's types
+    :param broken: called with the reason when a message can't be converted, the first time
     """
 
-    def __init__(self, number: int, topic: str, type_name: str, qos: QoS | None) -> None:
+    def __init__(
+        self,
+        number: int,
+        topic: str,
+        type_name: str,
+        qos: QoS | None,
+        types: Callable[[], TypeRegistry],
+        broken: Callable[[TopicUplink, str], None],
+    ) -> None:
         self.number = number
         self.topic = topic
         self.type = type_name
+        self.certain = False
+        """Whether the robot has the topic with this type; else the type is what a client says."""
         self.qos = qos
         self.phase = Phase.WAITING
         self.throttle_ms = 0
         self.encoding = "cdr"
         self.latched = False
-        self.listeners: dict[Member, Listener] = {}
-        self._recent: deque[Sample] = deque(maxlen=1)
-        self._untyped: deque[bytes] = deque(maxlen=LATCHED_KEPT)
         self.failures = 0
+        self.listeners: dict[Member, Listener] = {}
+        self.wanted: dict[Member, str] = {}
+        """The type each client says the topic has; those who leave it to the graph are not here."""
+        self.served: list[Listener] = []
+        """Those who get the samples: not those who say another type."""
+        self._types = types
+        self._broken = broken
+        self._converter = self._new_converter()
+        self._recent: deque[Sample] = deque(maxlen=1)
+        self._untyped: deque[Sample] = deque(maxlen=LATCHED_KEPT)
+
+    # --- who listens --------------------------------------------------------------------------------------
+
+    def join(self, member: Member, listener: Listener, type_name: str | None) -> None:
+        """A client listens, or listens otherwise than before.
+
+        :param type_name: empty when it leaves the type to the graph, ``None`` when it is as before
+        """
+        self.listeners[member] = listener
+        if type_name:
+            self.wanted[member] = type_name
+        elif type_name is not None:
+            self.wanted.pop(member, None)
+        self._serve()
+
+    def leave(self, member: Member) -> bool:
+        """A client listens no more; whether it did."""
+        self.wanted.pop(member, None)
+        left = self.listeners.pop(member, None) is not None
+        self._serve()
+        return left
+
+    def serves(self, member: Member) -> bool:
+        """Whether a client gets the samples."""
+        return member in self.listeners and self.wanted.get(member, self.type) == self.type
+
+    def mistaken(self) -> list[tuple[Member, str]]:
+        """Those who say another type, and which."""
+        return [(member, wanted) for member, wanted in self.wanted.items() if wanted != self.type]
+
+    def _serve(self) -> None:
+        self.served = [listener for member, listener in self.listeners.items() if self.serves(member)]
+
+    def least_throttle_ms(self) -> int:
+        """The throttle that still satisfies everyone who is served."""
+        return int(min((listener.throttle for listener in self.served), default=0.0) * 1000)
+
+    # --- the robot's side ---------------------------------------------------------------------------------
+
+    def asked(self) -> None:
+        """The robot has been asked to subscribe."""
+        self.phase = Phase.ASKED
+        self._converter = self._new_converter()
 
     def activate(self, type_name: str, encoding: str, latched: bool, publishers: int) -> None:
         """The robot has subscribed."""
         self.phase = Phase.ACTIVE
-        self.type = type_name
+        if (type_name, encoding) != (self.type, self.encoding):
+            self._forget()
         self.encoding = encoding
         self.latched = latched
+        self.retype(type_name)
         self._recent = deque(self._recent, maxlen=min(max(publishers, 1), LATCHED_KEPT))
+
+    def retype(self, type_name: str) -> None:
+        """The topic has this type."""
+        self.type = type_name
+        self._converter = self._new_converter()
+        self._serve()
 
     def reset(self) -> None:
         """The robot's side is gone."""
         self.phase = Phase.WAITING
+        self._forget()
+
+    def _forget(self) -> None:
         self._recent.clear()
         self._untyped.clear()
 
-    def least_throttle_ms(self) -> int:
-        """The throttle that still satisfies every listener."""
-        return int(min((listener.throttle for listener in self.listeners.values()), default=0.0) * 1000)
+    def _new_converter(self) -> Converter:
+        return Converter(self._types(), self.type, self.encoding, self._failed)
 
-    def sample(self, body: bytes, types: TypeRegistry) -> Sample | None:
+    def _failed(self, reason: str) -> None:
+        self.failures += 1
+        if self.failures == 1:
+            self._broken(self, reason)
+
+    # --- samples ------------------------------------------------------------------------------------------
+
+    def sample(self, body: bytes, stamp: int) -> None:
         """Take a sample from the robot and hand it to the listeners."""
-        if self.encoding == "cdr" and not types.knows(self.type):
-            self._untyped.append(body)
-            while sum(map(len, self._untyped)) > KEPT_BYTES:
-                self._untyped.popleft()
-            return None
-        sample = Sample(body, converter(types, self.type, self.encoding))
+        sample = Sample(body, stamp, self._converter)
         if self.latched:
-            self._recent.append(sample)
-            while sum(each.size for each in self._recent) > KEPT_BYTES:
-                self._recent.popleft()
-        for listener in list(self.listeners.values()):
-            listener.offer(sample)
-        return sample
+            _keep(self._recent, sample)
+        if self._converter.knows:
+            for listener in self.served:
+                listener.offer(sample)
+            return
+        _keep(self._untyped, sample)
+        for listener in self.served:
+            if listener.raw:
+                listener.offer(sample)
 
-    def typed(self, types: TypeRegistry) -> None:
-        """The type's definition has come: hand on what waited for it."""
+    def typed(self) -> None:
+        """The type's definition has come, or another one: hand on what waited for it."""
+        self._converter = self._new_converter()
         waiting = list(self._untyped)
         self._untyped.clear()
-        for body in waiting:
-            self.sample(body, types)
+        for sample in waiting:
+            for listener in self.served:
+                if not listener.raw:
+                    listener.offer(sample)
 
     def replay(self, listener: Listener) -> None:
         """Give a late joiner the latched samples the others have had."""
-        for sample in list(self._recent):
-            listener.replay(sample)
+        if self._converter.knows or listener.raw:
+            for sample in list(self._recent):
+                listener.replay(sample)
+
+
+def _keep(samples: deque[Sample], sample: Sample) -> None:
+    """The newest count, as far as they are not too large together."""
+    samples.append(sample)
+    while sum(each.size for each in samples) > KEPT_BYTES:
+        samples.popleft()
 
 
 class Held(NamedTuple):

@@ -341,7 +341,7 @@ class ChannelEnd:
 
     def sample(self, frame: SampleFrame) -> None:
         """A sample of a subscribed topic."""
-        self._channel.sample(frame.number, frame.body)
+        self._channel.sample(frame.number, frame.body, frame.stamp)
 
     def lost(self, reason: str) -> None:
         """The link has ended."""

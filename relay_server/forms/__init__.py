@@ -7,11 +7,9 @@ from typing import NamedTuple, Protocol
 
 from relay_protocol import rosbridge
 from relay_server import wsframe
+from relay_server.forms import cbor, fragments, png
 
 COMPRESSIONS = ("none", "png", "cbor", "cbor-raw")
-
-LEAST_FRAGMENT = 64
-"""Smallest fragments a client can ask for, bytes of ``data``."""
 
 
 class Form(NamedTuple):
@@ -62,15 +60,29 @@ def asked(ask: Asking, tell: Tell, *, topic: bool = False) -> Form:
     if compression == "cbor-raw" and not topic:
         compression = "cbor"
     size = max(0, ask.fragment_size or 0)
-    if 0 < size < LEAST_FRAGMENT:
-        tell("warning", f"fragments of {size} bytes are too small; they have {LEAST_FRAGMENT}", ask.id)
-        size = LEAST_FRAGMENT
+    if 0 < size < fragments.LEAST:
+        tell("warning", f"fragments of {size} bytes are too small; they have {fragments.LEAST}", ask.id)
+        size = fragments.LEAST
     return Form(compression, size)
 
 
 def frames(message: bytes, form: Form) -> bytes:
     """The websocket frames of one message.
 
-    :param message: JSON
+    :param message: JSON. In PNG it goes only if it is no longer than :data:`relay_server.forms.png.MOST`.
     """
-    return wsframe.text(message)
+    if form == PLAIN:
+        return wsframe.text(message)
+    if form.compression in ("cbor", "cbor-raw"):
+        return wsframe.binary(cbor.from_json(message))
+    if form.compression == "png" and len(message) <= png.MOST:
+        message = png.encode(message)
+    return divided(message, form.fragment_size)
+
+
+def divided(message: bytes, size: int) -> bytes:
+    """The websocket frames of a text message, in fragments if it is longer than their size.
+
+    :param size: bytes of ``data``; 0 for no fragments
+    """
+    return b"".join(map(wsframe.text, fragments.divide(message, size)))

@@ -232,8 +232,8 @@ class Session:
 
     # --- to the client ------------------------------------------------------------------------------------
 
-    def deliver(self, listener: Listener, parcel: Sample | bytes) -> None:
-        """Queue a message of a topic: a sample, opened when its turn comes, or frames."""
+    def deliver(self, listener: Listener, parcel: Sample) -> None:
+        """Queue a message of a topic, opened when its turn comes."""
         self.outbox.data(listener, parcel, listener.depth or DATA_PER_TOPIC)
 
     def say(self, message: bytes, form: Form = PLAIN) -> None:

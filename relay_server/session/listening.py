@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Refused
 from relay_protocol.rights import Operation
+from relay_protocol.ros_types import TypeRegistry
+from relay_server import forms
 from relay_server.channel import resolve
 from relay_server.channel.listener import Listener
+from relay_server.channel.sample import Converter, Sample
 from relay_server.clock import Clock, looping
-from relay_server.forms import frames
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ class Listening:
         self._local = local
         self._listeners: dict[str, Listener] = {}
         self._telling = looping(clock, self._publish_local)
+        self._own = Converter(TypeRegistry(), "", "json", lambda reason: None)
 
     def end(self) -> None:
         """The client is gone."""
@@ -46,24 +49,21 @@ class Listening:
         session = self._session
         topic = resolve(ask.topic)
         session.judge(Operation.SUBSCRIBE, topic)
-        if ask.compression not in ("none", ""):
-            session.tell(
-                "warning", f"compression {ask.compression} is not served; {topic} comes as plain JSON", ask.id
-            )
+        form = forms.asked(ask, session.tell, topic=True)
         listener = self._listeners.get(topic)
         if listener is None:
             if len(self._listeners) >= SUBSCRIPTIONS:
                 raise Refused(f"at most {SUBSCRIPTIONS} topics can be subscribed on one connection")
-            listener = Listener(self._clock, session, ask.topic)
+            listener = Listener(self._clock, session, topic)
         if self._local.topic(topic) is not None:
-            listener.add(ask)
+            listener.add(ask, form)
             self._listeners[topic] = listener
             if not self._telling.running:
                 self._telling.start(TELL_SECONDS, now=True)
             return
         subscriptions = session.channel.subscriptions
         subscriptions.check(topic, normal_type(ask.type))
-        listener.add(ask)
+        listener.add(ask, form)
         subscriptions.add(session, listener, normal_type(ask.type), ask.qos)
         self._listeners[topic] = listener
 
@@ -73,9 +73,9 @@ class Listening:
         listener = self._listeners.get(topic)
         if listener is None:
             return
-        if ask.id is not None and listener.remove(ask.id):
+        if ask.id is not None and listener.remove(ask.topic, ask.id):
             if self._local.topic(topic) is None:
-                self._session.channel.subscriptions.add(self._session, listener, "", None)
+                self._session.channel.subscriptions.add(self._session, listener, None, None)
             return
         self._drop(topic)
 
@@ -100,7 +100,6 @@ class Listening:
         for name, make in makers:
             if make is not None:
                 body = jsontext.encode(make(self._session))
-                listener = self._listeners[name]
-                self._session.deliver(listener, frames(rosbridge.publish(listener.name, body), listener.form))
+                self._listeners[name].replay(Sample(body, 0, self._own))
         if not any(make for _, make in makers):
             self._telling.stop()

@@ -8,6 +8,7 @@ from relay_protocol import link
 from relay_protocol.rights import Level
 from relay_server.channel import listener as listener_module
 from relay_server.channel import topics as module
+from relay_server.channel.sample import Converter
 from tests.relay_server.memory import GRAPH, STRING, Person, World, text
 
 
@@ -22,6 +23,19 @@ def watching(world: World, *asks: dict[str, Any]) -> tuple[int, list[Person]]:
     world.subscribed(number)
     world.define()
     return number, people
+
+
+def counting(world: World, number: int) -> list[str]:
+    """The list that every conversion of a topic's sample is written to from now on."""
+    converter = world.channel.subscriptions._numbers[number]._converter
+    converted: list[str] = []
+
+    def counted(language: str, body: bytes) -> bytes:
+        converted.append(language)
+        return Converter.convert(converter, language, body)
+
+    converter.convert = counted  # type: ignore[method-assign]
+    return converted
 
 
 def heard(person: Person) -> list[str]:
@@ -160,7 +174,7 @@ def test_what_is_kept_of_one_topic_is_bounded_in_bytes(world: World) -> None:
     uplink = world.channel.subscriptions._numbers[number]
     for _ in range(5):
         world.channel.sample(number, bytes(module.KEPT_BYTES // 3))
-    assert sum(map(len, uplink._untyped)) <= module.KEPT_BYTES
+    assert 0 < sum(each.size for each in uplink._untyped) <= module.KEPT_BYTES
     world.define()
     for _ in range(5):
         world.channel.sample(number, text("x" * (module.KEPT_BYTES // 3)))
@@ -217,11 +231,15 @@ def test_a_sample_that_can_not_be_converted_is_let_go(world: World) -> None:
 
 def test_a_sample_nobody_takes_is_not_converted(world: World) -> None:
     """Under a throttle only what is sent costs anything."""
-    number, _ = watching(world, {"throttle_rate": 1000})
+    number, (person,) = watching(world, {"throttle_rate": 1000})
+    converted = counting(world, number)
     world.channel.sample(number, text("sent"))
-    sample = world.channel.subscriptions._numbers[number].sample(text("waits"), world.robot.types)
-    assert sample is not None
-    assert sample._json is None
+    world.channel.sample(number, text("gives way"))
+    world.channel.sample(number, text("waits"))
+    assert converted == ["json"]
+    world.clock.advance(1)
+    assert heard(person) == ["sent", "waits"]
+    assert converted == ["json", "json"]
 
 
 def test_a_topic_has_one_type(world: World) -> None:
