@@ -70,11 +70,12 @@ def outcome_of(item: pytest.Item, report: pytest.TestReport) -> Outcome | None:
     if (
         mark is None
         or (report.when != "call" and report.passed)
-        or (report.when == "teardown"
-        and report.skipped)
+        or (report.when == "teardown" and report.skipped)
     ):
         return None
-    title = inspect.cleandoc(item.function.__doc__ or item.name).partition("\n")[0]  # type: ignore[attr-defined]
+    params = getattr(item, "callspec", None)
+    title = inspect.cleandoc(item.function.__doc__ or item.name)  # type: ignore[attr-defined]
+    title = title.partition("\n")[0] + (f" [{params.id}]" if params else "")
     word, remark = report.outcome, ""
     if hasattr(report, "wasxfail"):
         word, remark = "differs", report.wasxfail

@@ -11,6 +11,7 @@ and strings out, is borrowed from ``rcl_interfaces/srv/ListParameters``): ``pref
 from __future__ import annotations
 
 import array
+import contextlib
 import importlib
 import json
 import signal
@@ -317,10 +318,8 @@ def main() -> None:
 
 
 def _spin(executor: MultiThreadedExecutor) -> None:
-    try:
+    with contextlib.suppress(ExternalShutdownException):
         executor.spin()
-    except ExternalShutdownException:
-        pass
 
 
 if __name__ == "__main__":

@@ -1,0 +1,330 @@
+"""What holds for every operation: status, errors, limits, credentials, the address itself."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import urllib.request
+from typing import Any
+
+import pytest
+from conformance_suite import NO_STATUS, SPEC_ONLY, Server, case, fresh_name
+from rosbridge_client import ABSENCE, Client
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+ENVELOPE = "rosbridge v2, 1 Message envelope"
+ERRORS = "SPEC 1.3 Errors"
+BINARY_IS_TEXT = "a binary message is taken as text (rosbridge_server/websocket_handler.py, on_message)"
+NO_AUTH = "nobody has to log in, and there is no op auth in ROS 2"
+
+
+# --- status ---
+
+
+@case("status", "SPEC 1.2 status, only after set_level")
+def test_status_unasked(client: Client) -> None:
+    """Without set_level no status is ever sent, because common clients break on it."""
+    client.send("no_such_operation")
+    client.send_raw("{not JSON")
+    client.send("publish", topic=fresh_name(), msg={})
+    client.send("subscribe", topic=fresh_name())
+    client.lives()
+    client.none("status")
+
+
+@case("status", "SPEC 1.2 status", suite=NO_STATUS)
+def test_status(told: Client) -> None:
+    """A status has a level, a msg for people, and the id of what it is about."""
+    told.send("publish", id="mine", topic=fresh_name(), msg={})
+    status = told.until("status")
+    assert status["level"] == "error"
+    assert len(status["msg"]) > 10
+    assert status["id"] == "mine"
+
+
+@case("set_level", "SPEC 1.2 set_level", suite=NO_STATUS)
+def test_set_level_none(told: Client) -> None:
+    """After set_level none no status comes any more."""
+    told.send("no_such_operation")
+    told.until("status")
+    told.send("set_level", level="none")
+    told.send("no_such_operation")
+    told.lives()
+    told.none("status")
+
+
+@case("set_level", "SPEC 1.2 set_level", suite=NO_STATUS)
+@pytest.mark.parametrize("level", ["info", "warning", "error"])
+def test_set_level(client: Client, level: str) -> None:
+    """Errors are told at every level but none."""
+    client.send("set_level", level=level)
+    client.send("no_such_operation")
+    assert client.until("status", level="error")["msg"]
+
+
+@case("set_level", "SPEC 1.2 set_level", suite=NO_STATUS)
+def test_set_level_of_one_client(told: Client, client: Client) -> None:
+    """The level is of one client, not of all."""
+    client.send("no_such_operation")
+    told.send("no_such_operation")
+    told.until("status")
+    client.none("status")
+
+
+@case("set_level", ERRORS, suite=NO_STATUS)
+def test_set_level_unknown(told: Client) -> None:
+    """A level that doesn't exist is an error in words, and the old one stays."""
+    told.send("set_level", level="shouting")
+    assert told.until("status", level="error")["msg"]
+
+
+# --- messages ---
+
+
+@case("any op", ENVELOPE, suite=NO_STATUS)
+def test_unknown_op(told: Client) -> None:
+    """An unknown op is answered with an error that names it, and the connection lives."""
+    told.send("make_coffee", id="please")
+    assert "make_coffee" in told.until("status", level="error")["msg"]
+    told.lives()
+
+
+BAD = {
+    "no JSON": "{op: 'publish'}",
+    "half of it": '{"op": "publish", "topic": "/x"',
+    "two in one": '{"op":"publish","topic":"/x","msg":{}}{"op":"publish","topic":"/x","msg":{}}',
+    "an array": '["publish"]',
+    "a number": "17",
+    "nothing": "",
+    "no op": '{"topic": "/x"}',
+    "op a number": '{"op": 5}',
+    "a field missing": '{"op": "subscribe"}',
+    "a field of the wrong type": '{"op": "subscribe", "topic": 5}',
+    "NaN": '{"op": "publish", "topic": "/x", "msg": {"data": NaN}}',
+    "a control character": '{"op": "publish", "topic": "/x\n", "msg": {}}',
+}
+
+
+@case("any op", ERRORS + "; RFC 8259", suite=NO_STATUS)
+@pytest.mark.parametrize("what", BAD)
+def test_bad_message(told: Client, what: str) -> None:
+    """What is no rosbridge is answered with an error in words, and the connection lives."""
+    told.send_raw(BAD[what])
+    assert told.until("status", level="error")["msg"]
+    told.lives()
+
+
+@case("any op", ERRORS)
+def test_bad_messages_live(client: Client) -> None:
+    """What is no rosbridge harms nobody, also without set_level."""
+    for text in BAD.values():
+        if "half" not in text:
+            client.send_raw(text)
+    client.lives()
+
+
+@case("any op", "SPEC 1, nesting at most 64", suite=NO_STATUS)
+@pytest.mark.parametrize("depth", [65, 5000, 200_000])
+def test_deep(told: Client, depth: int) -> None:
+    """Nesting beyond 64 is answered with an error in words, and the connection lives."""
+    told.send_raw('{"op":"publish","topic":"/x","msg":{"data":' + "[" * depth + "]" * depth + "}}")
+    assert told.until("status", level="error")["msg"]
+    told.lives()
+
+
+@case("any op", "SPEC 1, unknown fields")
+def test_unknown_fields(client: Client) -> None:
+    """Unknown fields are passed over."""
+    answer = client.call("/conformance/invert", {"data": False}, favourite_colour="blue", nested={"a": [1]})
+    assert answer["result"] is True
+
+
+@case("any op", "SPEC 1, numbers within the range", suite=NO_STATUS)
+def test_large_number(told: Client) -> None:
+    """A number beyond double and 64 bits is answered with an error in words."""
+    told.send_raw(
+        '{"op":"call_service","service":"/conformance/invert","id":"n","args":{"data":' + "9" * 400 + "}}"
+    )
+    assert told.until("status", level="error")["msg"]
+
+
+@case(
+    "any op",
+    "SPEC 5, a message from a client; RFC 6455, 7.4.1",
+    suite="the limit is 10 MB (rosbridge_server, max_message_size)",
+)
+def test_oversized(client: Client) -> None:
+    """A message of more than 1 MiB closes the connection with 1009."""
+    with contextlib.suppress(ConnectionClosed):
+        client.send("publish", topic="/x", msg={"data": "x" * 2**20})
+    assert client.closed() == 1009
+
+
+@case("any op", "SPEC 5, a message from a client")
+def test_just_not_oversized(client: Client) -> None:
+    """A message of a little less than 1 MiB is taken."""
+    answer = client.call("/conformance/invert", {"data": False}, padding="x" * (2**20 - 1000))
+    assert answer["result"] is True
+
+
+@case("any op", "SPEC 1.4, 4403", suite=BINARY_IS_TEXT)
+def test_binary(client: Client) -> None:
+    """A binary message closes the connection with 4403."""
+    client.send_raw(json.dumps({"op": "no matter"}).encode())
+    assert client.closed() == 4403
+
+
+@case("any op", "SPEC 1, valid UTF-8, and 1.3; or RFC 6455, 8.1")
+def test_not_utf8(told: Client) -> None:
+    """Text that is no UTF-8 is refused: by an error in words, or by closing with 1007."""
+    told.connection.send(b'{"op":"call_service","id":"\xff","service":"/conformance/invert"}', text=True)
+    try:
+        assert told.until("status", level="error")["msg"]
+        told.lives()
+    except ConnectionClosed:
+        assert told.closed() == 1007
+
+
+@case("any op", "SPEC 1.3, 100 messages in a row; 1.4, 4429", suite=SPEC_ONLY)
+def test_too_many_errors(client: Client) -> None:
+    """A hundred messages in a row that are no rosbridge close the connection with 4429."""
+    with contextlib.suppress(ConnectionClosed):
+        for _ in range(100):
+            client.send_raw("gibberish")
+    assert client.closed() == 4429
+
+
+@case("any op", "RFC 6455, 5.4")
+def test_websocket_fragments(client: Client) -> None:
+    """A text message in several websocket frames is one message."""
+    text = json.dumps(
+        {"op": "call_service", "id": "w", "service": "/conformance/invert", "args": {"data": False}}
+    )
+    client.connection.send([text[:20], text[20:21], text[21:]])
+    assert client.until("service_response", id="w")["result"] is True
+
+
+@case("any op", "RFC 6455, 5.5.2 Ping")
+def test_ping(client: Client) -> None:
+    """A websocket ping is answered."""
+    assert client.connection.ping(b"are you there").wait(8)
+
+
+# --- credentials ---
+
+
+def closes_or_refuses(url: str, token: str = "", **options: Any) -> int:
+    """The HTTP status of a refused handshake, or the close code after one."""
+    try:
+        with Client(url, token, **options) as connected:
+            return connected.closed()
+    except InvalidStatus as refused:
+        return refused.response.status_code
+
+
+@case("auth", "SPEC 1.1, access token in mac", suite=NO_AUTH)
+def test_auth(server: Server) -> None:
+    """A client without credentials in the handshake logs in by auth, the token in mac."""
+    server.needs_token()
+    rosauth = {"client": "me", "dest": "you", "rand": "r", "t": 1, "level": "admin", "end": 2}
+    with Client(server.url) as client:
+        client.send("auth", mac=server.token, **rosauth)
+        client.lives()
+
+
+@case("auth", "SPEC 1.1; rosauth on every connection")
+def test_auth_again(client: Client, server: Server) -> None:
+    """auth on a connection that is logged in already harms nobody."""
+    client.send("auth", mac=server.token or "x")
+    client.lives()
+
+
+@case("auth", "SPEC 1.4, 4401", suite=NO_AUTH)
+def test_auth_wrong(server: Server) -> None:
+    """A wrong token in auth closes the connection with 4401."""
+    server.needs_token()
+    with Client(server.url) as client:
+        client.send("auth", mac="wrong" + server.token)
+        assert client.closed() == 4401
+
+
+@case("auth", "SPEC 1.1, the first message", suite=NO_AUTH)
+def test_nothing_before_auth(server: Server) -> None:
+    """Before auth nothing is done: the call is not answered, the connection closed with 4401."""
+    server.needs_token()
+    with Client(server.url) as client:
+        client.send("call_service", id="early", service="/conformance/invert", args={"data": True})
+        assert client.closed() == 4401
+
+
+@case("auth", "SPEC 1.1, Authorization", suite=NO_AUTH)
+def test_bearer_wrong(server: Server) -> None:
+    """A wrong token in the Authorization header is refused with HTTP 401."""
+    server.needs_token()
+    assert closes_or_refuses(server.url, "wrong" + server.token) == 401
+
+
+@case("auth", "SPEC 1.1, subprotocol", suite=NO_AUTH)
+def test_subprotocol(server: Server) -> None:
+    """The token may come as subprotocol bearer.<token>, which the answer selects."""
+    server.needs_token()
+    name = f"bearer.{server.token}"
+    with Client(server.url, subprotocols=[name]) as client:
+        assert client.connection.subprotocol == name
+        client.lives()
+
+
+@case("auth", "SPEC 1.1, the same answer", suite=NO_AUTH)
+def test_no_such_robot(server: Server) -> None:
+    """A robot that does not exist is refused, by a close code or a status that says no more than that."""
+    server.needs_token()
+    nobody = server.url.rpartition("/")[0] + "/no-such-robot"
+    assert closes_or_refuses(nobody, server.token) in (403, 404, 4403, 4404)
+
+
+@case("auth", "SPEC 1.1, ticket", suite=NO_AUTH)
+def test_ticket(server: Server) -> None:
+    """A ticket in the URL opens one connection, and no second."""
+    server.needs_token()
+    base, _, robot = server.http_url.rpartition("/robots/")
+    headers = {"Authorization": f"Bearer {server.token}", "Content-Type": "application/json"}
+    body = json.dumps({"robot": robot}).encode()
+    with urllib.request.urlopen(urllib.request.Request(f"{base}/api/v1/tickets", body, headers)) as answer:
+        ticket = json.load(answer)["ticket"]
+    with Client(f"{server.url}?ticket={ticket}") as client:
+        client.lives()
+    assert closes_or_refuses(f"{server.url}?ticket={ticket}") in (401, 4401)
+
+
+# --- the address ---
+
+
+@case("HTTP GET", "SPEC 1; protocol and version as JSON")
+def test_http_get(server: Server) -> None:
+    """A plain GET on the same address answers with version and protocol as JSON."""
+    headers = {"Authorization": f"Bearer {server.token}"} if server.token else {}
+    with urllib.request.urlopen(
+        urllib.request.Request(server.http_url, headers=headers), timeout=8
+    ) as answer:
+        assert answer.status == 200
+        assert answer.headers.get_content_type() == "application/json"
+        about = json.load(answer)
+    assert about["protocol"]
+    assert about.get("version") or about.get("server")
+
+
+@case("any op", "SPEC 1, one websocket is one client")
+def test_many_clients(server: Server) -> None:
+    """Ten clients at once are served, and none sees what another asked for."""
+    clients = [server.connect() for _ in range(10)]
+    try:
+        for number, each in enumerate(clients):
+            args = {"data": number % 2 == 0}
+            each.send("call_service", id=number, service="/conformance/invert", args=args)
+        for number, each in enumerate(clients):
+            answer = each.until("service_response")
+            assert (answer["id"], answer["values"]["success"]) == (number, number % 2 == 1)
+            each.none("service_response", ABSENCE / 10)
+    finally:
+        for each in clients:
+            each.close()
