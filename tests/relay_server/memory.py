@@ -26,7 +26,11 @@ M = TypeVar("M", bound=link.Message)
 STRING = "std_msgs/msg/String"
 TWIST = "geometry_msgs/msg/Twist"
 TRIGGER = "std_srvs/srv/Trigger"
+ADD = "example_interfaces/srv/AddTwoInts"
+FIBONACCI = "example_interfaces/action/Fibonacci"
 TEXTS = {
+    ADD: "int64 a\nint64 b\n---\nint64 sum\n",
+    FIBONACCI: "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
     STRING: "string data\n",
     TWIST: "Vector3 linear\nVector3 angular\n"
     + "=" * 80
@@ -223,6 +227,15 @@ class World:
             assert not types or asked.type in types
             self.channel.message(link.TypeDefinition(type=asked.type, text=TEXTS[asked.type]))
 
+    def cdr(self, part: str, **fields: Any) -> str:
+        """A body of a type the robot has defined, in base64."""
+        return link.to_base64(self.robot.types.from_json(part, fields, 0))
+
+    def fields(self, part: str, cdr: str | None) -> Any:
+        """What such a body says."""
+        assert cdr is not None
+        return json.loads(self.robot.types.to_json(part, link.from_base64(cdr, "cdr")))
+
     def subscribed(self, number: int, type_name: str = STRING, encoding: str = "cdr", **more: Any) -> None:
         """The robot confirms a subscription."""
         self.channel.message(
@@ -230,10 +243,14 @@ class World:
         )
 
     def person(
-        self, level: Level = Level.OPERATOR, allow: tuple[str, ...] = (), deny: tuple[str, ...] = ()
+        self,
+        level: Level = Level.OPERATOR,
+        allow: tuple[str, ...] = (),
+        deny: tuple[str, ...] = (),
+        user: int = 7,
     ) -> Person:
         """A client with a right on the robot, its session begun."""
-        principal = Principal(7, "ann", "main", False, next(self._tokens), None)
+        principal = Principal(user, "ann", "main", False, next(self._tokens), None)
         permit = Permit(principal, 1, Rules([Grant(level, allow, deny)]))
         client = MemoryClient()
         session = Session(
@@ -269,6 +286,6 @@ def fails(work: Any) -> str:
 
 
 __all__ = [
-    "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink", "Person",
+    "ADD", "FIBONACCI", "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink", "Person",
     "Presence", "Unavailable", "World", "fails", "text", "words",
 ]  # fmt: skip
