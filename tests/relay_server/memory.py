@@ -270,6 +270,14 @@ class World:
         session.start()
         return Person(session, client)
 
+    def wait(self, seconds: float, *people: Person) -> None:
+        """Time goes by, and these clients answer their pings."""
+        until = self.clock.seconds() + seconds
+        while (left := until - self.clock.seconds()) > 0:
+            self.clock.advance(min(left, 1.0))
+            for person in people:
+                person.answers_pings()
+
     def working(self) -> None:
         """The robot is there, joined, and has told of all types it was asked for."""
         self.robot_comes()
