@@ -16,9 +16,10 @@ import orjson
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
-from relay_protocol.limits import COMMAND_FRAME, MIB, TYPE_TEXTS
-from relay_protocol.ros import fast_reader
+from relay_protocol.limits import MIB, TYPE_TEXTS
+from relay_protocol.ros import fast_reader, fast_writer
 from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
+from relay_protocol.ros.fast_writer import LARGEST_BODY
 from relay_protocol.ros.reader import ReaderFactory
 from relay_protocol.ros.typedefs import typedef
 from relay_protocol.ros.writer import Mismatch, WriterFactory, as_invalid
@@ -26,8 +27,6 @@ from relay_protocol.ros.writer import Mismatch, WriterFactory, as_invalid
 _ORDERS = {b"\x00\x01": "<", b"\x00\x00": ">"}
 """Byte order of the numbers by the first two bytes of a message."""
 _WRITTEN_HEAD = b"\x00\x01\x00\x00"
-_LARGEST_BODY = COMMAND_FRAME - 17
-"""What is left of a frame after kind, number, stamp and encapsulation header."""
 _SHARED_CHARACTERS = 8 * MIB
 _TYPES_OF_A_ROBOT = 4096
 
@@ -91,7 +90,7 @@ class _Compiled:
     def _writer(self, name: str, checked: bool) -> Writer:
         decode = _decode_checked if checked else jsontext.decode_any
 
-        def write(body: Any, now_ns: int) -> bytes:
+        def slow(body: Any, now_ns: int) -> bytes:
             try:
                 value = decode(body) if type(body) is bytes else body
             except MalformedMessage as error:
@@ -101,13 +100,13 @@ class _Compiled:
                 self._writers.writer(name)(out, value, now_ns)
             except Mismatch as error:
                 raise as_invalid(name, error) from None
-            if len(out) > _LARGEST_BODY:
+            if len(out) > LARGEST_BODY:
                 raise Invalid(
-                    f"{name}: the message has {len(out)} bytes; a robot takes at most {_LARGEST_BODY}"
+                    f"{name}: the message has {len(out)} bytes; a robot takes at most {LARGEST_BODY}"
                 )
             return _WRITTEN_HEAD + out
 
-        return write
+        return fast_writer.generate(name, self.definitions, slow)
 
 
 def _decode_checked(text: bytes) -> Any:
@@ -191,6 +190,13 @@ class TypeRegistry:
             return False
         return name in self._types or all(part in self._types for part in parts_of(name))
 
+    def has_text(self, type_name: str) -> bool:
+        """Whether the robot has sent a text for just this type."""
+        try:
+            return normalise(type_name) in self._texts
+        except Invalid:
+            return False
+
     def definition(self, type_name: str) -> str:
         """The text as the robot sent it.
 
@@ -273,18 +279,19 @@ class TypeRegistry:
         return self.from_json(type_name, {}, 0)
 
     def typedefs(self, type_name: str) -> list[dict[str, Any]]:
-        """rosapi's typedefs of a message and of all it contains.
+        """rosapi's typedefs of a message and of all it contains, each where it is met first, going down.
 
         :raises NotFound: the type is not registered
         """
         name, compiled = self._find(type_name)
         waiting, found = [name], dict[str, dict[str, Any]]()
         while waiting:
-            name = waiting.pop(0)
+            name = waiting.pop()
             if name not in found:
                 definition = compiled.definitions[name]
                 found[name] = typedef(definition)
-                waiting += [each.type.base for each in definition.fields if each.type.primitive is None]
+                contained = [each.type.base for each in definition.fields if each.type.primitive is None]
+                waiting += reversed(contained)
         return list(found.values())
 
     def _request_of(self, type_name: str) -> str:

@@ -6,16 +6,16 @@ together in one expression. For little-endian messages on little-endian machines
 
 from __future__ import annotations
 
-import struct
 import sys
 from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 from relay_protocol.ros.definition import Definition, Field, FieldType, Primitive, Shape
-from relay_protocol.ros.forms import CborForm, JsonForm
+from relay_protocol.ros.forms import CborForm, HoldsArrays, JsonForm, PlainJsonForm
 from relay_protocol.ros.reader import HEAD, MAX_ELEMENTS
 from relay_protocol.ros.shapes import Block, Shapes
-from relay_protocol.ros.source import Cursor, Source, TooLarge
+from relay_protocol.ros.source import Cursor, Source, TooLarge, Unusual
+from relay_protocol.ros.structs import Structs
 
 Read = Callable[[bytes], bytes]
 
@@ -44,7 +44,7 @@ class Form(Protocol[V]):
     def numbers(self, kind: FieldType, count: str) -> V:
         """So many numbers from byte ``p`` on, which need not all be there; emits what takes them."""
 
-    def object(self, names: Sequence[str], values: Sequence[V]) -> V:
+    def object(self, definition: Definition, values: Sequence[V]) -> V:
         """A message."""
 
     def array(self, values: Sequence[V]) -> V:
@@ -72,14 +72,22 @@ def generate(name: str, definitions: dict[str, Definition], form: str, slow: Rea
     """
     if sys.byteorder == "big":
         return slow
-    source = Source()
     try:
-        if form == "json":
-            _Walk(definitions, source, JsonForm(source)).run(name)
-        else:
-            _Walk(definitions, source, CborForm(source)).run(name)
+        return _generated(name, definitions, form, slow)
     except TooLarge:
         return slow
+
+
+def _generated(name: str, definitions: dict[str, Definition], form: str, slow: Read) -> Read:
+    source = Source()
+    if form == "cbor":
+        _Walk(definitions, source, CborForm(source)).run(name)
+        return source.function("data", "data", slow)
+    try:
+        _Walk(definitions, source, PlainJsonForm(source, Structs(definitions))).run(name)
+    except HoldsArrays:
+        source = Source()
+        _Walk(definitions, source, JsonForm(source)).run(name)
     return source.function("data", "data", slow)
 
 
@@ -139,7 +147,7 @@ class _Walk(Cursor, Generic[V]):
         if not definition.fields:
             self.add("x", 1, 1)
         values = [self._field(field) for field in definition.fields]
-        return self._form.object([field.name for field in definition.fields], values)
+        return self._form.object(definition, values)
 
     def _field(self, field: Field) -> V:
         kind = field.type
@@ -261,8 +269,10 @@ class _Walk(Cursor, Generic[V]):
 
 
 def _wide(data: bytes, position: int, length: int) -> str:
-    """A text of 32-bit units, each a UTF-16 unit; half of a pair is left to the closures."""
-    text = data[position : position + 4 * length].decode("utf-32-le")
+    """A text of 32-bit units, each of which is a UTF-16 unit."""
+    text = data[position : position + 4 * length].decode("utf-32-le", "surrogatepass")
     if len(text) != length or (length and max(text) > "\uffff"):
-        raise struct.error
-    return text
+        raise Unusual
+    if text.isascii():
+        return text
+    return text.encode("utf-16-le", "surrogatepass").decode("utf-16-le")

@@ -14,9 +14,11 @@ import numpy
 import orjson
 import pybase64
 
-from relay_protocol.ros.definition import BYTES, FieldType, Primitive
+from relay_protocol import jsontext
+from relay_protocol.ros.definition import BYTES, Definition, FieldType, Primitive
 from relay_protocol.ros.reader import TYPED_ARRAYS
 from relay_protocol.ros.source import Source, quoted
+from relay_protocol.ros.structs import Structs
 
 _FEW = 24
 """Up to so many numbers :mod:`struct` is faster than numpy."""
@@ -82,8 +84,9 @@ class JsonForm:
         self._source.line(f"{name} = {value}")
         return name
 
-    def object(self, names: Sequence[str], values: Sequence[str]) -> str:
+    def object(self, definition: Definition, values: Sequence[str]) -> str:
         """A dict display."""
+        names = [field.name for field in definition.fields]
         return (
             "{"
             + ", ".join(f"{quoted(name)}: {value}" for name, value in zip(names, values, strict=True))
@@ -123,6 +126,37 @@ class JsonForm:
         array = f"{frombuffer}({data}, {dtype})"
         # Any byte but 0 is true; numpy's bool takes only 0 and 1.
         return f"({array} != 0)" if code == "?" else array
+
+
+class HoldsArrays(Exception):
+    """A message with arrays of numbers, which msgspec does not write."""
+
+
+class PlainJsonForm(JsonForm):
+    """Values are expressions, messages are msgspec's structs: cheaper to make than dicts."""
+
+    def __init__(self, source: Source, structs: Structs) -> None:
+        super().__init__(source)
+        self._structs = structs
+
+    def numbers(self, kind: FieldType, count: str) -> str:
+        """Not here.
+
+        :raises HoldsArrays: always
+        """
+        raise HoldsArrays
+
+    def object(self, definition: Definition, values: Sequence[str]) -> str:
+        """A struct."""
+        struct = self._source.constant(self._structs.of(definition.name))
+        return f"{struct}({', '.join(values)})"
+
+    def result(self, value: str) -> str:
+        """msgspec's text."""
+        return f"{self._source.constant(jsontext.encode)}({value})"
+
+    def _array(self, code: str, data: str) -> str:
+        raise HoldsArrays
 
 
 class Piece(NamedTuple):
@@ -209,8 +243,9 @@ class CborForm:
             return [Piece("BI", (str(_ARRAY), count)), Piece("", (translated,))]
         return [_known(head(6, TYPED_ARRAYS[code])), *self._sized(_BYTES, name)]
 
-    def object(self, names: Sequence[str], values: Sequence[list[Piece]]) -> list[Piece]:
+    def object(self, definition: Definition, values: Sequence[list[Piece]]) -> list[Piece]:
         """A map, its keys in between."""
+        names = [field.name for field in definition.fields]
         pieces = [_known(head(5, len(names)))]
         for name, value in zip(names, values, strict=True):
             key = name.encode()

@@ -1,9 +1,11 @@
 """Python source made for one type, and what bounds it.
 
 Definitions come from robots and are not to be trusted. Of their text only names of fields get into a source,
-after they were checked, as string constants written by :func:`repr`; everything else (defaults, key bytes, formats)
-is handed over as an object under a name made here. Its size is bounded. It is for messages that are as they should be: for all others it raises one of :data:`SURPRISES`, and the
-closures, which know every case and how to tell what was wrong, take the message instead.
+after they were checked, as string constants written by :func:`repr`; everything else (defaults, keys, formats) is
+handed over as an object under a name made here. The size of a source is bounded.
+
+Generated code is for messages that are as they should be. For all others it raises one of :data:`SURPRISES`,
+and the closures, which know every case and can tell what was wrong, take the message instead.
 """
 
 from __future__ import annotations
