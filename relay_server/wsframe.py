@@ -10,6 +10,7 @@ import struct
 
 TEXT = 0x81
 BINARY = 0x82
+PING = 0x89
 
 _SHORT = struct.Struct("!BB")
 _MEDIUM = struct.Struct("!BBH")
@@ -27,6 +28,14 @@ def text(payload: bytes) -> bytes:
 def binary(payload: bytes) -> bytes:
     """The frame of one binary message."""
     return _head(BINARY, len(payload)) + payload
+
+
+def ping(payload: bytes) -> bytes:
+    """The frame of a ping.
+
+    :param payload: at most 125 bytes (section 5.5)
+    """
+    return _SHORT.pack(PING, len(payload)) + payload
 
 
 def _head(first: int, length: int) -> bytes:

@@ -24,6 +24,7 @@ from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError,
 from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, encode_sample
 from relay_server.clock import Clock, Timer, cancel, looping
 from relay_server.edges.caps import AddressCap, Place
+from relay_server.edges.fastpath import Turns, Writer, writer_for
 from relay_server.outbox import Outbox
 
 PINGS = 256
@@ -66,6 +67,7 @@ class RobotConnection(TwistedProtocol):
 
     log = Logger()
     transport: Any
+    _writer: Writer
 
     def __init__(
         self,
@@ -100,6 +102,7 @@ class RobotConnection(TwistedProtocol):
         """A robot has dialled."""
         self.address = getattr(self.transport.getPeer(), "host", "")
         harden(self.transport)
+        self._writer = writer_for(self.transport, Turns(self._clock))
         self.transport.registerProducer(_Flow(self._outbox), True)
         if not self._cap.enter(self.address):
             self.refuse(link.Refused(reason="too many connections from your address", retry_after=10.0))
@@ -277,6 +280,7 @@ class RobotConnection(TwistedProtocol):
 
     def _hang_up(self, reason: str) -> None:
         self._end(reason)
+        self._writer.flush()
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()
         self._aborting = self._clock.callLater(2.0, self.transport.abortConnection)
@@ -304,7 +308,7 @@ class RobotConnection(TwistedProtocol):
         self._deadline = None
 
     def _write(self, data: bytes) -> None:
-        self.transport.write(data)
+        self._writer.write(data)
 
     def _overflow(self) -> None:
         self.log.warn("the robot at {address} takes nothing; it is cut", address=self.address)

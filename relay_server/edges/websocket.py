@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
-from autobahn.twisted.websocket import WebSocketServerFactory, WebSocketServerProtocol
+from autobahn.twisted.websocket import WebSocketServerFactory
 from autobahn.websocket.types import ConnectionDeny, ConnectionRequest
 from twisted.internet.defer import Deferred
 from twisted.internet.protocol import connectionDone
@@ -19,11 +19,12 @@ from twisted.logger import Logger
 
 from relay_protocol import limits, rosbridge
 from relay_protocol.errors import NotFound, PeerError, SwitchboardError, Unavailable
-from relay_server import closing
+from relay_server import closing, wsframe
 from relay_server.access import Principal
 from relay_server.auth import BadCredentials
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.caps import AddressCap, Place
+from relay_server.edges.fastpath import FastProtocol, Turns, Writer, writer_for
 from relay_server.frontdesk import Admission
 from relay_server.session import ClientTransport, Session
 
@@ -69,11 +70,12 @@ class Gate(Protocol):
         """Somebody who was admitted left before a session began."""
 
 
-class ClientProtocol(WebSocketServerProtocol):
+class ClientProtocol(FastProtocol):
     """One client's websocket."""
 
     log = Logger()
     factory: ClientFactory
+    _writer: Writer
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,6 +96,7 @@ class ClientProtocol(WebSocketServerProtocol):
 
     def connectionMade(self) -> None:
         """The site has handed over a connection that asked to become a websocket."""
+        self._writer = writer_for(self.transport, self.factory.turns)
         super().connectionMade()
         self._take_at_most(limits.UNPROVEN_BYTES)
         self._place = self.factory.cap.stranger()
@@ -287,7 +290,12 @@ class ClientProtocol(WebSocketServerProtocol):
         if session is not None:
             session.end()
 
+    def sendData(self, data: bytes, sync: bool = False, chopsize: int | None = None) -> None:
+        """What Autobahn itself sends, in order with what does not go through it."""
+        self._writer.write(data)
+
     def _closeConnection(self, abort: bool = False) -> None:
+        self._writer.flush()
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()
         super()._closeConnection(abort)
@@ -297,11 +305,11 @@ class ClientProtocol(WebSocketServerProtocol):
     def send(self, frames: bytes) -> None:
         """Whole frames. The peer may have begun to close: then nobody reads them."""
         if self.state == self.STATE_OPEN:
-            self.transport.write(frames)
+            self._writer.write(frames)
 
     def ping(self, payload: bytes) -> None:
         """A websocket ping."""
-        self.sendPing(payload)
+        self.send(wsframe.ping(payload))
 
     def close(self, code: int, reason: str) -> None:
         """Close with a code; the peer has a moment to answer, then the connection is dropped."""
@@ -375,6 +383,7 @@ class ClientFactory(WebSocketServerFactory):
         self.clock = clock
         self.clock_ns = clock_ns
         self.gate = gate
+        self.turns = Turns(clock)
         self.setProtocolOptions(
             webStatus=False,
             # Text is checked once, as a whole, by relay_protocol.jsontext.

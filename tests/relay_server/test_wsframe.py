@@ -17,3 +17,11 @@ def test_a_message_is_read_back_whole(length: int) -> None:
     reader.receive_data(wsframe.text(payload) + wsframe.binary(payload))
     read = [(frame.opcode, bytes(frame.data), frame.fin) for frame in reader.events_received()]
     assert read == [(Opcode.TEXT, payload, True), (Opcode.BINARY, payload, True)]
+
+
+def test_a_ping_is_read_back() -> None:
+    """With its payload."""
+    reader = Protocol(CLIENT, state=OPEN, max_size=None)
+    reader.receive_data(wsframe.ping(b"12345678"))
+    read = [(frame.opcode, bytes(frame.data)) for frame in reader.events_received()]
+    assert read == [(Opcode.PING, b"12345678")]

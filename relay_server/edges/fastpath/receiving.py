@@ -1,0 +1,211 @@
+"""A client's bytes, cut into frames (RFC 6455 section 5.2): the usual ones are read here, the others by Autobahn.
+
+A text message in one frame and a pong are read here when they are whole, all those of a chunk at once. Every other
+frame that is in order is passed on to Autobahn as it comes, and no byte beyond it. From the first frame that is not in
+order, Autobahn gets every byte as it comes: it fails the connection.
+
+No client has more than its share of a turn of the reactor: when its time is up, the rest of its bytes waits until the
+others have had their turn, and nothing more is read from it until then.
+"""
+
+from __future__ import annotations
+
+import struct
+
+from autobahn.twisted.websocket import WebSocketServerProtocol
+from twisted.logger import Logger
+
+try:
+    from websockets.speedups import apply_mask
+except ImportError:  # no wheel for this platform: right, but slow
+    from websockets.utils import apply_mask
+
+SHARE_SECONDS = 0.002
+"""Time for one client's messages in one turn; 64 KiB of small commands take less."""
+
+_OPEN = WebSocketServerProtocol.STATE_OPEN
+_SPEAKING = frozenset({_OPEN, WebSocketServerProtocol.STATE_CLOSING})
+
+_TEXT = 0x81
+_CLOSE = 0x88
+_PONG = 0x8A
+_MASKED = 0x80
+_BEGINNINGS = frozenset({0x01, 0x02, 0x81, 0x82})
+"""First byte of a frame that begins a text or binary message."""
+_CONTINUATIONS = frozenset({0x00, 0x80})
+_CONTROLS = frozenset({0x88, 0x89, 0x8A})
+"""Close, ping, pong: never in fragments, at most 125 bytes (section 5.5)."""
+
+_U16 = struct.Struct("!H").unpack_from
+_U64 = struct.Struct("!Q").unpack_from
+_LONGEST_HEAD = 14
+_HUGE = 1 << 63
+_COPIED = 4096
+"""Up to this length a copy of the payload is cheaper than a view of it."""
+
+_BROKEN = 0
+
+
+class FastProtocol(WebSocketServerProtocol):
+    """Autobahn's server protocol with a shorter way for what is frequent.
+
+    The factory's ``reactor`` is the clock. No extension may be negotiated: frames with reserved bits are refused.
+    """
+
+    log = Logger()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: bytearray | None = None
+        """Bytes from the beginning of a frame on, while they are not enough or the client's time is up."""
+        self._enough = 0
+        """Of so many bytes something can be made."""
+        self._passing = 0
+        """Bytes of the frame Autobahn is reading that have not come yet."""
+        self._verbatim = False
+        """Something was not in order: all bytes are Autobahn's."""
+        self._resting = False
+
+    def dataReceived(self, data: bytes) -> None:
+        """Bytes from the client, cut anywhere."""
+        if self._verbatim or not self._speaking():
+            super().dataReceived(data)
+            return
+        waiting = self._waiting
+        if waiting is not None:
+            waiting += data
+            if self._resting or len(waiting) < self._enough:
+                return
+            data = bytes(waiting)
+            self._waiting = None
+        self._read(data)
+
+    def _speaking(self) -> bool:
+        """The handshake is done, the connection not yet given up."""
+        return self.state in _SPEAKING
+
+    def _read(self, data: bytes) -> None:
+        at, have = 0, len(data)
+        seconds = self.factory.reactor.seconds
+        until = seconds() + SHARE_SECONDS
+        while at < have:
+            end = 0
+            if self.state == _OPEN and not self._passing and not self.inside_message:
+                start, end = _usual(data, at, self.maxFramePayloadSize)
+            if end > have:
+                self._wait(data, at, end - at)
+                return
+            if end:
+                take, at = data[at] == _TEXT, end
+                if take:
+                    self.onMessage(_unmasked(data, start, end), False)
+                else:
+                    self.onPong(_unmasked(data, start, end))
+            else:
+                at = self._pass_on(data, at)
+                if self._waiting is not None or not self._speaking():
+                    return
+            if seconds() > until and at < have:
+                self._rest(data, at)
+                return
+
+    def _wait(self, data: bytes, at: int, enough: int) -> None:
+        self._waiting = bytearray(memoryview(data)[at:])
+        self._enough = enough
+
+    # --- sharing the reactor ------------------------------------------------------------------------------
+
+    def _rest(self, data: bytes, at: int) -> None:
+        """The client's time is up; it goes on in the next turn."""
+        self._wait(data, at, 0)
+        self._resting = True
+        self.transport.pauseProducing()
+        self.factory.reactor.callLater(0, self._go_on)
+
+    def _go_on(self) -> None:
+        waiting, self._waiting = self._waiting, None
+        self._resting = False
+        if waiting is None or not self._speaking():
+            return
+        try:
+            self._read(bytes(waiting))
+        except Exception:
+            # Twisted, too, cuts a connection whose protocol fails on what it is given.
+            self.log.failure("what a client sent could not be handled; it is cut")
+            self.transport.abortConnection()
+            return
+        if not self._resting and self._speaking():
+            self.transport.resumeProducing()
+
+    # --- what is Autobahn's -------------------------------------------------------------------------------
+
+    def _pass_on(self, data: bytes, at: int) -> int:
+        """Give Autobahn the frame at ``at``, as far as it has come. Returns where to go on."""
+        if not self._passing:
+            size = _frame(data, at, inside=self.inside_message)
+            if size == _BROKEN:
+                self._verbatim = True
+                super().dataReceived(data[at:])
+                return len(data)
+            if size < 0:
+                self._wait(data, at, -size)
+                return at
+            self._passing = size
+        piece = data[at : at + self._passing]
+        self._passing -= len(piece)
+        super().dataReceived(piece)
+        return at + len(piece)
+
+
+def _usual(data: bytes, at: int, limit: int) -> tuple[int, int]:
+    """Where the payload of the frame at ``at`` starts and ends, if it is a text message or a pong and in order.
+
+    Anything else is (0, 0). What is shorter than the longest head is left to Autobahn too.
+    """
+    if len(data) - at < _LONGEST_HEAD or (data[at] != _TEXT and data[at] != _PONG):
+        return 0, 0
+    start, length = at + 6, data[at + 1] - _MASKED
+    least = 0
+    if length > 125:
+        if data[at] == _PONG:
+            return 0, 0
+        if length == 126:
+            start, length, least = at + 8, _U16(data, at + 2)[0], 126
+        else:
+            start, length, least = at + 14, _U64(data, at + 2)[0], 65536
+    return (start, start + length) if least <= length <= limit else (0, 0)
+
+
+def _unmasked(data: bytes, start: int, end: int) -> bytes:
+    payload = data[start:end] if end - start <= _COPIED else memoryview(data)[start:end]
+    return apply_mask(payload, data[start - 4 : start])
+
+
+def _frame(data: bytes, at: int, *, inside: bool) -> int:
+    """Bytes of the frame at ``at``, head and payload. Negative: so many are needed to tell. Or :data:`_BROKEN`.
+
+    :param inside: whether a fragmented message has begun
+    """
+    have = len(data) - at
+    if have < 2:
+        return -2
+    first, length = data[at], data[at + 1] - _MASKED
+    if length < 0 or not _allowed(first, length, inside):
+        return _BROKEN
+    head = 6 if length < 126 else 8 if length == 126 else _LONGEST_HEAD
+    if have < head:
+        return -head
+    if head == 6:
+        return 6 + length
+    length, shortest = (_U16(data, at + 2)[0], 126) if head == 8 else (_U64(data, at + 2)[0], 65536)
+    return head + length if shortest <= length < _HUGE else _BROKEN
+
+
+def _allowed(first: int, length: int, inside: bool) -> bool:
+    """Whether a frame may begin so (sections 5.4 and 5.5).
+
+    :param length: as the seven bits say
+    """
+    if first in _CONTROLS:
+        return length < 126 and not (first == _CLOSE and length == 1)
+    return first in (_CONTINUATIONS if inside else _BEGINNINGS)
