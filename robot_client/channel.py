@@ -183,7 +183,7 @@ class Channel:
         listening = self._listening.pop(number, None)
         if listening is not None:
             listening.source.close()
-            self.uplink.close(number)
+            self._sending.end(number)
 
     def _advertise(self, message: link.Advertise) -> None:
         number = message.number

@@ -26,10 +26,13 @@ class Sending:
     def offer(self, number: int, stamp: int, body: bytes) -> None:
         """Take one sample; see :meth:`robot_client.uplink.Uplink.offer`."""
         self.uplink.offer(number, stamp, body)
-        if self._flush is None and self.uplink.waiting:
-            # Zero seconds: after all samples of this turn of the reactor, so they share a write.
-            self._flush = self._clock.callLater(0, self.flush)
+        self._soon()
         self.arm()
+
+    def end(self, number: int) -> None:
+        """End a subscription; see :meth:`robot_client.uplink.Uplink.close`."""
+        self.uplink.close(number)
+        self._soon()
 
     def flush(self) -> None:
         """Write what waits, as far as the transport takes it."""
@@ -66,6 +69,11 @@ class Sending:
         self._release = None
         if due is not None:
             self._release = self._clock.callLater(max(0.0, due - self._clock.seconds()), self._let_go)
+
+    def _soon(self) -> None:
+        if self._flush is None and self.uplink.ready and not self.uplink.paused:
+            # Zero seconds: after all samples of this turn of the reactor, so they share a write.
+            self._flush = self._clock.callLater(0, self.flush)
 
     def _let_go(self) -> None:
         self._release = None

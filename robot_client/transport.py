@@ -14,7 +14,7 @@ from twisted.python.failure import Failure
 from zope.interface import implementer  # type: ignore[import-untyped]
 
 from relay_protocol.errors import PeerError, SwitchboardError
-from relay_protocol.limits import UNPROVEN_SECONDS
+from relay_protocol.limits import KIB, UNPROVEN_SECONDS
 from robot_client.link import Event, Link, State
 from robot_client.reactors import Clock, Timer
 from robot_client.tls import explain
@@ -22,8 +22,13 @@ from robot_client.tls import explain
 GOODBYE_SECONDS = 2.0
 """How long the last words may take to leave; a relay that takes nothing would hold the connection for ever."""
 
-_UNSENT = 128 * 1024
+_UNSENT = 64 * KIB
 """Bytes the kernel may hold unsent; more would be delay nobody sees."""
+
+_UNWRITTEN = 32 * KIB
+"""Bytes written to the transport that make it pause: with one part of a large sample it is full, so that nothing small
+has to wait behind a second one.
+"""
 
 _TCP_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", 25 if sys.platform == "linux" else None)
 _TCP_USER_TIMEOUT = getattr(socket, "TCP_USER_TIMEOUT", None)
@@ -167,14 +172,16 @@ class LinkProtocol(TwistedProtocol):
         self.owner.on_pause()
 
 
-def tune(transport: object, patience: float) -> None:
+def tune(transport: Any, patience: float) -> None:
     """Set what the kernel should do: no delay, no long silent retries, little data unsent.
 
     :param patience: seconds after which unacknowledged data means the connection is lost
     """
-    handle = _socket_of(transport)
-    if handle is None:
+    found = _tcp_of(transport)
+    if found is None:
         return
+    connection, handle = found
+    connection.bufferSize = _UNWRITTEN
     handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     handle.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in ((_TCP_USER_TIMEOUT, int(patience * 1000)), (_TCP_NOTSENT_LOWAT, _UNSENT)):
@@ -182,11 +189,11 @@ def tune(transport: object, patience: float) -> None:
             handle.setsockopt(socket.IPPROTO_TCP, option, value)
 
 
-def _socket_of(transport: object) -> socket.socket | None:
-    """The socket under a transport, through TLS; ``None`` in memory."""
+def _tcp_of(transport: Any) -> tuple[Any, socket.socket] | None:
+    """The TCP connection under a transport, through TLS, and its socket; ``None`` in memory."""
     while transport is not None:
         handle = getattr(transport, "getHandle", lambda: None)()
         if isinstance(handle, socket.socket):
-            return handle
+            return transport, handle
         transport = getattr(transport, "transport", None)
     return None

@@ -1,7 +1,9 @@
-"""Samples on their way to the relay: throttled, bounded, newest first to survive.
+"""Samples on their way to the relay: throttled, bounded, newest first to survive, large ones in parts.
 
-While the transport takes data, samples pass in the order they came. While it does not, each subscription
-keeps its latest (small ones by the hundred, a big one alone), no older than a second, all together at most 4 MiB.
+While the transport takes data, small samples pass in the order they came, and between them parts of the large ones, one
+subscription after the other: a picture must not delay what is small. While it does not, each subscription keeps its
+latest (small ones by the hundred, a big one alone), no older than a second, all together at most 4 MiB. A sample whose
+parts have begun is finished.
 """
 
 from __future__ import annotations
@@ -16,8 +18,10 @@ from relay_protocol.limits import KIB, MIB, ROBOT_FRAME
 MAX_AGE = 1.0
 MAX_BYTES = 4 * MIB
 LANE_BYTES = 256 * KIB
-_HEAD = 13
-"""Kind, number and stamp, counted by a frame's length."""
+WHOLE = 64 * KIB
+"""A sample of more bytes goes in parts."""
+
+PART = 32 * KIB
 
 
 class _Sample(NamedTuple):
@@ -37,6 +41,10 @@ class _Lane:
         self.size = 0
         self.next_at = 0.0
         self.held: _Sample | None = None
+        self.large = 0
+        self.begun: _Sample | None = None
+        self.sent = 0
+        """Bytes of :attr:`begun` that have gone."""
 
 
 class Uplink:
@@ -53,7 +61,14 @@ class Uplink:
         self._now = now
         self._limit = frame_limit
         self._lanes: dict[int, _Lane] = {}
-        self._queue: OrderedDict[int, _Sample] = OrderedDict()
+        self._small: OrderedDict[int, _Sample] = OrderedDict()
+        self._large: OrderedDict[int, _Sample] = OrderedDict()
+        """What must not overtake a large sample of its subscription is here too, however small."""
+        self._turns: deque[int] = deque()
+        """Subscriptions with something in :attr:`_large` or begun, in the order of their turns."""
+        self._begun = 0
+        """Bytes of all samples whose parts have begun, whole."""
+        self._ends: list[bytes] = []
         self._serial = 0
         self._size = 0
 
@@ -68,18 +83,25 @@ class Uplink:
         lane.latched = latched
 
     def close(self, number: int) -> None:
-        """End a subscription; what waits of it is forgotten."""
+        """End a subscription; what waits of it is forgotten, what has begun is broken off."""
         lane = self._lanes.pop(number, None)
-        if lane is not None:
-            for serial in lane.waiting:
-                self._size -= len(self._queue.pop(serial).body)
+        if lane is None:
+            return
+        for serial in lane.waiting:
+            self._size -= len(self._pop(serial).body)
+        if lane.large or lane.begun:
+            self._turns.remove(number)
+        if lane.begun is not None:
+            self._begun -= len(lane.begun.body)
+            # SPEC 2.1: what is unfinished would stay with the relay until the link ends.
+            self._ends.append(frames.encode_part(number, lane.begun.stamp, 1, 0, b"\0"))
 
     def offer(self, number: int, stamp: int, body: bytes) -> None:
         """Take one sample; ``stamp`` is the wall clock in nanoseconds."""
         lane = self._lanes.get(number)
         if lane is None:
             return
-        if len(body) + _HEAD > self._limit:
+        if len(body) + frames.SAMPLE_HEAD > self._limit:
             self.oversized += 1
             self.dropped += 1
             return
@@ -102,60 +124,134 @@ class Uplink:
                 self._admit(lane, lane.held, now)
 
     def take(self, at_least: int) -> list[bytes]:
-        """The next frames to write: up to the one that makes ``at_least`` bytes. Empty when nothing waits."""
+        """The next frames to write: small samples up to the one that makes ``at_least`` bytes, then one part of a large
+        one. Empty when nothing waits.
+        """
         if self.paused:
             return []
-        out: list[bytes] = []
+        self._trim_old()
+        out, self._ends = self._ends, []
         taken = 0
-        while self._queue and taken < at_least:
-            sample = self._remove(next(iter(self._queue)))
+        while self._small and taken < at_least:
+            sample = self._remove(next(iter(self._small)))
             frame = frames.encode_sample(sample.number, sample.stamp, sample.body)
             taken += len(frame)
             out.append(frame)
+        if self._turns:
+            out += self._next_part()
         return out
 
     @property
     def waiting(self) -> int:
-        """Bytes of samples that wait."""
+        """Bytes of samples that wait, without those begun."""
         return self._size
+
+    @property
+    def ready(self) -> bool:
+        """Whether :meth:`take` has something, once the transport takes it."""
+        return bool(self._small or self._turns or self._ends)
 
     def trim(self) -> None:
         """Drop what is over the bounds; called while the transport takes nothing."""
         for lane in self._lanes.values():
             self._trim_lane(lane)
-        while self._size > MAX_BYTES and len(self._queue) > 1:
-            self._drop(next(iter(self._queue)))
-        oldest = self._now() - MAX_AGE
-        for serial, sample in list(self._queue.items()):
-            if sample.arrived >= oldest:
-                break
-            lane = self._lanes[sample.number]
-            if not (lane.latched and lane.waiting[-1] == serial):
-                self._drop(serial)
+        self._trim_all()
 
     def _admit(self, lane: _Lane, sample: _Sample, now: float) -> None:
         lane.held = None
         lane.next_at = now + lane.throttle
         self._serial += 1
-        self._queue[self._serial] = sample
+        if lane.large or lane.begun or len(sample.body) > WHOLE:
+            if not lane.large and lane.begun is None:
+                self._turns.append(sample.number)
+            lane.large += 1
+            self._large[self._serial] = sample
+        else:
+            self._small[self._serial] = sample
         lane.waiting.append(self._serial)
         lane.size += len(sample.body)
         self._size += len(sample.body)
         if self.paused:
-            self.trim()
+            self._trim_lane(lane)
+            self._trim_all()
+
+    def _next_part(self) -> list[bytes]:
+        """A frame of the first subscription in turn that may send one."""
+        for _ in range(len(self._turns)):
+            number = self._turns[0]
+            self._turns.rotate(-1)
+            lane = self._lanes[number]
+            if lane.begun is not None or self._begin(lane):
+                return [self._part(number, lane)]
+        return []
+
+    def _begin(self, lane: _Lane) -> bool:
+        serial = lane.waiting[0]
+        if serial in self._small:
+            return False  # it came before
+        # The relay holds what is unfinished; what fits into one frame it takes together in any case.
+        size = len(self._large[serial].body)
+        if self._begun and self._begun + size > self._limit:
+            return False
+        lane.begun, lane.sent = self._remove(serial), 0
+        self._begun += size
+        return True
+
+    def _part(self, number: int, lane: _Lane) -> bytes:
+        assert lane.begun is not None
+        _, _, stamp, body = lane.begun
+        total = len(body)
+        if total <= WHOLE:
+            frame, lane.sent = frames.encode_sample(number, stamp, body), total
+        else:
+            piece = body[lane.sent : lane.sent + PART]
+            frame = frames.encode_part(number, stamp, total, lane.sent, piece)
+            lane.sent += len(piece)
+        if lane.sent >= total:
+            lane.begun = None
+            self._begun -= total
+            if not lane.large:
+                self._turns.remove(number)
+        return frame
 
     def _trim_lane(self, lane: _Lane) -> None:
         while len(lane.waiting) > 1 and lane.size > LANE_BYTES:
             self._drop(lane.waiting[0])
 
+    def _trim_all(self) -> None:
+        while self._size > MAX_BYTES and len(self._small) + len(self._large) > 1:
+            self._drop(min(next(iter(queue)) for queue in (self._small, self._large) if queue))
+        self._trim_old()
+
+    def _trim_old(self) -> None:
+        oldest = self._now() - MAX_AGE
+        for queue in (self._small, self._large):
+            old = []
+            for serial, sample in queue.items():
+                if sample.arrived >= oldest:
+                    break
+                lane = self._lanes[sample.number]
+                if not (lane.latched and lane.waiting[-1] == serial):
+                    old.append(serial)
+            for serial in old:
+                self._drop(serial)
+
     def _drop(self, serial: int) -> None:
-        self._remove(serial)
+        sample = self._remove(serial)
+        lane = self._lanes[sample.number]
+        if not lane.large and lane.begun is None and sample.number in self._turns:
+            self._turns.remove(sample.number)
         self.dropped += 1
 
     def _remove(self, serial: int) -> _Sample:
-        sample = self._queue.pop(serial)
+        large = serial in self._large
+        sample = self._pop(serial)
         lane = self._lanes[sample.number]
         lane.waiting.remove(serial)
+        lane.large -= large
         lane.size -= len(sample.body)
         self._size -= len(sample.body)
         return sample
+
+    def _pop(self, serial: int) -> _Sample:
+        return self._small.pop(serial) if serial in self._small else self._large.pop(serial)

@@ -6,17 +6,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 from twisted.internet.task import Clock
 
-from relay_protocol.frames import FrameDecoder, SampleFrame
-from robot_client.uplink import LANE_BYTES, MAX_BYTES, Uplink
+from relay_protocol.frames import PART, SAMPLE, FrameDecoder, SampleFrame
+from relay_protocol.limits import ROBOT_FRAME
+from robot_client.uplink import LANE_BYTES, MAX_BYTES, WHOLE, Uplink
+from robot_client.uplink import PART as PART_BYTES
+
+
+def samples(uplink: Uplink) -> list[SampleFrame]:
+    """All that waits, as the relay joins it."""
+    decoder, out = FrameDecoder(ROBOT_FRAME), []
+    while chunk := uplink.take(2**16):
+        for frame in decoder.feed(b"".join(chunk)):
+            assert isinstance(frame, SampleFrame)
+            out.append(frame)
+    assert decoder.buffered == 0
+    return out
 
 
 def bodies(uplink: Uplink) -> list[bytes]:
-    out = []
-    while chunk := uplink.take(2**16):
-        for frame in FrameDecoder(2**25).feed(b"".join(chunk)):
-            assert isinstance(frame, SampleFrame)
-            out.append(frame.body)
-    return out
+    return [each.body for each in samples(uplink)]
+
+
+def kinds(chunk: list[bytes]) -> list[tuple[int, int]]:
+    """Kind and number of each frame."""
+    return [(frame[4], int.from_bytes(frame[5:9], "big")) for frame in chunk]
 
 
 def uplink(clock: Clock, throttle: float = 0.0, latched: bool = False) -> Uplink:
@@ -144,3 +157,164 @@ def test_closed_subscription_leaves_nothing() -> None:
     link.offer(1, 0, b"y")
     assert bodies(link) == []
     assert link.waiting == 0
+
+
+def test_large_sample_goes_in_parts() -> None:
+    """A sample over 64 KiB goes in parts of 32 KiB, one at a time; a smaller one goes whole."""
+    link = uplink(Clock())
+    link.offer(1, 5, bytes(WHOLE))
+    assert kinds(link.take(2**16)) == [(SAMPLE, 1)]
+    body = bytes(range(256)) * 400
+    link.offer(1, 6, body)
+    chunks = [link.take(2**16) for _ in range(4)]
+    assert [kinds(chunk) for chunk in chunks] == [[(PART, 1)]] * 4
+    assert [len(chunk[0]) for chunk in chunks] == [25 + PART_BYTES] * 3 + [25 + len(body) - 3 * PART_BYTES]
+    decoder = FrameDecoder(ROBOT_FRAME)
+    assert decoder.feed(b"".join(b"".join(chunk) for chunk in chunks)) == [SampleFrame(1, 6, body)]
+    assert link.take(2**16) == []
+
+
+def test_small_samples_go_between_parts() -> None:
+    """What is small waits for one part of a large sample at most, however large it is."""
+    link = uplink(Clock())
+    link.open(2)
+    link.offer(1, 0, bytes(6_000_000))
+    link.take(2**16)
+    for number in range(100):
+        link.offer(2, number, b"odometry")
+        assert kinds(link.take(2**16)) == [(SAMPLE, 2), (PART, 1)]
+    assert link.dropped == 0
+
+
+def test_flood_of_small_samples_does_not_stop_a_large_one() -> None:
+    """However many small samples wait, each look at them is followed by a part."""
+    link = uplink(Clock())
+    link.open(2)
+    link.offer(1, 0, bytes(3 * PART_BYTES))
+    for _ in range(1000):
+        link.offer(2, 0, bytes(1000))
+    assert [kinds(link.take(2**16))[-1] for _ in range(3)] == [(PART, 1)] * 3
+
+
+def test_large_samples_take_turns() -> None:
+    """Large samples of several subscriptions share the link part by part."""
+    link = uplink(Clock())
+    link.open(2)
+    link.offer(1, 0, bytes(10 * PART_BYTES))
+    link.offer(2, 0, bytes(3 * PART_BYTES))
+    assert [kinds(link.take(2**16))[0][1] for _ in range(8)] == [1, 2, 1, 2, 1, 2, 1, 1]
+
+
+def test_no_sample_overtakes_another_of_its_subscription() -> None:
+    """A small sample behind a large one of the same subscription waits for it, one before it goes first."""
+    link = uplink(Clock())
+    link.offer(1, 1, b"before")
+    link.offer(1, 2, bytes(WHOLE + 1))
+    link.offer(1, 3, b"after")
+    link.offer(1, 4, bytes(WHOLE + 1))
+    assert [each.stamp for each in samples(link)] == [1, 2, 3, 4]
+
+
+def test_sample_that_has_begun_is_finished() -> None:
+    """While the transport is full a begun sample is neither replaced nor too old; what waits behind it is."""
+    clock = Clock()
+    link = uplink(clock)
+    decoder = FrameDecoder(ROBOT_FRAME)
+    link.offer(1, 0, bytes([0]) * 2 * LANE_BYTES)
+    got = decoder.feed(b"".join(link.take(2**16)))
+    link.paused = True
+    for number in range(1, 10):
+        clock.advance(0.5)
+        link.offer(1, number, bytes([number]) * 2 * LANE_BYTES)
+    link.paused = False
+    while chunk := link.take(2**16):
+        got += decoder.feed(b"".join(chunk))
+    assert [each.body[0] for each in got] == [0, 9]
+    assert link.dropped == 8
+
+
+def test_old_large_sample_goes() -> None:
+    """A large sample that could not begin for more than a second is dropped, also when nothing newer comes."""
+    clock = Clock()
+    link = uplink(clock)
+    link.paused = True
+    link.offer(1, 0, bytes(WHOLE + 1))
+    clock.advance(1.5)
+    link.paused = False
+    assert bodies(link) == []
+    assert link.dropped == 1
+
+
+def test_closed_subscription_leaves_nothing_with_the_relay() -> None:
+    """A sample that is broken off takes no memory of the relay: what was unfinished is ended."""
+    link, decoder = uplink(Clock()), FrameDecoder(ROBOT_FRAME)
+    link.offer(1, 7, bytes(WHOLE + 1))
+    decoder.feed(b"".join(link.take(2**16)))
+    assert decoder.buffered
+    link.close(1)
+    assert decoder.feed(b"".join(link.take(2**16))) == [SampleFrame(1, 7, b"\0")]
+    assert decoder.buffered == 0
+    assert not link.ready
+
+
+def test_unfinished_samples_fit_the_relay() -> None:
+    """However many large samples there are, the unfinished ones together are no more than the relay holds."""
+    link = Uplink(Clock().seconds, 2**20)
+    for number in range(40):
+        link.open(number)
+        link.offer(number, 0, bytes(300_000))
+    decoder, got = FrameDecoder(2**20), []
+    while chunk := link.take(2**16):
+        got += decoder.feed(b"".join(chunk))
+        assert decoder.buffered <= 2**20
+    assert sorted(each.number for each in got) == list(range(40))
+
+
+@given(
+    st.lists(
+        st.one_of(
+            st.tuples(st.just("offer"), st.integers(1, 4), st.sampled_from([1, 70_000, 200_000, 900_000])),
+            st.tuples(st.just("take"), st.integers(1, 3), st.just(0)),
+            st.tuples(st.just("pause"), st.integers(0, 1), st.just(0)),
+            st.tuples(st.just("wait"), st.integers(1, 900), st.just(0)),
+            st.tuples(st.just("close"), st.integers(1, 4), st.just(0)),
+        ),
+        max_size=60,
+    )
+)
+def test_what_arrives_is_whole_and_in_order(steps: list[tuple[str, int, int]]) -> None:
+    """Whatever happens, the relay can join what it gets, in order within a subscription, and all else is counted."""
+    clock, offered, closed = Clock(), 0, 0
+    link, decoder = Uplink(clock.seconds, 2**20), FrameDecoder(2**20)
+    got: list[SampleFrame] = []
+
+    def take(times: int) -> None:
+        for _ in range(times):
+            got.extend(decoder.feed(b"".join(link.take(2**16))))  # type: ignore[arg-type]
+
+    for number in range(1, 5):
+        link.open(number)
+    for what, number, size in steps:
+        if what == "offer":
+            offered += 1
+            link.offer(number, offered, bytes(size))
+        elif what == "take":
+            take(number)
+        elif what == "pause":
+            link.paused = bool(number)
+        elif what == "wait":
+            clock.advance(number / 1000)
+        else:
+            closed += 1
+            link.close(number)
+            link.open(number)
+    link.paused = False
+    while link.ready:
+        take(1)
+    assert decoder.buffered == 0
+    assert link.waiting == 0
+    for number in range(1, 5):
+        stamps = [each.stamp for each in got if each.number == number and each.body != b"\0"]
+        assert stamps == sorted(stamps)
+    if not closed:
+        assert len(got) + link.dropped == offered

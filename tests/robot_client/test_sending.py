@@ -1,0 +1,155 @@
+"""When samples are written, on a link slower than what it is given."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+from twisted.internet.endpoints import TCP4ClientEndpoint
+from twisted.internet.protocol import Factory
+from twisted.internet.task import Clock
+from twisted.internet.threads import deferToThread
+
+from relay_protocol import link
+from relay_protocol.frames import JSON, PART, SAMPLE
+from robot_client.link import ChannelLink, Event, JoinedChannel
+from robot_client.sending import Sending
+from robot_client.transport import LinkProtocol
+from tests.robot_client.ros import until
+
+PICTURE = 6_000_000
+CLOUD = 300_000
+
+
+class SlowLink:
+    """A transport that is full after one write and takes another when told."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.order: list[tuple[int, int]] = []
+        self.sending = Sending(self, self.clock, 2**24)
+        self.sending.uplink.open(1)
+        self.sending.uplink.open(2)
+
+    def say(self, message: link.Message) -> None:
+        self.order.append((JSON, 0))
+
+    def write(self, frames: list[bytes]) -> None:
+        self.order += [(each[4], int.from_bytes(each[5:9], "big")) for each in frames]
+        self.sending.pause()
+
+    def turn(self) -> None:
+        self.clock.advance(0.0)
+        self.sending.resume()
+
+
+@pytest.mark.parametrize("size", [CLOUD, PICTURE])
+def test_odometry_waits_for_one_part_of_a_cloud(size: int) -> None:
+    """While a cloud or picture is on its way, each odometry sample goes before the next part of it."""
+    slow = SlowLink()
+    slow.sending.offer(1, 0, bytes(size))
+    slow.turn()
+    while slow.sending.uplink.ready:
+        before = len(slow.order)
+        slow.sending.offer(2, 0, b"odometry")
+        slow.turn()
+        assert slow.order[before] == (SAMPLE, 2)
+        assert slow.order[before + 1 :].count((PART, 1)) <= 1
+    assert slow.order.count((PART, 1)) == -(-size // (32 * 1024))
+
+
+class Robot:
+    """The robot's end of a channel link."""
+
+    def __init__(self) -> None:
+        self.joined = False
+        self.sending: Any = None
+
+    def on_event(self, event: Event) -> None:
+        self.joined = self.joined or isinstance(event, JoinedChannel)
+
+    def on_lost(self, reason: Exception) -> None:
+        pass
+
+    def on_pause(self) -> None:
+        self.sending.pause()
+
+    def on_resume(self) -> None:
+        self.sending.resume()
+
+
+class Wire:
+    """What a sender needs of a connection."""
+
+    def __init__(self, protocol: LinkProtocol) -> None:
+        self.protocol = protocol
+
+    def say(self, message: link.Message) -> None:
+        self.protocol.link.say(message)
+        self.protocol.flush()
+
+    def write(self, frames: list[bytes]) -> None:
+        self.protocol.write(frames)
+
+
+@pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    with socket.socket() as made:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16 * 1024)
+        made.bind(("127.0.0.1", 0))
+        made.listen()
+        made.settimeout(20)
+        yield made
+
+
+def read(relay: socket.socket, done: Any) -> list[tuple[int, int]]:
+    """Kind and number of each frame, until ``done`` says so; JSON has the number 1 if it is the answer."""
+    got: list[tuple[int, int]] = []
+    buffer = b""
+    while not done(got):
+        buffer += relay.recv(65536)
+        while len(buffer) >= 4 and len(buffer) >= 4 + int.from_bytes(buffer[:4], "big"):
+            length = int.from_bytes(buffer[:4], "big")
+            number = int.from_bytes(buffer[5:9], "big")
+            answer = b'"failed"' in buffer[: 4 + length]
+            got.append((buffer[4], number if buffer[4] != JSON else int(answer)))
+            buffer = buffer[4 + length :]
+    return got
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_small_overtakes_a_picture_on_a_real_connection(listener: socket.socket) -> None:
+    """On TCP to a relay that reads late, an odometry sample and an answer that come while a picture is on its way
+    arrive long before its end.
+    """
+    robot = Robot()
+    port = listener.getsockname()[1]
+    factory = Factory.forProtocol(
+        lambda: LinkProtocol(ChannelLink("t", time.monotonic_ns, 60), lambda _: robot, reactor)
+    )
+    factory.noisy = False
+    protocol = await TCP4ClientEndpoint(reactor, "127.0.0.1", port).connect(factory)
+    relay, _ = listener.accept()
+    relay.settimeout(20)
+    try:
+        wire = Wire(protocol)
+        robot.sending = Sending(wire, reactor, 2**24)
+        for number in (1, 2):
+            robot.sending.uplink.open(number)
+        relay.sendall(link.frame(link.Joined(channel="c", at=1)))
+        await until(lambda: robot.joined)
+        robot.sending.offer(1, 0, bytes(PICTURE))
+        await until(lambda: robot.sending.uplink.paused)
+        robot.sending.offer(2, 0, b"odometry")
+        wire.say(link.Failed(what="get_type", ref="x", reason="no such type"))
+        got = await deferToThread(read, relay, lambda got: got.count((PART, 1)) == -(-PICTURE // (32 * 1024)))
+    finally:
+        protocol.transport.abortConnection()
+        relay.close()
+    for early in ((SAMPLE, 2), (JSON, 1)):
+        assert got[got.index(early) :].count((PART, 1)) > 100
