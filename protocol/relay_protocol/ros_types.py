@@ -7,123 +7,23 @@ numbers are typed arrays (RFC 8746). For the relay only; a robot passes CDR on u
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
 from typing import Any
-
-import cbor2
-import msgspec
-import orjson
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
-from relay_protocol.limits import MIB, TYPE_TEXTS
-from relay_protocol.ros import fast_reader, fast_writer
-from relay_protocol.ros.definition import Definition, normalise, parse, parts_of
-from relay_protocol.ros.fast_writer import LARGEST_BODY
-from relay_protocol.ros.reader import ReaderFactory
+from relay_protocol.limits import KIB, MIB, TYPE_TEXTS
+from relay_protocol.ros.compiled import Compiled, Reader, Writer
+from relay_protocol.ros.definition import normalise, parts_of
 from relay_protocol.ros.typedefs import typedef
-from relay_protocol.ros.writer import Mismatch, WriterFactory, as_invalid
 
-_ORDERS = {b"\x00\x01": "<", b"\x00\x00": ">"}
-"""Byte order of the numbers by the first two bytes of a message."""
-_WRITTEN_HEAD = b"\x00\x01\x00\x00"
+__all__ = ["Body", "Reader", "TypeRegistry", "Writer"]
+
 _SHARED_CHARACTERS = 8 * MIB
+_LEAST_CHARACTERS = 4 * KIB
+"""A short text counts as so many, because what is compiled of it takes memory too."""
 _TYPES_OF_A_ROBOT = 4096
 
 Body = bytes | dict[str, Any]
-
-
-Reader = Callable[[bytes], bytes]
-"""Takes CDR with its header; gives the message in JSON or CBOR. Raises :class:`Invalid`."""
-
-Writer = Callable[[Any, int], bytes]
-"""Takes JSON (text as bytes, or decoded) and the present time (ns since 1970); gives CDR with its header.
-Raises :class:`Invalid`."""
-
-
-class _Compiled:
-    """All types of one text. Readers and writers are built when first needed, and then kept."""
-
-    def __init__(self, type_name: str, text: str) -> None:
-        self.definitions: dict[str, Definition] = parse(type_name, text)
-        self._writers = WriterFactory(self.definitions)
-        self._factories: dict[tuple[str, str], ReaderFactory] = {}
-        self._made: dict[tuple[str, str], Reader] = {}
-        self._made_writers: dict[tuple[str, bool], Writer] = {}
-
-    def reader(self, name: str, form: str) -> Reader:
-        """What turns a message of this type into ``form``."""
-        found = self._made.get((name, form))
-        if found is None:
-            found = self._made[name, form] = self._reader(name, form)
-        return found
-
-    def _reader(self, name: str, form: str) -> Reader:
-        encode = _ENCODERS[form]
-
-        def slow(cdr: bytes) -> bytes:
-            if len(cdr) < 4:
-                raise Invalid(f"{name}: {len(cdr)} bytes are too short for a CDR message")
-            try:
-                return encode(self._factory(cdr[:2], form).read(name, cdr))
-            except Invalid as error:
-                raise Invalid(f"{name}: {error}") from None
-
-        return fast_reader.generate(name, self.definitions, form, slow)
-
-    def _factory(self, encapsulation: bytes, form: str) -> ReaderFactory:
-        order = _ORDERS.get(encapsulation)
-        if order is None:
-            raise Invalid(f"bytes 0 and 1 are {encapsulation.hex()}; plain CDR has 0001 or 0000")
-        found = self._factories.get((order, form))
-        if found is None:
-            found = self._factories[order, form] = ReaderFactory(self.definitions, order, form == "cbor")
-        return found
-
-    def writer(self, name: str, checked: bool) -> Writer:
-        """What turns JSON into a message of this type."""
-        found = self._made_writers.get((name, checked))
-        if found is None:
-            found = self._made_writers[name, checked] = self._writer(name, checked)
-        return found
-
-    def _writer(self, name: str, checked: bool) -> Writer:
-        decode = _decode_checked if checked else jsontext.decode_any
-
-        def slow(body: Any, now_ns: int) -> bytes:
-            try:
-                value = decode(body) if type(body) is bytes else body
-            except MalformedMessage as error:
-                raise Invalid(f"{name}: {error}") from None
-            out = bytearray()
-            try:
-                self._writers.writer(name)(out, value, now_ns)
-            except Mismatch as error:
-                raise as_invalid(name, error) from None
-            if len(out) > LARGEST_BODY:
-                raise Invalid(
-                    f"{name}: the message has {len(out)} bytes; a robot takes at most {LARGEST_BODY}"
-                )
-            return _WRITTEN_HEAD + out
-
-        return fast_writer.generate(name, self.definitions, slow)
-
-
-def _decode_checked(text: bytes) -> Any:
-    try:
-        return _ANY.decode(text)
-    except (msgspec.DecodeError, RecursionError, ValueError) as error:
-        raise MalformedMessage(f"the message is not JSON: {error}") from None
-
-
-_ANY: msgspec.json.Decoder[Any] = msgspec.json.Decoder()
-
-
-def _json(value: Any) -> bytes:
-    return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
-
-
-_ENCODERS: dict[str, Callable[[Any], bytes]] = {"json": _json, "cbor": cbor2.dumps}
 
 
 class _Shared:
@@ -131,19 +31,19 @@ class _Shared:
 
     def __init__(self, characters: int) -> None:
         self._room = characters
-        self._kept: OrderedDict[tuple[str, str], _Compiled] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, str], Compiled] = OrderedDict()
 
-    def compiled(self, type_name: str, text: str) -> _Compiled:
+    def compiled(self, type_name: str, text: str) -> Compiled:
         key = (type_name, text)
         found = self._kept.get(key)
         if found is not None:
             self._kept.move_to_end(key)
             return found
-        found = self._kept[key] = _Compiled(type_name, text)
-        self._room -= len(text)
+        found = self._kept[key] = Compiled(type_name, text)
+        self._room -= max(len(text), _LEAST_CHARACTERS)
         while self._room < 0:
             (_, former), _ = self._kept.popitem(last=False)
-            self._room += len(former)
+            self._room += max(len(former), _LEAST_CHARACTERS)
         return found
 
 
@@ -154,9 +54,11 @@ class TypeRegistry:
     """What one robot's types look like. Names may be given as ``pkg/Name`` or ``pkg/msg/Name``."""
 
     def __init__(self) -> None:
-        self._types: dict[str, _Compiled] = {}
+        self._types: dict[str, Compiled] = {}
         self._texts: dict[str, str] = {}
         self._characters = 0
+        self._readers: dict[str, dict[str, Reader]] = {"json": {}, "cbor": {}}
+        self._writers: dict[bool, dict[str, Writer]] = {False: {}, True: {}}
 
     def add(self, type_name: str, text: str) -> None:
         """Register a definition; the same again changes nothing, another one replaces the former.
@@ -176,6 +78,7 @@ class TypeRegistry:
         compiled = _shared.compiled(name, text)
         self._texts[name] = text
         self._characters = characters
+        self._forget_made()
         for part in parts_of(name):
             self._types[part] = compiled
         # What it contains is known too, unless the robot sent a text of its own for it.
@@ -215,8 +118,12 @@ class TypeRegistry:
         :param form: ``json`` or ``cbor``
         :raises NotFound: the type is not registered
         """
-        name, compiled = self._find(type_name)
-        return compiled.reader(name, form)
+        made = self._readers[form]
+        found = made.get(type_name)
+        if found is None:
+            name, compiled = self._find(type_name)
+            found = made[type_name] = compiled.reader(name, form)
+        return found
 
     def writer(self, type_name: str, checked: bool = False) -> Writer:
         """What turns JSON into messages of this type for a robot; see :meth:`reader`.
@@ -225,8 +132,18 @@ class TypeRegistry:
             before, as part of a larger message
         :raises NotFound: the type is not registered
         """
-        name, compiled = self._find(type_name)
-        return compiled.writer(name, checked)
+        made = self._writers[checked]
+        found = made.get(type_name)
+        if found is None:
+            name, compiled = self._find(type_name)
+            found = made[type_name] = compiled.writer(name, checked)
+        return found
+
+    def _forget_made(self) -> None:
+        for readers in self._readers.values():
+            readers.clear()
+        for writers in self._writers.values():
+            writers.clear()
 
     def to_json(self, type_name: str, cdr: bytes) -> bytes:
         """A message from a robot as compact JSON.
@@ -236,7 +153,8 @@ class TypeRegistry:
         :raises NotFound: the type is not registered
         :raises Invalid: the bytes are no message of this type
         """
-        return self.reader(type_name, "json")(cdr)
+        found = self._readers["json"].get(type_name) or self.reader(type_name, "json")
+        return found(cdr)
 
     def to_cbor(self, type_name: str, cdr: bytes) -> bytes:
         """A message from a robot as CBOR; see :meth:`to_json`. NaN and infinity stay what they are."""
@@ -253,16 +171,17 @@ class TypeRegistry:
         return self.writer(type_name)(body, now_ns)
 
     def args_from_json(self, type_name: str, body: Body | list[Any] | None, now_ns: int) -> bytes:
-        """A service request as CDR, from an object or from a list of arguments in order.
+        """A service request or an action's goal as CDR, from an object or from a list of arguments in order.
 
-        :param type_name: the service (``pkg/srv/Name`` or ``pkg/Name``) or its request (``…/Name_Request``)
+        :param type_name: the service (``pkg/srv/Name`` or ``pkg/Name``), the action, or the message they
+            stand for (``…/Name_Request``, ``…/Name_Goal``)
         :param body: ``None`` or nothing for no arguments
         :raises NotFound: the type is not registered
         :raises Invalid: see :meth:`from_json`
         """
-        name, compiled = self._find(self._request_of(type_name))
+        name, compiled = self._find(self._asked(type_name))
         value = None if body == b"" else body
-        if isinstance(value, bytes):
+        if isinstance(value, bytes) and not value.startswith(b"{"):
             try:
                 value = jsontext.decode_any(value)
             except MalformedMessage as error:
@@ -294,13 +213,18 @@ class TypeRegistry:
                 waiting += reversed(contained)
         return list(found.values())
 
-    def _request_of(self, type_name: str) -> str:
+    def _asked(self, type_name: str) -> str:
+        """The message that asks, of a service or an action; any other name as it is."""
+        full = [type_name]
         if type_name.count("/") == 1:
-            type_name = type_name.replace("/", "/srv/")
-        request = f"{normalise(type_name)}_Request"
-        return request if request in self._types else type_name
+            full = [type_name.replace("/", f"/{kind}/") for kind in ("srv", "action")]
+        for name in map(normalise, full):
+            for asking in (f"{name}_Request", f"{name}_Goal"):
+                if asking in self._types:
+                    return asking
+        return type_name
 
-    def _find(self, type_name: str) -> tuple[str, _Compiled]:
+    def _find(self, type_name: str) -> tuple[str, Compiled]:
         compiled = self._types.get(type_name)
         if compiled is not None:
             return type_name, compiled

@@ -82,13 +82,13 @@ def _generated(name: str, definitions: dict[str, Definition], form: str, slow: R
     source = Source()
     if form == "cbor":
         _Walk(definitions, source, CborForm(source)).run(name)
-        return source.function("data", "data", slow)
+        return source.function("data")(slow)
     try:
         _Walk(definitions, source, PlainJsonForm(source, Structs(definitions))).run(name)
     except HoldsArrays:
         source = Source()
         _Walk(definitions, source, JsonForm(source)).run(name)
-    return source.function("data", "data", slow)
+    return source.function("data")(slow)
 
 
 class _Walk(Cursor, Generic[V]):

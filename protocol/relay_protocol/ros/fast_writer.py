@@ -46,20 +46,19 @@ _NUL_AND_PADDING = {
 """What fills up to a multiple in the body, by the length of the message so far; after a text with its NUL."""
 
 
-def generate(name: str, definitions: dict[str, Definition], slow: Write) -> Write:
-    """A writer for one type.
+def generate(name: str, definitions: dict[str, Definition]) -> Callable[[Write], Write]:
+    """A writer for one type, still without what takes the values that are unusual.
 
-    :param slow: takes the values that are unusual
-    :returns: ``slow`` itself, when the type is too large
+    :returns: what takes that writer and gives the whole; that writer itself, when the type is too large
     """
-    if sys.byteorder == "big":
-        return slow
     source = Source()
     try:
+        if sys.byteorder == "big":
+            raise TooLarge
         _Walk(definitions, source).run(name)
     except TooLarge:
-        return slow
-    return source.function("body, now", "body, now", slow)
+        return lambda slow: slow
+    return source.function("body, now")
 
 
 class _Walk(Cursor):

@@ -93,11 +93,11 @@ class Source:
         self._objects[name] = value
         return name
 
-    def function(self, arguments: str, otherwise: str, slow: Callable[..., bytes]) -> Callable[..., bytes]:
+    def function(self, arguments: str) -> Callable[[Callable[..., bytes]], Callable[..., bytes]]:
         """The function whose body the lines are.
 
-        :param otherwise: the arguments as ``slow`` takes them
-        :param slow: called for messages that raise any of :data:`SURPRISES`
+        :returns: what takes the function for messages that raise any of :data:`SURPRISES`, with the same
+            arguments, and gives the whole
         """
         text = "\n".join(
             [
@@ -106,13 +106,18 @@ class Source:
                 *self._lines,
                 "    except SURPRISES:",
                 "        pass",
-                f"    return slow({otherwise})",
+                f"    return slow({arguments})",
             ]
         )
-        objects = {**self._objects, "slow": slow}
-        exec(compile(text, "<generated>", "exec"), objects)  # noqa: S102 # its text is made here; see above
-        function: Callable[..., bytes] = objects["convert"]
-        return function
+        code = compile(text, "<generated>", "exec")
+
+        def bind(slow: Callable[..., bytes]) -> Callable[..., bytes]:
+            objects = {**self._objects, "slow": slow}
+            exec(code, objects)  # noqa: S102 # its text was made here; see above
+            function: Callable[..., bytes] = objects["convert"]
+            return function
+
+        return bind
 
 
 def quoted(name: str) -> str:
