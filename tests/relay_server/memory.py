@@ -294,6 +294,6 @@ def fails(work: Any) -> str:
 
 
 __all__ = [
-    "ADD", "FIBONACCI", "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink", "Person",
-    "Presence", "Unavailable", "World", "fails", "text", "words",
+    "ADD", "FIBONACCI", "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink",
+    "Person", "Presence", "Unavailable", "World", "fails", "text", "words",
 ]  # fmt: skip
