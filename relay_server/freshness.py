@@ -9,7 +9,8 @@ holds through stalls of any kind: a frozen relay, a frozen client, a partition t
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 PENDING = 64
 """Pings out at once; a client that answers none is soon cut for its silence."""
@@ -56,6 +57,16 @@ class Freshness:
     def age(self) -> int:
         """Nanoseconds: no message arriving now is older than this."""
         return self._clock() - self.not_before
+
+    @contextmanager
+    def as_of(self, moment: int) -> Iterator[None]:
+        """Judge by this moment, if it is the earlier one: what is handled meanwhile began to come then."""
+        latest = self.not_before
+        self.not_before = min(latest, moment)
+        try:
+            yield
+        finally:
+            self.not_before = latest
 
     def silence(self) -> int:
         """Nanoseconds since the client last answered a ping."""

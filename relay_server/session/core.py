@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from twisted.logger import Logger
 
 from relay_protocol import jsontext, rosbridge
-from relay_protocol.errors import PeerError, Refused, SwitchboardError
+from relay_protocol.errors import MalformedMessage, PeerError, Refused, SwitchboardError
 from relay_protocol.rights import Level, Operation
 from relay_server import closing
 from relay_server.access import Permit
@@ -28,6 +28,7 @@ from relay_server.freshness import Freshness
 from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
 from relay_server.session.calling import Calling
+from relay_server.session.incoming import Incoming
 from relay_server.session.listening import Listening
 from relay_server.session.providing import Providing
 from relay_server.session.publishing import Publishing
@@ -124,6 +125,7 @@ class Session:
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
         self._pinging = looping(clock, self._ping)
+        self.incoming = Incoming(clock, lambda: freshness.not_before, self._joined, self._given_up)
         self.listening = Listening(self, clock, local)
         self.publishing = Publishing(self, freshness)
         self.calling = Calling(self, local)
@@ -172,6 +174,7 @@ class Session:
         self.outbox.close()
         if self._pinging.running:
             self._pinging.stop()
+        self.incoming.end()
         self.listening.end()
         self.calling.end()
         self.channel.detach(self)
@@ -188,10 +191,19 @@ class Session:
 
     def message(self, data: bytes) -> None:
         """One message of the client."""
-        if self._closed:
-            return
+        if not self._closed:
+            self._take(data)
+
+    def _joined(self, data: bytes, since: int) -> None:
+        """A message that came in fragments, the first of which can't have been sent before ``since``."""
+        with self._freshness.as_of(since):
+            self._take(data, joined=True)
+
+    def _take(self, data: bytes, joined: bool = False) -> None:
         try:
             operation = rosbridge.decode(data)
+            if joined and isinstance(operation, rosbridge.Fragment):
+                raise MalformedMessage("a message in fragments can't be a fragment itself")
         except PeerError as error:
             self._malformed += 1
             if self._malformed == 1:
@@ -207,7 +219,9 @@ class Session:
                     f"{MALFORMED} messages in a row were not rosbridge: {error}"[:120],
                 )
             return
-        self._malformed = 0
+        if not isinstance(operation, rosbridge.Fragment):
+            # What it is a part of has yet to show.
+            self._malformed = 0
         try:
             handler = _HANDLERS.get(type(operation))
             if handler is None:
@@ -279,6 +293,9 @@ class Session:
     def _auth(self, ask: rosbridge.Auth) -> None:
         """Authenticated already; rosauth clients send it on every connection."""
 
+    def _given_up(self, reason: str, id: rosbridge.Id) -> None:
+        self.tell("error", reason, id)
+
     def _ping_interval(self) -> float:
         only_watches = all(
             grant.level is Level.VIEWER and not grant.allow for grant in self.permit.rules.grants
@@ -339,6 +356,7 @@ _HANDLERS: dict[type, Callable[[Session, Any], None]] = {
     rosbridge.ActionResult: lambda session, ask: session.providing.action_result(ask),
     rosbridge.SendActionGoal: lambda session, ask: session.pursuing.send_goal(ask),
     rosbridge.CancelActionGoal: lambda session, ask: session.pursuing.cancel(ask),
+    rosbridge.Fragment: lambda session, part: session.incoming.take(part),
     rosbridge.SetLevel: Session._set_level,
     rosbridge.Auth: Session._auth,
 }

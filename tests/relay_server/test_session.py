@@ -86,18 +86,19 @@ def test_an_unknown_level_is_refused(world: World) -> None:
     assert status["msg"] == "level 'loud' is none of info, warning, error, none"
 
 
-def test_operations_that_are_not_served_are_refused_in_words(world: World) -> None:
-    """Unknown operations; compression is only a warning."""
+def test_what_is_unknown_is_refused_in_words(world: World) -> None:
+    """Unknown operations, and forms of messages."""
     person = world.person()
     person.says("set_level", level="warning")
     person.says("dance")
-    person.says("subscribe", topic="/x", type=STRING, compression="cbor")
-    first, second = person.hears("status")
+    person.says("subscribe", topic="/x", type=STRING, compression="zip", fragment_size=1)
+    first, second, third = person.hears("status")
     assert first["msg"].startswith("unknown op 'dance'")
     assert (second["level"], second["msg"]) == (
-        "warning",
-        "compression cbor is not served; /x comes as plain JSON",
+        "error",
+        "compression 'zip' is none of none, png, cbor, cbor-raw; plain JSON is sent",
     )
+    assert (third["level"], third["msg"]) == ("warning", "fragments of 1 bytes are too small; they have 64")
 
 
 @pytest.mark.parametrize(

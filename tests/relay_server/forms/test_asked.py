@@ -22,23 +22,23 @@ def asked(topic: bool = False, **fields: Any) -> tuple[Form, list[tuple[str, str
     return forms.asked(ask, lambda *words: told.append(words), topic=topic), told
 
 
-def test_nothing_asked_is_plain():
+def test_nothing_asked_is_plain() -> None:
     """Who asks for nothing gets plain JSON, whole."""
     assert asked() == (forms.PLAIN, [])
 
 
 @pytest.mark.parametrize("compression", ["none", "png", "cbor", "cbor-raw"])
-def test_known_compressions(compression):
+def test_known_compressions(compression: str) -> None:
     """Each compression of the protocol can be had for topics."""
     assert asked(topic=True, compression=compression) == (Form(compression), [])
 
 
-def test_raw_is_for_topics():
+def test_raw_is_for_topics() -> None:
     """An answer has no time of arrival: cbor-raw counts as cbor there."""
     assert asked(compression="cbor-raw") == (Form("cbor"), [])
 
 
-def test_unknown_compression():
+def test_unknown_compression() -> None:
     """An unknown compression is an error that names the known ones, and plain JSON is sent."""
     form, [(level, words, id)] = asked(compression="zip")
     assert (form, level, id) == (forms.PLAIN, "error", "q")
@@ -46,18 +46,18 @@ def test_unknown_compression():
 
 
 @pytest.mark.parametrize("size", [None, 0, -5])
-def test_no_fragments(size):
+def test_no_fragments(size: int | None) -> None:
     """No size, zero and less mean whole messages."""
     assert asked(fragment_size=size) == (forms.PLAIN, [])
 
 
-def test_small_fragments():
+def test_small_fragments() -> None:
     """Fragments smaller than the least are raised to it, and the client is warned."""
     form, [(level, words, _)] = asked(fragment_size=10)
     assert (form, level) == (Form("none", 64), "warning")
     assert "64" in words
 
 
-def test_a_good_size_is_taken():
+def test_a_good_size_is_taken() -> None:
     """A sensible size is taken as it is."""
     assert asked(fragment_size=1000) == (Form("none", 1000), [])

@@ -1,0 +1,59 @@
+"""Messages in PNG."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+
+import pytest
+from PIL import Image
+
+from relay_server import forms
+from relay_server.forms import Form, png
+from tests.relay_server.memory import messages_in
+
+
+def picture_of(message: bytes) -> Image.Image:
+    """The picture in a ``png`` operation."""
+    operation = json.loads(message)
+    assert list(operation) == ["op", "data"] and operation["op"] == "png"
+    return Image.open(io.BytesIO(base64.b64decode(operation["data"], validate=True)))
+
+
+@pytest.mark.parametrize("length", [*range(2, 40), 3 * 17 * 17, 3 * 17 * 17 + 1, 100_000])
+def test_the_pixels_are_the_bytes(length: int) -> None:
+    """8-bit RGB without alpha, rows from the top left, padded with line feeds, about square."""
+    message = (b'"' + b"0123456789" * 10_000)[: length - 1] + b'"'
+    picture = picture_of(png.encode(message))
+    assert picture.mode == "RGB"
+    assert picture.tobytes().rstrip(b"\n") == message
+    width, height = picture.size
+    assert 3 * width * (height - 1) < length <= 3 * width * height
+    assert length < 100 or abs(width - height) <= 2
+
+
+def test_characters_beyond_ascii_are_escaped() -> None:
+    """The same JSON in ASCII: in browsers roslib 1.x takes each byte for a character."""
+    message = json.dumps({"data": "naïve 😀 \\u00e9 \x7f"}, ensure_ascii=False).encode()
+    data = picture_of(png.encode(message)).tobytes()
+    assert data.isascii()
+    assert json.loads(data) == json.loads(message)
+
+
+def test_nothing_but_pixels() -> None:
+    """No chunk tells a browser to change the colours, which are letters here."""
+    data = base64.b64decode(json.loads(png.encode(b'{"op":"status"}'))["data"])
+    at, kinds = 8, []
+    while at < len(data):
+        kinds.append(data[at + 4 : at + 8])
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    assert set(kinds) == {b"IHDR", b"IDAT", b"IEND"}
+
+
+def test_long_answers_come_plain() -> None:
+    """What would keep the relay busy for too long is sent as JSON."""
+    for length, op in ((png.MOST, "png"), (png.MOST + 1, "status")):
+        message = b'{"op":"status"}'.ljust(length)
+        [(first, payload)] = messages_in(forms.frames(message, Form("png")))
+        assert (first, json.loads(payload)["op"]) == (0x81, op)
