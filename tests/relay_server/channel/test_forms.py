@@ -1,0 +1,246 @@
+"""Samples in every form clients want."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+from typing import Any
+
+import cbor2
+import pytest
+from PIL import Image
+from twisted.logger import LogLevel, globalLogPublisher
+
+from relay_protocol import link
+from relay_server.channel import sample as module
+from relay_server.forms import png
+from tests.relay_server.channel.test_subscriptions import counting, heard, watching
+from tests.relay_server.memory import STRING, Person, World, text
+
+STAMP = 1_700_000_000_000_000_007
+
+
+def last(person: Person) -> dict[str, Any]:
+    """The last message that came, out of whatever form."""
+    return opened(person.client.sent[-1])
+
+
+def opened(payload: bytes) -> dict[str, Any]:
+    """A message out of its form; fragments are not joined."""
+    message = json.loads(payload) if payload.startswith(b"{") else cbor2.loads(payload)
+    if message["op"] == "png":
+        picture = Image.open(io.BytesIO(base64.b64decode(message["data"])))
+        message = json.loads(picture.tobytes())
+    return dict(message)
+
+
+def errors(person: Person) -> list[str]:
+    """What the client was told."""
+    return [message["msg"] for message in map(opened, person.client.sent) if message["op"] == "status"]
+
+
+@pytest.mark.parametrize("compression", ["none", "png", "cbor"])
+def test_the_same_in_each_form(world: World, compression: str) -> None:
+    """The content does not depend on the form."""
+    number, (person,) = watching(world, {"compression": compression})
+    world.channel.sample(number, text("häi"), STAMP)
+    assert last(person) == {"op": "publish", "topic": "/chatter", "msg": {"data": "häi"}}
+    assert person.client.sent[0].startswith(b'{"op":"png"') == (compression == "png")
+
+
+def test_raw_is_what_the_robot_sent(world: World) -> None:
+    """The time at which the sample reached the robot, and its bytes untouched."""
+    number, (person,) = watching(world, {"compression": "cbor-raw"})
+    world.channel.sample(number, text("hi"), STAMP)
+    assert last(person)["msg"] == {"secs": 1_700_000_000, "nsecs": 7, "bytes": text("hi")}
+
+
+def test_raw_needs_no_definition(world: World) -> None:
+    """It comes at once also when the definition is not here, late or not to be had; others wait for it."""
+    world.robot_comes()
+    raw, plain = world.person(), world.person()
+    world.robot_joins()
+    for person, compression in ((raw, "cbor-raw"), (plain, "none")):
+        person.says("set_level", level="error")
+        person.says("subscribe", topic="/chatter", compression=compression)
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number, latched=True, publishers=1)
+    world.channel.sample(number, text("a"), STAMP)
+    assert last(raw)["msg"]["bytes"] == text("a")
+    assert not plain.client.sent
+    late = world.person()
+    late.says("subscribe", topic="/chatter", compression="cbor-raw")
+    assert last(late)["msg"]["bytes"] == text("a")
+    late_plain = world.person()
+    late_plain.says("subscribe", topic="/chatter")
+    world.channel.message(link.Failed(what="get_type", ref=STRING, reason="not installed"))
+    assert errors(plain) == ["subscribe /chatter: not installed"]
+    assert not errors(raw)
+    world.channel.sample(number, text("b"), STAMP)
+    assert last(raw)["msg"]["bytes"] == text("b")
+    assert not late_plain.client.sent
+
+
+def test_what_waited_for_its_type_comes_once(world: World) -> None:
+    """When the definition comes, to those who had to wait and not again to those who had not."""
+    world.robot_comes()
+    raw, plain = world.person(), world.person()
+    world.robot_joins()
+    for person, compression in ((raw, "cbor-raw"), (plain, "none")):
+        person.says("subscribe", topic="/chatter", compression=compression)
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number)
+    world.channel.sample(number, text("a"))
+    world.define()
+    assert heard(plain) == ["a"]
+    assert len(raw.client.sent) == 1
+
+
+def test_raw_of_a_robot_that_speaks_json(world: World) -> None:
+    """An error once, and plain JSON."""
+    world.robot_comes(encodings=["json"])
+    person = world.person()
+    world.robot_joins()
+    person.says("set_level", level="error")
+    person.says("subscribe", topic="/chatter", compression="cbor-raw")
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number, encoding="json")
+    for word in ("a", "b"):
+        world.channel.sample(number, json.dumps({"data": word}).encode())
+    told, first, second = map(opened, person.client.sent)
+    assert told["level"] == "error" and "not CDR" in told["msg"]
+    assert (first["msg"], second["msg"]) == ({"data": "a"}, {"data": "b"})
+
+
+def test_cbor_of_a_robot_that_speaks_json(world: World) -> None:
+    """What its JSON says, in a binary message."""
+    world.robot_comes(encodings=["json"])
+    person = world.person()
+    world.robot_joins()
+    person.says("subscribe", topic="/chatter", compression="cbor")
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number, encoding="json")
+    world.channel.sample(number, b'{"data": [1, 2.5, null]}')
+    assert not person.client.sent[-1].startswith(b"{")
+    assert last(person)["msg"] == {"data": [1, 2.5, None]}
+
+
+def test_nan_stays_nan_in_cbor(world: World) -> None:
+    """JSON has no word for it; CBOR has."""
+    world.robot.types.add("test/msg/Ranges", "float32[] ranges\n")
+    cdr = b"\x00\x01\x00\x00" + struct.pack("<Iff", 2, float("nan"), 1.5)
+    sample = module.Sample(cdr, 0, module.Converter(world.robot.types, "test/msg/Ranges", "cdr", print))
+    person = world.person()
+    for compression in ("none", "cbor"):
+        person.says("subscribe", topic="/chatter", compression=compression)
+        listener = person.session.listening._listeners["/chatter"]
+        person.session.deliver(listener, sample)
+    plain, typed = map(opened, person.client.sent)
+    assert plain["msg"] == {"ranges": [None, 1.5]}
+    assert typed["msg"]["ranges"] == cbor2.CBORTag(85, cdr[8:])
+
+
+def test_long_samples_come_in_fragments(world: World) -> None:
+    """Text only, and only what is longer; each message whole before the next."""
+    number, (parts, binary) = watching(
+        world, {"fragment_size": 100}, {"fragment_size": 100, "compression": "cbor"}
+    )
+    world.channel.sample(number, text("x" * 300))
+    world.channel.sample(number, text("short"))
+    *fragments, short = [opened(payload) for payload in parts.client.sent]
+    assert [each["num"] for each in fragments] == [0, 1, 2, 3]
+    joined = json.loads("".join(each["data"] for each in fragments))
+    assert joined["msg"]["data"] == "x" * 300
+    assert short["msg"]["data"] == "short"
+    assert [opened(payload)["op"] for payload in binary.client.sent] == ["publish", "publish"]
+
+
+def test_a_png_that_would_take_long_comes_plain(world: World) -> None:
+    """The client is told once, by a warning."""
+    number, (person,) = watching(world, {"compression": "png"})
+    person.says("set_level", level="warning")
+    for _ in range(2):
+        world.channel.sample(number, text("x" * png.MOST))
+    told, first, second = map(json.loads, person.client.sent)
+    assert (told["op"], told["level"]) == ("status", "warning")
+    assert str(png.MOST) in told["msg"]
+    assert first["op"] == second["op"] == "publish"
+
+
+def test_fifty_clients_cost_one_conversion_a_form(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """JSON once, CBOR once, PNG once, whatever is made of them for whom."""
+    asks: list[dict[str, Any]] = [
+        {"compression": compression, "fragment_size": size}
+        for compression in ("none", "png", "cbor", "cbor-raw", "none")
+        for size in (0, 64, 100, 1000, 5000)
+    ] * 2
+    number, people = watching(world, *asks)
+    pictures: list[bytes] = []
+    encode = png.encode
+    monkeypatch.setattr(png, "encode", lambda message: pictures.append(message) or encode(message))
+    converted = counting(world, number)
+    world.channel.sample(number, text("x" * 500))
+    assert sorted(converted) == ["cbor", "json"]
+    assert len(pictures) == 1
+    assert all(person.client.sent for person in people)
+
+
+def test_nothing_is_converted_while_everybody_is_paused(world: World) -> None:
+    """Nor when what waited gives way to what is newer; then once, when the first takes it."""
+    number, people = watching(world, {"compression": "cbor"}, {"queue_length": 1}, {"queue_length": 1})
+    converted = counting(world, number)
+    for person in people:
+        person.session.pause()
+    for word in ("a", "b", "c"):
+        world.channel.sample(number, text(word))
+    assert converted == []
+    people[1].session.resume()
+    people[2].session.resume()
+    assert converted == ["json"]
+    assert [heard(person) for person in people[1:]] == [["c"], ["c"]]
+
+
+def test_what_is_made_ready_of_a_sample_is_bounded(world: World) -> None:
+    """A latched sample stays for long; what clients think of to ask for does not."""
+    number, (person,) = watching(world, {})
+    world.subscribed(number, latched=True, publishers=1)
+    world.channel.sample(number, text("x" * 100_000))
+    (kept,) = world.channel.subscriptions._numbers[number]._recent
+    for size in range(1000, 1100):
+        person.says("subscribe", topic="/chatter", fragment_size=size)
+        listener = person.session.listening._listeners["/chatter"]
+        person.session.deliver(listener, kept)
+    assert sum(len(each.frames or b"") for each in kept._ready.values()) == kept._ready_bytes
+    assert kept._ready_bytes <= 4 * kept.size + module._SPARE
+
+
+def test_a_failure_is_logged_once_and_told_once(world: World) -> None:
+    """To everyone who could have had it otherwise, in words; those who want the bytes have them."""
+    number, people = watching(world, {}, {"compression": "cbor"}, {"compression": "cbor-raw"})
+    for person in people:
+        person.says("set_level", level="error")
+    logged: list[Any] = []
+    globalLogPublisher.addObserver(logged.append)
+    try:
+        for _ in range(3):
+            world.channel.sample(number, b"\x00\x01\x00\x00\xff\xff\xff\x7f")
+    finally:
+        globalLogPublisher.removeObserver(logged.append)
+    assert len([event for event in logged if event["log_level"] is LogLevel.warn]) == 1
+    for person in people[:2]:
+        (told,) = errors(person)
+        assert told.startswith("/chatter: a message can't be converted: std_msgs/msg/String")
+    assert len(people[2].client.sent) == 3
+    assert not errors(people[2])
+
+
+def test_a_failure_is_told_again_to_who_asks_again(world: World) -> None:
+    """A new subscription is a new question."""
+    number, (person,) = watching(world, {})
+    person.says("set_level", level="error")
+    world.channel.sample(number, b"")
+    person.says("subscribe", topic="/chatter")
+    world.channel.sample(number, b"")
+    assert len(errors(person)) == 2
