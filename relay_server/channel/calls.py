@@ -17,6 +17,9 @@ from relay_server.clock import Clock, cancel
 PENDING = 1024
 """Calls under way on one robot."""
 
+CANCEL_GOALS = "/_action/cancel_goal"
+"""How the name of the service ends by which an action takes cancellations (design.ros2.org, actions)."""
+
 GRACE = 1.0
 """The robot gives up by itself at the timeout; this much later the relay does, seconds."""
 
@@ -47,7 +50,7 @@ class Calls:
         offer = self._offers.standing(service)
         if offer is not None:
             return await self._ask_client(offer, args, seconds)
-        type_name = self._wire.robot.graph.service_type(service) or type_name
+        type_name = self._known_type(service) or type_name
         if not type_name:
             raise NotFound(f"service {service} does not exist on robot {self._wire.robot.name}")
         await self._bodies.ready(type_name)
@@ -56,6 +59,14 @@ class Calls:
         if not response.result:
             raise Unavailable(response.reason or f"service {service} failed")
         return self._values(type_name, response)
+
+    def _known_type(self, service: str) -> str:
+        """By the graph, which does not show the hidden services of actions; roslibjs cancels all goals by one."""
+        graph = self._wire.robot.graph
+        action = service.removesuffix(CANCEL_GOALS)
+        if action != service and graph.action_type(action):
+            return "action_msgs/srv/CancelGoal"
+        return graph.service_type(service) or ""
 
     async def _ask_client(self, offer: Offer, args: bytes, seconds: float) -> bytes:
         """What goes by the robot could come back only as a call without an answer when the client says no."""

@@ -119,6 +119,8 @@ class Offers:
         word = self._kind.word
         if f"{name}/".startswith(RESERVED):
             raise Refused(f"{name}: names under /relay and /rosapi are the relay's own")
+        if "/_action/" in name:
+            raise Refused(f"{name}: ROS keeps names with /_action/ for the parts of actions")
         if not type_name:
             raise Invalid(f"{word} {name} needs a type")
         former = self._offers.get(name)

@@ -53,7 +53,7 @@ class Calling:
             )
         local = self._local.service(service)
         if local is None:
-            self._session.judge(Operation.CALL, service)
+            self._judge(service)
             answer: Awaitable[bytes] = self._session.channel.call(
                 service, normal_type(ask.type, "srv"), raw, ask.timeout
             )
@@ -65,6 +65,13 @@ class Calling:
         self._bytes += size
         running.addErrback(self._unexpected, ask)
         running.addBoth(self._call_ended, running, size)
+
+    def _judge(self, service: str) -> None:
+        """An action's hidden services are the action: who may not call it may not send or cancel its goals so."""
+        self._session.judge(Operation.CALL, service)
+        action, hidden, _ = service.partition("/_action/")
+        if hidden:
+            self._session.judge(Operation.CALL, action)
 
     def answer(self, call: rosbridge.CallService, result: bool, values: bytes) -> None:
         """Answer one call in the form it asked for; ``values`` is JSON, a string when ``result`` is false."""

@@ -140,6 +140,20 @@ def test_what_can_not_be_called_is_refused_in_words(world: World) -> None:
     assert not world.link.all(link.CallService)
 
 
+def test_all_goals_of_an_action_are_cancelled_by_its_hidden_service(world: World) -> None:
+    """As roslibjs does, without a type; who may not call the action may not do so either."""
+    person = at_work(world)
+    world.robot.graph.actions["/walk"] = link.Service(types=["a/action/Walk"], providers=["/legs"])
+    denied = world.person(deny=("call:/walk",))
+    denied.says("call_service", service="/walk/_action/cancel_goal")
+    assert denied.hears("service_response")[0]["result"] is False
+    assert not world.link.all(link.GetType)
+    person.says("call_service", service="/walk/_action/cancel_goal")
+    assert [asked.type for asked in world.link.all(link.GetType)] == ["action_msgs/srv/CancelGoal"]
+    person.says("call_service", service="/stand/_action/cancel_goal")
+    assert "does not exist" in person.hears("service_response")[0]["values"]
+
+
 def test_too_many_calls_of_one_client_are_refused(world: World) -> None:
     """Those under way go on; their places are free again afterwards."""
     person = at_work(world)

@@ -91,6 +91,15 @@ def test_the_relays_own_names_are_refused(world: World, kind: str, name: str) ->
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_the_hidden_parts_of_actions_are_refused(world: World, kind: str) -> None:
+    """Whoever offers them would speak for the action."""
+    person = at_work(world)
+    offer(person, kind, "/walk/_action/send_goal")
+    assert "for the parts of actions" in errors(person)[0]
+    assert not world.link.all(ASKED[kind])
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_offering_is_judged(world: World, kind: str) -> None:
     """By the right to provide, by name."""
     at_work(world)
