@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from msgspec.structs import replace
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
@@ -118,10 +119,17 @@ def enroll(
 @click.option(
     "--log-json", is_flag=True, envvar="SWITCHBOARD_ROBOT_LOG_JSON", help="Log a JSON object per line."
 )
+@click.option(
+    "--use-sim-time",
+    is_flag=True,
+    help="The robot's time is what /clock says; also a setting, ros.use_sim_time.",
+)
 @in_words
-def run(state: Path, config_path: Path | None, log_json: bool) -> None:
+def run(state: Path, config_path: Path | None, log_json: bool, use_sim_time: bool) -> None:
     """Keep this robot at its relay until told to stop."""
     settings = config.load(config_path, os.environ)
+    if use_sim_time:
+        settings = replace(settings, ros=replace(settings.ros, use_sim_time=True))
     enrolment, me = StateFolder(state).load()
     _warn_if_plain(split_address(enrolment.address)[0], enrolment.tls)
     logs.begin(log_json)

@@ -67,11 +67,14 @@ class Ros(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     :param executor: ``events`` is cheaper, ``single`` is the older one
     :param graph_hz: how often the graph is looked at
     :param battery: whether the first battery topic is listened to
+    :param use_sim_time: whether the robot's time is what ``/clock`` says; what stops the robot goes by the machine's
+        own clock in any case
     """
 
     executor: Literal["events", "single"] = "events"
     graph_hz: Annotated[float, msgspec.Meta(gt=0, le=20)] = 3.0
     battery: bool = True
+    use_sim_time: bool = False
 
 
 class Monitor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -252,6 +252,7 @@ class Daemon:
             os=_operating_system(),
             agent=self._agent,
             started=self._started,
+            sim_time=facts.sim_time,
             motion=self.motion.policy,
             extra=facts.extra,
         )

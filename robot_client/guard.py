@@ -177,10 +177,15 @@ class Guard:
 
 
 class RosOutlets:
-    """Publishers in a node of their own; nothing spins, so the node costs nothing while it waits."""
+    """Publishers in a node of their own; nothing spins, so the node costs nothing while it waits.
 
-    def __init__(self, name: str) -> None:
+    :param sim_time: whether the robot's time is what ``/clock`` says. The guard does not listen to it and leaves stamps
+        at 0, which controllers take for now; the machine's time would lie far in the future of a simulation
+    """
+
+    def __init__(self, name: str, sim_time: bool) -> None:
         import rclpy
+        from builtin_interfaces.msg import Time
         from rclpy.signals import SignalHandlerOptions
 
         from robot_client.platforms.ros2_types import Types
@@ -188,6 +193,7 @@ class RosOutlets:
         ensure_log_folder()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._node: Any = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
+        self._unknown = Time() if sim_time else None
         self._types = Types()
         self._publishers: dict[TypedTopic, Any] = {}
 
@@ -203,7 +209,8 @@ class RosOutlets:
 
     def zero(self, on: TypedTopic) -> bool:
         """Publish zero."""
-        self._publisher(on).publish(self._types.zero(on.type, self._node.get_clock().now().to_msg()))
+        stamp = self._unknown or self._node.get_clock().now().to_msg()
+        self._publisher(on).publish(self._types.zero(on.type, stamp))
         return self.heard(on)
 
     def heard(self, on: TypedTopic) -> bool:
@@ -293,13 +300,14 @@ def _wake_on_sigterm() -> int:
 @click.command()
 @click.option("--node", required=True, help="Name of the guard's node.")
 @click.option("--within-ms", type=int, required=True, help="Time to stop, milliseconds.")
-def main(node: str, within_ms: int) -> None:
+@click.option("--sim-time", is_flag=True, help="The robot's time is what /clock says.")
+def main(node: str, within_ms: int, sim_time: bool) -> None:
     """Stop the robot when the daemon that started this can't."""
     with contextlib.suppress(PermissionError):  # a leader of its own already
         os.setsid()  # what ends the daemon's group or terminal must not end its guard
     outlet = _own_stdout()
     wake = _wake_on_sigterm()
-    guard = Guard(within_ms, RosOutlets(node), now_ns)
+    guard = Guard(within_ms, RosOutlets(node, sim_time), now_ns)
     _answer(outlet, Alive())
     watch(guard, 0, outlet, wake)
     # Publishers are not taken down in order: Python's and DDS's farewells take longer than the stop is worth.

@@ -49,13 +49,15 @@ class GuardKeeper:
     :param reactor: for processes and timers
     :param node: name of the guard's node; those of later guards begin with it
     :param within_ms: time to stop, milliseconds
+    :param sim_time: whether the robot's time is what ``/clock`` says
     """
 
-    def __init__(self, reactor: Any, node: str, within_ms: int) -> None:
+    def __init__(self, reactor: Any, node: str, within_ms: int, sim_time: bool = False) -> None:
         self.on_alert: Callable[[str, str], None] = lambda level, text: None
         self._reactor = reactor
         self._node = node
         self._within_ms = str(within_ms)
+        self._sim_time = sim_time
         self._started = 0
         self._process: _Process | None = None
         self._topics: dict[TypedTopic, Topic] = {}
@@ -167,7 +169,8 @@ class GuardKeeper:
         # The network remembers a dead node for a while; one of the same name would be mistaken for it.
         node = f"{self._node}_{self._started}" if self._started else self._node
         self._started += 1
-        return ["-m", "robot_client.guard", "--node", node, "--within-ms", self._within_ms]
+        told = ["-m", "robot_client.guard", "--node", node, "--within-ms", self._within_ms]
+        return [*told, "--sim-time"] if self._sim_time else told
 
     def _tell(self, line: Line) -> None:
         if self._process is not None:

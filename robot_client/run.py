@@ -53,6 +53,7 @@ def make_ros(reactor: Any, settings: Settings, suffix: str) -> Platform:
         guard=f"switchboard_guard_{suffix}",
         executor=settings.ros.executor,
         battery=settings.ros.battery,
+        sim_time=settings.ros.use_sim_time,
     )
 
 
@@ -75,7 +76,12 @@ class Runner:
         self.platform = platform or make_ros(reactor, settings, suffix)
         self.keeper: GuardKeeper | None = None
         if settings.safety.guard:
-            self.keeper = GuardKeeper(reactor, f"switchboard_guard_{suffix}", settings.safety.stop_within_ms)
+            self.keeper = GuardKeeper(
+                reactor,
+                f"switchboard_guard_{suffix}",
+                settings.safety.stop_within_ms,
+                settings.ros.use_sim_time,
+            )
         self._enrolment = enrolment
         connection = Connection(
             self._dial,

@@ -35,6 +35,7 @@ class Facts(NamedTuple):
     platform: str
     distro: str = ""
     extra: dict[str, str] = {}  # noqa: RUF012  (NamedTuple default, never changed)
+    sim_time: bool = False
 
 
 class GraphView(msgspec.Struct, frozen=True, kw_only=True):

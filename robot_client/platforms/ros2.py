@@ -14,6 +14,8 @@ from importlib import metadata
 from typing import Any
 
 import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from twisted.internet.defer import Deferred, fail
@@ -70,18 +72,26 @@ class Ros2Platform(Platform):
     :param guard: how the names of guards' nodes begin; they are left out of the graph like our own
     :param executor: ``events`` or ``single``
     :param battery: whether to listen to the first battery topic there is
+    :param sim_time: whether the node's clock follows ``/clock``; nothing but stamps goes by it
     """
 
     encoding = "cdr"
 
     def __init__(
-        self, reactor: Any, name: str, guard: str = "", executor: str = "events", battery: bool = True
+        self,
+        reactor: Any,
+        name: str,
+        guard: str = "",
+        executor: str = "events",
+        battery: bool = True,
+        sim_time: bool = False,
     ) -> None:
         self._reactor = reactor
         self._name = name
         self._guard = guard
         self._kind = executor
         self._want_battery = battery
+        self._sim_time = sim_time
         self._own = tuple("/" + each for each in (name, guard) if each)
         self._types = Types()
         self._hop = Hop(reactor.callFromThread)
@@ -110,9 +120,15 @@ class Ros2Platform(Platform):
         try:
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             self._node = rclpy.create_node(
-                self._name, context=self._context, start_parameter_services=False, enable_rosout=False
+                self._name,
+                context=self._context,
+                start_parameter_services=False,
+                enable_rosout=False,
+                parameter_overrides=[Parameter("use_sim_time", value=self._sim_time)],
             )
-            self._spinner = Spinner(make_executor(self._kind, self._context), self._node)
+            # The node's clock stands still when a simulation pauses.
+            steady = Clock(clock_type=ClockType.STEADY_TIME)
+            self._spinner = Spinner(make_executor(self._kind, self._context), self._node, steady)
         except Exception as error:
             raise Unavailable(f"ROS 2 does not start: {error}") from error
         self._lingering = Lingering(self._node, self._reactor)
@@ -154,6 +170,7 @@ class Ros2Platform(Platform):
                 "domain": os.environ.get("ROS_DOMAIN_ID", "0"),
                 "python": machine.python_version(),
             },
+            self._sim_time,
         )
 
     def graph(self) -> GraphView:

@@ -40,17 +40,19 @@ def make_executor(kind: str, context: Any) -> Any:
 class Spinner:
     """Turns an executor in a thread of its own and knows, by a timer of the node, whether it still serves.
 
+    :param timer_clock: of rclpy, for that timer; one that never stands still
     :param clock: seconds
-
     """
 
-    def __init__(self, executor: Any, node: Any, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, executor: Any, node: Any, timer_clock: Any, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._executor = executor
         self._clock = clock
         self._stop = threading.Event()
         self._served = clock()
         self._thread = threading.Thread(target=self._turn, name="ros2-executor", daemon=True)
-        self._timer = node.create_timer(1.0, self._beat)
+        self._timer = node.create_timer(1.0, self._beat, clock=timer_clock)
         self._work: deque[tuple[Callable[..., Any], tuple[Any, ...]]] = deque()
         self._lock = threading.Lock()
         self._scheduled = False

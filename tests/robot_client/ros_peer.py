@@ -9,6 +9,7 @@ import threading
 import time
 
 import rclpy
+from builtin_interfaces.msg import Time
 from example_interfaces.action import Fibonacci
 from example_interfaces.srv import AddTwoInts
 from geometry_msgs.msg import Twist, TwistStamped
@@ -16,6 +17,7 @@ from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalRespons
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -167,6 +169,13 @@ def cancel(action: str) -> None:
 
 def publishers(topic: str) -> None:
     tell(publishers=[each.node_name for each in node.get_publishers_info_by_topic(topic)])
+
+
+def clock(seconds: float) -> None:
+    """Say once what time it is in the simulation."""
+    publisher = ends.setdefault("/clock", node.create_publisher(Clock, "/clock", 1))
+    now = Time(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
+    publisher.publish(Clock(clock=now))
 
 
 def battery(topic: str, charge: float) -> None:

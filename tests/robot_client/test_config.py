@@ -94,3 +94,12 @@ def test_motion_that_could_match_nothing_is_refused(tmp_path: Path, key: str, va
     file.write_text(f'[safety]\n{key} = ["{value}"]\n')
     with pytest.raises(Invalid, match=key):
         load(file, {})
+
+
+def test_simulated_time_is_a_setting(tmp_path: Path) -> None:
+    """``use_sim_time`` can be set in the file and by a variable, and is off by default."""
+    file = tmp_path / "robot.toml"
+    file.write_text("[ros]\nuse_sim_time = true\n")
+    assert not load(None, {}).ros.use_sim_time
+    assert load(file, {}).ros.use_sim_time
+    assert load(None, {"SWITCHBOARD_ROBOT_ROS_USE_SIM_TIME": "true"}).ros.use_sim_time

@@ -391,3 +391,12 @@ def test_wrong_type_before_the_driver_is_up_does_no_harm(drive: Drive) -> None:
     drive.process.kill()
     until(lambda: drive.node.heard("/base")[-1]["x"] == 0.0)
     until(lambda: not drive.guard.is_running())
+
+
+def test_simulated_time_is_told(enrolled: Robot, relay: FakeRelay) -> None:
+    """With ``--use-sim-time`` the relay hears that the robot's time is simulated, and the guard is told too."""
+    process = enrolled.run("--use-sim-time")
+    control = relay.register()
+    assert control.expect(link.Describe).sim_time is True
+    until(lambda: enrolled.guards(process))
+    assert "--sim-time" in enrolled.guards(process)[0].cmdline()

@@ -77,7 +77,7 @@ def test_executor_that_serves_nothing_is_noticed() -> None:
     """Five seconds without the node's own timer mean that the executor is stuck; a beat means it is not."""
 
     class Node:
-        def create_timer(self, period: float, beat: Callable[[], None]) -> None:
+        def create_timer(self, period: float, beat: Callable[[], None], clock: object) -> None:
             self.beat = beat
 
     class Executor:
@@ -85,7 +85,7 @@ def test_executor_that_serves_nothing_is_noticed() -> None:
             pass
 
     now, node = [0.0], Node()
-    spinner = Spinner(Executor(), node, lambda: now[0])
+    spinner = Spinner(Executor(), node, None, lambda: now[0])
     now[0] = STUCK_SECONDS + 1
     assert "served nothing" in str(spinner.trouble())
     node.beat()
@@ -110,14 +110,14 @@ class Tasks:
 
 
 class Timers:
-    def create_timer(self, period: float, beat: Callable[[], None]) -> None:
+    def create_timer(self, period: float, beat: Callable[[], None], clock: object) -> None:
         pass
 
 
 def test_work_for_the_executor_is_done_in_order() -> None:
     """What is given to the executor's thread is done there in the order it came, by one task."""
     tasks, done = Tasks(), list[int]()
-    spinner = Spinner(tasks, Timers())
+    spinner = Spinner(tasks, Timers(), None)
     for number in range(5):
         spinner.do(done.append, number)
     assert len(tasks.tasks) == 1
@@ -130,7 +130,7 @@ def test_work_for_the_executor_is_done_in_order() -> None:
 def test_work_that_fails_costs_no_other() -> None:
     """A request that ROS refuses does not lose those behind it."""
     tasks, done = Tasks(), list[int]()
-    spinner = Spinner(tasks, Timers())
+    spinner = Spinner(tasks, Timers(), None)
     spinner.do(lambda: 1 / 0)
     spinner.do(done.append, 1)
     tasks.turn()

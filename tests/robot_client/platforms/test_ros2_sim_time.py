@@ -1,0 +1,106 @@
+"""A robot whose time is what a simulation says: stamps follow it, safety does not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+import pytest_twisted
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.serialization import deserialize_message, serialize_message
+from twisted.internet import reactor
+
+from relay_protocol.link import MotionPolicy
+from robot_client.clocks import now_ns
+from robot_client.motion import MOTION_QOS, MotionDesk, NoGuard
+from robot_client.offset import Offset
+from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.topics import TypedTopic
+from tests.robot_client.ros import Peer, until
+
+TWIST = "geometry_msgs/msg/Twist"
+STAMPED = "geometry_msgs/msg/TwistStamped"
+
+
+@pytest.fixture(scope="module", params=["events", "single"])
+def ros(request: pytest.FixtureRequest, environment: dict[str, str]) -> Iterator[Ros2Platform]:
+    made = Ros2Platform(reactor, "switchboard_test", executor=request.param, sim_time=True)
+    made.start()
+    yield made
+    made.stop()
+
+
+def stamp(ros: Ros2Platform) -> float:
+    zero = deserialize_message(ros.zero(STAMPED), TwistStamped).header.stamp
+    return zero.sec + zero.nanosec / 1e9
+
+
+@pytest_twisted.ensureDeferred
+async def test_stamps_follow_the_simulation(ros: Ros2Platform, peer: Peer) -> None:
+    """A stop is stamped with the time of the simulation, which also goes back, and the relay is told so."""
+    assert ros.facts().sim_time
+    for seconds in (12.5, 3.25):
+        await until(lambda seconds=seconds: peer.do("clock", seconds) or stamp(ros) == seconds)
+
+
+@pytest_twisted.ensureDeferred
+async def test_paused_simulation_is_no_stuck_executor(ros: Ros2Platform) -> None:
+    """The executor's sign of life goes by the machine's clock: it comes while the simulation stands still."""
+    served = ros._spinner._served
+    await until(lambda: ros._spinner._served > served)
+    assert ros.trouble() is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_paused_simulation_keeps_no_robot_moving(ros: Ros2Platform, peer: Peer) -> None:
+    """While the simulation stands still commands still grow old, and a robot whose driver fell silent is stopped."""
+    topic = f"/cmd_{ros._kind}"
+    peer.do("clock", 5.0)
+    peer.do("listen", topic, "twist")
+    desk = MotionDesk(MotionPolicy(types=[TWIST]), ros, reactor, now_ns, NoGuard())
+    on, offset = TypedTopic(topic, TWIST), Offset()
+    offset.add(now_ns(), now_ns(), now_ns())
+    desk.open("driver", on, ros.advertise(topic, TWIST, False, MOTION_QOS))
+    command = Twist()
+    command.linear.x = 0.5
+    body = bytes(serialize_message(command))
+
+    def drive() -> bool:
+        desk.command("driver", body, now_ns(), offset)
+        return bool(peer.heard(topic))
+
+    await until(drive)
+    await until(lambda: peer.heard(topic)[-1]["x"] == 0.0)
+    assert desk.watchdog_stops >= 1
+    assert not desk.command("driver", body, now_ns() - 10**9, offset)
+    assert desk.stale_commands == 1
+    desk.close("driver")
+
+
+def test_guard_knows_no_wall_time_of_a_simulation(environment: dict[str, str]) -> None:
+    """The guard stamps its stops with 0 when the robot's time is simulated: to controllers that means now."""
+    program = f"""
+from robot_client.guard import RosOutlets
+from robot_client.topics import TypedTopic
+from geometry_msgs.msg import TwistStamped
+from rclpy.serialization import deserialize_message
+for simulated in (True, False):
+    outlets = RosOutlets("switchboard_guard_test", simulated)
+    class Publisher:
+        def publish(self, body): print(deserialize_message(body, TwistStamped).header.stamp.sec > 0)
+        def get_subscription_count(self): return 1
+    outlets._publishers[TypedTopic("/cmd", "{STAMPED}")] = Publisher()
+    outlets.zero(TypedTopic("/cmd", "{STAMPED}"))
+    import rclpy; rclpy.shutdown()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert done.stdout.split() == ["False", "True"]
