@@ -9,6 +9,7 @@ from relay_protocol import jsontext, link, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
+from relay_protocol.ros_types import Writer
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.topics import Held, Phase, Publication
@@ -27,8 +28,6 @@ HELD_BYTES = MIB
 
 HELD_SECONDS = 3.0
 """A message that could not go out by then is dropped: nobody wants it done that late."""
-
-Failed = Callable[[str], None]
 
 
 class Publications:
@@ -111,23 +110,37 @@ class Publications:
         publication: Publication,
         body: bytes,
         stamp: int,
-        failed: Failed,
+        id: rosbridge.Id,
         good_for: float = HELD_SECONDS,
     ) -> None:
         """Send one message to the robot, or hold it for the moment until the link or the type is there.
 
-        :param body: JSON of the message
+        The client is told in words when it could not be sent.
+
+        :param body: JSON of the message, part of a text that was checked
         :param stamp: the relay's monotonic nanoseconds; the message can't have been sent before
-        :param failed: told in words when it could not be sent
+        :param id: of the client's ``publish``
         :param good_for: seconds from now after which it must not be sent any more
         """
-        if publication.phase is Phase.FAILED:
-            failed(f"the robot could not advertise {publication.topic}; the message was dropped")
-        elif publication.phase is Phase.WAITING or self._untyped(publication):
-            until = self._clock.seconds() + min(good_for, HELD_SECONDS)
-            self._hold(publication, Held(member, body, stamp, failed, until))
+        encode = publication.encode or self._encoder(publication)
+        if encode is not None:
+            self._send(member, publication, encode, body, stamp, id)
+        elif publication.phase is Phase.FAILED:
+            reason = f"the robot could not advertise {publication.topic}; the message was dropped"
+            member.tell("error", reason, id)
         else:
-            self._convert(publication, body, stamp, failed)
+            until = self._clock.seconds() + min(good_for, HELD_SECONDS)
+            self._hold(publication, Held(member, body, stamp, id, until))
+
+    def _encoder(self, publication: Publication) -> Writer | None:
+        """What makes the robot's form of a message, if it can be sent now."""
+        if publication.phase in (Phase.WAITING, Phase.FAILED) or self._untyped(publication):
+            return None
+        if self._wire.cdr:
+            publication.encode = self._wire.robot.types.writer(publication.type, checked=True)
+        else:
+            publication.encode = _as_it_came
+        return publication.encode
 
     def _hold(self, publication: Publication, message: Held) -> None:
         mine = (
@@ -137,14 +150,12 @@ class Publications:
             if each.member is message.member
         )
         if sum(mine) + len(message.body) > HELD_BYTES:
-            message.failed(f"publish {publication.topic}: too much waits for the robot already; dropped")
+            _dropped(publication, message, "too much waits for the robot already; dropped")
             return
         publication.held.append(message)
         if len(publication.held) > HELD_MESSAGES:
             oldest = publication.held.popleft()
-            oldest.failed(
-                f"publish {publication.topic}: too much waits for the robot; the oldest was dropped"
-            )
+            _dropped(publication, oldest, "too much waits for the robot; the oldest was dropped")
 
     def graph_changed(self) -> None:
         """What the robot could not advertise may be possible now."""
@@ -160,13 +171,14 @@ class Publications:
     def lost(self) -> None:
         """The robot's side is gone; what was held is older than anyone would want executed."""
         for publication in self._topics.values():
-            publication.phase = Phase.WAITING
+            publication.enter(Phase.WAITING)
             publication.held.clear()
 
     def typed(self, type_name: str) -> None:
         """A definition has come: what was held for it goes."""
         for publication in list(self._topics.values()):
             if publication.type == type_name:
+                publication.enter(publication.phase)
                 self._flush(publication)
 
     def advertised(self, message: link.Advertised) -> None:
@@ -174,7 +186,7 @@ class Publications:
         self._wire.asks.answered(("advertise", message.number))
         publication = self._numbers.get(message.number)
         if publication is not None:
-            publication.phase = Phase.ACTIVE
+            publication.enter(Phase.ACTIVE)
 
     def refused(self, number: int, reason: str) -> None:
         """The robot could not advertise."""
@@ -182,11 +194,11 @@ class Publications:
         publication = self._numbers.get(number)
         if publication is None:
             return
-        publication.phase = Phase.FAILED
+        publication.enter(Phase.FAILED)
         held = list(publication.held)
         publication.held.clear()
         for each in held:
-            each.failed(f"publish {publication.topic}: {reason}")
+            _dropped(publication, each, reason)
         for member in list(publication.holders):
             member.tell("error", f"advertise {publication.topic}: {reason}")
 
@@ -226,7 +238,7 @@ class Publications:
     def _ask(self, publication: Publication) -> None:
         if self._wire.link is None:
             return
-        publication.phase = Phase.WAITING
+        publication.enter(Phase.WAITING)
         self._definitions.want(publication.type)
         message = link.Advertise(
             number=publication.number,
@@ -238,35 +250,38 @@ class Publications:
         )
 
         def sent() -> None:
-            publication.phase = Phase.ASKED
+            publication.enter(Phase.ASKED)
             if not self._untyped(publication):
                 self._flush(publication)
 
         self._wire.asks.ask(Ask(("advertise", publication.number), message, sent))
 
     def _flush(self, publication: Publication) -> None:
-        if publication.phase is Phase.WAITING:
+        encode = self._encoder(publication)
+        if encode is None:
             return
         held = list(publication.held)
         publication.held.clear()
         now = self._clock.seconds()
         for each in held:
             if each.until < now:
-                each.failed(f"publish {publication.topic}: the robot could not be reached in time; dropped")
+                _dropped(publication, each, "the robot could not be reached in time; dropped")
             else:
-                self._convert(publication, each.body, each.stamp, each.failed)
+                self._send(each.member, publication, encode, each.body, each.stamp, each.id)
 
-    def _convert(self, publication: Publication, body: bytes, stamp: int, failed: Failed) -> None:
+    def _send(
+        self,
+        member: Member,
+        publication: Publication,
+        encode: Writer,
+        body: bytes,
+        stamp: int,
+        id: rosbridge.Id,
+    ) -> None:
         try:
-            message = jsontext.decode_any(body)
-            if not isinstance(message, dict):
-                raise Invalid("'msg' must be an object")
-            if self._wire.cdr:
-                encoded = self._wire.robot.types.from_json(publication.type, message, self._wall_ns())
-            else:
-                encoded = jsontext.encode(message)
+            encoded = encode(body, self._wall_ns())
         except SwitchboardError as error:
-            failed(f"publish {publication.topic}: {error}")
+            member.tell("error", f"publish {publication.topic}: {error}", id)
             return
         if self._wire.link is not None:
             self._wire.link.sample(publication.number, stamp, encoded)
@@ -283,3 +298,19 @@ class Publications:
         self._wire.asks.withdraw(("advertise", publication.number))
         if publication.phase in (Phase.ASKED, Phase.ACTIVE):
             self._wire.send(link.Unadvertise(number=publication.number))
+
+
+def _dropped(publication: Publication, message: Held, reason: str) -> None:
+    message.member.tell("error", f"publish {publication.topic}: {reason}", message.id)
+
+
+def _as_it_came(body: bytes, now_ns: int) -> bytes:
+    """A message for a robot that speaks JSON: the client's own words, once it is sure that any reader can take them.
+
+    msgspec has skipped the body, which finds all that is not JSON except a number beyond any double; the text around
+    it was checked for UTF-8 and depth.
+    """
+    if body[:1] != b"{":
+        raise Invalid("'msg' must be an object")
+    jsontext.check_range(body)
+    return body

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from relay_protocol import limits, rosbridge
 from relay_protocol.link import QoS
-from relay_protocol.ros_types import TypeRegistry
+from relay_protocol.ros_types import TypeRegistry, Writer
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
 from relay_server.channel.wire import Member
@@ -189,13 +189,14 @@ def _keep(samples: deque[Sample], sample: Sample) -> None:
 class Held(NamedTuple):
     """A message that waits for the moment until it can be sent; see :meth:`Publications.publish`.
 
+    :param id: of the client's ``publish``, for what is told about it
     :param until: seconds of the relay's clock; nobody wants it sent later
     """
 
     member: Member
     body: bytes
     stamp: int
-    failed: Callable[[str], None]
+    id: rosbridge.Id
     until: float
 
 
@@ -210,5 +211,12 @@ class Publication:
         self.queue_size = 0
         self.qos: QoS | None = None
         self.phase = Phase.WAITING
+        self.encode: Writer | None = None
+        """Makes what the robot is sent of a message's JSON. ``None`` until the first message after a change."""
         self.holders: dict[Member, set[rosbridge.Id]] = {}
         self.held: deque[Held] = deque()
+
+    def enter(self, phase: Phase) -> None:
+        """Go on to this phase; how messages are made is found out anew."""
+        self.phase = phase
+        self.encode = None

@@ -2,26 +2,47 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from relay_protocol import rosbridge
+from relay_protocol import link, rosbridge
 from relay_protocol.errors import Unavailable
-from relay_protocol.rights import Operation
+from relay_protocol.rights import Operation, Rules
 from relay_server.channel import resolve
 from relay_server.channel.publications import HELD_SECONDS
+from relay_server.channel.topics import Publication
 from relay_server.freshness import Freshness
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
     from relay_server.session.core import Session
 
+ROUTES = 256
+"""Topics of which one client's routes are kept."""
+
+
+class Route(NamedTuple):
+    """What was found out about a topic this client may publish to, and on what that was founded.
+
+    :param type: as the client wrote it in ``publish``
+    :param motion: whether the robot's own safety counts it as motion
+    """
+
+    type: str
+    rules: Rules
+    description: link.Describe
+    publication: Publication
+    motion: bool
+
 
 class Publishing:
     """The messages of one session on their way to the robot."""
 
+    __slots__ = ("_freshness", "_routes", "_session", "stale_commands")
+
     def __init__(self, session: Session, freshness: Freshness) -> None:
         self._session = session
         self._freshness = freshness
+        self._routes: dict[str, Route] = {}
         self.stale_commands = 0
 
     def advertise(self, ask: rosbridge.Advertise) -> None:
@@ -36,31 +57,59 @@ class Publishing:
         session.channel.publications.unadvertise(session, resolve(ask.topic), ask.id)
 
     def publish(self, ask: rosbridge.Publish) -> None:
-        """One message to the robot."""
+        """One message to the robot.
+
+        The route found before holds while all it was founded on is the same: rights are compiled anew when they
+        change, and a robot's words about itself are replaced as a whole. So nothing has to be told of a change.
+
+        :raises Refused: the client may not publish there
+        :raises Unavailable: the robot is offline
+        :raises Invalid: no such topic, or of another type
+        """
         session = self._session
+        robot = session.robot
+        route = self._routes.get(ask.topic)
+        if (
+            route is None
+            or route.rules is not session.permit.rules
+            or route.description is not robot.description
+            or session not in route.publication.holders
+            or ask.type != route.type
+            or robot.control is None
+        ):
+            route = self._find(ask)
+        good_for = HELD_SECONDS
+        if route.motion:
+            age_ms = self._freshness.age() / 1e6
+            deadline_ms = route.description.motion.deadline_ms
+            if age_ms > deadline_ms:
+                self._stale(route, age_ms, ask.id)
+                return
+            good_for = (deadline_ms - age_ms) / 1000
+        session.channel.publications.publish(
+            session, route.publication, bytes(ask.msg), self._freshness.not_before, ask.id, good_for
+        )
+
+    def _find(self, ask: rosbridge.Publish) -> Route:
+        self._routes.pop(ask.topic, None)
+        session = self._session
+        robot, rules = session.robot, session.permit.rules
         topic = resolve(ask.topic)
         session.judge(Operation.PUBLISH, topic)
-        robot = session.robot
         if robot.control is None:
             raise Unavailable(f"robot {robot.name} is offline; the message was dropped")
         publication = session.channel.publications.get(session, topic, normal_type(ask.type))
-        good_for = HELD_SECONDS
-        if robot.is_motion(topic, publication.type):
-            age_ms = self._freshness.age() / 1e6
-            deadline_ms = robot.description.motion.deadline_ms
-            if age_ms > deadline_ms:
-                self.stale_commands += 1
-                session.tell(
-                    "warning",
-                    f"a command to {topic} was dropped: it may be {age_ms:.0f} ms old, by the last ping "
-                    f"answered; the robot takes none older than {deadline_ms} ms",
-                    ask.id,
-                )
-                return
-            good_for = (deadline_ms - age_ms) / 1000
+        motion = robot.is_motion(topic, publication.type)
+        if len(self._routes) >= ROUTES:
+            self._routes.clear()
+        route = self._routes[ask.topic] = Route(ask.type, rules, robot.description, publication, motion)
+        return route
 
-        def failed(reason: str) -> None:
-            session.tell("error", reason, ask.id)
-
-        stamp = self._freshness.not_before
-        session.channel.publications.publish(session, publication, bytes(ask.msg), stamp, failed, good_for)
+    def _stale(self, route: Route, age_ms: float, id: rosbridge.Id) -> None:
+        self.stale_commands += 1
+        self._session.tell(
+            "warning",
+            f"a command to {route.publication.topic} was dropped: it may be {age_ms:.0f} ms old, by the last ping "
+            f"answered; the robot takes none older than {route.description.motion.deadline_ms} ms",
+            id,
+        )

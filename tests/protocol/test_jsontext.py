@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_protocol import jsontext
@@ -97,3 +97,59 @@ def test_a_number_of_five_thousand_digits_is_refused() -> None:
     """It is told to be out of range."""
     with pytest.raises(MalformedMessage, match="out of range"):
         jsontext.decode_any(b"[" + b"1" * 5000 + b"]")
+
+
+@pytest.mark.parametrize(
+    "text", [b"1" * 400, b"-" + b"1" * 400, b"2" * 309, b"1e999", b"[1,%s]" % (b"1" * 400)]
+)
+def test_a_number_that_no_double_can_hold_is_refused(text: bytes) -> None:
+    """However it is written; the longest that fits is taken."""
+    with pytest.raises(MalformedMessage):
+        jsontext.decode_any(text)
+    with pytest.raises(MalformedMessage):
+        jsontext.check_range(text)
+    for fits in (b"1" * 309, b"1" * 400 + b"e-300", b'"%s"' % (b"1" * 400)):
+        jsontext.decode_any(fits)
+
+
+class Skipping(msgspec.Struct):
+    """Reads one field, keeps another undecoded, skips the rest."""
+
+    kept: msgspec.Raw
+
+
+SKIPPING = msgspec.json.Decoder(Skipping)
+PIECES = st.sampled_from(
+    [*'{}[]",:0123456789eE.+-', "true", "false", "null", "NaN", "\\", "\\u", "d800", "\\udc00", "\\n", "\n", "\x01",
+     '"a"', '"a":', " ", "1e5", "0", "-", "ß", "\\x", "/", "\x7f"]
+)  # fmt: skip
+
+
+@given(
+    st.sampled_from([b'{"kept":%s}', b'{"kept":1,"skipped":%s}', b'{"skipped":[%s],"kept":1}']),
+    st.lists(PIECES, max_size=12).map("".join) | VALUES.map(json.dumps),
+)
+@settings(max_examples=500)
+def test_what_is_kept_undecoded_or_skipped_is_json_all_the_same(around: bytes, inside: str) -> None:
+    """Passing a part of a checked text on as it is can't pass on what is not JSON, but for the size of numbers."""
+    data = around % inside.encode()
+    try:
+        value = json.loads(data, parse_constant=_no)
+        sane = "kept" in value
+    except ValueError:
+        sane = False
+    try:
+        found: Any = jsontext.decode(SKIPPING, data).kept
+        taken = True
+    except MalformedMessage:
+        taken = False
+    if taken:
+        assert sane, data
+        json.loads(bytes(found), parse_constant=_no)
+    elif sane:
+        # Python's reader takes lone surrogates, which are no characters.
+        assert "\\u" in inside
+
+
+def _no(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from relay_protocol import link
 from relay_protocol.link import QoS
 from relay_server.channel import publications as module
@@ -187,8 +189,55 @@ def test_a_robot_of_json_is_sent_json(world: World) -> None:
     person = world.person()
     world.robot_joins()
     person.says("publish", topic="/chatter", msg={"data": "x"})
-    assert [body for _, _, body in world.link.samples] == [b'{"data":"x"}']
+    assert [body for _, _, body in world.link.samples] == [b'{"data": "x"}']
     assert not world.link.all(link.GetType)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"1e999", b"[1]", b'"{"', b"null", b'{"a":-1e999}', b'{"a":[%s]}' % (b"9" * 400), b'{"a":1.8e308}'],
+)
+def test_a_robot_of_json_gets_objects_with_numbers_that_are_finite(world: World, body: bytes) -> None:
+    """What a reader would take for infinity is refused here, though nobody decodes the rest."""
+    world.robot_comes(encodings=["json"])
+    person = world.person()
+    person.says("set_level", level="error")
+    world.robot_joins()
+    person.session.message(b'{"op":"publish","topic":"/chatter","msg":%s}' % body)
+    assert not world.link.samples
+    (error,) = told(person)
+    assert error.startswith("publish /chatter: ")
+    person.session.message(b'{"op":"publish","topic":"/chatter","msg":  {"a" : 1e308}  }')
+    assert [sent for _, _, sent in world.link.samples] == [b'{"a" : 1e308}']
+
+
+def test_a_robot_that_comes_back_with_another_definition_is_sent_that(world: World) -> None:
+    """What was made for the former one is not used again."""
+    person = at_work(world)
+    person.says("publish", topic="/chatter", msg={"data": "a"})
+    world.define()
+    assert said(world) == ["a"]
+    world.robot_goes()
+    world.robot_comes()
+    world.robot_joins()
+    for asked in world.link.take(link.GetType):
+        world.channel.message(link.TypeDefinition(type=asked.type, text="string text\n"))
+    person.says("publish", topic="/chatter", msg={"data": "b"})
+    person.says("publish", topic="/chatter", msg={"text": "c"})
+    assert said(world) == ["c"]
+
+
+def test_a_robot_that_comes_back_speaking_otherwise_is_sent_that(world: World) -> None:
+    """CDR before, JSON after."""
+    person = at_work(world)
+    person.says("publish", topic="/chatter", msg={"data": "a"})
+    world.define()
+    assert said(world) == ["a"]
+    world.robot_goes()
+    world.robot_comes(encodings=["json"])
+    world.robot_joins()
+    person.says("publish", topic="/chatter", msg={"data": "b"})
+    assert [body for _, _, body in world.link.samples] == [b'{"data": "b"}']
 
 
 def test_advertisements_of_one_client_are_bounded(world: World, monkeypatch: Any) -> None:
