@@ -28,23 +28,32 @@ class Definitions:
 
     def want(self, type_name: str) -> None:
         """Ask for a type unless it is known or asked for already."""
-        if self._wire.robot.types.knows(type_name) or type_name in self._asked:
-            return
-        if self._wire.cdr and self._wire.link is not None:
+        if not self._wire.robot.types.knows(type_name):
+            self._ask(type_name)
+
+    def _ask(self, type_name: str) -> None:
+        if type_name not in self._asked and self._wire.cdr and self._wire.link is not None:
             self._asked[type_name] = []
             self._wire.send(link.GetType(type=type_name))
 
-    def ready(self, type_name: str) -> Deferred[None]:
-        """Fires when the type is known; fails in words when the robot does not know it or is lost."""
-        if self._wire.robot.types.knows(type_name) or not self._wire.cdr:
+    def ready(self, type_name: str, text: bool = False) -> Deferred[None]:
+        """Fires when the type is known; fails in words when the robot does not know it or is lost.
+
+        :param text: wait for the robot's text of just this type; else one that contains it will do
+        """
+        if not self._wire.cdr or self._has(type_name, text):
             return succeed(None)
         if self._wire.link is None:
             # Nobody would ask the robot, and this type would count as asked for.
             return fail(Unavailable(f"robot {self._wire.robot.name} is not connected"))
-        self.want(type_name)
+        self._ask(type_name)
         waiting: Deferred[None] = Deferred()
         self._asked.setdefault(type_name, []).append(waiting)
         return waiting
+
+    def _has(self, type_name: str, text: bool) -> bool:
+        types = self._wire.robot.types
+        return types.has_text(type_name) if text else types.knows(type_name)
 
     def add(self, message: link.TypeDefinition) -> None:
         """The robot has sent a definition."""

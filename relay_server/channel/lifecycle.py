@@ -311,7 +311,12 @@ class Channel:
 
     def ends(self) -> Ends:
         """What the robot has in its graph for our members."""
-        return Ends(self.publications.active(), self.subscriptions.active())
+        return Ends(
+            self.publications.active(),
+            self.subscriptions.active(),
+            self.services.active(),
+            self.actions.active(),
+        )
 
     def joined(self, channel_link: ChannelLink) -> None:
         """The robot has come with our ticket."""

@@ -105,6 +105,10 @@ class Offers:
         offer = self._offers.get(name)
         return None if offer is None or offer.phase is Phase.FAILED else offer
 
+    def active(self) -> tuple[tuple[str, str], ...]:
+        """Names the robot offers for us, with their types."""
+        return tuple((each.name, each.type) for each in self._offers.values() if each.phase is Phase.ACTIVE)
+
     def check(self, offer: Offer) -> None:
         """:raises NotFound: the offer is over"""
         if self.standing(offer.name) is not offer:

@@ -20,6 +20,7 @@ from relay_server.channel.sample import Sample
 from relay_server.channel.subscriptions import Subscriptions
 from relay_server.channel.wire import Wire
 from relay_server.clock import Clock
+from relay_server.forms import Form
 
 TOPIC = "/clock"
 TYPE = "rosgraph_msgs/msg/Clock"
@@ -63,7 +64,8 @@ class RobotClock:
             self.lost()
         elif wanted and not self._following:
             ticks = _Ticks(self._clock, self, TOPIC)
-            ticks.add(rosbridge.Subscribe(topic=TOPIC, throttle_rate=THROTTLE_MS))
+            # As the robot sends it: the type need not be known.
+            ticks.add(rosbridge.Subscribe(topic=TOPIC, throttle_rate=THROTTLE_MS), Form("cbor-raw"))
             try:
                 self._subscriptions.add(self, ticks, TYPE, None)
                 self._following = True
@@ -80,12 +82,11 @@ class RobotClock:
             "the simulated time of {robot}: {text}", robot=self._wire.robot.name, text=text, severity=level
         )
 
-    def deliver(self, listener: Listener, parcel: Sample | bytes) -> None:
+    def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Keep the newest."""
-        if isinstance(parcel, Sample):
-            told = nanoseconds(parcel.body)
-            if told is not None:
-                self._newest = told
+        told = nanoseconds(parcel.body)
+        if told is not None:
+            self._newest = told
 
 
 class _Ticks(Listener):

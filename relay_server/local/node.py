@@ -54,14 +54,25 @@ class RelayNode:
         return {
             "robot": robot.name,
             "state": robot.state.value,
-            "level": str(rules.level) if rules.level else None,
+            "level": str(rules.level or ""),
             "clients": [{"user": each.name, "since": each.since} for each in self._sessions(robot.robot_id)],
             "rtt_ms": {"client_relay": milliseconds(session.rtt), "relay_robot": milliseconds(robot.rtt)},
             "drops": session.outbox.dropped,
+            "topic_drops": [],
             "refusals": session.refusals,
             "stale_commands": session.stale_commands,
+            "uplink": self._uplink(session),
             "motion": _whole(robot.description.motion),
             "health": _whole(robot.health),
+        }
+
+    def _uplink(self, session: Session) -> dict[str, Any]:
+        ends = session.channel.ends()
+        return {
+            "state": session.channel.state.value,
+            "subscribed": len(ends.subscribes),
+            "published": len(ends.publishes),
+            "sim_time": session.robot.description.sim_time,
         }
 
 

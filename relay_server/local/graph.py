@@ -1,0 +1,110 @@
+"""``/rosapi/…`` about the robot's graph, answered from the relay's mirror of it.
+
+What the caller may not use is absent from every answer. What does not exist gets an empty answer, as rosapi gives it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from relay_protocol.errors import Invalid
+from relay_server.local.arguments import name, text
+from relay_server.local.view import view
+from relay_server.session import Session, normal_type
+
+
+def _first(types: Iterable[str]) -> str:
+    return next(iter(types), "")
+
+
+async def topics(session: Session, args: Any) -> Any:
+    """``/rosapi/topics``"""
+    found = view(session).topics
+    return {"topics": list(found), "types": [_first(topic.types) for topic in found.values()]}
+
+
+async def topics_for_type(session: Session, args: Any) -> Any:
+    """``/rosapi/topics_for_type``"""
+    wanted = normal_type(text(args, "type"))
+    return {"topics": [each for each, topic in view(session).topics.items() if wanted in topic.types]}
+
+
+async def topic_type(session: Session, args: Any) -> Any:
+    """``/rosapi/topic_type``"""
+    topic = view(session).topics.get(name(args, "topic"))
+    return {"type": _first(topic.types) if topic else ""}
+
+
+async def publishers(session: Session, args: Any) -> Any:
+    """``/rosapi/publishers``"""
+    topic = view(session).topics.get(name(args, "topic"))
+    return {"publishers": topic.publishers if topic else []}
+
+
+async def subscribers(session: Session, args: Any) -> Any:
+    """``/rosapi/subscribers``"""
+    topic = view(session).topics.get(name(args, "topic"))
+    return {"subscribers": topic.subscribers if topic else []}
+
+
+async def services(session: Session, args: Any) -> Any:
+    """``/rosapi/services``"""
+    return {"services": list(view(session).services)}
+
+
+async def services_for_type(session: Session, args: Any) -> Any:
+    """``/rosapi/services_for_type``"""
+    wanted = normal_type(text(args, "type"), "srv")
+    return {"services": [each for each, service in view(session).services.items() if wanted in service.types]}
+
+
+async def service_type(session: Session, args: Any) -> Any:
+    """``/rosapi/service_type``"""
+    service = view(session).services.get(name(args, "service"))
+    return {"type": _first(service.types) if service else ""}
+
+
+async def service_node(session: Session, args: Any) -> Any:
+    """``/rosapi/service_node``"""
+    service = view(session).services.get(name(args, "service"))
+    return {"node": _first(service.providers) if service else ""}
+
+
+async def service_providers(session: Session, args: Any) -> Any:
+    """``/rosapi/service_providers``: by the service's type, which is how rosapi means it, or by its name."""
+    wanted, full = text(args, "service"), name(args, "service")
+    try:
+        type_name = normal_type(wanted, "srv")
+    except Invalid:
+        type_name = ""
+    found = [
+        each for known, each in view(session).services.items() if known == full or type_name in each.types
+    ]
+    return {"providers": sorted({node for each in found for node in each.providers})}
+
+
+async def nodes(session: Session, args: Any) -> Any:
+    """``/rosapi/nodes``"""
+    return {"nodes": view(session).nodes}
+
+
+async def node_details(session: Session, args: Any) -> Any:
+    """``/rosapi/node_details``"""
+    node, seen = name(args, "node"), view(session)
+    return {
+        "subscribing": [each for each, topic in seen.topics.items() if node in topic.subscribers],
+        "publishing": [each for each, topic in seen.topics.items() if node in topic.publishers],
+        "services": [each for each, service in seen.services.items() if node in service.providers],
+    }
+
+
+async def action_servers(session: Session, args: Any) -> Any:
+    """``/rosapi/action_servers``"""
+    return {"action_servers": list(view(session).actions)}
+
+
+async def action_type(session: Session, args: Any) -> Any:
+    """``/rosapi/action_type``"""
+    action = view(session).actions.get(name(args, "action"))
+    return {"type": _first(action.types) if action else ""}

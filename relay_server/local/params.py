@@ -1,0 +1,223 @@
+"""``/rosapi/…`` about parameters, answered by the nodes' own parameter services on the robot.
+
+A parameter is named ``<node>:<parameter>``, its value is JSON text. Whoever asks needs the right to call just that
+service of just that node. Source: rosapi of rosbridge_suite for ROS 2; ROS 2 design, "ROS 2 Parameters";
+``rcl_interfaces/msg/ParameterType``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from twisted.internet.defer import Deferred, DeferredList
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Invalid, MalformedMessage, NotFound, SwitchboardError, Unavailable
+from relay_protocol.rights import Operation
+from relay_server.channel import Channel
+from relay_server.local.arguments import absolute, text
+from relay_server.local.values import NOT_SET, from_parameter, to_parameter
+from relay_server.local.view import view
+from relay_server.session import Session
+
+SECONDS = 5.0
+"""A node has this long to answer about one parameter, as in rosapi."""
+
+LIST_SECONDS = 2.0
+"""A node has this long to list its parameters; one that does not is left out."""
+
+ALL_SECONDS = 10.0
+"""All nodes together have this long."""
+
+AT_A_TIME = 16
+"""Nodes that are asked for their lists at a time, for one caller."""
+
+SURVEYS = 16
+"""Callers for whom the nodes of one robot are asked at a time."""
+
+_LIST = "rcl_interfaces/srv/ListParameters"
+_NAMES = 65_536
+"""Most names in one answer."""
+
+_surveys: WeakKeyDictionary[Channel, set[object]] = WeakKeyDictionary()
+
+
+def _split(args: Any) -> tuple[str, str]:
+    """Node and parameter.
+
+    :raises Invalid: not of the form ``<node>:<parameter>``
+    """
+    given = text(args, "name")
+    node, colon, parameter = given.partition(":")
+    if not colon or not node.strip("/") or not parameter:
+        raise Invalid(f"'{given[:80]}' is no parameter; write <node>:<parameter>, say /camera:exposure")
+    return absolute(node), parameter
+
+
+async def _ask(session: Session, node: str, service: str, request: Any, seconds: float = SECONDS) -> Any:
+    """Call a parameter service of a node.
+
+    :raises Refused: the caller may not call it
+    :raises NotFound: the node is not there, or has no such service
+    """
+    name = f"{node}/{service}"
+    session.judge(Operation.CALL, name)
+    found = view(session).services.get(name)
+    if found is None or not found.types:
+        raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
+    answer = await session.channel.call(name, found.types[0], jsontext.encode(request), seconds)
+    return jsontext.decode_any(answer)
+
+
+async def _value(session: Session, node: str, parameter: str) -> Any:
+    """The parameter's ``rcl_interfaces/msg/ParameterValue``; its type is 0 when it is not set."""
+    answer = await _ask(session, node, "get_parameters", {"names": [parameter]})
+    try:
+        values = answer["values"]
+        # A node that does not know the parameter at all sends no value.
+        return values[0] if values else {"type": NOT_SET}
+    except (TypeError, KeyError) as error:
+        raise _odd(node) from error
+
+
+def _odd(node: str) -> Unavailable:
+    return Unavailable(f"node {node} gave an answer about its parameters that makes no sense")
+
+
+async def get_param(session: Session, args: Any) -> Any:
+    """``/rosapi/get_param``. What can't be had comes as ``default_value``, or as null."""
+    default = text(args, "default_value", 1, "")
+    try:
+        node, parameter = _split(args)
+        found = await _value(session, node, parameter)
+        try:
+            value = from_parameter(found)
+        except Invalid as error:
+            raise _odd(node) from error
+        if value is not None:
+            return _got(jsontext.encode(value[0]).decode())
+        if default:
+            return _got(_as_json(default))
+        reason = f"the parameter {parameter} of node {node} is not set"
+    except SwitchboardError as error:
+        reason = str(error)
+    return {"value": _as_json(default), "successful": False, "reason": reason}
+
+
+def _got(value: str) -> dict[str, Any]:
+    return {"value": value, "successful": True, "reason": ""}
+
+
+def _as_json(default: str) -> str:
+    """The default as JSON text; what is none counts as a string."""
+    if not default:
+        return "null"
+    try:
+        return jsontext.encode(jsontext.decode_any(default.encode())).decode()
+    except MalformedMessage:
+        return jsontext.encode(default).decode()
+
+
+async def has_param(session: Session, args: Any) -> Any:
+    """``/rosapi/has_param``: false also for what the caller may not ask, as for what is not there."""
+    try:
+        node, parameter = _split(args)
+        return {"exists": from_parameter(await _value(session, node, parameter)) is not None}
+    except SwitchboardError:
+        return {"exists": False}
+
+
+async def set_param(session: Session, args: Any) -> Any:
+    """``/rosapi/set_param``"""
+    given = text(args, "value", 1)
+    try:
+        node, parameter = _split(args)
+        try:
+            value = jsontext.decode_any(given.encode())
+        except MalformedMessage as error:
+            raise Invalid(f"'value' must be JSON text: {error}") from None
+        session.judge(Operation.CALL, f"{node}/set_parameters")
+        has = await _type_it_has(session, node, parameter) if _ambiguous(value) else None
+        return await _set(session, node, parameter, to_parameter(value, has))
+    except SwitchboardError as error:
+        return {"successful": False, "reason": str(error)}
+
+
+def _ambiguous(value: Any) -> bool:
+    """JSON does not tell 1 from 1.0, nor bytes from integers, nor what an empty list would hold."""
+    return isinstance(value, list) or (isinstance(value, int) and not isinstance(value, bool))
+
+
+async def _type_it_has(session: Session, node: str, parameter: str) -> int | None:
+    """The type of the parameter now, ``None`` when nobody can tell."""
+    try:
+        found = (await _value(session, node, parameter))["type"]
+    except (SwitchboardError, TypeError, KeyError):
+        return None
+    return found if isinstance(found, int) else None
+
+
+async def delete_param(session: Session, args: Any) -> Any:
+    """``/rosapi/delete_param``: in ROS 2 a parameter is deleted by setting it to nothing."""
+    try:
+        node, parameter = _split(args)
+        return await _set(session, node, parameter, {"type": NOT_SET})
+    except SwitchboardError as error:
+        return {"successful": False, "reason": str(error)}
+
+
+async def _set(session: Session, node: str, parameter: str, value: dict[str, Any]) -> dict[str, Any]:
+    request = {"parameters": [{"name": parameter, "value": value}]}
+    answer = await _ask(session, node, "set_parameters", request)
+    try:
+        (result,) = answer["results"]
+        return {"successful": bool(result["successful"]), "reason": str(result["reason"])}
+    except (TypeError, KeyError, ValueError) as error:
+        raise _odd(node) from error
+
+
+async def get_param_names(session: Session, args: Any) -> Any:
+    """``/rosapi/get_param_names``: of all nodes the caller may ask, side by side. Who does not answer is left out."""
+    nodes = [
+        name.removesuffix("/list_parameters")
+        for name, service in view(session).services.items()
+        if name.endswith("/list_parameters") and _LIST in service.types
+    ]
+    found: dict[str, list[str]] = {}
+    with _survey(session.channel), contextlib.suppress(Unavailable):
+        await session.channel.within(ALL_SECONDS, _side_by_side(session, deque(nodes), found))
+    return {"names": [name for node in nodes for name in found.get(node, [])][:_NAMES]}
+
+
+@contextlib.contextmanager
+def _survey(channel: Channel) -> Iterator[None]:
+    """:raises Unavailable: too many ask all nodes of this robot already"""
+    under_way = _surveys.setdefault(channel, set())
+    if len(under_way) >= SURVEYS:
+        raise Unavailable(
+            f"{SURVEYS} callers are asking all nodes for their parameters; try again in a moment"
+        )
+    mine = object()
+    under_way.add(mine)
+    try:
+        yield
+    finally:
+        under_way.remove(mine)
+
+
+async def _side_by_side(session: Session, nodes: deque[str], found: dict[str, list[str]]) -> None:
+    askers = [Deferred.fromCoroutine(_ask_next(session, nodes, found)) for _ in range(AT_A_TIME)]
+    await DeferredList(askers, consumeErrors=True)
+
+
+async def _ask_next(session: Session, nodes: deque[str], found: dict[str, list[str]]) -> None:
+    while nodes:
+        node = nodes.popleft()
+        # Who does not answer, or not with names, is left out.
+        with contextlib.suppress(SwitchboardError, TypeError, KeyError):
+            answer = await _ask(session, node, "list_parameters", {}, LIST_SECONDS)
+            found[node] = [f"{node}:{each}" for each in answer["result"]["names"] if isinstance(each, str)]

@@ -1,0 +1,139 @@
+"""``/rosapi/…`` about types, from the definitions the robot sends: packages the relay has never seen work too."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from twisted.internet.defer import Deferred, DeferredList
+
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError
+from relay_protocol.limits import MIB
+from relay_protocol.ros_types import TypeRegistry
+from relay_server.local import catalogue
+from relay_server.local.arguments import text
+from relay_server.local.view import View, view
+from relay_server.session import Session, normal_type
+
+RAW_CHARACTERS = 8 * MIB
+"""Most characters of definitions in one answer; what is beyond is left out, with a remark in its place."""
+
+_CONTAINED = re.compile(r"^MSG: (\w+)/msg/(\w+)[ \t\r]*$", re.MULTILINE)
+_KINDS = {"msg": "message", "srv": "service", "action": "action"}
+
+
+async def _known(session: Session, type_name: str, text: bool = False) -> TypeRegistry:
+    """Where the definition of a type is, once it is there.
+
+    :param text: its own text is wanted
+    :raises NotFound: the robot does not have it
+    :raises Invalid: the robot's definition is unusable
+    :raises Unavailable: the robot is offline
+    """
+    if catalogue.TYPES.knows(type_name):
+        return catalogue.TYPES
+    await session.channel.definition(type_name, text)
+    return session.robot.types
+
+
+def _type(args: Any, kind: str) -> str:
+    """The argument ``type``, in full.
+
+    :raises Invalid: it is left out, no type name, or a type of another kind
+    """
+    type_name = normal_type(text(args, "type"), kind)
+    if not type_name:
+        raise Invalid("give 'type', a string")
+    if type_name.split("/")[1] != kind:
+        raise Invalid(f"{type_name} is no {_KINDS[kind]} type")
+    return type_name
+
+
+async def message_details(session: Session, args: Any) -> Any:
+    """``/rosapi/message_details``: a type the robot does not have gets an empty answer, as in rosapi."""
+    type_name = _type(args, "msg")
+    try:
+        types = await _known(session, type_name)
+        return {"typedefs": types.typedefs(type_name)}
+    except NotFound:
+        return {"typedefs": []}
+
+
+async def _part_details(session: Session, args: Any, kind: str, part: str) -> Any:
+    type_name = _type(args, kind)
+    types = await _known(session, type_name)
+    return {"typedefs": types.typedefs(f"{type_name}_{part}")}
+
+
+async def service_request_details(session: Session, args: Any) -> Any:
+    """``/rosapi/service_request_details``"""
+    return await _part_details(session, args, "srv", "Request")
+
+
+async def service_response_details(session: Session, args: Any) -> Any:
+    """``/rosapi/service_response_details``"""
+    return await _part_details(session, args, "srv", "Response")
+
+
+async def action_goal_details(session: Session, args: Any) -> Any:
+    """``/rosapi/action_goal_details``"""
+    return await _part_details(session, args, "action", "Goal")
+
+
+async def action_result_details(session: Session, args: Any) -> Any:
+    """``/rosapi/action_result_details``"""
+    return await _part_details(session, args, "action", "Result")
+
+
+async def action_feedback_details(session: Session, args: Any) -> Any:
+    """``/rosapi/action_feedback_details``"""
+    return await _part_details(session, args, "action", "Feedback")
+
+
+async def topics_and_raw_types(session: Session, args: Any) -> Any:
+    """``/rosapi/topics_and_raw_types``: one type that is not to be had spoils nothing."""
+    found = view(session).topics
+    types = [next(iter(topic.types), "") for topic in found.values()]
+    texts = await _texts(session, types)
+    room, given = RAW_CHARACTERS, []
+    for type_name in types:
+        full = texts[type_name]
+        if len(full) > room:
+            full = "# left out: the definitions of all topics are too large for one answer"
+        room -= len(full)
+        given.append(full)
+    return {"topics": list(found), "types": types, "typedefs_full_text": given}
+
+
+async def _texts(session: Session, types: Iterable[str]) -> dict[str, str]:
+    """The full text of each type, all asked for at once."""
+    names = list(dict.fromkeys(types))
+    asked = [Deferred.fromCoroutine(_full_text(session, each)) for each in names]
+    told = await DeferredList(asked, fireOnOneErrback=True, consumeErrors=True)
+    return dict(zip(names, (text for _, text in told), strict=True))
+
+
+async def _full_text(session: Session, type_name: str) -> str:
+    if not type_name:
+        return ""
+    try:
+        types = await _known(session, type_name, text=True)
+        return _CONTAINED.sub(r"MSG: \1/\2", types.definition(type_name))
+    except SwitchboardError as error:
+        return f"# no definition: {error}"
+
+
+async def interfaces(session: Session, args: Any) -> Any:
+    """``/rosapi/interfaces``: all types the robot has; of a robot that does not tell them, those in its graph."""
+    if "cdr" in session.robot.encodings:
+        told: Iterable[str] = await session.channel.interfaces()
+    else:
+        told = _in_graph(view(session))
+    return {"interfaces": sorted({*told, *catalogue.TYPE_NAMES})}
+
+
+def _in_graph(seen: View) -> Iterable[str]:
+    for things in (seen.topics, seen.services, seen.actions):
+        for each in things.values():
+            yield from each.types

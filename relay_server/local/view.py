@@ -1,0 +1,116 @@
+"""A robot's graph as one caller sees it: with the relay in it, and without what the caller may not use.
+
+Nodes are no resources: their names are shown to everyone with a right on the robot, what they do is not.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+from relay_protocol.link import Service, Topic
+from relay_protocol.rights import Grant, Operation
+from relay_server.graph import Ends, GraphMirror
+from relay_server.local.catalogue import OWN_SERVICES, OWN_TOPICS, RELAY, ROSAPI
+from relay_server.session import Session
+
+KEPT = 16
+"""Views kept of one robot: callers with the same rights share one."""
+
+
+class View(NamedTuple):
+    """What there is, by name and in order."""
+
+    topics: dict[str, Topic]
+    services: dict[str, Service]
+    actions: dict[str, Service]
+    nodes: list[str]
+
+
+class _Kept(NamedTuple):
+    version: int
+    ends: Ends
+    view: View
+
+
+_kept: WeakKeyDictionary[GraphMirror, OrderedDict[tuple[Grant, ...], _Kept]] = WeakKeyDictionary()
+
+
+def view(session: Session) -> View:
+    """What the caller sees; made anew only after something has changed."""
+    graph, ends = session.robot.graph, session.channel.ends()
+    views = _kept.setdefault(graph, OrderedDict())
+    key = session.permit.rules.grants
+    found = views.get(key)
+    if found is None or found.version != graph.version or found.ends != ends:
+        found = views[key] = _Kept(graph.version, ends, _made(session, graph, ends))
+    views.move_to_end(key)
+    while len(views) > KEPT:
+        views.popitem(last=False)
+    return found.view
+
+
+def _made(session: Session, graph: GraphMirror, ends: Ends) -> View:
+    judge = session.permit.judge
+
+    def callable(name: str) -> bool:
+        return judge(Operation.CALL, name).allowed
+
+    topics = {
+        name: topic
+        for name, topic in sorted(_topics(graph, ends).items())
+        if not hidden(name)
+        and (judge(Operation.SUBSCRIBE, name).allowed or judge(Operation.PUBLISH, name).allowed)
+    }
+    services = {
+        name: service
+        for name, service in _services(graph.services, ends.services).items()
+        if not hidden(name) and callable(name)
+    }
+    actions = {
+        name: action
+        for name, action in sorted(_services(graph.actions, ends.actions).items())
+        if not hidden(name) and callable(name)
+    }
+    # The relay's own services are open to everyone with a right on the robot.
+    services = dict(sorted({**services, **OWN_SERVICES}.items()))
+    return View(topics, services, actions, sorted({*graph.nodes, RELAY, ROSAPI}))
+
+
+def _topics(graph: GraphMirror, ends: Ends) -> dict[str, Topic]:
+    """The robot's topics with the relay at the ends that it has there for its clients."""
+    found = dict(graph.topics)
+    for name, type_name in ends.publishes:
+        known = found.get(name) or Topic(types=[type_name])
+        found[name] = Topic(
+            types=known.types, publishers=_with_relay(known.publishers), subscribers=known.subscribers
+        )
+    for name, _ in ends.subscribes:
+        # One that nobody publishes yet is no topic that others could use.
+        if name in found:
+            known = found[name]
+            found[name] = Topic(
+                types=known.types, publishers=known.publishers, subscribers=_with_relay(known.subscribers)
+            )
+    found.update(OWN_TOPICS)
+    return found
+
+
+def _services(told: dict[str, Service], offered: Iterable[tuple[str, str]]) -> dict[str, Service]:
+    """The robot's services or actions, and what clients offer."""
+    found = dict(told)
+    for name, type_name in offered:
+        known = found.get(name) or Service(types=[type_name])
+        found[name] = Service(types=known.types, providers=_with_relay(known.providers))
+    return found
+
+
+def _with_relay(nodes: list[str]) -> list[str]:
+    return nodes if RELAY in nodes else [*nodes, RELAY]
+
+
+def hidden(name: str) -> bool:
+    """Names with a part that begins with ``_`` are not listed (ROS 2 design, topic and service names)."""
+    return "/_" in name

@@ -1,0 +1,202 @@
+"""What rosapi tells of types."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from relay_protocol import link
+from relay_server.local import types
+from relay_server.local.catalogue import TYPE_NAMES
+from tests.relay_server.local.asking import ask, begin
+from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World
+
+DOCK = "a_msgs/action/Dock"
+TWIST_STAMPED = (
+    "Twist twist\n"
+    + "=" * 80
+    + "\nMSG: geometry_msgs/msg/Twist\nVector3 linear\nVector3 angular\n"
+    + "=" * 80
+    + "\nMSG: geometry_msgs/msg/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+)
+
+
+def define(world: World, type_name: str, text: str) -> None:
+    """The robot answers what it was asked for."""
+    assert type_name in [each.type for each in world.link.take(link.GetType)]
+    world.channel.message(link.TypeDefinition(type=type_name, text=text))
+
+
+@pytest.mark.parametrize(
+    ("service", "type_name", "text", "first", "fields"),
+    [
+        ("message_details", "a_msgs/Thing", "uint8[3] a\n", "a_msgs/Thing", ["a"]),
+        ("message_details", "a_msgs/msg/Thing", "uint8[3] a\n", "a_msgs/Thing", ["a"]),
+        ("service_request_details", "a_msgs/Do", "int8 a\n---\nint8 b\n", "a_msgs/Do_Request", ["a"]),
+        ("service_response_details", "a_msgs/srv/Do", "int8 a\n---\nint8 b\n", "a_msgs/Do_Response", ["b"]),
+        (
+            "action_goal_details",
+            "a_msgs/Dock",
+            "int8 a\n---\nint8 b\n---\nint8 c\n",
+            "a_msgs/Dock_Goal",
+            ["a"],
+        ),
+        ("action_result_details", DOCK, "int8 a\n---\nint8 b\n---\nint8 c\n", "a_msgs/Dock_Result", ["b"]),
+        (
+            "action_feedback_details",
+            DOCK,
+            "int8 a\n---\nint8 b\n---\nint8 c\n",
+            "a_msgs/Dock_Feedback",
+            ["c"],
+        ),
+    ],
+)
+def test_details_come_from_the_robots_definition_of_a_type_nobody_here_knows(
+    world: World, viewer: Person, service: str, type_name: str, text: str, first: str, fields: list[str]
+) -> None:
+    """Asked for once, then kept."""
+    got = begin(viewer, f"/rosapi/{service}", {"type": type_name})
+    (asked,) = world.link.all(link.GetType)
+    define(world, asked.type, text)
+    (typedef,) = got()["typedefs"]
+    assert typedef["type"] == first
+    assert typedef["fieldnames"] == fields
+    assert ask(viewer, f"/rosapi/{service}", {"type": type_name})["typedefs"] == [typedef]
+    assert not world.link.all(link.GetType)
+
+
+def test_what_a_message_contains_comes_going_down(world: World, viewer: Person) -> None:
+    """Each type once, where it is met first."""
+    got = begin(viewer, "/rosapi/message_details", {"type": TWIST})
+    world.define(TWIST)
+    assert [each["type"] for each in got()["typedefs"]] == ["geometry_msgs/Twist", "geometry_msgs/Vector3"]
+
+
+def test_a_type_the_robot_does_not_have_is_empty_for_messages_and_an_error_for_the_rest(
+    world: World, viewer: Person
+) -> None:
+    """As in rosapi."""
+    got = begin(viewer, "/rosapi/message_details", {"type": "a_msgs/None"})
+    world.channel.message(link.Failed(what="get_type", ref="a_msgs/msg/None", reason="not installed"))
+    assert got() == {"typedefs": []}
+    viewer.says("call_service", service="/rosapi/service_request_details", args={"type": "a_msgs/None"})
+    world.channel.message(link.Failed(what="get_type", ref="a_msgs/srv/None", reason="not installed"))
+    (reply,) = viewer.hears("service_response")
+    assert reply["values"] == "type a_msgs/srv/None: not installed"
+
+
+def test_a_definition_that_is_none_is_told(world: World, viewer: Person) -> None:
+    """Not taken for a type that is not there."""
+    viewer.says("call_service", service="/rosapi/message_details", args={"type": "a_msgs/Odd"})
+    define(world, "a_msgs/msg/Odd", "this is no definition")
+    (reply,) = viewer.hears("service_response")
+    assert "unusable" in reply["values"]
+
+
+@pytest.mark.parametrize(
+    "args", [None, {}, {"type": 7}, {"type": None}, [], [7], "text", {"type": "///"}, [""]]
+)
+def test_arguments_that_are_none_are_told_in_words(viewer: Person, args: Any) -> None:
+    """Never an internal error."""
+    values = ask(viewer, "/rosapi/message_details", args)
+    assert values == "give 'type', a string" or "is no type name" in values
+
+
+def test_types_of_another_kind_are_told_in_words(viewer: Person) -> None:
+    """A service has no message details."""
+    assert ask(viewer, "/rosapi/message_details", {"type": TRIGGER}) == f"{TRIGGER} is no message type"
+    assert ask(viewer, "/rosapi/action_goal_details", {"type": TRIGGER}) == f"{TRIGGER} is no action type"
+    assert ask(viewer, "/rosapi/service_request_details", [STRING]) == f"{STRING} is no service type"
+
+
+def test_the_relays_own_types_are_told_without_the_robot(world: World, viewer: Person) -> None:
+    """Those of its topics and services, and those of rosapi."""
+    status = ask(viewer, "/rosapi/message_details", {"type": "switchboard_msgs/Status"})["typedefs"]
+    assert status[0]["fieldnames"][:2] == ["robot", "state"]
+    assert status[1]["type"] == "switchboard_msgs/Client"
+    ping = ask(viewer, "/rosapi/service_response_details", {"type": "switchboard_msgs/srv/Ping"})["typedefs"]
+    assert ping[0]["fieldnames"] == ["relay_time_ns", "robot_rtt_ms"]
+    topics = ask(viewer, "/rosapi/service_response_details", {"type": "rosapi_msgs/Topics"})["typedefs"]
+    assert topics[0]["fieldnames"] == ["topics", "types"]
+    assert not world.link.all(link.GetType)
+
+
+def test_raw_types_wait_for_definitions_and_say_what_fails(world: World, operator: Person) -> None:
+    """One type the robot does not have spoils nothing; contained types are named as rosapi names them."""
+    got = begin(operator, "/rosapi/topics_and_raw_types")
+    assert {each.type for each in world.link.all(link.GetType)} == {STRING, TWIST}
+    world.channel.message(
+        link.TypeDefinition(type=TWIST, text=f"int8 a\n{'=' * 80}\nMSG: a_msgs/msg/B\nint8 b\n")
+    )
+    world.channel.message(link.Failed(what="get_type", ref=STRING, reason="not installed"))
+    answer = got()
+    assert answer["topics"] == ["/chatter", "/cmd_vel", "/relay/status"]
+    chatter, cmd_vel, status = answer["typedefs_full_text"]
+    assert chatter == f"# no definition: type {STRING}: not installed"
+    assert cmd_vel == f"int8 a\n{'=' * 80}\nMSG: a_msgs/B\nint8 b\n"
+    assert status.startswith("string robot\n")
+
+
+def test_raw_types_are_of_just_this_type(world: World, operator: Person) -> None:
+    """A type that is known as a part of another is asked for by itself."""
+    got = begin(operator, "/rosapi/message_details", {"type": "geometry_msgs/TwistStamped"})
+    define(world, "geometry_msgs/msg/TwistStamped", TWIST_STAMPED)
+    assert len(got()["typedefs"]) == 3
+    raw = begin(operator, "/rosapi/topics_and_raw_types")
+    world.define(STRING, TWIST)
+    assert raw()["typedefs_full_text"][1].startswith("Vector3 linear\n")
+
+
+def test_raw_types_are_bounded(world: World, operator: Person, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot with large types on many topics does not fill the relay's memory."""
+    monkeypatch.setattr(types, "RAW_CHARACTERS", 60)
+    got = begin(operator, "/rosapi/topics_and_raw_types")
+    world.define(STRING, TWIST)
+    chatter, cmd_vel, status = got()["typedefs_full_text"]
+    assert chatter == "string data\n"
+    assert "left out" in cmd_vel
+    assert "left out" in status
+
+
+def test_interfaces_are_asked_for_once(world: World, operator: Person, viewer: Person) -> None:
+    """However many callers; with the relay's own, in order."""
+    first = begin(operator, "/rosapi/interfaces")
+    second = begin(viewer, "/rosapi/interfaces")
+    assert len(world.link.all(link.GetInterfaces)) == 1
+    world.channel.message(link.Interfaces(types=["z_msgs/msg/Z", "a_msgs/msg/A"]))
+    told = {"interfaces": ["a_msgs/msg/A", *TYPE_NAMES, "z_msgs/msg/Z"]}
+    assert first() == told
+    assert second() == told
+    assert ask(operator, "/rosapi/interfaces") == told
+    assert len(world.link.all(link.GetInterfaces)) == 1
+
+
+def test_interfaces_that_are_not_told(world: World, operator: Person) -> None:
+    """Refused, lost or never answered: in words; the next caller asks anew."""
+    operator.says("call_service", service="/rosapi/interfaces")
+    world.channel.message(link.Failed(what="get_interfaces", ref="", reason="too many"))
+    (reply,) = operator.hears("service_response")
+    assert reply["values"] == "robot rover does not tell its types: too many"
+    operator.says("call_service", service="/rosapi/interfaces")
+    for _ in range(31):
+        world.clock.advance(1.0)
+        operator.answers_pings()
+    (reply,) = operator.hears("service_response")
+    assert "did not answer within 30 s" in reply["values"]
+    operator.says("call_service", service="/rosapi/interfaces")
+    assert len(world.link.all(link.GetInterfaces)) == 3
+    world.robot_goes()
+    (reply,) = operator.hears("service_response")
+    assert "lost its connection" in reply["values"]
+    assert "is offline" in ask(operator, "/rosapi/interfaces")
+    world.channel.message(link.Interfaces(types=["a_msgs/msg/A"]))
+
+
+def test_a_robot_that_tells_no_interfaces_shows_those_of_its_graph(world: World) -> None:
+    """Those of what the caller may use."""
+    world.robot_comes(["json"])
+    person = world.person(deny=("*:/cmd_vel",))
+    world.robot_joins()
+    assert ask(person, "/rosapi/interfaces")["interfaces"] == sorted({*TYPE_NAMES, STRING, TRIGGER})
+    assert not world.link.all(link.GetInterfaces)
