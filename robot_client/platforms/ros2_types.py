@@ -22,7 +22,7 @@ class Types:
     """All types of this robot, each looked up once."""
 
     def __init__(self) -> None:
-        self._classes: dict[str, Any] = {}
+        self._classes: dict[tuple[str, str], Any] = {}
         self._definitions: dict[str, link.TypeDefinition] = {}
         self._prefixes = definitions.prefixes()
         self._names: list[str] | None = None
@@ -49,13 +49,14 @@ class Types:
         return self._class(name, "action")
 
     def _class(self, name: str, kind: str) -> Any:
-        found = self._classes.get(name)
+        # By kind too: the C library of a service must never be handed to what makes an action.
+        found = self._classes.get((name, kind))
         if found is None:
             full = definitions.normalise(name, kind)
             package, has, short = full.split("/")
             if has != kind:
                 raise Invalid(f"{name} is no type of {_OF[kind]}")
-            found = self._classes[name] = _load(package, kind, short, full)
+            found = self._classes[name, kind] = _load(package, kind, short, full)
         return found
 
     def definition(self, name: str) -> link.TypeDefinition:
