@@ -16,11 +16,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_harness import Relay, running, wait_for
+from switchboard_harness import running, wait_for
 
 from bench import ROOT
 from bench.cpu import seconds_of
 from bench.native import Receivers
+from bench.relay import Relay
 from bench.report import Options, Row, Unavailable
 from bench.robot import RealRobot
 from bench.viewers import SCAN, STREAM, TOPIC, subscribe
@@ -75,7 +76,6 @@ def run(options: Options) -> list[Row]:
         folder = Path(name)
         relay = Relay(folder)
         stack.enter_context(running(relay))
-        assert relay.process is not None
         robot = RealRobot(relay, "rover", [STREAM])
         stack.enter_context(running(robot))
         bridge = RosbridgeLike(robot.environment, TOPIC)
@@ -88,7 +88,7 @@ def run(options: Options) -> list[Row]:
         stack.callback(theirs.stop)
         for each in (ours, theirs):
             wait_for("all viewers have something", lambda each=each: each.report()["least"] > 0, 20)
-        pids = {"daemon": robot.pid, "relay": relay.process.popen.pid, "rosbridge": bridge.pid}
+        pids = {"daemon": robot.pid, "relay": relay.pid, "rosbridge": bridge.pid}
         time.sleep(seconds / 4)
         for _ in range(rounds):
             for each in (ours, theirs):

@@ -15,11 +15,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from switchboard_harness import Relay, running
+from switchboard_harness import running
 
 from bench.cpu import measured
 from bench.messages import STRING, text_of
 from bench.native import Native, Receivers
+from bench.relay import Relay
 from bench.report import Options, Row
 from bench.wire import Loop, PlainRobot, handshake, text_frame
 from relay_protocol import jsontext
@@ -58,7 +59,6 @@ class Side:
 
 def relay_side(loop: Loop, relay: Relay, folder: Path, clients: int) -> Side:
     """The relay, a robot that speaks CDR, clients with tokens of one viewer."""
-    assert relay.process is not None
     texts = text_of(STRING)
     robot = PlainRobot(loop, relay, "plain", "cdr", texts)
     token = relay.user("watcher")
@@ -74,7 +74,7 @@ def relay_side(loop: Loop, relay: Relay, folder: Path, clients: int) -> Side:
     assert channel is not None
     channel.send(frame)
     loop.until("everybody has the first", lambda: receivers.report()["messages"], 10)
-    return Side(relay.process.popen.pid, receivers, lambda: channel.send(frame))
+    return Side(relay.pid, receivers, lambda: channel.send(frame))
 
 
 def _empty() -> bytes:

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from switchboard_harness import Relay, running
+from switchboard_harness import running
 
 from bench.cpu import measured
 from bench.messages import STRING, TWIST, text_of
+from bench.relay import Relay
 from bench.report import Options, Row, Unavailable
 from bench.websockify import Websockify
 from bench.wire import End, Loop, PlainRobot, WebEnd, flood, one_at_a_time, text_frame
@@ -76,9 +77,8 @@ class Ground:
     """A relay with two plain robots, one speaking JSON, one CDR, and a client at each."""
 
     def __init__(self, loop: Loop, relay: Relay) -> None:
-        assert relay.process is not None
         self.loop = loop
-        self.pid = relay.process.popen.pid
+        self.pid = relay.pid
         token = relay.user("driver")
         texts = text_of(STRING, TWIST)
         self.types = TypeRegistry()

@@ -7,10 +7,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_harness import Relay, running
+from switchboard_harness import running
 
 from bench.cpu import resident
 from bench.native import Receivers
+from bench.relay import Relay
 from bench.report import Options, Row
 from bench.wire import Loop, PlainRobot, handshake
 
@@ -37,8 +38,7 @@ def run(options: Options) -> list[Row]:
         folder = Path(name)
         relay = Relay(folder, "--heartbeat", "10")
         stack.enter_context(running(relay))
-        assert relay.process is not None
-        pid = relay.process.popen.pid
+        pid = relay.pid
         loop = Loop()
         stack.callback(loop.close)
         PlainRobot(loop, relay, "plain", "cdr", {})

@@ -12,11 +12,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_harness import Relay, running
+from switchboard_harness import running
 from websockets.frames import Frame, Opcode
 
 from bench.haproxy import HAProxy, executable
 from bench.hop import SMALL, Ground, Hop, text_message
+from bench.relay import Relay
 from bench.report import Options, Row
 from bench.wire import Loop, text_frame
 

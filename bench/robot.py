@@ -10,9 +10,10 @@ import sys
 import threading
 from typing import Any
 
-from switchboard_harness import BIN, ChaosProxy, Process, Relay, free_domain, ros_environment, wait_for
+from switchboard_harness import BIN, ChaosProxy, Process, free_domain, ros_environment, wait_for
 
 from bench import ROOT
+from bench.relay import Relay
 from bench.report import Unavailable
 
 

@@ -18,6 +18,7 @@ import tornado.web
 import tornado.websocket
 import ujson
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import LaserScan
 
 from bench import rosbridge_way
@@ -68,7 +69,7 @@ def main() -> None:
     port, topic = int(sys.argv[1]), sys.argv[2]
     loop = tornado.ioloop.IOLoop.current()
     bridge = Bridge(topic, loop)
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("rosbridge_like")
     node.create_subscription(LaserScan, topic, bridge.heard, 10)
     executor = SingleThreadedExecutor()

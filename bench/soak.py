@@ -1,100 +1,82 @@
-"""Load for a minute or longer: a real ROS 2 publisher, daemon, relay and client; prints what it cost.
+"""Load for a minute or longer, a real ROS 2 publisher, daemon, relay and client: what it cost, and what was lost.
 
-``python bench/soak.py [--minutes N] [--rate MESSAGES_PER_SECOND]``. Ends with code 1 when a message was lost or
-something still waits in a queue.
+A thousand small messages a second and ten of 20 KB, numbered, to one client that takes all of them.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
+import contextlib
 import tempfile
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / each) for each in (".", "protocol", "db", "tests/harness")]
+from switchboard_harness import Robot, running, wait_for
+from switchboard_load import Counter, Publisher, meter_of, status_of
 
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
-from switchboard_harness import Relay, Robot, running, wait_for  # noqa: E402
-from switchboard_load import Counter, Publisher, meter_of, status_of  # noqa: E402
+from bench.relay import Relay
+from bench.report import Options, Row
 
 TOPICS = ("small", "big")
-WARM_SECONDS = 5
+RATE = 1000.0
+SECONDS = 60.0
+WARM_SECONDS = 5.0
 
 
-def soak(folder: Path, seconds: float, rate: float) -> bool:
-    """Run, print the figures, and tell whether nothing was lost."""
-    relay = Relay(folder)
-    with running(relay):
-        robot = Robot(relay, "rover")
-        with running(robot):
-            token = relay.user("watcher")
-            relay.cli("right", "grant", "watcher", "rover", "viewer")
-            client = relay.connect("rover", token)
-            publisher = Publisher(robot, seconds, rate)
-            with running(publisher):
-                publisher.known_to(client)
-                counter = Counter(client, dict.fromkeys((*TOPICS, "unsure", "burst"), 0))
-                with running(counter):
-                    return measured(relay, robot, publisher, counter, rate)
-
-
-def measured(relay: Relay, robot: Robot, publisher: Publisher, counter: Counter, rate: float) -> bool:
+def run(options: Options) -> list[Row]:
     """Watch one load from its beginning to its end."""
-    meter = meter_of(relay, robot)
-    wait_for("it is warm", lambda: counter.last("small") > WARM_SECONDS * rate, 120)
-    warm, cpu, first = meter.memory(), meter.cpu(), counter.last("small")
-    sent = publisher.sent()
-    for name in TOPICS:
-        wait_for(f"the last of {name} comes", lambda name=name: counter.last(name) == sent[name] - 1, 60)
-    end, used = meter.memory(), meter.cpu()
-    status = status_of(relay, robot.name)
-    show_messages(counter, sent)
-    thousands = (sent["small"] - first) / 1000
-    show_processes(warm, end, {name: (used[name] - cpu[name]) / thousands for name in used})
-    waiting = sum(each["waiting_bytes"] for each in status["clients"])
-    drops = sum(each["drops"] for each in status["clients"])
-    lost_by_robot = status["health"]["dropped_samples"]
-    print(
-        f"waiting for clients {waiting} bytes, dropped for clients {drops}, dropped by the robot {lost_by_robot}"
-    )
-    return not (waiting or drops or lost_by_robot or any(counter.lost(name) for name in TOPICS))
+    seconds = options.seconds or options.pick(3, SECONDS)
+    warm = options.pick(0.5, WARM_SECONDS)
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder, contextlib.ExitStack() as stack:
+        relay = Relay(Path(folder))
+        stack.enter_context(running(relay))
+        robot = Robot(relay, "rover")
+        stack.enter_context(running(robot))
+        token = relay.user("watcher")
+        relay.cli("right", "grant", "watcher", "rover", "viewer")
+        client = relay.connect("rover", token)
+        publisher = Publisher(robot, seconds, RATE)
+        stack.enter_context(running(publisher))
+        publisher.known_to(client)
+        counter = Counter(client, dict.fromkeys((*TOPICS, "unsure", "burst"), 0))
+        stack.enter_context(running(counter))
+        meter = meter_of(relay, robot)
+        wait_for("it is warm", lambda: counter.last("small") > warm * RATE, 120)
+        memory, cpu, first = meter.memory(), meter.cpu(), counter.last("small")
+        sent = publisher.sent()
+        for name in TOPICS:
+            wait_for(f"the last of {name} comes", lambda name=name: counter.last(name) == sent[name] - 1, 60)
+        grown = {name: now - memory[name] for name, now in meter.memory().items()}
+        thousands = (sent["small"] - first) / 1000
+        used = {name: (now - cpu[name]) * 1000 / thousands for name, now in meter.cpu().items()}
+        status = status_of(relay, robot.name)
+        return rows(sent, counter, grown, used, status)
 
 
-def show_messages(counter: Counter, sent: dict[str, Any]) -> None:
-    """What was sent and what came."""
-    table = Table("topic", "sent", "per second", "came", "lost", "in order", title="Messages")
-    for name in (*TOPICS, "unsure"):
-        table.add_row(
-            f"/load/{name}",
-            str(sent[name]),
-            f"{sent[name] / sent['seconds']:.0f}",
-            str(len(counter.numbers[name])),
-            str(len(counter.lost(name))),
-            "yes" if counter.in_order(name) else "no",
-        )
-    Console().print(table)
+def rows(
+    sent: dict[str, Any],
+    counter: Counter,
+    grown: dict[str, int],
+    used: dict[str, float],
+    status: dict[str, Any],
+) -> list[Row]:
+    """What must hold, and what it cost."""
+    lost = sum(len(counter.lost(name)) for name in TOPICS)
+    lost += sum(each["drops"] for each in status["clients"]) + status["health"]["dropped_samples"]
+    total = sum(sent[name] for name in TOPICS)
+    found = [
+        Row("soak", f"lost or dropped, of {total} messages", "messages", lost, bar=0),
+        Row("soak", "bytes that wait at the end", "bytes", _waiting(status), bar=0),
+        Row(
+            "soak", "topics out of order", "topics", sum(not counter.in_order(each) for each in TOPICS), bar=0
+        ),
+    ]
+    for name in ("relay", "daemon"):
+        found.append(Row("soak", f"growth of the {name}'s memory", "MiB", grown[name] / 2**20, bar=8.0))
+        found.append(Row("soak", f"{name}'s processor time", "ms/1000 messages", used[name]))
+    for row in found:
+        print(f"    {row.what}: {row.ours:.3g} {row.unit}", flush=True)
+    return found
 
 
-def show_processes(warm: dict[str, int], end: dict[str, int], cpu: dict[str, float]) -> None:
-    """What it cost."""
-    table = Table("process", "MiB warm", "MiB at the end", "CPU s per 1000 messages", title="Processes")
-    for name in warm:
-        table.add_row(name, f"{warm[name] / 2**20:.1f}", f"{end[name] / 2**20:.1f}", f"{cpu[name]:.3f}")
-    Console().print(table)
-
-
-def main() -> int:
-    """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--minutes", type=float, default=1.0)
-    parser.add_argument("--rate", type=float, default=1000.0, help="messages a second on the small topic")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        return 0 if soak(Path(folder), options.minutes * 60, options.rate) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def _waiting(status: dict[str, Any]) -> int:
+    return int(sum(each["waiting_bytes"] for each in status["clients"]))

@@ -1,26 +1,21 @@
-"""How long a robot moves on after something has broken, by its own record. Prints a table, milliseconds.
+"""How long a robot moves on after something has broken, by its own record, in milliseconds.
 
-.venv/bin/python bench/standstill.py --runs 10
+A real relay, daemon and simulated robot, driven in circles through proxies that can be broken.
 """
 
 from __future__ import annotations
 
-import argparse
 import signal
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "harness"))
-
-from switchboard_drive import Drive
+from switchboard_drive import LIMIT_MS, SIM_STEP_MS, Drive
 from switchboard_harness import Driver
+
+from bench.report import Options, Row
 
 Fault = Callable[[Drive, Driver], None]
 Repair = Callable[[Drive], None]
@@ -62,22 +57,30 @@ FAULTS: dict[str, tuple[Fault, Repair]] = {
 }
 
 
-def main() -> None:
-    """Run all faults in turn and print the table."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--runs", type=int, default=5, help="runs of each fault")
-    runs = options.parse_args().runs
-    table = Table("fault", "median ms", "worst ms", title=f"From the fault to standstill, {runs} runs each")
-    with tempfile.TemporaryDirectory() as folder:
+def run(options: Options) -> list[Row]:
+    """All faults in turn, some times each; the worst counts."""
+    names = list(FAULTS)[: 1 if options.quick else None]
+    runs = int(options.pick(1, 4))
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         drive = Drive(Path(folder))
         try:
-            for name, (fault, repair) in FAULTS.items():
-                times = [_once(drive, fault, repair) for _ in range(runs)]
-                table.add_row(name, f"{statistics.median(times):.0f}", f"{max(times):.0f}")
-                print(f"{name}: {', '.join(f'{each:.0f}' for each in times)}", file=sys.stderr)
+            for name in names:
+                times = [_once(drive, *FAULTS[name]) for _ in range(runs)]
+                print(f"    {name}: {', '.join(f'{each:.0f}' for each in times)} ms", flush=True)
+                rows.append(
+                    Row(
+                        "standstill",
+                        f"standstill, worst of {runs}: {name}",
+                        "ms",
+                        max(times),
+                        bar=LIMIT_MS + SIM_STEP_MS,
+                        note=f"{name}: median {statistics.median(times):.0f} ms",
+                    )
+                )
         finally:
             drive.stop()
-    Console().print(table)
+    return rows
 
 
 def _once(drive: Drive, fault: Fault, repair: Repair) -> float:
@@ -89,7 +92,3 @@ def _once(drive: Drive, fault: Fault, repair: Repair) -> float:
     repair(drive)
     drive.robot.wait_online()
     return took
-
-
-if __name__ == "__main__":
-    main()

@@ -12,10 +12,11 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from switchboard_harness import Relay, running, wait_for
+from switchboard_harness import running, wait_for
 
 from bench.cpu import measured
 from bench.native import Receivers
+from bench.relay import Relay
 from bench.report import Options, Row
 from bench.robot import RealRobot
 from bench.wire import handshake, text_frame

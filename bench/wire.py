@@ -15,6 +15,7 @@ from typing import Any
 
 from websockets.frames import Frame, Opcode
 
+from bench.relay import Relay
 from relay_protocol import PROTOCOL_VERSION, identity, jsontext, link
 from relay_protocol.frames import encode_sample
 
@@ -229,7 +230,7 @@ class PlainRobot:
     def __init__(
         self,
         loop: Loop,
-        relay: Any,
+        relay: Relay,
         name: str,
         encoding: str,
         texts: dict[str, str],
