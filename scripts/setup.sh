@@ -113,12 +113,16 @@ install_node() {
     done
 }
 
-stage_web() {
-    local packages sources
-    [ -f web_client/package.json ] || fail "web_client/package.json is missing; is the checkout complete?"
+need_node() {
     if ! scripts/with-node.sh true 2>/dev/null; then
         run "Node.js into $venv (the system has none that is new enough)" install_node
     fi
+}
+
+stage_web() {
+    local packages sources
+    [ -f web_client/package.json ] || fail "web_client/package.json is missing; is the checkout complete?"
+    need_node
     packages=$(fingerprint web_client/package.json web_client/package-lock.json)
     if [ ! -d web_client/node_modules ] || ! done_for web-packages "$packages"; then
         run "web packages" scripts/with-node.sh npm --prefix web_client ci
@@ -182,9 +186,16 @@ stage_interfaces() {
     build_packages interfaces tf2_msgs 'the simulated robot publishes no /tf' scripts/interfaces/*
 }
 
-# Packages for the tests alone: one of every kind of field, and the examples every ROS 2 has.
+# For the tests alone: packages with one of every kind of field and the examples every ROS 2 has; the roslib of old.
 stage_fixtures() {
+    local clients=tests/e2e/clients packages
     build_packages fixtures 'packages for the tests' 'tests of services and actions fail' tests/interfaces/*
+    need_node
+    packages=$(fingerprint $clients/package.json $clients/package-lock.json)
+    if [ ! -d $clients/node_modules ] || ! done_for client-packages "$packages"; then
+        run "clients for the tests" scripts/with-node.sh npm --prefix $clients ci
+        note_done client-packages "$packages"
+    fi
 }
 
 # --- A browser for the browser tests ----------------------------------------------------------------------------
