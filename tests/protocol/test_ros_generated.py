@@ -1,0 +1,376 @@
+"""Code generated for a type: it agrees with the closures on everything, and no definition gets into it."""
+
+from __future__ import annotations
+
+import json
+import keyword
+import math
+import struct
+import time
+from typing import Any
+
+import cbor2
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Invalid
+from relay_protocol.ros import fast_reader, fast_writer
+from relay_protocol.ros.compiled import Compiled
+from relay_protocol.ros.source import MAX_STEPS, Source, TooLarge, quoted
+from relay_protocol.ros_types import TypeRegistry
+
+LINE = "=" * 80
+EVERYTHING = f"""std_msgs/Header header
+bool flag
+int8 i8
+uint16 u16
+int64 i64
+float32 f32
+float64 f64
+string text
+wstring<=3 wide
+string<=4 short
+uint8[] bytes
+byte[3] octets
+bool[] flags
+bool[2] two
+int16[2] pair
+uint64[<=3] longs
+float32[] singles
+float64[9] nine
+string[<=3] texts
+wstring[2] wides
+Inner[] inners
+Inner[2] couple
+Inner[6] many
+Point[] points
+Point[5] five
+Empty nothing
+Empty[] nothings
+int64 last
+{LINE}
+MSG: a/Inner
+uint8 tag
+Point[] path
+string name
+{LINE}
+MSG: a/Point
+float64 x
+float64 y
+{LINE}
+MSG: a/Empty
+{LINE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+TYPE = "a/msg/B"
+COMPILED = Compiled(TYPE, EVERYTHING)
+FULL = {
+    "header": {"stamp": {"sec": -1, "nanosec": 7}, "frame_id": "map"},
+    "flag": True, "i8": -128, "u16": 65535, "i64": -(2**63), "f32": 0.5, "f64": -1e300, "text": "größer 😀",
+    "wide": "a😀", "short": "abcd", "bytes": "YWJj", "octets": "AAEC", "flags": [True, False], "two": [False, True],
+    "pair": [-1, 32767], "longs": [2**64 - 1, 0], "singles": [1.5, None], "nine": [0.25] * 9, "texts": ["", "x"],
+    "wides": ["", "ß"], "inners": [{"tag": 1, "path": [{"x": 1.0, "y": 2.0}], "name": "n"}] * 2,
+    "couple": [{"tag": 2, "path": [], "name": ""}] * 2, "many": [{"tag": 3, "path": [], "name": "m"}] * 6,
+    "points": [{"x": 3.0, "y": 4.0}] * 3, "five": [{"x": 0.0, "y": 0.1}] * 5, "nothing": {},
+    "nothings": [{}, {}], "last": 5,
+}  # fmt: skip
+TEXT = json.dumps(FULL, ensure_ascii=False).encode()
+CDR = COMPILED.writer(TYPE, False)(TEXT, 0)
+
+
+class Passed(Exception):
+    """Generated code leaves a message to the closures."""
+
+
+def passed(*arguments: Any) -> bytes:
+    """Stands for the closures."""
+    raise Passed
+
+
+def outcome(convert: Any, *arguments: Any) -> Any:
+    """What comes of a conversion: bytes, or the sentence of the error."""
+    try:
+        return convert(*arguments)
+    except Invalid as error:
+        return str(error)
+
+
+FAST = {form: fast_reader.generate(TYPE, COMPILED.definitions, form, passed) for form in ("json", "cbor")}
+SLOW = {form: COMPILED._slow_reader(TYPE, form) for form in ("json", "cbor")}
+FAST_WRITE = fast_writer.generate(TYPE, COMPILED.definitions)(passed)
+SLOW_WRITE = COMPILED._slow_writer(TYPE, jsontext.decode_any)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Equality in which NaN equals NaN, and single precision is what it is in decimal."""
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same(one[name], other[name]) for name in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return (
+            one == other
+            or (one != one and other != other)
+            or struct.pack("f", one) == struct.pack("f", other)
+        )
+    return bool(one == other)
+
+
+def damaged(data: bytes, draw: Any) -> bytes:
+    """Bytes with one stretch replaced, or cut off."""
+    place = draw(st.integers(0, len(data)))
+    gone = draw(st.sampled_from([0, 1, 4, 8, len(data)]))
+    put = draw(st.binary(max_size=9) | st.sampled_from([b"\0", b"\xff" * 4, b"\1\0\0\0", b"\0\0\0\0"]))
+    return data[:place] + put + data[place + gone :]
+
+
+@given(st.data())
+def test_damaged_messages_are_read_alike(data: st.DataObject) -> None:
+    """Whatever generated code reads, the closures read just so; what they refuse it does not read."""
+    cdr = damaged(CDR, data.draw)
+    for form, decode in (("json", json.loads), ("cbor", cbor2.loads)):
+        slow = outcome(SLOW[form], cdr)
+        try:
+            fast = FAST[form](cdr)
+        except Passed:
+            continue
+        assert isinstance(slow, bytes)
+        assert same(decode(fast), decode(slow))
+
+
+TOKENS = [
+    b"null", b"true", b"1", b"-1", b"2.0", b"1e5", b"1e999", b"300", b'"x"', b'"\\u0000"', b'"\xff"', b'"\\ud800"',
+    b"[]", b"{}", b"[1]", b"[null]", b'{"x":1}', b",", b":", b'"', b"\\", b" ", b"NaN", b"1" * 30, b"9" * 5000,
+    b'"AAEC"', b'"AA"', b'{"tag":1,"tag":256}', b"[" * 70, b'"a\nb"', b'"\xf0\x9f\x98\x80\xed\xa0\x80"',
+]  # fmt: skip
+
+
+@given(st.data())
+def test_damaged_texts_are_written_alike(data: st.DataObject) -> None:
+    """Whatever text generated code writes, the strict closures write just so; what they refuse it does not write."""
+    places = [place for place, byte in enumerate(TEXT) if byte in b'{}[]:,"0123456789']
+    place, token = (
+        data.draw(st.sampled_from(places)),
+        data.draw(st.sampled_from(TOKENS) | st.binary(max_size=3)),
+    )
+    end = data.draw(st.sampled_from([each for each in places if place <= each <= place + 30]))
+    text = TEXT[:place] + token + TEXT[end:]
+    slow = outcome(SLOW_WRITE, text, 5)
+    try:
+        fast = FAST_WRITE(text, 5)
+    except Passed:
+        return
+    assert fast == slow
+
+
+@given(st.data())
+def test_values_of_any_type_are_written_alike(data: st.DataObject) -> None:
+    """The same with one value replaced by another of any type, and with fields left out."""
+    value = data.draw(
+        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+        | st.text(max_size=5) | st.lists(st.integers(0, 300) | st.none() | st.text(max_size=2), max_size=3)
+        | st.dictionaries(st.sampled_from(["x", "sec", "secs", "tag"]), st.integers(), max_size=2)
+    )  # fmt: skip
+    kept = data.draw(st.sets(st.sampled_from(sorted(FULL))))
+    message = {name: FULL[name] for name in FULL if name in kept}
+    message[data.draw(st.sampled_from(sorted(FULL)))] = value
+    text = json.dumps(message).encode()
+    slow = outcome(SLOW_WRITE, text, 5)
+    for body in (text, json.loads(text)):
+        try:
+            assert FAST_WRITE(body, 5) == slow
+        except Passed:
+            continue
+
+
+def test_what_is_usual_needs_no_closures() -> None:
+    """Full and partial messages are converted by generated code alone."""
+    assert same(json.loads(FAST["json"](CDR)), FULL)
+    assert FAST_WRITE(TEXT, 0) == CDR
+    assert FAST_WRITE(b"{}", 5 * 10**9 + 6)[4:12] == struct.pack("<iI", 5, 6)
+    assert FAST_WRITE(b'{"text":"x"}', 0) == SLOW_WRITE(b'{"text":"x"}', 0)
+
+
+HARMLESS = [
+    *keyword.kwlist,
+    *keyword.softkwlist,
+    "print",
+    "exec",
+    "len",
+    "data",
+    "body",
+    "now",
+    "out",
+    "slow",
+    "p",
+    "e",
+]
+HARMLESS += [
+    "m",
+    "K1",
+    "v1",
+    "f0",
+    "f1",
+    "Unusual",
+    "SURPRISES",
+    "convert",
+    "eval",
+    "room",
+    "self",
+    "globals",
+    "class_",
+]
+
+
+@pytest.mark.parametrize("name", sorted(name for name in HARMLESS if name[0] != "_"))
+def test_fields_may_have_any_name(name: str) -> None:
+    """Keywords, builtins and the names generated code itself uses are names like others."""
+    types = TypeRegistry()
+    types.add(
+        TYPE, f"float64 {name}\nstring[] s{name}\nInner[] i{name}\n{LINE}\nMSG: a/Inner\nstring {name}\n"
+    )
+    value = {name: 1.5, f"s{name}": ["x"], f"i{name}": [{name: "y"}]}
+    cdr = types.from_json(TYPE, json.dumps(value).encode(), 0)
+    assert json.loads(types.to_json(TYPE, cdr)) == cbor2.loads(types.to_cbor(TYPE, cdr)) == value
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "__class__", "_x", "a-b", "a.b", "a'", 'a"', "a\\", "a\\n", "a}", "x:1}", "ä", "a\u2028b", "a\0b", "9",
+        "a,b", "a(b)", "{a}", "a\x0bb", "ª",
+    ],
+)  # fmt: skip
+def test_other_names_are_refused(name: str) -> None:
+    """What is no identifier never becomes a field; and if it did, no code would be made with it."""
+    with pytest.raises(Invalid):
+        Compiled(TYPE, f"float64 {name}")
+    with pytest.raises(TooLarge):
+        quoted(name)
+
+
+@pytest.mark.parametrize(
+    "text", ['\'"""\'', '"\\"); import os; (\\""', "'a\\\\'", "\"'''\"", '"{0}%s\\n"', "x\x85y"]
+)
+def test_texts_of_defaults_and_constants_are_values_only(text: str) -> None:
+    """Quotes, backslashes and newlines in them mean nothing to generated code."""
+    types = TypeRegistry()
+    types.add(TYPE, f"string a {text}\nstring A={text}\nstring[] b [{text}, 'x']\nint8 c")
+    value = json.loads(types.to_json(TYPE, types.from_json(TYPE, b'{"c":1}', 0)))
+    assert value == json.loads(types.to_json(TYPE, types.zero(TYPE))) | {"c": 1}
+    assert value["b"] == [value["a"], "x"]
+    assert types.typedefs(TYPE)[0]["constvalues"] == [value["a"]]
+
+
+def many_fields(count: int) -> str:
+    """A definition of so many texts."""
+    return "\n".join(f"string f{index}" for index in range(count))
+
+
+def nested(depth: int, sequences: bool) -> str:
+    """Messages in messages, or in sequences of messages."""
+    brackets = "[]" if sequences else ""
+    return f"T1{brackets} t\nint8 a\n" + "\n".join(
+        f"{LINE}\nMSG: a/T{level}\n"
+        + (f"T{level + 1}{brackets} t\n" if level < depth else "")
+        + "int8 a\nstring s"
+        for level in range(1, depth + 1)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "large"),
+    [
+        (many_fields(MAX_STEPS), False),
+        (many_fields(MAX_STEPS + 1), True),
+        (nested(7, sequences=True), False),
+        (nested(9, sequences=True), True),
+        (nested(32, sequences=False), False),
+        (nested(32, sequences=True), True),
+        ("float64[200000] a", False),
+        ("\n".join(f"T f{i}" for i in range(300)) + f"\n{LINE}\nMSG: a/T\nint8 x\nint8 y\nint8 z", True),
+        ("T[4] a" + "".join(f"\n{LINE}\nMSG: a/T{'T' * i}\nT{'T' * (i + 1)}[4] a" for i in range(5))
+         + f"\n{LINE}\nMSG: a/{'T' * 6}\nstring s", True),
+    ],
+)  # fmt: skip
+def test_large_types_are_left_to_the_closures(text: str, large: bool) -> None:
+    """No definition makes much code; the messages are converted all the same."""
+    compiled = Compiled(TYPE, text)
+    began = time.thread_time()
+    slow = compiled._slow_reader(TYPE, "json")
+    assert (fast_reader.generate(TYPE, compiled.definitions, "json", slow) is slow) == large
+    assert time.thread_time() - began < 5
+    types = TypeRegistry()
+    types.add(TYPE, text)
+    zero = types.from_json(TYPE, b"{}", 0)
+    assert json.loads(types.to_json(TYPE, zero)) == json.loads(slow(zero))
+    assert types.from_json(TYPE, types.to_json(TYPE, zero), 0) == zero
+    assert types.to_cbor(TYPE, zero)
+
+
+def test_deep_texts_are_refused_by_generated_code_too() -> None:
+    """JSON nests at most 64 deep, whatever the type would take."""
+    deepest = 0
+    for depth in range(1, 33):
+        compiled = Compiled(TYPE, nested(depth, sequences=True))
+        if fast_writer.generate(TYPE, compiled.definitions)(passed) is not passed:
+            deepest = depth
+    assert 2 * (deepest + 1) < 64
+
+
+def test_short_texts_can_not_become_many_large_structs() -> None:
+    """A megabyte of ``{}`` is not given to generated code where each would become an object of many fields."""
+    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\n" + many_fields(400))
+    write = fast_writer.generate(TYPE, compiled.definitions)(passed)
+    assert write(b'{"t":[{},{}]}', 0)
+    with pytest.raises(Passed):
+        write(b'{"t":[' + b",".join([b"{}"] * 100_000) + b"]}", 0)
+    with pytest.raises(Passed):
+        write({"t": [{}]}, 0)
+
+
+@pytest.mark.parametrize(
+    "time",
+    [
+        "int32 sec\nuint32 nanosec\nint8 more",
+        "string sec\nstring nanosec",
+        "uint32 nanosec\nint32 sec",
+        "T[2] sec",
+    ],
+)
+def test_a_time_of_the_robots_own_making_breaks_nothing(time: str) -> None:
+    """A header whose stamp is no time is written, or refused, by the closures."""
+    text = f"std_msgs/Header h\n{LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\n"
+    text += f"{LINE}\nMSG: builtin_interfaces/Time\n{time}\n{LINE}\nMSG: builtin_interfaces/T\nint8 x"
+    compiled = Compiled(TYPE, text)
+    slow = compiled._slow_writer(TYPE, json.loads)
+    assert outcome(compiled.writer(TYPE, False), b"{}", 5) == outcome(slow, b"{}", 5)
+
+
+def test_lines_of_a_source_are_the_only_code() -> None:
+    """Objects are handed over by name and never written into the text."""
+    source = Source()
+    name = source.constant("'); raise SystemExit('")
+    source.line(f"return {name}.encode()")
+    assert source.function("data")(passed)(b"") == b"'); raise SystemExit('"
+
+
+def test_numbers_of_cbor_are_exact() -> None:
+    """Integers of every width and sign, floats of both precisions, NaN and infinity."""
+    types = TypeRegistry()
+    types.add(
+        TYPE,
+        "int8 a\nint16 b\nint32 c\nint64 d\nuint8 e\nuint16 f\nuint32 g\nuint64 h\nfloat32 i\nfloat64 j\nbool k",
+    )
+    for low in (True, False):
+        values = [-(2 ** (bits - 1)) if low else 2 ** (bits - 1) - 1 for bits in (8, 16, 32, 64)]
+        values += [0 if low else 2**bits - 1 for bits in (8, 16, 32, 64)]
+        real = math.nan if low else -math.inf
+        cdr = b"\0\1\0\0" + struct.pack("<bxhiqBxHIQf4xd?", *values, real, real, low)
+        back = list(cbor2.loads(types.to_cbor(TYPE, cdr)).values())
+        assert back[:8] == values
+        assert same(back[8:], [real, real, low])
