@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from rosbridge_client import Client
 
@@ -103,10 +104,10 @@ def table(outcomes: Iterable[Outcome]) -> None:
             view.add_section()
         view.add_row(
             each.op if each.op != before else "",
-            each.title,
+            escape(each.title),
             each.section,
             WORDS.get(each.word, each.word),
-            each.remark,
+            escape(each.remark),
         )
         before = each.op
     console = Console(width=None if Console().is_terminal else 200, highlight=False)

@@ -21,6 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
+from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import ParameterDescriptor
 from rcl_interfaces.srv import ListParameters
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
@@ -110,8 +111,12 @@ class Fixture(Node):
         self.create_timer(COUNTER_SECONDS, self._count, callback_group=self._group)
         self._echo = self.create_publisher(String, "/conformance/echo/out", PROFILES["reliable"])
         self.create_subscription(String, "/conformance/echo/in", self._echo.publish, PROFILES["reliable"])
+        # What moves and says so: the convention of docs/robots.md for checking a robot's motion.
+        heard = self.create_publisher(Twist, "/conformance/cmd_vel/heard", PROFILES["latched"])
+        self.create_subscription(Twist, "/conformance/cmd_vel", heard.publish, PROFILES["reliable"])
         for type_, name, function in (
             (ListParameters, "do", self._do),
+            (Trigger, "beep", self._beep),
             (SetBool, "invert", self._invert),
             (Trigger, "slow", self._slow),
             (Empty, "nothing", lambda _, response: response),
@@ -139,6 +144,11 @@ class Fixture(Node):
     def _invert(self, request: Any, response: Any) -> Any:
         response.success = not request.data
         response.message = "inverted"
+        return response
+
+    def _beep(self, request: Any, response: Any) -> Any:
+        response.success = True
+        response.message = "beep"
         return response
 
     def _slow(self, request: Any, response: Any) -> Any:

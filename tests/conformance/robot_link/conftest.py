@@ -1,0 +1,65 @@
+"""The robot under test: one that dials in with ``--listen``, else our own ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+from link_relay import ENROLMENT_CODE, LinkRelay
+from robots_under_test import ROBOTS
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Every case for every robot."""
+    if "relay" in metafunc.fixturenames:
+        robots = ["dialled"] if metafunc.config.getoption("--listen", "") else list(ROBOTS)
+        metafunc.parametrize("relay", robots, indirect=True, scope="session")
+
+
+@pytest.fixture(scope="session")
+def relay(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LinkRelay]:
+    """A relay of the suite's own with the robot enrolled and registered."""
+    listen = request.config.getoption("--listen", "")
+    if listen:
+        yield from _dialled(request.config, listen)
+        return
+    made = LinkRelay("robot-under-test")
+    robot = ROBOTS[request.param](tmp_path_factory.mktemp(request.param), made.robot, made.port)
+    try:
+        made.enrol(30)
+        robot.run()
+        _wait_for_graph(made)
+        yield made
+    finally:
+        robot.stop()
+        made.close()
+
+
+def _dialled(config: pytest.Config, listen: str) -> Iterator[LinkRelay]:
+    host, _, port = listen.rpartition(":")
+    made = LinkRelay(config.getoption("--robot-name"), host or "0.0.0.0", int(port))
+    patience = config.getoption("--patience")
+    capture = config.pluginmanager.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled():
+        print(
+            f"\nEnrol and start your robot now: relay {made.host}:{made.port} (plain TCP), robot {made.robot}, "
+            f"enrolment code {ENROLMENT_CODE}. Waiting {patience:g} s for it to dial …",
+            flush=True,
+        )
+    try:
+        made.enrol(patience)
+        made.register(patience)
+        _wait_for_graph(made)
+        yield made
+    finally:
+        made.close()
+
+
+def _wait_for_graph(made: LinkRelay) -> None:
+    """A daemon may know little of its graph at first; give it some seconds to find out."""
+    assert made.control
+    made.facts()
+    until = time.monotonic() + 5
+    while time.monotonic() < until and not any(name.endswith("/heard") for name in made.graph["topics"]):
+        time.sleep(0.02)

@@ -1,0 +1,57 @@
+"""Robots for the link's cases without ``--listen``: our daemon on ROS 2 with the fixture node, and the JSON example."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from link_relay import ENROLMENT_CODE
+from switchboard_harness import BIN, Process, free_domain, ros_environment
+
+HERE = Path(__file__).parent
+EXAMPLE = HERE.parents[1] / "docs" / "examples" / "json_robot.py"
+
+
+class Daemon:
+    """``switchboard-robot`` in a ROS graph of its own."""
+
+    def __init__(self, folder: Path, name: str, port: int) -> None:
+        self._environment = ros_environment(free_domain())
+        node = [sys.executable, str(HERE / "fixture_node.py")]
+        self._node = Process(node, folder, "node", self._environment)
+        self._state = folder / "state"
+        enroll = [str(BIN / "switchboard-robot"), "enroll", "--relay", f"127.0.0.1:{port}", "--robot", name]
+        enroll += ["--code", ENROLMENT_CODE, "--state", str(self._state)]
+        self._daemon = Process(enroll, folder, "enroll", self._environment)
+        self._folder = folder
+
+    def run(self) -> None:
+        """Dial, once it is enrolled."""
+        self._daemon.popen.wait(30)
+        self._node.wait_to_say("READY")
+        run = [str(BIN / "switchboard-robot"), "run", "--state", str(self._state)]
+        self._daemon = Process(run, self._folder, "daemon", self._environment)
+
+    def stop(self) -> None:
+        """End."""
+        self._daemon.stop()
+        self._node.stop()
+
+
+class JsonRobot:
+    """The example of a robot that speaks JSON only."""
+
+    def __init__(self, folder: Path, name: str, port: int) -> None:
+        command = [sys.executable, str(EXAMPLE), "--relay", f"127.0.0.1:{port}", "--robot", name]
+        command += ["--code", ENROLMENT_CODE, "--state", str(folder / "robot.json")]
+        self._process = Process(command, folder, "json_robot")
+
+    def run(self) -> None:
+        """It dials by itself."""
+
+    def stop(self) -> None:
+        """End."""
+        self._process.stop()
+
+
+ROBOTS = {"daemon": Daemon, "json_robot": JsonRobot}
