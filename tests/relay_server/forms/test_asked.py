@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from relay_protocol import rosbridge
+from relay_protocol.limits import KIB
 from relay_server import forms
-from relay_server.forms import Form
+from relay_server.forms import Form, fragments, png
+from relay_server.session import incoming
 
 
 def asked(topic: bool = False, **fields: Any) -> tuple[Form, list[tuple[str, str, rosbridge.Id]]]:
@@ -61,3 +64,14 @@ def test_small_fragments() -> None:
 def test_a_good_size_is_taken() -> None:
     """A sensible size is taken as it is."""
     assert asked(fragment_size=1000) == (Form("none", 1000), [])
+
+
+def test_the_specification_says_the_same() -> None:
+    """The sizes and counts of SPEC 1.6 are the code's."""
+    spec = (Path(__file__).parents[3] / "protocol" / "SPEC.md").read_text("utf-8")
+    section = spec[spec.index("### 1.6 ") : spec.index("## 2. ")]
+    assert all(f"| `{compression}` |" in section for compression in forms.COMPRESSIONS)
+    assert f"longer than {png.MOST // KIB} KiB" in section
+    assert f"Less than {fragments.LEAST} counts as {fragments.LEAST}" in section
+    assert f"at most {fragments.MOST:,} fragments" in section
+    assert f"{incoming.PARTS:,} fragments together" in section
