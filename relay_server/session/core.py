@@ -206,7 +206,7 @@ class Session:
                 raise MalformedMessage("a message in fragments can't be a fragment itself")
         except PeerError as error:
             self._malformed += 1
-            if self._malformed == 1:
+            if self._malformed == 1 and self._noise.take():
                 self.log.info(
                     "client {number} sent what is not rosbridge: {reason}",
                     number=self.number,

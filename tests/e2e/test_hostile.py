@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import random
 import socket
@@ -15,6 +14,7 @@ from typing import Any
 import psutil
 import pytest
 from switchboard_harness import Client, FakeRobot, wait_for
+from switchboard_watchers import Watcher, bystanders, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -24,73 +24,19 @@ from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json
 from relay_server import passwords
 
-STAMP_GAP = 1.0
-"""Seconds between two odometry stamps that a busy machine can explain; the simulator sends 20 a second or more."""
-
-
-class Watcher(threading.Thread):
-    """Somebody who watches odometry all the time and keeps the stamps."""
-
-    def __init__(self, client: Client) -> None:
-        super().__init__(daemon=True)
-        self.client = client
-        self.stamps: list[float] = []
-        self.broken = ""
-        self._end = threading.Event()
-        client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
-
-    def run(self) -> None:
-        """Until told to stop, or until the connection breaks."""
-        while not self._end.is_set():
-            try:
-                message = self.client.receive(0.5)
-            except TimeoutError:
-                continue
-            except Exception as error:
-                self.broken = repr(error)
-                return
-            stamp = message["msg"]["header"]["stamp"]
-            self.stamps.append(stamp["sec"] + stamp["nanosec"] / 1e9)
-
-    def stop(self) -> None:
-        """Leave."""
-        self._end.set()
-        self.join(10)
-        self.client.close()
-
 
 @pytest.fixture(scope="module")
 def watchers(world: Any) -> Iterator[list[Watcher]]:
     """Two bystanders for all tests: the same connections from the first attack to the last."""
-    watchers = [Watcher(world.relay.connect("rover", token)) for token in (world.viewer, world.operator)]
-    for each in watchers:
-        each.start()
-    yield watchers
-    for each in watchers:
-        each.stop()
+    with bystanders(world.relay, "rover", world.viewer, world.operator) as found:
+        yield found
 
 
 @pytest.fixture(autouse=True)
-def undisturbed(world: Any, watchers: list[Watcher]) -> Iterator[None]:
+def nobody_notices(world: Any, watchers: list[Watcher]) -> Iterator[None]:
     """Whatever a test does, the bystanders go on, the process is the same, and the log shows no traceback."""
-    for each in watchers:
-        wait_for("odometry comes", lambda each=each: each.stamps)
-    begun = [len(each.stamps) for each in watchers]
-    logged = len(world.relay.log)
-    process = world.relay.process.popen
-    yield
-    for each in watchers:
-        seen = len(each.stamps)
-        wait_for("odometry still comes", lambda each=each, seen=seen: len(each.stamps) > seen + 3)
-    for each, start in zip(watchers, begun, strict=True):
-        assert each.broken == ""
-        stamps = each.stamps[start - 1 :]
-        gaps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
-        assert min(gaps) > 0
-        assert max(gaps) < STAMP_GAP
-    assert world.relay.process.popen is process
-    assert process.poll() is None
-    assert "Traceback" not in world.relay.log[logged:]
+    with undisturbed(world.relay, watchers):
+        yield
 
 
 def logs(world: Any, words: str, since: int) -> None:

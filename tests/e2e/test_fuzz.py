@@ -1,0 +1,169 @@
+"""Clients that break every rule at random, always the same at random: told or cut, and nobody else notices."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from switchboard_watchers import Watcher, bystanders, undisturbed
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from relay_protocol import rosbridge
+
+OPS = {each.__struct_config__.tag: each.__struct_fields__ for each in typing.get_args(rosbridge.ClientOp)}
+NAMES = (
+    "/odom",
+    "scan",
+    "/cmd_vel",
+    "/reset",
+    "/rosapi/topics",
+    "/relay/status",
+    "/nowhere",
+    "",
+    "/",
+    "//",
+    "1x",
+    "~",
+)
+TYPES = (
+    "std_msgs/msg/String",
+    "nav_msgs/Odometry",
+    "std_srvs/srv/Trigger",
+    "example_interfaces/action/Fibonacci",
+    "?",
+    "a/b/c/d",
+)
+ODD = (
+    None, True, False, 0, -1, 1, 7, 2**31, -(2**63), 2**64, 1e308, 0.5, "", "x", "\x00", "é" * 300, "none", "cbor",
+    "png", "cbor-raw", [], {}, [[]], {"a": {"b": {}}}, [1, "2", None], {"data": "x"}, {"depth": -5},
+    {"reliability": "maybe"}, {"order": 3}, {"linear": {"x": "fast"}},
+)  # fmt: skip
+"""Values that are right for some field, and wrong for most."""
+MESSAGES = 4000
+
+
+@pytest.fixture(scope="module")
+def watchers(world: Any) -> Iterator[list[Watcher]]:
+    """Two bystanders from the first message to the last."""
+    with bystanders(world.relay, "rover", world.viewer, world.operator) as found:
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def nobody_notices(world: Any, watchers: list[Watcher]) -> Iterator[None]:
+    """Bystanders, process, log and robot are as before."""
+    daemon = len(world.robot.daemon.log.read_text())
+    with undisturbed(world.relay, watchers):
+        yield
+    assert world.robot.daemon.popen.poll() is None
+    assert "Traceback" not in world.robot.daemon.log.read_text()[daemon:]
+
+
+def value_for(field: str, chance: random.Random) -> Any:
+    """Often what the field wants, often not."""
+    if chance.random() < 0.25:
+        return chance.choice(ODD)
+    if field in ("topic", "service", "action"):
+        return chance.choice(NAMES)
+    if field in ("type", "action_type"):
+        return chance.choice(TYPES)
+    if field == "id":
+        return chance.choice(("a", "b", 3, None))
+    return chance.choice(ODD)
+
+
+def message(chance: random.Random) -> str | bytes:
+    """One message: an op with some of its fields, and sometimes hardly that."""
+    op = chance.choice(list(OPS))
+    fields = {field: value_for(field, chance) for field in OPS[op] if chance.random() < 0.8}
+    text = json.dumps({"op": op, **fields})
+    kind = chance.random()
+    if kind < 0.05:
+        return text[: chance.randrange(len(text))]
+    if kind < 0.08:
+        return text.replace('"', chance.choice(("'", "", '""')))
+    if kind < 0.1:
+        return chance.choice(
+            ("null", "[]", "3", '"op"', "{}", '{"op":null}', '{"op":["publish"]}', "\ufeff{}")
+        )
+    return text
+
+
+def connected(world: Any, token: str) -> ClientConnection:
+    """A connection of a client that means no good."""
+    return connect(
+        world.relay.url("rover"),
+        additional_headers={"Authorization": f"Bearer {token}"},
+        max_size=None,
+        compression=None,
+    )
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_random_operations_are_told_or_cut(world: Any, seed: int) -> None:
+    """Each refusal is a sentence; who is cut gets a code and a reason, comes again and goes on."""
+    chance = random.Random(seed)
+    left, told = MESSAGES, 0
+    while left:
+        with connected(world, world.operator) as client:
+            try:
+                client.send('{"op":"set_level","level":"error"}')
+                while left:
+                    left -= 1
+                    client.send(message(chance))
+                    with contextlib.suppress(TimeoutError):
+                        while True:
+                            heard = client.recv(timeout=0)
+                            told += isinstance(heard, str) and '"level":"error"' in heard
+            except ConnectionClosed as cut:
+                assert cut.rcvd is not None
+                assert cut.rcvd.reason
+    assert told > MESSAGES / 20
+
+
+def test_random_bytes_after_the_handshake_are_cut(world: Any) -> None:
+    """Frames with reserved bits, without masks, of wrong lengths, half of them never finished."""
+    chance = random.Random(4)
+    for _ in range(40):
+        with contextlib.suppress(ConnectionClosed, OSError), connected(world, world.viewer) as client:
+            client.socket.sendall(chance.randbytes(chance.randrange(1, 4000)))
+            if chance.random() < 0.5:
+                client.socket.close()
+
+
+def test_a_flood_of_everything_at_once_disturbs_nobody(world: Any) -> None:
+    """Ten clients of one user, each as fast as it can, none reading its answers."""
+    chance = random.Random(5)
+    texts = [message(chance) for _ in range(200)]
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(connected(world, world.operator)) for _ in range(10)]
+        for _ in range(10):
+            for client in clients:
+                with contextlib.suppress(ConnectionClosed):
+                    for text in texts:
+                        client.send(text)
+        for client in clients:
+            client.socket.close()
+
+
+def test_half_a_message_and_then_nothing_holds_nobody_up(world: Any) -> None:
+    """A frame that never ends, a fragmented message without its last part, fragments without their others."""
+    mask = os.urandom(4)
+    with contextlib.ExitStack() as stack:
+        first, second, third, another = (
+            stack.enter_context(connected(world, world.viewer)) for _ in range(4)
+        )
+        first.socket.sendall(b"\x81\xff" + (500_000).to_bytes(8, "big") + mask + bytes(1000))
+        second.socket.sendall(b"\x01\x85" + mask + bytes(5))
+        third.send('{"op":"fragment","id":"f","num":0,"total":2,"data":"{"}')
+        another.send('{"op":"call_service","service":"/rosapi/get_time","id":"now"}')
+        assert json.loads(another.recv(timeout=10))["id"] == "now"
+        for client in (first, second):
+            client.socket.close()

@@ -1,0 +1,80 @@
+"""Bystanders: clients that watch while others misbehave, and must not notice."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from switchboard_harness import Client, Relay, wait_for
+
+STAMP_GAP = 1.0
+"""Seconds between two odometry stamps that a busy machine can explain; the simulator sends 20 a second or more."""
+
+
+class Watcher(threading.Thread):
+    """Somebody who watches odometry all the time and keeps the stamps."""
+
+    def __init__(self, client: Client) -> None:
+        super().__init__(daemon=True)
+        self.client = client
+        self.stamps: list[float] = []
+        self.broken = ""
+        self._end = threading.Event()
+        client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
+
+    def run(self) -> None:
+        """Until told to stop, or until the connection breaks."""
+        while not self._end.is_set():
+            try:
+                message = self.client.receive(0.5)
+            except TimeoutError:
+                continue
+            except Exception as error:
+                self.broken = repr(error)
+                return
+            stamp = message["msg"]["header"]["stamp"]
+            self.stamps.append(stamp["sec"] + stamp["nanosec"] / 1e9)
+
+    def stop(self) -> None:
+        """Leave."""
+        self._end.set()
+        self.join(10)
+        self.client.close()
+
+
+@contextmanager
+def bystanders(relay: Relay, robot: str, *tokens: str) -> Iterator[list[Watcher]]:
+    """A watcher for each token."""
+    watchers = [Watcher(relay.connect(robot, token)) for token in tokens]
+    for each in watchers:
+        each.start()
+    try:
+        yield watchers
+    finally:
+        for each in watchers:
+            each.stop()
+
+
+@contextmanager
+def undisturbed(relay: Relay, watchers: list[Watcher]) -> Iterator[None]:
+    """Whatever is done meanwhile: nobody misses anything, the process is the same, the log shows no traceback."""
+    for each in watchers:
+        wait_for("odometry comes", lambda each=each: each.stamps)
+    begun = [len(each.stamps) for each in watchers]
+    logged = len(relay.log)
+    process = relay.process.popen
+    yield
+    for each in watchers:
+        seen = len(each.stamps)
+        wait_for("odometry still comes", lambda each=each, seen=seen: len(each.stamps) > seen + 3)
+    for each, start in zip(watchers, begun, strict=True):
+        assert each.broken == ""
+        stamps = each.stamps[start - 1 :]
+        gaps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
+        assert min(gaps) > 0
+        assert max(gaps) < STAMP_GAP
+    assert relay.process.popen is process
+    assert process.poll() is None
+    assert "Traceback" not in relay.log[logged:]
