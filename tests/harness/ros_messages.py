@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cbor2 import CBORTag
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from rosidl_parser import definition as idl
 
@@ -23,6 +24,16 @@ SHARES = [
     for prefix in [*os.environ.get("AMENT_PREFIX_PATH", "").split(":"), sys.prefix]
     if prefix
 ]
+EVERY = settings(
+    derandomize=True,
+    database=None,
+    deadline=None,
+    max_examples=8,
+    phases=[Phase.explicit, Phase.generate],
+    suppress_health_check=list(HealthCheck),
+)
+"""A few messages of each of the many types, the same ones every time."""
+
 PARTS = {"msg": [""], "srv": ["Request", "Response"], "action": ["Goal", "Result", "Feedback"]}
 REFERENCE = re.compile(r"\s*([A-Za-z]\w*(?:/\w+){0,2})(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")
 

@@ -10,9 +10,9 @@ from typing import Any
 import cbor2
 import orjson
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given, settings
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import decoded, installed, messages, walk_message, whole_text
+from ros_messages import EVERY, decoded, installed, messages, walk_message, whole_text
 from rosbags.typesys import Stores, get_typestore
 
 from relay_protocol.ros import fast_reader, fast_writer
@@ -28,16 +28,6 @@ TEXTS = {owner: whole_text(owner) for owner in {each.owner for each in TYPES.val
 REGISTRY = TypeRegistry()
 for owner, text in TEXTS.items():
     REGISTRY.add(owner, text)
-
-EVERY = settings(
-    derandomize=True,
-    database=None,
-    deadline=None,
-    max_examples=8,
-    phases=[Phase.explicit, Phase.generate],
-    suppress_health_check=list(HealthCheck),
-)
-"""A few messages of each of the many types, the same ones every time."""
 
 
 def refuse(*arguments: Any) -> bytes:
