@@ -15,6 +15,8 @@ PARTS = 16_384
 class _Unfinished:
     """A message of which something has come."""
 
+    __slots__ = ("bytes", "parts", "since", "total", "touched")
+
     def __init__(self, total: int, since: int) -> None:
         self.total = total
         self.since = since
@@ -32,6 +34,19 @@ class Incoming:
         command is as old as its beginning
     :param given_up: takes the words about one that is not, and its id
     """
+
+    # Every client has one of these, and hardly any uses it.
+    __slots__ = (
+        "_bytes",
+        "_clock",
+        "_dropped",
+        "_finished",
+        "_given_up",
+        "_not_before",
+        "_parts",
+        "_timer",
+        "_unfinished",
+    )
 
     def __init__(
         self,

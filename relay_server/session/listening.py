@@ -25,6 +25,9 @@ SUBSCRIPTIONS = 1024
 TELL_SECONDS = 1.0
 """How often the relay publishes its own topics."""
 
+_OWN = Converter(TypeRegistry(), "", "json", lambda reason: None)
+"""For what the relay itself says, which is JSON."""
+
 
 class Listening:
     """The subscriptions of one session."""
@@ -35,7 +38,6 @@ class Listening:
         self._local = local
         self._listeners: dict[str, Listener] = {}
         self._telling = looping(clock, self._publish_local)
-        self._own = Converter(TypeRegistry(), "", "json", lambda reason: None)
 
     def end(self) -> None:
         """The client is gone."""
@@ -100,6 +102,6 @@ class Listening:
         for name, make in makers:
             if make is not None:
                 body = jsontext.encode(make(self._session))
-                self._listeners[name].replay(Sample(body, 0, self._own))
+                self._listeners[name].replay(Sample(body, 0, _OWN))
         if not any(make for _, make in makers):
             self._telling.stop()
