@@ -10,7 +10,8 @@ from relay_server.session import Session
 async def get_time(session: Session, args: Any) -> Any:
     """``/rosapi/get_time``: the robot's simulated time where it has one, else the relay's wall clock."""
     sec, nanosec = divmod(session.channel.now_ns(), 10**9)
-    return {"time": {"sec": sec, "nanosec": nanosec}}
+    # roslibpy reads the names of ROS 1.
+    return {"time": {"sec": sec, "nanosec": nanosec, "secs": sec, "nsecs": nanosec}}
 
 
 async def get_ros_version(session: Session, args: Any) -> Any:

@@ -258,6 +258,9 @@ def test_every_service_has_a_handler_and_a_type_whose_fields_its_answers_have(op
         (reply,) = operator.hears("service_response")
         assert reply["result"], reply
         response = f"{SERVICES[name].type}_Response"
+        if name == "/rosapi/get_time":
+            for former in ("secs", "nsecs"):  # for roslibpy
+                del reply["values"]["time"][former]
         TYPES.from_json(response, reply["values"], 0)
         (fields,) = [each["fieldnames"] for each in TYPES.typedefs(response)[:1]]
         assert set(reply["values"]) == set(fields), name
