@@ -49,7 +49,7 @@ class Outbox:
     def __init__(
         self, write: Callable[[bytes], None], seconds: Callable[[], float], overflow: Callable[[], None]
     ) -> None:
-        self._write = write
+        self.write = write
         self._seconds = seconds
         self._overflow = overflow
         self._control: deque[bytes] = deque()
@@ -76,7 +76,7 @@ class Outbox:
         while self._control and self.paused_since is None and not self._closed:
             message = self._control.popleft()
             self._control_bytes -= len(message)
-            self._write(message)
+            self.write(message)
         while self._data and self.paused_since is None and not self._closed:
             key = next(iter(self._data))
             queue = self._data.pop(key)
@@ -98,7 +98,7 @@ class Outbox:
         if self._closed:
             return
         if self.paused_since is None:
-            self._write(message)
+            self.write(message)
             return
         self._control.append(message)
         self._control_bytes += len(message)
@@ -115,7 +115,9 @@ class Outbox:
         if self._closed:
             return
         if self.paused_since is None:
-            self._put(key, parcel)
+            message = parcel if isinstance(parcel, bytes) else parcel.open(key)
+            if message is not None:
+                self.write(message)
             return
         size = len(parcel) if isinstance(parcel, bytes) else parcel.size
         queue = self._data.setdefault(key, _Queue())
@@ -135,7 +137,7 @@ class Outbox:
     def _put(self, key: Hashable, parcel: bytes | Parcel) -> None:
         message = parcel if isinstance(parcel, bytes) else parcel.open(key)
         if message is not None:
-            self._write(message)
+            self.write(message)
 
     def forget(self, key: Hashable) -> None:
         """Let go of what waits of this topic."""

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
+import orjson
+
 from relay_protocol import jsontext, link, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
-from relay_protocol.ros_types import Writer
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
-from relay_server.channel.topics import Held, Phase, Publication
+from relay_server.channel.topics import Encode, Held, Phase, Publication
 from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire, resolve
 from relay_server.clock import Clock
 
@@ -33,16 +34,14 @@ HELD_SECONDS = 3.0
 class Publications:
     """Keeps the robot's publishers in step with what clients advertise, and carries their messages.
 
-    :param wall_ns: Unix time in nanoseconds, for header stamps a client leaves out
+    :param now_ns: the robot's time, nanoseconds, for header stamps a client leaves out
     """
 
-    def __init__(
-        self, clock: Clock, wire: Wire, definitions: Definitions, wall_ns: Callable[[], int]
-    ) -> None:
+    def __init__(self, clock: Clock, wire: Wire, definitions: Definitions, now_ns: Callable[[], int]) -> None:
         self._clock = clock
         self._wire = wire
         self._definitions = definitions
-        self._wall_ns = wall_ns
+        self._now_ns = now_ns
         self._topics: dict[str, Publication] = {}
         self._numbers: dict[int, Publication] = {}
 
@@ -123,8 +122,14 @@ class Publications:
         :param good_for: seconds from now after which it must not be sent any more
         """
         encode = publication.encode or self._encoder(publication)
-        if encode is not None:
-            self._send(member, publication, encode, body, stamp, id)
+        robot = self._wire.link
+        if encode is not None and robot is not None:
+            try:
+                encoded = encode(body)
+            except SwitchboardError as error:
+                member.tell("error", f"publish {publication.topic}: {error}", id)
+            else:
+                robot.sample(publication.number, stamp, encoded)
         elif publication.phase is Phase.FAILED:
             reason = f"the robot could not advertise {publication.topic}; the message was dropped"
             member.tell("error", reason, id)
@@ -132,12 +137,13 @@ class Publications:
             until = self._clock.seconds() + min(good_for, HELD_SECONDS)
             self._hold(publication, Held(member, body, stamp, id, until))
 
-    def _encoder(self, publication: Publication) -> Writer | None:
+    def _encoder(self, publication: Publication) -> Encode | None:
         """What makes the robot's form of a message, if it can be sent now."""
         if publication.phase in (Phase.WAITING, Phase.FAILED) or self._untyped(publication):
             return None
         if self._wire.cdr:
-            publication.encode = self._wire.robot.types.writer(publication.type, checked=True)
+            write, now_ns = self._wire.robot.types.writer(publication.type, checked=True), self._now_ns
+            publication.encode = lambda body: write(body, now_ns())
         else:
             publication.encode = _as_it_came
         return publication.encode
@@ -257,8 +263,7 @@ class Publications:
         self._wire.asks.ask(Ask(("advertise", publication.number), message, sent))
 
     def _flush(self, publication: Publication) -> None:
-        encode = self._encoder(publication)
-        if encode is None:
+        if self._encoder(publication) is None:
             return
         held = list(publication.held)
         publication.held.clear()
@@ -267,24 +272,7 @@ class Publications:
             if each.until < now:
                 _dropped(publication, each, "the robot could not be reached in time; dropped")
             else:
-                self._send(each.member, publication, encode, each.body, each.stamp, each.id)
-
-    def _send(
-        self,
-        member: Member,
-        publication: Publication,
-        encode: Writer,
-        body: bytes,
-        stamp: int,
-        id: rosbridge.Id,
-    ) -> None:
-        try:
-            encoded = encode(body, self._wall_ns())
-        except SwitchboardError as error:
-            member.tell("error", f"publish {publication.topic}: {error}", id)
-            return
-        if self._wire.link is not None:
-            self._wire.link.sample(publication.number, stamp, encoded)
+                self.publish(each.member, publication, each.body, each.stamp, each.id)
 
     def _let_go(self, publication: Publication, member: Member) -> None:
         if publication.holders.pop(member, None) is None:
@@ -304,7 +292,7 @@ def _dropped(publication: Publication, message: Held, reason: str) -> None:
     message.member.tell("error", f"publish {publication.topic}: {reason}", message.id)
 
 
-def _as_it_came(body: bytes, now_ns: int) -> bytes:
+def _as_it_came(body: bytes) -> bytes:
     """A message for a robot that speaks JSON: the client's own words, once it is sure that any reader can take them.
 
     msgspec has skipped the body, which finds all that is not JSON except a number beyond any double; the text around
@@ -312,5 +300,8 @@ def _as_it_came(body: bytes, now_ns: int) -> bytes:
     """
     if body[:1] != b"{":
         raise Invalid("'msg' must be an object")
-    jsontext.check_range(body)
+    try:
+        orjson.loads(body)
+    except ValueError:
+        jsontext.check_range(body)
     return body

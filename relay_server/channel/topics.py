@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from relay_protocol import limits, rosbridge
 from relay_protocol.link import QoS
-from relay_protocol.ros_types import TypeRegistry, Writer
+from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
 from relay_server.channel.wire import Member
@@ -186,6 +186,10 @@ def _keep(samples: deque[Sample], sample: Sample) -> None:
         samples.popleft()
 
 
+Encode = Callable[[bytes], bytes]
+"""Takes a message's JSON, gives what the robot is sent. Raises :class:`Invalid`."""
+
+
 class Held(NamedTuple):
     """A message that waits for the moment until it can be sent; see :meth:`Publications.publish`.
 
@@ -211,7 +215,7 @@ class Publication:
         self.queue_size = 0
         self.qos: QoS | None = None
         self.phase = Phase.WAITING
-        self.encode: Writer | None = None
+        self.encode: Encode | None = None
         """Makes what the robot is sent of a message's JSON. ``None`` until the first message after a change."""
         self.holders: dict[Member, set[rosbridge.Id]] = {}
         self.held: deque[Held] = deque()

@@ -93,7 +93,7 @@ class RobotConnection(TwistedProtocol):
         self._aborting: Timer | None = None
         self._pings: OrderedDict[int, Deferred[float] | None] = OrderedDict()
         self.on_round_trip: Callable[[float], None] = lambda seconds: None
-        self._outbox = Outbox(self._write, clock.seconds, self._overflow)
+        self._outbox = Outbox(_nowhere, clock.seconds, self._overflow)
         self.address = ""
 
     # --- Twisted ------------------------------------------------------------------------------------------
@@ -103,6 +103,7 @@ class RobotConnection(TwistedProtocol):
         self.address = getattr(self.transport.getPeer(), "host", "")
         harden(self.transport)
         self._writer = writer_for(self.transport, Turns(self._clock))
+        self._outbox.write = self._writer.write
         self.transport.registerProducer(_Flow(self._outbox), True)
         if not self._cap.enter(self.address):
             self.refuse(link.Refused(reason="too many connections from your address", retry_after=10.0))
@@ -307,9 +308,6 @@ class RobotConnection(TwistedProtocol):
         cancel(self._deadline)
         self._deadline = None
 
-    def _write(self, data: bytes) -> None:
-        self._writer.write(data)
-
     def _overflow(self) -> None:
         self.log.warn("the robot at {address} takes nothing; it is cut", address=self.address)
         self._end("the robot takes nothing")
@@ -330,6 +328,10 @@ class _Flow:
 
     def stopProducing(self) -> None:
         self._outbox.close()
+
+
+def _nowhere(data: bytes) -> None:
+    """Nobody has dialled yet."""
 
 
 def harden(transport: Any) -> None:

@@ -189,17 +189,18 @@ class Session:
 
     # --- from the transport -------------------------------------------------------------------------------
 
-    def message(self, data: bytes) -> None:
-        """One message of the client."""
-        if not self._closed:
-            self._take(data)
-
     def _joined(self, data: bytes, since: int) -> None:
         """A message that came in fragments, the first of which can't have been sent before ``since``."""
         with self._freshness.as_of(since):
-            self._take(data, joined=True)
+            self.message(data, joined=True)
 
-    def _take(self, data: bytes, joined: bool = False) -> None:
+    def message(self, data: bytes, *, joined: bool = False) -> None:
+        """One message of the client.
+
+        :param joined: whether it came in fragments
+        """
+        if self._closed:
+            return
         try:
             operation = rosbridge.decode(data)
             if joined and isinstance(operation, rosbridge.Fragment):

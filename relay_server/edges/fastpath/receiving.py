@@ -25,10 +25,12 @@ SHARE_SECONDS = 0.002
 
 _OPEN = WebSocketServerProtocol.STATE_OPEN
 _SPEAKING = frozenset({_OPEN, WebSocketServerProtocol.STATE_CLOSING})
+"""The handshake is done, the connection not yet given up."""
 
 _TEXT = 0x81
 _CLOSE = 0x88
 _PONG = 0x8A
+_READ_HERE = frozenset({_TEXT, _PONG})
 _MASKED = 0x80
 _BEGINNINGS = frozenset({0x01, 0x02, 0x81, 0x82})
 """First byte of a frame that begins a text or binary message."""
@@ -68,7 +70,7 @@ class FastProtocol(WebSocketServerProtocol):
 
     def dataReceived(self, data: bytes) -> None:
         """Bytes from the client, cut anywhere."""
-        if self._verbatim or not self._speaking():
+        if self._verbatim or self.state not in _SPEAKING:
             super().dataReceived(data)
             return
         waiting = self._waiting
@@ -80,30 +82,40 @@ class FastProtocol(WebSocketServerProtocol):
             self._waiting = None
         self._read(data)
 
-    def _speaking(self) -> bool:
-        """The handshake is done, the connection not yet given up."""
-        return self.state in _SPEAKING
-
     def _read(self, data: bytes) -> None:
         at, have = 0, len(data)
         seconds = self.factory.reactor.seconds
         until = seconds() + SHARE_SECONDS
         while at < have:
-            end = 0
-            if self.state == _OPEN and not self._passing and not self.inside_message:
-                start, end = _usual(data, at, self.maxFramePayloadSize)
-            if end > have:
-                self._wait(data, at, end - at)
-                return
-            if end:
-                take, at = data[at] == _TEXT, end
-                if take:
-                    self.onMessage(_unmasked(data, start, end), False)
+            first, start = data[at], 0
+            # What is shorter than the longest head can be left to Autobahn too.
+            if (
+                first in _READ_HERE
+                and have - at >= _LONGEST_HEAD
+                and self.state == _OPEN
+                and not self._passing
+                and not self.inside_message
+            ):
+                length = data[at + 1] - _MASKED
+                if 0 <= length < 126:
+                    start = at + 6
+                elif first == _TEXT:
+                    start, length = _long(data, at, length)
+            if start and length <= self.maxFramePayloadSize:
+                end = start + length
+                if end > have:
+                    self._wait(data, at, end - at)
+                    return
+                payload = data[start:end] if length <= _COPIED else memoryview(data)[start:end]
+                payload = apply_mask(payload, data[start - 4 : start])
+                at = end
+                if first == _TEXT:
+                    self.onMessage(payload, False)
                 else:
-                    self.onPong(_unmasked(data, start, end))
+                    self.onPong(payload)
             else:
                 at = self._pass_on(data, at)
-                if self._waiting is not None or not self._speaking():
+                if self._waiting is not None or self.state not in _SPEAKING:
                     return
             if seconds() > until and at < have:
                 self._rest(data, at)
@@ -125,7 +137,7 @@ class FastProtocol(WebSocketServerProtocol):
     def _go_on(self) -> None:
         waiting, self._waiting = self._waiting, None
         self._resting = False
-        if waiting is None or not self._speaking():
+        if waiting is None or self.state not in _SPEAKING:
             return
         try:
             self._read(bytes(waiting))
@@ -134,7 +146,7 @@ class FastProtocol(WebSocketServerProtocol):
             self.log.failure("what a client sent could not be handled; it is cut")
             self.transport.abortConnection()
             return
-        if not self._resting and self._speaking():
+        if not self._resting and self.state in _SPEAKING:
             self.transport.resumeProducing()
 
     # --- what is Autobahn's -------------------------------------------------------------------------------
@@ -157,28 +169,18 @@ class FastProtocol(WebSocketServerProtocol):
         return at + len(piece)
 
 
-def _usual(data: bytes, at: int, limit: int) -> tuple[int, int]:
-    """Where the payload of the frame at ``at`` starts and ends, if it is a text message or a pong and in order.
+def _long(data: bytes, at: int, length: int) -> tuple[int, int]:
+    """Where the payload of a frame with a longer head starts, and how long it is; 0 when it is not in order.
 
-    Anything else is (0, 0). What is shorter than the longest head is left to Autobahn too.
+    :param length: 126 or 127, as the seven bits say; negative when the frame is not masked
     """
-    if len(data) - at < _LONGEST_HEAD or (data[at] != _TEXT and data[at] != _PONG):
+    if length < 0:
         return 0, 0
-    start, length = at + 6, data[at + 1] - _MASKED
-    least = 0
-    if length > 125:
-        if data[at] == _PONG:
-            return 0, 0
-        if length == 126:
-            start, length, least = at + 8, _U16(data, at + 2)[0], 126
-        else:
-            start, length, least = at + 14, _U64(data, at + 2)[0], 65536
-    return (start, start + length) if least <= length <= limit else (0, 0)
-
-
-def _unmasked(data: bytes, start: int, end: int) -> bytes:
-    payload = data[start:end] if end - start <= _COPIED else memoryview(data)[start:end]
-    return apply_mask(payload, data[start - 4 : start])
+    if length == 126:
+        length = _U16(data, at + 2)[0]
+        return (at + 8 if length > 125 else 0), length
+    length = _U64(data, at + 2)[0]
+    return (at + 14 if length > 65535 else 0), length
 
 
 def _frame(data: bytes, at: int, *, inside: bool) -> int:
