@@ -87,6 +87,8 @@ def run(options: Options) -> list[Row]:
         stack.enter_context(running(relay))
         robot = RealRobot(relay, "rover", [STREAM])
         stack.enter_context(running(robot))
+        # A daemon that has just come up is busy for some seconds with what it finds.
+        time.sleep(options.pick(0, 6))
         rest = at_rest({"daemon": robot.pid, "relay": relay.pid}, seconds / 2)
         bridge = RosbridgeLike(robot.environment, TOPIC)
         stack.enter_context(running(bridge))
@@ -121,7 +123,8 @@ def run(options: Options) -> list[Row]:
         "rosbridge-like server (stand-in)",
         0.1,
         note=f"daemon {spent['daemon']:.1f} ms/s on the robot, relay {spent['relay']:.1f} ms/s elsewhere; the "
-        f"stand-in runs on the robot. While nobody watches: daemon {rest['daemon']:.1f}, relay {rest['relay']:.1f} ms/s",
+        f"stand-in runs on the robot. While nobody watches: daemon {rest['daemon']:.1f}, "
+        f"relay {rest['relay']:.1f} ms/s",
     )
     print(
         f"    daemon {spent['daemon']:.1f}, relay {spent['relay']:.1f}, stand-in {row.other:.1f} ms/s",
