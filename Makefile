@@ -6,11 +6,11 @@ export ROS_LOG_DIR ?= $(CURDIR)/build/ros-log
 NPM := scripts/with-node.sh npm --silent --prefix web_client
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench lint types web clean
+.PHONY: help setup demo test conformance robot-conformance bench lint types web clean
 
 help: ## list these commands
 	@echo 'make <command>:'
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST)
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST)
 
 setup: ## prepare .venv, build the portal, find a browser for the tests (again: instant)
 	@scripts/setup.sh
@@ -22,6 +22,17 @@ demo: ## run a relay with two simulated robots and print how to log in (options:
 test: setup ## all tests: Python, ROS 2, browser, portal (options: PYTEST='-k drive')
 	$(BIN)/python -m pytest $(PYTEST)
 	$(NPM) run test
+
+CASES := $(BIN)/python -m pytest -q --no-header -r N --tb=short --table
+LISTEN ?= 0.0.0.0:9091
+
+conformance: ## check a rosbridge server: URL=ws://host:9090 TOKEN=…, without URL our own (docs/conformance.md)
+	@scripts/setup.sh python $(if $(URL),,web fixtures)
+	@CONFORMANCE_TOKEN='$(TOKEN)' $(CASES) tests/conformance/clients --url='$(URL)' --target='$(TARGET)'
+
+robot-conformance: ## check a robot that dials LISTEN=0.0.0.0:9091 (docs/conformance.md)
+	@scripts/setup.sh python
+	@$(CASES) tests/conformance/robot_link --listen='$(LISTEN)'
 
 bench: ## measure beside alternatives, about 15 minutes (options: BENCH='hop fanout', BENCH='--quick')
 	@scripts/setup.sh python interfaces bench

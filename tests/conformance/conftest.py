@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Generator, Iterator
 from typing import Any
 
 import conformance_suite as suite
 import pytest
 from rosbridge_client import Client
+from websockets.exceptions import WebSocketException
 
 _outcomes = pytest.StashKey[list[suite.Outcome]]()
 
@@ -17,7 +19,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Where and what is checked."""
     group = parser.getgroup("conformance")
     group.addoption("--url", default="", help="websocket of the rosbridge server to check; without: our own")
-    group.addoption("--token", default="", help="access token for it")
+    token = os.environ.get("CONFORMANCE_TOKEN", "")
+    group.addoption("--token", default=token, help="access token for it; better CONFORMANCE_TOKEN")
     group.addoption("--target", default="", help="rosbridge_suite: count its known differences as such")
     group.addoption("--table", action="store_true", help="print the table of cases")
     group.addoption("--listen", default="", help="HOST:PORT for a robot to dial; without: our own robots")
@@ -62,7 +65,10 @@ def server(
     if url:
         target = request.config.getoption("--target", "")
         found = suite.Server(url.rstrip("/"), request.config.getoption("--token", ""), target)
-        _look_for_fixture(found)
+        try:
+            _look_for_fixture(found)
+        except (OSError, WebSocketException) as error:
+            pytest.exit(f"{url} can't be reached: {error}", returncode=2)
         yield found
     else:
         from our_server import OurServer

@@ -64,7 +64,7 @@ class Link:
         self._connection = connection
         self._hook = hook
         self._waiting: list[Any] = []
-        self._parts: dict[int, bytearray] = {}
+        self._parts: dict[int, tuple[tuple[int, int], bytearray]] = {}
         self._change = threading.Condition()
         self.ended = False
         self.broken = ""
@@ -185,9 +185,10 @@ class Link:
 
     def _part(self, body: bytes) -> Sample | None:
         number, stamp, total, offset = _PART.unpack_from(body)
-        whole = self._parts.setdefault(number, bytearray())
         if offset == 0:
-            whole.clear()
+            self._parts[number] = (stamp, total), bytearray()
+        begun, whole = self._parts[number]
+        assert begun == (stamp, total), "parts of one sample with two stamps or lengths"
         assert offset == len(whole), "parts of a sample with a gap"
         whole += body[_PART.size :]
         assert len(whole) <= total, "parts of a sample beyond its end"
@@ -233,6 +234,7 @@ class LinkRelay:
         until = time.monotonic() + seconds
         while True:
             with self._change:
+                self._dialled = [each for each in self._dialled if not each.ended]
                 links = list(self._dialled)
             for each in links:
                 with contextlib.suppress(AssertionError):
