@@ -1,0 +1,37 @@
+"""What the relay says its own services and topics are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from relay_server.local.catalogue import SERVICES, STATUS, TYPE_NAMES, TYPES
+
+SPEC = (Path(__file__).parents[3] / "protocol" / "SPEC.md").read_text("utf-8")
+SECTION = SPEC[SPEC.index("### 1.7 ") : SPEC.index("## 2. ")]
+
+
+def test_the_contract_names_every_service_of_rosapi() -> None:
+    """And none besides."""
+    for name in SERVICES:
+        if name.startswith("/rosapi/"):
+            assert f"`{name.removeprefix('/rosapi/')}`" in SECTION
+
+
+@pytest.mark.parametrize(
+    "type_name", [STATUS, "switchboard_msgs/srv/Ping_Request", "switchboard_msgs/srv/Ping_Response"]
+)
+def test_the_contract_names_every_field_of_the_relays_own_types(type_name: str) -> None:
+    """Those that come from the robot are in section 2.4."""
+    for typedef in TYPES.typedefs(type_name):
+        section = SPEC if typedef["type"].endswith(("/Motion", "/Health")) else SECTION
+        for field in typedef["fieldnames"]:
+            assert f"`{field}`" in section, (typedef["type"], field)
+
+
+def test_every_type_is_known_by_its_own_text() -> None:
+    """A client may ask for the text of each, as of any type of the robot."""
+    for type_name in TYPE_NAMES:
+        assert TYPES.has_text(type_name)
+        assert TYPES.definition(type_name)
