@@ -206,6 +206,7 @@ class ClientProtocol(FastProtocol):
         self._take_at_most(limits.CLIENT_MESSAGE)
         self._session = self.factory.gate.open(admission, self, self._opened_ns)
         self._session.start()
+        self.takes_text = self._session.message
         early, self._early = self._early, []
         for message in early:
             self.onMessage(message, False)
@@ -287,6 +288,7 @@ class ClientProtocol(FastProtocol):
         self._early.clear()
         self._turn_away()
         session, self._session = self._session, None
+        self.takes_text = None
         if session is not None:
             session.end()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from relay_protocol import link, rosbridge
 from relay_protocol.errors import Unavailable
@@ -20,18 +20,23 @@ ROUTES = 256
 """Topics of which one client's routes are kept."""
 
 
-class Route(NamedTuple):
+class Route:
     """What was found out about a topic this client may publish to, and on what that was founded.
 
     :param type: as the client wrote it in ``publish``
-    :param motion: whether the robot's own safety counts it as motion
+    :param motion: whether the robot's own safety counts the topic as motion
     """
 
-    type: str
-    rules: Rules
-    description: link.Describe
-    publication: Publication
-    motion: bool
+    __slots__ = ("description", "motion", "publication", "rules", "type")
+
+    def __init__(
+        self, type: str, rules: Rules, description: link.Describe, publication: Publication, motion: bool
+    ) -> None:
+        self.type = type
+        self.rules = rules
+        self.description = description
+        self.publication = publication
+        self.motion = motion
 
 
 class Publishing:

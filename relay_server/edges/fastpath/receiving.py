@@ -11,6 +11,7 @@ others have had their turn, and nothing more is read from it until then.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 from autobahn.twisted.websocket import WebSocketServerProtocol
 from twisted.logger import Logger
@@ -55,6 +56,8 @@ class FastProtocol(WebSocketServerProtocol):
     """
 
     log = Logger()
+    takes_text: Callable[[bytes], object] | None = None
+    """Gets the text messages read here, if it is set; else ``onMessage`` does."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -110,7 +113,10 @@ class FastProtocol(WebSocketServerProtocol):
                 payload = apply_mask(payload, data[start - 4 : start])
                 at = end
                 if first == _TEXT:
-                    self.onMessage(payload, False)
+                    if self.takes_text is None:
+                        self.onMessage(payload, False)
+                    else:
+                        self.takes_text(payload)
                 else:
                     self.onPong(payload)
             else:
