@@ -62,7 +62,7 @@ class Channel:
         self._platform = platform
         self._motion = motion
         self._wall = wall
-        self._sending = Sending(wire, clock, frame_limit)
+        self._sending = Sending(wire, clock, platform.after_samples, frame_limit)
         self.uplink = self._sending.uplink
         self._listening: dict[int, _Listening] = {}
         self._publishing: dict[int, _Publishing] = {}

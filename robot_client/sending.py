@@ -2,51 +2,71 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from relay_protocol.limits import KIB
 from robot_client.reactors import Clock, Timer
 from robot_client.uplink import Uplink
 from robot_client.wire import Wire
 
 CHUNK = 64 * KIB
+AT_ONCE = 8
+"""Chunks written before others have their turn on the reactor: a link that takes all is no reason to keep it."""
 
 
 class Sending:
     """The uplink of one channel, with its timers.
 
+    :param after: takes what is to be called when the samples that came together are all there; they share a write
     :param frame_limit: largest frame the relay takes, bytes
     """
 
-    def __init__(self, wire: Wire, clock: Clock, frame_limit: int) -> None:
+    def __init__(
+        self, wire: Wire, clock: Clock, after: Callable[[Callable[[], None]], None], frame_limit: int
+    ) -> None:
         self.uplink = Uplink(clock.seconds, frame_limit)
         self._wire = wire
         self._clock = clock
+        self._after = after
+        self._awaited = False
+        self._closed = False
         self._flush: Timer | None = None
         self._release: Timer | None = None
 
     def offer(self, number: int, stamp: int, body: bytes) -> None:
         """Take one sample; see :meth:`robot_client.uplink.Uplink.offer`."""
         self.uplink.offer(number, stamp, body)
-        self._soon()
-        self.arm()
+        if self.uplink.throttled:
+            self.arm()
+        if not self._awaited and self.uplink.ready and not self.uplink.paused:
+            self._awaited = True
+            self._after(self._all_there)
 
     def end(self, number: int) -> None:
         """End a subscription; see :meth:`robot_client.uplink.Uplink.close`."""
         self.uplink.close(number)
-        self._soon()
+        self.flush()
 
     def flush(self) -> None:
         """Write what waits, as far as the transport takes it."""
+        if self._closed:
+            return
         if self._flush is not None and self._flush.active():
             self._flush.cancel()
         self._flush = None
-        while chunk := self.uplink.take(CHUNK):
-            self._wire.write(chunk)
-        if self.uplink.paused:
-            self.uplink.trim()
+        for _ in range(AT_ONCE):
+            if not self.uplink.ready or self.uplink.paused:
+                return
+            chunk = self.uplink.take(CHUNK)
+            if chunk:
+                self._wire.write(chunk)
+        if self.uplink.ready and not self.uplink.paused:
+            self._flush = self._clock.callLater(0, self.flush)
 
     def pause(self) -> None:
         """The transport is full."""
         self.uplink.paused = True
+        self.uplink.trim()
 
     def resume(self) -> None:
         """The transport has room again."""
@@ -55,6 +75,7 @@ class Sending:
 
     def close(self) -> None:
         """Write no more."""
+        self._closed = True
         for timer in (self._flush, self._release):
             if timer is not None and timer.active():
                 timer.cancel()
@@ -70,10 +91,9 @@ class Sending:
         if due is not None:
             self._release = self._clock.callLater(max(0.0, due - self._clock.seconds()), self._let_go)
 
-    def _soon(self) -> None:
-        if self._flush is None and self.uplink.ready and not self.uplink.paused:
-            # Zero seconds: after all samples of this turn of the reactor, so they share a write.
-            self._flush = self._clock.callLater(0, self.flush)
+    def _all_there(self) -> None:
+        self._awaited = False
+        self.flush()
 
     def _let_go(self) -> None:
         self._release = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import sys
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import Any, Protocol
 from twisted.internet.interfaces import IPushProducer
 from twisted.internet.protocol import Protocol as TwistedProtocol
 from twisted.internet.protocol import connectionDone
+from twisted.internet.tcp import Client
 from twisted.python.failure import Failure
 from zope.interface import implementer  # type: ignore[import-untyped]
 
@@ -26,8 +28,8 @@ _UNSENT = 64 * KIB
 """Bytes the kernel may hold unsent; more would be delay nobody sees."""
 
 _UNWRITTEN = 32 * KIB
-"""Bytes written to the transport that make it pause: with one part of a large sample it is full, so that nothing small
-has to wait behind a second one.
+"""Bytes written to TLS that make it pause: one part of a large sample fills it, and nothing small has to wait behind
+a second one. A plain connection pauses with the first byte the socket does not take.
 """
 
 _TCP_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", 25 if sys.platform == "linux" else None)
@@ -71,13 +73,14 @@ class LinkProtocol(TwistedProtocol):
         self._clock = clock
         self._ping: Timer | None = None
         self._deadline: Timer | None = None
+        self._socket: socket.socket | None = None
         self._heard = False
         self._patience: Timer | None = None
         self._reason: SwitchboardError | None = None
 
     def connectionMade(self) -> None:
         """The connection stands."""
-        tune(self.transport, self.link.heartbeat * 3)
+        self._socket = tune(self.transport, self.link.heartbeat * 3)
         self.transport.registerProducer(self, True)
         self._deadline = self._clock.callLater(UNPROVEN_SECONDS, self._too_slow)
         self.link.begin()
@@ -116,12 +119,34 @@ class LinkProtocol(TwistedProtocol):
         """Write what the link has to say."""
         out = self.link.take()
         if out and self.transport is not None:
-            self.transport.write(b"".join(out))
+            self._put(b"".join(out))
 
     def write(self, frames: list[bytes]) -> None:
         """Write sample frames behind all that was said before."""
-        self.flush()
-        self.transport.writeSequence(frames)
+        out = self.link.take()
+        self._put(b"".join([*out, *frames]))
+
+    def _put(self, data: bytes) -> None:
+        """Write at once where that can be.
+
+        Twisted keeps what is written until the reactor has found the socket writable: a turn and two calls to the
+        kernel more for each sample. ``_tempDataLen`` (written, not yet joined) and ``dataBuffer`` (being sent) are all
+        it keeps.
+        """
+        transport = self.transport
+        if self._socket is None or transport.disconnecting:
+            transport.write(data)
+            return
+        if not (transport._tempDataLen or transport.dataBuffer):
+            with contextlib.suppress(OSError):  # full, or broken: Twisted finds out which, and tells
+                data = data[self._socket.send(data) :]
+            if not data:
+                return
+        transport.write(data)
+        if not transport.producerPaused:
+            # Twisted would take some more first; what is small would wait behind it.
+            transport.producerPaused = True
+            self.owner.on_pause()
 
     def end(self, reason: SwitchboardError, gently: bool = False) -> None:
         """Close the connection; ``gently`` lets what was written leave first."""
@@ -172,21 +197,25 @@ class LinkProtocol(TwistedProtocol):
         self.owner.on_pause()
 
 
-def tune(transport: Any, patience: float) -> None:
+def tune(transport: Any, patience: float) -> socket.socket | None:
     """Set what the kernel should do: no delay, no long silent retries, little data unsent.
 
     :param patience: seconds after which unacknowledged data means the connection is lost
+    :return: the socket, if bytes may be put on it as they are
     """
     found = _tcp_of(transport)
     if found is None:
-        return
+        return None
     connection, handle = found
-    connection.bufferSize = _UNWRITTEN
     handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     handle.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in ((_TCP_USER_TIMEOUT, int(patience * 1000)), (_TCP_NOTSENT_LOWAT, _UNSENT)):
         if option is not None:
             handle.setsockopt(socket.IPPROTO_TCP, option, value)
+    plain = connection is transport and type(transport) is Client and not transport.TLS
+    if not plain:
+        connection.bufferSize = _UNWRITTEN
+    return handle if plain else None
 
 
 def _tcp_of(transport: Any) -> tuple[Any, socket.socket] | None:

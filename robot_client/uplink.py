@@ -71,6 +71,7 @@ class Uplink:
         self._ends: list[bytes] = []
         self._serial = 0
         self._size = 0
+        self._held = 0
 
     def open(self, number: int, throttle: float = 0.0, latched: bool = False) -> None:
         """Begin a subscription, or change the throttle (seconds) of one."""
@@ -87,6 +88,7 @@ class Uplink:
         lane = self._lanes.pop(number, None)
         if lane is None:
             return
+        self._held -= lane.held is not None
         for serial in lane.waiting:
             self._size -= len(self._pop(serial).body)
         if lane.large or lane.begun:
@@ -108,12 +110,20 @@ class Uplink:
         now = self._now()
         sample = _Sample(number, now, stamp, body)
         if lane.throttle and now < lane.next_at:
+            self._held += lane.held is None
             lane.held = sample
             return
         self._admit(lane, sample, now)
 
+    @property
+    def throttled(self) -> bool:
+        """Whether a sample is held back by a throttle."""
+        return self._held > 0
+
     def next_due(self) -> float | None:
         """When the next sample held back by a throttle may go, on the clock given; ``None`` for none."""
+        if not self._held:
+            return None
         return min((lane.next_at for lane in self._lanes.values() if lane.held), default=None)
 
     def release(self) -> None:
@@ -158,7 +168,9 @@ class Uplink:
         self._trim_all()
 
     def _admit(self, lane: _Lane, sample: _Sample, now: float) -> None:
-        lane.held = None
+        if lane.held is not None:
+            lane.held = None
+            self._held -= 1
         lane.next_at = now + lane.throttle
         self._serial += 1
         if lane.large or lane.begun or len(sample.body) > WHOLE:

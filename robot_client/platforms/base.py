@@ -174,6 +174,9 @@ class Platform(Protocol):
         :param on_change: called when :attr:`Source.latched` or :attr:`Source.publishers` changed
         """
 
+    def after_samples(self, call: Callable[[], None]) -> None:
+        """Call once when the samples that came together have all been passed on."""
+
     def resolve(self, topic: str, type: str) -> TypedTopic:
         """Name and type that :meth:`advertise` would use, however they are spelled.
 

@@ -192,6 +192,7 @@ class MemoryPlatform(Platform):
         self.definitions: dict[str, str] = {}
         self.charge: float | None = None
         self.running = False
+        self._after: list[Callable[[], None]] = []
 
     @property
     def dropped(self) -> int:
@@ -214,11 +215,19 @@ class MemoryPlatform(Platform):
         """The graph set."""
         return self.view
 
-    def emit(self, topic: str, body: bytes) -> None:
-        """Let a message appear on a topic."""
-        for source in list(self.sources):
-            if source.topic == topic:
-                source.on_sample(body)
+    def emit(self, topic: str, *bodies: bytes) -> None:
+        """Let messages appear on a topic, together."""
+        for body in bodies:
+            for source in list(self.sources):
+                if source.topic == topic:
+                    source.on_sample(body)
+        after, self._after = self._after, []
+        for call in after:
+            call()
+
+    def after_samples(self, call: Callable[[], None]) -> None:
+        """Call at the end of what is emitted."""
+        self._after.append(call)
 
     def subscribe(
         self,

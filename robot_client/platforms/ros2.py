@@ -214,6 +214,10 @@ class Ros2Platform(Platform):
         self._sources.append(source)
         return source
 
+    def after_samples(self, call: Callable[[], None]) -> None:
+        """Call when the batch from the executor's thread is done."""
+        self._hop.after(call)
+
     def resolve(self, topic: str, type: str) -> TypedTopic:
         """Expand the name; the type is what others in the graph use, else what is asked for."""
         full = check_name(self._node.resolve_topic_name, topic, "topic")

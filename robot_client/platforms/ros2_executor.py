@@ -131,6 +131,11 @@ class Hop:
         self._size = 0
         self._lock = threading.Lock()
         self._scheduled = False
+        self._after: list[Callable[[], None]] = []
+
+    def after(self, call: Callable[[], None]) -> None:
+        """Call once at the end of the batch that is being passed on; on the reactor's thread."""
+        self._after.append(call)
 
     def put(self, function: Callable[[Any], None], argument: Any, size: int = 0) -> None:
         """Have ``function(argument)`` called on the reactor's thread; from any thread.
@@ -158,3 +163,9 @@ class Hop:
                 function(argument)
             except Exception:  # one receiver's fault must not lose the others their samples
                 Logger("ros2").failure("a sample could not be passed on")
+        after, self._after = self._after, []
+        for call in after:
+            try:
+                call()
+            except Exception:
+                Logger("ros2").failure("samples could not be passed on")

@@ -32,7 +32,7 @@ class SlowLink:
     def __init__(self) -> None:
         self.clock = Clock()
         self.order: list[tuple[int, int]] = []
-        self.sending = Sending(self, self.clock, 2**24)
+        self.sending = Sending(self, self.clock, lambda call: call(), 2**24)
         self.sending.uplink.open(1)
         self.sending.uplink.open(2)
 
@@ -138,7 +138,7 @@ async def test_what_is_small_overtakes_a_picture_on_a_real_connection(listener: 
     relay.settimeout(20)
     try:
         wire = Wire(protocol)
-        robot.sending = Sending(wire, reactor, 2**24)
+        robot.sending = Sending(wire, reactor, lambda call: call(), 2**24)
         for number in (1, 2):
             robot.sending.uplink.open(number)
         relay.sendall(link.frame(link.Joined(channel="c", at=1)))
