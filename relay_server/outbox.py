@@ -31,9 +31,10 @@ class Parcel(Protocol):
 class _Queue:
     """Samples of one topic that wait, each with the moment it came."""
 
-    __slots__ = ("bytes", "samples")
+    __slots__ = ("bytes", "key", "samples")
 
-    def __init__(self) -> None:
+    def __init__(self, key: Hashable) -> None:
+        self.key = key
         self.samples: deque[tuple[float, int, bytes | Parcel]] = deque()
         self.bytes = 0
 
@@ -59,6 +60,8 @@ class Outbox:
         self._closed = False
         self.paused_since: float | None = None
         self.dropped = 0
+        self.drops: dict[Hashable, int] = {}
+        """Samples dropped of each topic that was not forgotten since."""
 
     @property
     def waiting_bytes(self) -> int:
@@ -120,7 +123,9 @@ class Outbox:
                 self.write(message)
             return
         size = len(parcel) if isinstance(parcel, bytes) else parcel.size
-        queue = self._data.setdefault(key, _Queue())
+        queue = self._data.get(key)
+        if queue is None:
+            queue = self._data[key] = _Queue(key)
         queue.samples.append((self._seconds(), size, parcel))
         queue.bytes += size
         self._data_bytes += size
@@ -141,6 +146,7 @@ class Outbox:
 
     def forget(self, key: Hashable) -> None:
         """Let go of what waits of this topic."""
+        self.drops.pop(key, None)
         queue = self._data.pop(key, None)
         if queue is not None:
             self._data_bytes -= queue.bytes
@@ -164,6 +170,7 @@ class Outbox:
     def _drop_oldest(self, queue: _Queue) -> None:
         self._take(queue)
         self.dropped += 1
+        self.drops[queue.key] = self.drops.get(queue.key, 0) + 1
 
     def _take(self, queue: _Queue) -> bytes | Parcel:
         _, size, parcel = queue.samples.popleft()

@@ -58,7 +58,9 @@ class RelayNode:
             "clients": [{"user": each.name, "since": each.since} for each in self._sessions(robot.robot_id)],
             "rtt_ms": {"client_relay": milliseconds(session.rtt), "relay_robot": milliseconds(robot.rtt)},
             "drops": session.outbox.dropped,
-            "topic_drops": [],
+            "topic_drops": [
+                {"topic": topic, "drops": drops} for topic, drops in session.listening.drops().items()
+            ],
             "refusals": session.refusals,
             "stale_commands": session.stale_commands,
             "uplink": self._uplink(session),

@@ -81,6 +81,13 @@ class Listening:
             return
         self._drop(topic)
 
+    def drops(self) -> dict[str, int]:
+        """Samples the client did not take in time, by topic."""
+        counted = self._session.outbox.drops
+        return {
+            topic: counted[listener] for topic, listener in self._listeners.items() if listener in counted
+        }
+
     def rights_changed(self) -> None:
         """What the client may not hear any more ends."""
         for topic in list(self._listeners):

@@ -210,3 +210,19 @@ def test_the_account_of_waiting_bytes_never_drifts(steps: list[tuple[str, int, i
         assert sum(map(len, box._control)) <= module.CONTROL_BYTES
     receiver.resume()
     assert box.waiting_bytes == 0
+
+
+def test_drops_are_counted_by_topic() -> None:
+    """However they came about; what is forgotten is counted from zero again."""
+    receiver = Receiver()
+    outbox = receiver.outbox
+    outbox.pause()
+    for number in range(3):
+        outbox.data("a", b"%d" % number, 1)
+        outbox.data("b", b"%d" % number)
+    receiver.now += module.DATA_AGE * 2
+    outbox.resume()
+    assert outbox.drops == {"a": 2, "b": 2}
+    assert outbox.dropped == 4
+    outbox.forget("a")
+    assert outbox.drops == {"b": 2}

@@ -10,7 +10,7 @@ from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.local.catalogue import SERVICES, STATUS, TYPES
 from tests.relay_server.local.asking import ask
-from tests.relay_server.memory import STRING, Person, World
+from tests.relay_server.memory import STRING, Person, World, text
 
 
 def test_ping_is_answered_at_once_or_after_a_round_trip(world: World, viewer: Person) -> None:
@@ -81,6 +81,30 @@ def test_status_tells_of_the_uplink(world: World, viewer: Person, operator: Pers
     viewer.says("subscribe", topic="/relay/status")
     (told,) = viewer.hears("publish")
     assert told["msg"]["uplink"] == {"state": "open", "subscribed": 1, "published": 1, "sim_time": False}
+
+
+def test_status_tells_of_which_topics_the_client_took_too_little(world: World, viewer: Person) -> None:
+    """Counted from the subscription on."""
+    viewer.says("subscribe", topic="/chatter", queue_length=1)
+    viewer.says("subscribe", topic="/cmd_vel")
+    viewer.says("subscribe", topic="/relay/status")
+    chatter = next(each for each in world.link.all(link.Subscribe) if each.topic == "/chatter")
+    world.define()
+    world.subscribed(chatter.number)
+    viewer.session.pause()
+    for words in "abc":
+        world.channel.sample(chatter.number, text(words), 0)
+    viewer.session.resume()
+    viewer.client.take()
+    world.clock.advance(1.0)
+    (told,) = viewer.hears("publish")
+    assert told["msg"]["drops"] == 2
+    assert told["msg"]["topic_drops"] == [{"topic": "/chatter", "drops": 2}]
+    viewer.says("unsubscribe", topic="/chatter")
+    viewer.says("subscribe", topic="/chatter")
+    viewer.client.take()
+    world.clock.advance(1.0)
+    assert viewer.hears("publish")[-1]["msg"]["topic_drops"] == []
 
 
 def test_status_can_be_denied(viewer: Person) -> None:
