@@ -142,7 +142,12 @@ class Publications:
         if publication.phase in (Phase.WAITING, Phase.FAILED) or self._untyped(publication):
             return None
         if self._wire.cdr:
-            write, now_ns = self._wire.robot.types.writer(publication.type, checked=True), self._now_ns
+            try:
+                write, now_ns = self._wire.robot.types.writer(publication.type, checked=True), self._now_ns
+            except SwitchboardError as error:
+                # The robot said it was known: it told of a service's type, or of something else that is no message.
+                self.refused(publication.number, str(error))
+                return None
             publication.encode = lambda body: write(body, now_ns())
         else:
             publication.encode = _as_it_came

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
+from relay_protocol.errors import Invalid
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server import closing
 from relay_server.channel import subscriptions
@@ -323,6 +324,18 @@ def test_types_in_the_habit_of_ros_1_are_understood() -> None:
     assert normal_type("std_srvs/Trigger", "srv") == "std_srvs/srv/Trigger"
     assert normal_type(STRING) == STRING
     assert normal_type(None) == normal_type("") == ""
+
+
+def test_a_type_of_another_kind_is_told_at_once() -> None:
+    """A topic of a service's type can't be; what an action is made of are messages and services all the same."""
+    with pytest.raises(
+        Invalid, match="std_srvs/srv/Trigger is the type of services; here it must be one of messages"
+    ):
+        normal_type("std_srvs/srv/Trigger")
+    with pytest.raises(Invalid, match="must be one of actions"):
+        normal_type(STRING, "action")
+    feedback = "example_interfaces/action/Fibonacci_FeedbackMessage"
+    assert normal_type(feedback) == feedback
 
 
 def test_the_number_of_topics_of_one_client_is_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 from relay_protocol import link
 from relay_protocol.link import QoS
 from relay_server.channel import publications as module
-from tests.relay_server.memory import STRING, TWIST, Person, World, words
+from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World, words
 
 
 def at_work(world: World) -> Person:
@@ -276,3 +276,16 @@ def test_what_one_client_makes_the_relay_hold_is_bounded(world: World) -> None:
     assert len([words for words in told(person) if "too much waits" in words]) == 2
     person.session.end()
     assert world.channel.publications._topics == {}
+
+
+def test_a_robot_that_calls_a_service_s_type_a_topic_s_harms_nobody(world: World) -> None:
+    """Its link goes on; who publishes is told."""
+    graph = link.Graph(full=True, topics={"/odd": link.Topic(types=[TRIGGER], subscribers=["/base"])})
+    world.robot_comes(graph=graph)
+    person = world.person()
+    world.robot_joins()
+    person.says("set_level", level="error")
+    person.says("publish", topic="/odd", msg={})
+    world.define()
+    assert "is not known" in person.hears("status")[0]["msg"]
+    assert world.link.closed is None
