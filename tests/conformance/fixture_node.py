@@ -275,9 +275,9 @@ class Fixture(Node):
 
     def do_goal(self, action: str, type_name: str, text: str, cancel: str = "0") -> list[str]:
         """Pursue a goal on an action somebody else offers, cancelled after the first feedback if ``cancel`` is 1;
-        a JSON of ``accepted``, ``status``, ``feedback`` and ``result``."""
+        a JSON of ``accepted``, ``status``, ``feedback`` and ``result``. Feedback can be ``heard`` meanwhile."""
         type_ = load(type_name)
-        feedback: list[Any] = []
+        feedback = self._heard[action] = []
         client = ActionClient(self, type_, action, callback_group=self._group)
         try:
             if not client.wait_for_server(PATIENCE):

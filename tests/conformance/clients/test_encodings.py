@@ -9,6 +9,7 @@ import time
 import zlib
 
 import cbor2
+import pytest
 from conformance_suite import NO_STATUS, SPEC_ONLY, Hand, Server, case
 from rosbridge_client import Client, png_text, strict_json
 
@@ -166,20 +167,50 @@ def test_fragment_in_of_two_clients(client: Client, server: Server) -> None:
         assert other.until("service_response", id="others")["result"] is True
 
 
+BAD = {
+    "num is total": [{"data": "{}", "num": 2, "total": 2}],
+    "num below 0": [{"data": "{}", "num": -1, "total": 2}],
+    "total 0": [{"data": "{}", "num": 0, "total": 0}],
+    "total no number": [{"data": "{}", "num": 0, "total": "two"}],
+    "no data": [{"data": "", "num": 0, "total": 2}],
+    "text that is no message": [{"data": "no JSON", "num": 0, "total": 1}],
+    "total changes": [{"data": "{", "num": 0, "total": 2}, {"data": "}", "num": 1, "total": 3}],
+    "a num twice": [{"data": "{", "num": 0, "total": 3}, {"data": "{", "num": 0, "total": 3}],
+    "a fragment inside": [
+        {"data": '{"op":"fragment","id":"in","data":"{}","num":0,"total":1}', "num": 0, "total": 1}
+    ],
+}
+
+
 @case("fragment", "SPEC 1.6 and 1.3", suite=NO_STATUS)
-def test_fragment_in_nonsense(told: Client) -> None:
-    """Fragments that make no sense are told in words: numbers out of range, text that is no message."""
-    bad = [
-        {"id": "b1", "data": "{}", "num": 2, "total": 2},
-        {"id": "b2", "data": "{}", "num": -1, "total": 2},
-        {"id": "b3", "data": "{}", "num": 0, "total": 0},
-        {"id": "b4", "data": "no JSON", "num": 0, "total": 1},
-        {"id": "b5", "data": "{}", "num": 0, "total": "two"},
-    ]
-    for fields in bad:
-        told.send("fragment", **fields)
-        assert told.until("status", level="error")["msg"], fields
+@pytest.mark.parametrize("what", BAD)
+def test_fragment_in_nonsense(told: Client, what: str) -> None:
+    """Fragments that make no sense are refused in words, and the connection lives."""
+    for fields in BAD[what]:
+        told.send("fragment", id="nonsense", **fields)
+    assert told.until("status", level="error")["msg"]
     told.lives()
+
+
+@case("fragment", "SPEC 1.6, dropped until num 0")
+def test_fragment_in_again(client: Client) -> None:
+    """After a message in fragments that made no sense one with the same id is joined."""
+    client.send("fragment", id="again", data="{", num=0, total=2)
+    client.send("fragment", id="again", data="}", num=1, total=3)
+    for part in cut(invert("sense"), 3, "again"):
+        client.send(**part)
+    assert client.until("service_response", id="sense")["result"] is True
+
+
+@case("fragment", "SPEC 1.6, less than 64 counts as 64", suite=SPEC_ONLY)
+def test_fragment_size_tiny(server: Server, hand: Hand, topic: str) -> None:
+    """A fragment_size below 64 counts as 64, told by a warning."""
+    with server.connect() as client:
+        client.send("set_level", level="warning")
+        subscribed(client, hand, topic, STRING, {"data": "x" * 500}, fragment_size=1)
+        assert client.until("status", level="warning")["msg"]
+        parts = client.fragments()
+        assert max(len(part["data"]) for part in parts) == 64
 
 
 @case("fragment", "SPEC 1.6, 16 messages at a time", suite=SPEC_ONLY)
@@ -210,6 +241,23 @@ def test_png_of_samples(client: Client, hand: Hand, topic: str) -> None:
     message = client.until("png")
     whole = strict_json(png_text(message["data"]))
     assert whole == {"op": "publish", "topic": topic, "msg": {"data": LONG}}
+
+
+@case("png", "SPEC 1.6, png", suite=SPEC_ONLY)
+def test_png_plain(client: Client, hand: Hand, topic: str) -> None:
+    """The picture is about square, has no chunk that is not needed, and its JSON is ASCII."""
+    subscribed(client, hand, topic, STRING, {"data": LONG}, compression="png")
+    data = client.until("png")["data"]
+    png = base64.b64decode(data)
+    kinds, at = [], 8
+    while at < len(png):
+        kinds.append(png[at + 4 : at + 8])
+        at += 12 + int.from_bytes(png[at : at + 4], "big")
+    assert set(kinds) == {b"IHDR", b"IDAT", b"IEND"}
+    width, height = int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
+    assert width == math.isqrt(len(png_text(data).encode()) // 3)
+    assert height >= width
+    assert png_text(data).isascii()
 
 
 @case("png", PNG)

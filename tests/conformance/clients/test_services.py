@@ -344,6 +344,33 @@ def test_offer_refuses(offer: Offer, server: Server) -> None:
         assert isinstance(answer["values"], str)
 
 
+@case("advertise_service", "SPEC 1.2, one that does not fit the type fails the call", suite=OWN_CALLS)
+def test_offer_answers_nonsense(offer: Offer, server: Server) -> None:
+    """An answer that does not fit the type makes the call fail in words, and the next one is answered."""
+    with server.connect() as other:
+        other.send("call_service", id="bad", service=offer.name, type=SET_BOOL, args={"data": True})
+        call = offer.called()
+        values = {"success": "perhaps", "colour": "blue"}
+        offer.client.send("service_response", service=offer.name, id=call["id"], result=True, values=values)
+        answer = other.until("service_response", id="bad")
+        assert answer["result"] is False
+        assert isinstance(answer["values"], str)
+        other.send("call_service", id="good", service=offer.name, type=SET_BOOL, args={"data": True})
+        offer.respond(offer.called(), "better")
+        assert other.until("service_response", id="good")["values"]["message"] == "better"
+
+
+@case("advertise_service", "SPEC 1.2, a call without an answer ends after its timeout", suite=OWN_CALLS)
+def test_offer_never_answers(offer: Offer, server: Server) -> None:
+    """A call the client never answers ends after its timeout, result false."""
+    with server.connect() as other:
+        other.send(
+            "call_service", id="lost", service=offer.name, type=SET_BOOL, args={"data": True}, timeout=0.3
+        )
+        offer.called()
+        assert other.until("service_response", id="lost")["result"] is False
+
+
 @case("advertise_service", "SPEC 1.2; a call is always answered", suite=OWN_CALLS)
 def test_offer_client_leaves(hand: Hand, client: Client, server: Server) -> None:
     """When the client that offers leaves during a call, the caller gets an answer, result false, and no hang."""

@@ -94,6 +94,29 @@ def test_subscribe_type_mismatch_lives(client: Client) -> None:
     client.lives()
 
 
+@case("subscribe", "SPEC 1.2 subscribe, under both names", suite=SPEC_ONLY)
+def test_subscribe_both_names(client: Client, hand: Hand, topic: str) -> None:
+    """Subscribed with and without leading slash, each sample comes under both names."""
+    hand.topic(topic, STRING)
+    for name in (topic, topic.lstrip("/")):
+        client.send("subscribe", topic=name, type=STRING)
+    client.lives()
+    hand.publish(topic, {"data": "twice"})
+    for name in (topic, topic.lstrip("/")):
+        assert client.until("publish", topic=name)["msg"] == {"data": "twice"}
+    client.none("publish")
+
+
+@case("subscribe", "SPEC 1.2 subscribe, with another type", suite=NO_STATUS)
+def test_subscribe_pending_other_type(told: Client, hand: Hand, topic: str) -> None:
+    """Who waits for a topic that appears with another type is told, and gets nothing."""
+    told.send("subscribe", topic=topic, type="std_msgs/msg/Int32")
+    told.lives()
+    hand.topic(topic, STRING)
+    assert told.until("status", level="error")["msg"]
+    told.none("publish")
+
+
 @case("subscribe", SUBSCRIBE)
 def test_subscribe_comes_back(client: Client, hand: Hand, topic: str) -> None:
     """A topic that vanishes and appears again goes on."""
