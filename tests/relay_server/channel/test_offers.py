@@ -69,7 +69,7 @@ def test_a_name_is_offered_once(world: World, kind: str) -> None:
     offer(person, kind)
     offer(other, kind)
     assert errors(other) == [f"another client offers the {kind} /mine already"]
-    offer(person, kind, type_name="std_srvs/srv/Empty")
+    offer(person, kind, type_name={"service": "std_srvs/srv/Empty", "action": "a_msgs/action/Other"}[kind])
     assert errors(person) == [f"you offer the {kind} /mine already"]
     world.robot.graph.actions["/walk"] = link.Service(types=[FIBONACCI], providers=["/legs"])
     taken = {"service": "/reset", "action": "/walk"}[kind]
