@@ -28,11 +28,20 @@ EVERY = settings(
     derandomize=True,
     database=None,
     deadline=None,
-    max_examples=8,
+    max_examples=5,
     phases=[Phase.explicit, Phase.generate],
     suppress_health_check=list(HealthCheck),
 )
 """A few messages of each of the many types, the same ones every time."""
+
+MORE = settings(EVERY, max_examples=25)
+"""For the types that have every kind of field."""
+
+
+def thorough(name: str) -> settings:
+    """How many messages of a type are tried."""
+    return MORE if name.startswith("switchboard_test_interfaces/msg") else EVERY
+
 
 PARTS = {"msg": [""], "srv": ["Request", "Response"], "action": ["Goal", "Result", "Feedback"]}
 REFERENCE = re.compile(r"\s*([A-Za-z]\w*(?:/\w+){0,2})(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")

@@ -12,7 +12,7 @@ import orjson
 import pytest
 from hypothesis import given, settings
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import EVERY, decoded, installed, messages, walk_message, whole_text
+from ros_messages import EVERY, decoded, installed, messages, thorough, walk_message, whole_text
 from rosbags.typesys import Stores, get_typestore
 
 from relay_protocol.ros import fast_reader, fast_writer
@@ -62,7 +62,7 @@ def test_messages_from_rclpy_are_read(name: str) -> None:
     fast = {form: fast_reader.generate(name, definitions, form, refuse) for form in ("json", "cbor")}
     slow = {form: ReaderFactory(definitions, "<", form == "cbor") for form in ("json", "cbor")}
 
-    @EVERY
+    @thorough(name)
     @given(messages(cls))
     def check(message: Any) -> None:
         cdr = serialize_message(message)
@@ -91,7 +91,7 @@ def test_messages_for_rclpy_are_written(name: str) -> None:
     cls, definitions = TYPES[name].cls, REGISTRY._types[name].definitions
     fast, slow = fast_writer.generate(name, definitions)(refuse), WriterFactory(definitions).writer(name)
 
-    @EVERY
+    @thorough(name)
     @given(messages(cls, finite=True))
     def check(message: Any) -> None:
         theirs = serialize_message(message)

@@ -13,7 +13,7 @@ import cbor2
 import pytest
 from hypothesis import given
 from rclpy.serialization import serialize_message
-from ros_messages import EVERY, bits, class_of, installed, messages, slots, whole_text
+from ros_messages import bits, class_of, installed, messages, slots, thorough, whole_text
 from rosidl_parser import definition as idl
 
 from relay_protocol.errors import Invalid
@@ -85,7 +85,7 @@ def drawn(name: str) -> list[tuple[Any, bytes]]:
     types, found = TypeRegistry(), list[tuple[Any, bytes]]()
     types.add(owner, whole_text(owner))
 
-    @EVERY
+    @thorough(name)
     @given(messages(cls))
     def collect(message: Any) -> None:
         found.append((message, types.to_cbor(name, serialize_message(message))))

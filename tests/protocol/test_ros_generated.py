@@ -324,7 +324,7 @@ def test_deep_texts_are_refused_by_generated_code_too() -> None:
 
 def test_short_texts_can_not_become_many_large_structs() -> None:
     """A megabyte of ``{}`` is not given to generated code where each would become an object of many fields."""
-    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\n" + many_fields(400))
+    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\n" + many_fields(300))
     write = fast_writer.generate(TYPE, compiled.definitions)(passed)
     assert write(b'{"t":[{},{}]}', 0)
     with pytest.raises(Passed):

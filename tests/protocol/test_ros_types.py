@@ -9,6 +9,7 @@ import struct
 import tracemalloc
 from typing import Any
 
+import cbor2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -250,7 +251,7 @@ def test_defaults_of_the_definition_are_used() -> None:
         ("f64", '"1"', "f64 must be a number, not a string"),
         ("f64", "true", "f64 must be a number, not a boolean"),
         ("f64", "1" * 5000, "out of range"),
-        ("f64", "1" * 400, "f64 is out of range for float64"),
+        ("f64", "1" * 400, "can't be read"),
         ("f32", "1e39", "f32 is out of range for float32"),
         ("singles", "[1, 1e39]", "singles[1] is out of range for float32"),
         ("i32", "2147483648", "i32 is out of range for int32"),
@@ -377,6 +378,119 @@ def test_service_arguments_come_by_name_by_order_or_not_at_all() -> None:
             types.args_from_json("a/srv/Add", body, 0)
     with pytest.raises(Invalid, match="b must be an integer"):
         types.args_from_json("a/srv/Add", b'[1,"2"]', 0)
+
+
+ACTION = "int32 order\nInner[] inners\n---\nint32[] sequence\nstring OK=yes\n---\nfloat32 done 0.5\n"
+ACTION += f"{LINE}\nMSG: a/Inner\nfloat64 x\n"
+
+
+def test_the_parts_of_an_action_are_messages() -> None:
+    """Goal, result and feedback are converted both ways under names of their own."""
+    types = TypeRegistry()
+    types.add("a/action/Count", ACTION)
+    goal = b'{"order":5,"inners":[{"x":1.5}]}'
+    for name, text in (("Goal", goal), ("Result", b'{"sequence":[0,1]}'), ("Feedback", b'{"done":0.25}')):
+        part = f"a/action/Count_{name}"
+        assert types.knows(part)
+        assert types.to_json(part, types.from_json(part, text, 0)) == text
+        assert cbor2.loads(types.to_cbor(part, types.zero(part))).keys() == json.loads(text).keys()
+    assert types.knows("a/action/Count")
+    assert types.to_json("a/action/Count_Feedback", types.zero("a/action/Count_Feedback")) == b'{"done":0.5}'
+    assert types.definition("a/action/Count") == ACTION
+    with pytest.raises(NotFound):
+        types.to_json("a/action/Count", b"")
+
+
+def test_goals_come_by_name_by_order_or_not_at_all() -> None:
+    """The arguments of an action are given like those of a service."""
+    types = TypeRegistry()
+    types.add("a/action/Count", ACTION)
+    wanted = types.from_json("a/action/Count_Goal", {"order": 5, "inners": [{"x": 2.0}]}, 0)
+    for name in ("a/action/Count", "a/Count", "a/action/Count_Goal"):
+        assert types.args_from_json(name, b'{"inners":[{"x":2}],"order":5}', 0) == wanted
+        assert types.args_from_json(name, b'[5,[{"x":2}]]', 0) == wanted
+        assert types.args_from_json(name, [5, [{"x": 2}]], 0) == wanted
+        assert types.args_from_json(name, None, 0) == types.zero("a/action/Count_Goal")
+    with pytest.raises(Invalid, match="a/action/Count_Goal has 2 arguments, not 3"):
+        types.args_from_json("a/action/Count", [1, [], 3], 0)
+
+
+def test_typedefs_of_the_parts_of_actions_and_services() -> None:
+    """Each part is a type of its own to rosapi, with what it contains behind it."""
+    types = TypeRegistry()
+    types.add("a/action/Count", ACTION)
+    types.add("std_srvs/srv/Trigger", TRIGGER)
+    goal, inner = types.typedefs("a/action/Count_Goal")
+    assert goal == {
+        "type": "a/Count_Goal",
+        "fieldnames": ["order", "inners"],
+        "fieldtypes": ["int32", "a/Inner"],
+        "fieldarraylen": [-1, 0],
+        "examples": ["0", "[]"],
+        "constnames": [],
+        "constvalues": [],
+    }
+    assert inner["type"] == "a/Inner"
+    (result,) = types.typedefs("a/action/Count_Result")
+    assert (result["constnames"], result["constvalues"]) == (["OK"], ["yes"])
+    (feedback,) = types.typedefs("a/action/Count_Feedback")
+    assert feedback["examples"] == ["0.5"]
+    (response,) = types.typedefs("std_srvs/srv/Trigger_Response")
+    assert response["fieldnames"] == ["success", "message"]
+
+
+def test_readers_and_writers_are_kept_until_the_type_changes() -> None:
+    """They are made once, for like robots together; another definition brings others, the old stay what they were."""
+    types, other = registry(B="int8 a"), registry(B="int8 a")
+    read, write = types.reader("a/msg/B", "json"), types.writer("a/B", checked=True)
+    assert types.reader("a/B", "json") is read is other.reader("a/msg/B", "json")
+    assert types.writer("a/msg/B", checked=True) is write
+    types.add("a/msg/B", "int16 b")
+    assert types.reader("a/msg/B", "json")(types.writer("a/msg/B")(b'{"b":300}', 0)) == b'{"b":300}'
+    assert read(write(b'{"a":3}', 0)) == b'{"a":3}'
+
+
+@pytest.mark.parametrize(
+    "ask", [lambda types: types.reader("a/msg/X", "cbor"), lambda types: types.writer("a/msg/X")]
+)
+def test_there_is_no_reader_or_writer_of_an_unknown_type(ask: Any) -> None:
+    """Asking for one is NotFound, not the first message."""
+    with pytest.raises(NotFound, match="the definition of a/msg/X is not known"):
+        ask(registry(B="int8 a"))
+
+
+@pytest.mark.parametrize("checked", [False, True])
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b'{"a":1}x',
+        b'{"a":"\xff"}',
+        b'{"b":1}',
+        b'{"a":NaN}',
+        b'{"a":1e999}',
+        [1],
+        5,
+    ],
+)
+def test_a_writer_raises_invalid_for_whatever_is_no_message(checked: bool, body: Any) -> None:
+    """Texts and values, checked before or not."""
+    with pytest.raises(Invalid, match="a/msg/B"):
+        registry(B="string a").writer("a/msg/B", checked)(body, 0)
+
+
+def test_a_writer_is_strict_unless_the_text_was_checked() -> None:
+    """Where the closures decode, an unchecked text is looked at as a whole."""
+    types = registry(B="string a", C="\n".join(f"string f{number}" for number in range(1000)))
+    deep = b'{"a":' + b"[" * 70 + b"]" * 70 + b"}"
+    for name in ("a/msg/B", "a/msg/C"):
+        with pytest.raises(Invalid, match="deeper than 64"):
+            types.writer(name)(deep, 0)
+    with pytest.raises(Invalid, match="a must be a string, not an array"):
+        types.writer("a/msg/B", checked=True)(deep, 0)
 
 
 def test_an_empty_request_is_one_byte() -> None:

@@ -114,5 +114,5 @@ class Compiled:
 def _decode(text: bytes) -> Any:
     try:
         return _ANY.decode(text)
-    except (msgspec.DecodeError, RecursionError, ValueError) as error:
-        raise MalformedMessage(f"the message is not JSON: {error}") from None
+    except jsontext.FAULTS as error:
+        raise jsontext.malformed(error, Any) from None

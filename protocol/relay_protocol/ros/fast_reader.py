@@ -79,16 +79,26 @@ def generate(name: str, definitions: dict[str, Definition], form: str, slow: Rea
 
 
 def _generated(name: str, definitions: dict[str, Definition], form: str, slow: Read) -> Read:
-    source = Source()
     if form == "cbor":
-        _Walk(definitions, source, CborForm(source)).run(name)
-        return source.function("data")(slow)
-    try:
-        _Walk(definitions, source, PlainJsonForm(source, Structs(definitions))).run(name)
-    except HoldsArrays:
         source = Source()
-        _Walk(definitions, source, JsonForm(source)).run(name)
+        _Walk(definitions, source, CborForm(source)).run(name)
+    else:
+        source = _json_source(name, definitions)
     return source.function("data")(slow)
+
+
+def _json_source(name: str, definitions: dict[str, Definition]) -> Source:
+    # Structs are cheaper than dicts where messages are nested, but orjson writes arrays and long texts faster.
+    if any(field.type.primitive is None for field in definitions[name].fields):
+        source = Source()
+        try:
+            _Walk(definitions, source, PlainJsonForm(source, Structs(definitions))).run(name)
+            return source
+        except HoldsArrays:
+            pass
+    source = Source()
+    _Walk(definitions, source, JsonForm(source)).run(name)
+    return source
 
 
 class _Walk(Cursor, Generic[V]):
@@ -137,7 +147,8 @@ class _Walk(Cursor, Generic[V]):
         codec, slots = found
         targets = "".join(f"{slot}, " for slot in slots)
         unpack = self.source.constant(codec.unpack_from)
-        self.source.line(f"{targets + '= ' if targets else ''}{unpack}(data, {self._place()})")
+        place = "" if first else f", {self._place()}"
+        self.source.line(f"{targets + '= ' if targets else ''}{unpack}(data{place})")
         self._taken += codec.size
         if first:
             self.source.line(f"if {slots[0]} != {_HEAD_WORD}: raise Unusual")

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-MAX_STEPS = 600
+MAX_STEPS = 400
 """Most values a generated function handles one by one; larger types stay with the closures."""
 
 MAX_LOOPS = 8
