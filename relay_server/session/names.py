@@ -21,7 +21,5 @@ def normal_type(name: str | None, kind: str = "msg") -> str:
     full = normalise(f"{package}/{kind}/{rest}" if slash and "/" not in rest else name)
     has, short = full.split("/")[1:]
     if has != kind and "_" not in short:
-        raise Invalid(
-            f"{full} is the type of {_WORDS.get(has, has)}s; here it must be one of {_WORDS[kind]}s"
-        )
+        raise Invalid(f"{full} is no {_WORDS[kind]} type")
     return full
