@@ -10,6 +10,14 @@ from relay_server.channel.definitions import Definitions
 from relay_server.channel.listener import Listener
 from relay_server.channel.topics import Phase, TopicUplink
 from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire
+from relay_server.clock import cancel
+
+RETRY_SECONDS = 0.25
+LONGEST_RETRY_SECONDS = 30.0
+"""Pauses before a robot that refused a topic it has is asked again; each is twice the one before."""
+
+PATIENCE = 2
+"""Refusals that are told to nobody when a topic has just got another type."""
 
 
 class Subscriptions:
@@ -155,8 +163,6 @@ class Subscriptions:
         uplink = self._numbers.get(message.number)
         if uplink is not None:
             uplink.activate(message.type, message.encoding, message.latched, message.publishers)
-            if message.publishers:
-                self._know(uplink, message.type)
             if message.encoding == "cdr":
                 self._definitions.want(message.type)
 
@@ -167,8 +173,18 @@ class Subscriptions:
         if uplink is None:
             return
         uplink.phase = Phase.FAILED
-        for member in list(uplink.listeners):
-            member.tell("error", f"subscribe {uplink.topic}: {reason}")
+        if uplink.refusals == uplink.patience:
+            for member in list(uplink.listeners):
+                member.tell("error", f"subscribe {uplink.topic}: {reason}")
+        if uplink.certain:
+            self._try_again(uplink)
+
+    def _try_again(self, uplink: TopicUplink) -> None:
+        """A topic that is there as we say can be had later: some middleware must let go of its former type first."""
+        pause = min(RETRY_SECONDS * 2.0 ** min(uplink.refusals, 10), LONGEST_RETRY_SECONDS)
+        uplink.refusals += 1
+        cancel(uplink.retry)
+        uplink.retry = self._wire.clock.callLater(pause, self._ask, uplink)
 
     def type_refused(self, type_name: str, reason: str) -> None:
         """A type is not to be had: its topics can't be shown, but to those who want them as they are."""
@@ -221,7 +237,9 @@ class Subscriptions:
 
     def _retype(self, uplink: TopicUplink, type_name: str) -> None:
         """Let the topic begin anew with another type, under a number of its own: samples may be under way."""
+        had_it = uplink.phase in (Phase.ASKED, Phase.ACTIVE)
         self._unsubscribe(uplink)
+        uplink.patience = PATIENCE if had_it else 0
         del self._numbers[uplink.number]
         self._wire.names -= 1
         uplink.number = self._wire.number()

@@ -13,6 +13,7 @@ from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
 from relay_server.channel.wire import Member
+from relay_server.clock import Timer, cancel
 
 LATCHED_KEPT = 64
 """Most latched samples kept for late joiners of one topic (one for each publisher)."""
@@ -58,6 +59,11 @@ class TopicUplink:
         self.throttle_ms = 0
         self.encoding = "cdr"
         self.latched = False
+        self.refusals = 0
+        """How often the robot has refused to subscribe since it last did."""
+        self.patience = 0
+        """Refusals that are nothing to tell yet."""
+        self.retry: Timer | None = None
         self.failures = 0
         self.listeners: dict[Member, Listener] = {}
         self.wanted: dict[Member, str] = {}
@@ -111,11 +117,13 @@ class TopicUplink:
     def asked(self) -> None:
         """The robot has been asked to subscribe."""
         self.phase = Phase.ASKED
+        cancel(self.retry)
         self._converter = self._new_converter()
 
     def activate(self, type_name: str, encoding: str, latched: bool, publishers: int) -> None:
         """The robot has subscribed."""
         self.phase = Phase.ACTIVE
+        self.refusals = 0
         if (type_name, encoding) != (self.type, self.encoding):
             self._forget()
         self.encoding = encoding
@@ -132,6 +140,8 @@ class TopicUplink:
     def reset(self) -> None:
         """The robot's side is gone."""
         self.phase = Phase.WAITING
+        self.refusals = self.patience = 0
+        cancel(self.retry)
         self._forget()
 
     def _forget(self) -> None:

@@ -143,6 +143,7 @@ class Wire:
     """The open link to the robot, or none, and what names and numbers are in use on it."""
 
     def __init__(self, clock: Clock, robot: Presence) -> None:
+        self.clock = clock
         self.robot = robot
         self.link: ChannelLink | None = None
         self.asks = Asks(clock, self.send)

@@ -9,6 +9,7 @@ import cbor2
 from relay_protocol import link
 from relay_protocol.rights import Level
 from relay_server.channel import listener as listener_module
+from relay_server.channel import subscriptions as subscriptions_module
 from relay_server.channel import topics as module
 from relay_server.channel.sample import Converter
 from tests.relay_server.memory import GRAPH, STRING, TWIST, Person, World, text
@@ -512,3 +513,43 @@ def test_another_definition_of_a_type_is_taken(world: World) -> None:
         world.channel.message(link.TypeDefinition(type=asked.type, text="string words\n"))
     world.channel.sample(number, text("late"))
     assert [message["msg"] for message in person.hears("publish")] == [{"words": "early"}, {"words": "late"}]
+
+
+def test_a_topic_that_is_there_is_asked_for_again(world: World) -> None:
+    """After growing pauses, without telling the same again, until it is had or nobody wants it."""
+    number, (person,) = watching(world, {})
+    person.says("set_level", level="error")
+    world.link.take(link.Subscribe)
+    refusal = link.Failed(what="subscribe", ref=str(number), reason="not now")
+    pauses = []
+    for _ in range(10):
+        world.channel.message(refusal)
+        before = world.clock.seconds()
+        while not world.link.take(link.Subscribe):
+            world.clock.advance(0.25)
+            person.answers_pings()
+        pauses.append(world.clock.seconds() - before)
+    assert pauses == [0.25, 0.5, 1, 2, 4, 8, 16, 30, 30, 30]
+    assert told(person) == ["subscribe /chatter: not now"]
+    world.subscribed(number)
+    world.channel.message(refusal)
+    assert told(person) == ["subscribe /chatter: not now"]
+    person.says("unsubscribe", topic="/chatter")
+    world.clock.advance(2)
+    assert not world.link.take(link.Subscribe)
+
+
+def test_a_robot_may_need_a_moment_for_another_type(world: World) -> None:
+    """Some middleware lets go of the former type late: that is told only if it lasts."""
+    number, (person,) = watching(world, {})
+    person.says("set_level", level="error")
+    appears(world, topic="/chatter")
+    appears(world, TWIST, topic="/chatter")
+    for _ in range(subscriptions_module.PATIENCE + 1):
+        assert not told(person)
+        ask = world.link.take(link.Subscribe)[-1]
+        assert ask.number != number
+        world.channel.message(link.Failed(what="subscribe", ref=str(ask.number), reason="not yet"))
+        world.clock.advance(2)
+        person.answers_pings()
+    assert told(person) == ["subscribe /chatter: not yet"]
