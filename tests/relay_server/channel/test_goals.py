@@ -449,6 +449,24 @@ def test_a_goal_nobody_wants_any_more_keeps_its_place_for_a_while(world: World) 
     assert not world.channel.goals._errands._of
 
 
+def test_a_client_that_reads_slowly_is_not_cut_for_what_others_ask(world: World) -> None:
+    """Nor by those who ask and give up in a hurry."""
+    person = offering(world)
+    person.session.pause()
+    for round in range(3):
+        for number in range(300):
+            graph_sends(world, f"{round}-{number}")
+            world.channel.message(link.CancelActionGoal(id=f"{round}-{number}"))
+        world.channel.link_lost(world.link)
+        world.clock.advance(0.5)
+        world.robot_joins()
+    assert person.client.closed is None
+    person.session.resume()
+    told = person.client.take()
+    assert sum(each["op"] == "send_action_goal" for each in told) == errands.WAITING
+    assert sum(each["op"] == "cancel_action_goal" for each in told) == errands.WAITING
+
+
 def test_goals_that_can_not_be_served_are_ended(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not offered, unreadable, an id in use, too many, a defect."""
     person = offering(world)
