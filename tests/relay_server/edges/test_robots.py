@@ -408,3 +408,17 @@ async def test_a_robot_that_takes_no_commands_is_cut(hall: Hall) -> None:
     assert robot.transport.aborted
     assert hall.presence is not None
     assert hall.presence.control is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_of_feedback_a_slow_robot_gets_the_newest(hall: Hall) -> None:
+    """A client that tells more than the link takes does not have it cut."""
+    robot = hall.dial()
+    await robot.registers()
+    robot.connection._outbox.pause()
+    for number in range(5000):
+        for goal in ("a", "b"):
+            robot.connection.newest(goal, link.ActionFeedback(id=goal, cdr=str(number)))
+    robot.hears()
+    robot.connection._outbox.resume()
+    assert [(each["id"], each["cdr"]) for each in robot.hears()] == [("a", "4999"), ("b", "4999")]
