@@ -22,13 +22,13 @@ Text = msgspec.Raw | msgspec.UnsetType
 class Bodies:
     """Turns bodies from one form into another. A part of a type is named like ``std_srvs/srv/Trigger_Request``.
 
-    :param wall_ns: Unix time in nanoseconds, for header stamps a client leaves out
+    :param now_ns: the robot's time, nanoseconds, for header stamps a client leaves out
     """
 
-    def __init__(self, wire: Wire, definitions: Definitions, wall_ns: Callable[[], int]) -> None:
+    def __init__(self, wire: Wire, definitions: Definitions, now_ns: Callable[[], int]) -> None:
         self._wire = wire
         self._definitions = definitions
-        self._wall_ns = wall_ns
+        self._now_ns = now_ns
 
     def ready(self, type_name: str) -> Deferred[None]:
         """Fires when the parts of this type can be turned; fails in words when they never can."""
@@ -45,7 +45,7 @@ class Bodies:
         if not self._wire.cdr:
             body = jsontext.encode({} if value is None else value)
         else:
-            body = self._wire.robot.types.args_from_json(part, value, self._wall_ns())
+            body = self._wire.robot.types.args_from_json(part, value, self._now_ns())
         if len(body) > LARGEST:
             raise Invalid(f"{part} has {len(body)} bytes here; a robot takes at most {LARGEST}")
         return body

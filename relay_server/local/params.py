@@ -17,6 +17,7 @@ from twisted.internet.defer import Deferred, DeferredList
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, SwitchboardError, Unavailable
+from relay_protocol.limits import NAME
 from relay_protocol.rights import Operation
 from relay_server.channel import Channel
 from relay_server.local.arguments import absolute, text
@@ -40,8 +41,8 @@ SURVEYS = 16
 """Callers for whom the nodes of one robot are asked at a time."""
 
 _LIST = "rcl_interfaces/srv/ListParameters"
-_NAMES = 65_536
-"""Most names in one answer."""
+NAMES = 65_536
+"""Most names in one answer; longer ones than a name may be are left out."""
 
 _surveys: WeakKeyDictionary[Channel, set[object]] = WeakKeyDictionary()
 
@@ -190,7 +191,7 @@ async def get_param_names(session: Session, args: Any) -> Any:
     found: dict[str, list[str]] = {}
     with _survey(session.channel), contextlib.suppress(Unavailable):
         await session.channel.within(ALL_SECONDS, _side_by_side(session, deque(nodes), found))
-    return {"names": [name for node in nodes for name in found.get(node, [])][:_NAMES]}
+    return {"names": [name for node in nodes for name in found.get(node, [])][:NAMES]}
 
 
 @contextlib.contextmanager
@@ -215,9 +216,10 @@ async def _side_by_side(session: Session, nodes: deque[str], found: dict[str, li
 
 
 async def _ask_next(session: Session, nodes: deque[str], found: dict[str, list[str]]) -> None:
-    while nodes:
+    while nodes and sum(map(len, found.values())) < NAMES:
         node = nodes.popleft()
         # Who does not answer, or not with names, is left out.
         with contextlib.suppress(SwitchboardError, TypeError, KeyError):
             answer = await _ask(session, node, "list_parameters", {}, LIST_SECONDS)
-            found[node] = [f"{node}:{each}" for each in answer["result"]["names"] if isinstance(each, str)]
+            told = answer["result"]["names"][:NAMES]
+            found[node] = [f"{node}:{each}" for each in told if isinstance(each, str) and len(each) <= NAME]

@@ -273,6 +273,29 @@ def test_a_viewer_has_no_parameters(lab: Any) -> None:
         assert client.call("/rosapi/get_param_names")["values"] == {"names": []}
 
 
+def test_what_a_client_offers_is_seen_by_others(lab: Any) -> None:
+    """The robot leaves its daemon out of the graph it tells; the relay stands for it. It goes with the client."""
+    with lab.relay.connect("rover", lab.operator) as other:
+
+        def node_of(service: str) -> str:
+            return str(other.call("/rosapi/service_node", {"service": service})["values"]["node"])
+
+        with lab.relay.connect("rover", lab.operator) as client:
+            client.send(op="advertise_service", service="/lab/offered", type=EVERYTHING)
+            client.send(op="advertise_action", action="/lab/offered_too", type=WALK)
+            wait_for("the service is offered", lambda: node_of("/lab/offered") == "/relay")
+            kind = other.call("/rosapi/service_type", {"service": "/lab/offered"})["values"]
+            assert kind == {"type": EVERYTHING}
+            wait_for(
+                "the action is offered",
+                lambda: (
+                    other.call("/rosapi/action_type", {"action": "/lab/offered_too"})["values"]["type"]
+                    == WALK
+                ),
+            )
+        wait_for("the service is gone", lambda: node_of("/lab/offered") == "")
+
+
 def test_a_node_that_is_frozen_hangs_nobody(lab: Any, tmp_path: Path) -> None:
     """Its parameters are left out, the others are listed all the same."""
     with lab.relay.connect("rover", lab.operator) as client:

@@ -9,6 +9,7 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Level
+from relay_server.local import params
 from relay_server.local.params import ALL_SECONDS, AT_A_TIME, SURVEYS
 from tests.relay_server.local.asking import answers, ask, asked, begin, fails
 from tests.relay_server.memory import Person, World
@@ -256,6 +257,16 @@ def test_a_robot_that_is_lost_ends_the_asking(world: World, crowd: Person) -> No
     got = begin(crowd, "/rosapi/get_param_names")
     world.robot_goes()
     assert got() == {"names": []}
+
+
+def test_the_names_are_bounded(world: World, person: Person, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot with names without end does not fill the relay's memory."""
+    monkeypatch.setattr(params, "NAMES", 3)
+    world.registry.graph(world.robot, link.Graph(services=node("/camera")))
+    got = begin(person, "/rosapi/get_param_names")
+    answers(world, "/camera/list_parameters", {"result": {"names": ["a", "b", "c", "d"]}})
+    answers(world, "/base/list_parameters", {"result": {"names": ["x" * 256, "y"]}})
+    assert got() == {"names": ["/base:y", "/camera:a", "/camera:b"]}
 
 
 def test_a_caller_who_leaves_is_asked_for_no_more(world: World, crowd: Person) -> None:
