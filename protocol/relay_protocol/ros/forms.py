@@ -79,7 +79,7 @@ class JsonForm:
             value = f"{self._array(code, part)} if {count} else ()"
         else:
             few = self._source.constant(_UNPACK[code])
-            # A copy, because orjson takes no array whose memory is not aligned; the head moves that by 4.
+            # A copy, whose memory is aligned as orjson expects it; the message's head moves numbers by 4.
             value = f"{few}[{count}](data, p) if {count} <= {_FEW} else {self._array(code, part)}"
         self._source.line(f"{name} = {value}")
         return name

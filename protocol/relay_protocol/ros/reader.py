@@ -296,7 +296,7 @@ def _numbers(primitive: Primitive, order: str) -> Convert:
     def convert(data: bytes, position: int, count: int) -> Any:
         if not count:
             return []
-        # A copy, because orjson takes no array whose memory is not aligned; the head moves that by 4.
+        # A copy, whose memory is aligned as orjson expects it; the message's head moves numbers by 4.
         numbers = numpy.frombuffer(data[position : position + count * dtype.itemsize], dtype)
         return numbers if order == _NATIVE else numbers.astype(native)
 
