@@ -30,7 +30,7 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Int64, String
+from std_msgs.msg import Int64, String, UInt8MultiArray
 from std_srvs.srv import Empty, SetBool, Trigger
 
 try:
@@ -41,6 +41,7 @@ except ImportError:
 
 VERSION = 1
 COUNTER_SECONDS = 0.02
+LARGE = 1_000_000
 SLOW_SECONDS = 1.0
 STEP_SECONDS = 0.05
 PATIENCE = 10.0
@@ -107,6 +108,8 @@ class Fixture(Node):
         for topic, text in (("about", json.dumps(about)), ("latched", "still here")):
             publisher = self.create_publisher(String, f"/conformance/{topic}", PROFILES["latched"])
             publisher.publish(String(data=text))
+        large = self.create_publisher(UInt8MultiArray, "/conformance/large", PROFILES["latched"])
+        large.publish(UInt8MultiArray(data=array.array("B", bytes(each % 251 for each in range(LARGE)))))
         self._counter = self.create_publisher(Int64, "/conformance/counter", PROFILES["reliable"])
         self.create_timer(COUNTER_SECONDS, self._count, callback_group=self._group)
         self._echo = self.create_publisher(String, "/conformance/echo/out", PROFILES["reliable"])

@@ -55,7 +55,7 @@ def sample_frame(number: int, stamp: int, body: bytes) -> bytes:
 
 
 class Link:
-    """One connection a robot has dialled. Pings are answered at once, whatever else goes on.
+    """One connection a robot has dialled. Pings are answered at once, unless told otherwise.
 
     :param hook: told of every JSON message as it comes
     """
@@ -69,6 +69,7 @@ class Link:
         self.ended = False
         self.broken = ""
         self.pings = 0
+        self.answers_pings = True
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -171,7 +172,8 @@ class Link:
             found = json.loads(body)
             if found["op"] == "ping":
                 self.pings += 1
-                self.say("pong", t=found["t"], at=time.monotonic_ns())
+                if self.answers_pings:
+                    self.say("pong", t=found["t"], at=time.monotonic_ns())
             self._hook(found)
         elif kind == SAMPLE:
             found = Sample(*_SAMPLE.unpack_from(body), body[_SAMPLE.size :])

@@ -19,7 +19,6 @@ FRAGMENTATION = "rosbridge v2, 3.1.1 Fragmentation"
 PNG = "rosbridge v2, 3.1.2 PNG compression"
 CBOR = "rosbridge v2, 3.1.3 CBOR encoding"
 RAW = "rosbridge v2, 3.1.4 CBOR-RAW encoding"
-SHARED_TABLE = "unfinished fragments of all clients share one table (defragmentation.py, ReceivedFragments)"
 NO_COMPRESSION_OF_CALLS = "answers of services and actions are never compressed (call_service.py; issue 1091)"
 SIZE_OF_CLIENT = (
     "fragment_size is the connection's, set by whichever message named one last (protocol.py, incoming)"
@@ -152,7 +151,7 @@ def test_fragment_in_unfinished(client: Client) -> None:
     client.lives()
 
 
-@case("fragment", "SPEC 1.6, of one client", suite=SHARED_TABLE)
+@case("fragment", "SPEC 1.6, of one client")
 def test_fragment_in_of_two_clients(client: Client, server: Server) -> None:
     """Fragments of two clients with the same id are not mixed up."""
     with server.connect() as other:
@@ -229,6 +228,28 @@ def test_fragment_in_too_large(told: Client) -> None:
         told.send("fragment", id="large", data="x" * 500_000, num=number, total=4)
     assert told.until("status", level="error")["msg"]
     told.lives()
+
+
+# --- large samples ---
+
+
+@case("subscribe", "SPEC 2.1, samples in parts; SPEC 4, base64")
+def test_large_sample(client: Client) -> None:
+    """A sample of 1 MB comes whole, byte by byte."""
+    client.send("subscribe", topic="/conformance/large", type="std_msgs/msg/UInt8MultiArray")
+    data = base64.b64decode(client.until("publish")["msg"]["data"], validate=True)
+    assert data == bytes(number % 251 for number in range(1_000_000))
+
+
+@case("cbor", "SPEC 2.1, samples in parts; SPEC 1.6")
+def test_large_sample_in_cbor(client: Client) -> None:
+    """A sample of 1 MB comes whole in CBOR too."""
+    client.send(
+        "subscribe", topic="/conformance/large", type="std_msgs/msg/UInt8MultiArray", compression="cbor"
+    )
+    data = client.until("publish")["msg"]["data"]
+    data = data.value if isinstance(data, cbor2.CBORTag) else data
+    assert data == bytes(number % 251 for number in range(1_000_000))
 
 
 # --- png ---

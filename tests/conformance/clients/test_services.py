@@ -146,11 +146,7 @@ def test_call_late_answer_is_no_second(client: Client) -> None:
     client.none("service_response", id="late")
 
 
-@case(
-    "call_service",
-    CALL,
-    suite="with calls in the connection's own thread they are answered in turn (call_service.py)",
-)
+@case("call_service", CALL)
 def test_call_out_of_order(client: Client) -> None:
     """A quick call is answered before a slow one that was sent first."""
     client.send("call_service", id="slow", service=SLOW)
@@ -244,11 +240,7 @@ def test_offer(offer: Offer) -> None:
     assert offer.outcome(asked) == {"success": True, "message": "from the client"}
 
 
-@case(
-    "advertise_service",
-    "SPEC 1.2 advertise_service",
-    suite="call_service to a client has no type (advertise_service.py)",
-)
+@case("advertise_service", "SPEC 1.2 advertise_service", suite=SPEC_ONLY)
 def test_offer_type(offer: Offer) -> None:
     """The call that comes to the client names the type."""
     asked = offer.ask()

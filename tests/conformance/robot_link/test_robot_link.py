@@ -17,6 +17,7 @@ from link_relay import ABSENCE, COMMAND_FRAME, JSON, Link, LinkRelay, Sample, fr
 
 TWIST = "geometry_msgs/msg/Twist"
 TRIGGER = "std_srvs/srv/Trigger"
+FIBONACCI = "example_interfaces/action/Fibonacci"
 CDR = b"\0\1\0\0"
 STRANGE = {"later": True, "fields": [1, {"more": None}]}
 
@@ -261,6 +262,21 @@ def test_unsubscribe_unknown(channel: Link) -> None:
     channel.expect("pong", t=1)
 
 
+@case("subscribe", "SPEC 2.1, samples in parts")
+def test_large_sample(relay: LinkRelay, channel: Link) -> None:
+    """A sample of 1 MB, whole or in parts, comes byte by byte, and pings are answered meanwhile."""
+    topics = relay.graph["topics"]
+    large = next((name for name in topics if name.endswith("/large")), None)
+    if large is None:
+        not_offered("no topic …/large with samples of 1 MB")
+    channel.say("subscribe", number=1, topic=large, type=topics[large]["types"][0])
+    assert channel.expect("subscribed", number=1)["latched"] is True
+    channel.say("ping", t=1)
+    sample = channel.expect_sample(1)
+    assert sample.body[-1_000_000:] == bytes(number % 251 for number in range(1_000_000))
+    channel.expect("pong", t=1)
+
+
 # --- topics in ---
 
 
@@ -332,6 +348,37 @@ def test_call_unknown(channel: Link) -> None:
     assert answer["reason"]
 
 
+@case("advertise_service", "SPEC 2.5 advertise_service")
+def test_offer_service(relay: LinkRelay) -> None:
+    """A service the relay offers is called from the robot's graph, here by another channel, and answered."""
+    name = f"/conformance_offer_{time.monotonic_ns()}"
+    with relay.channel() as offering, relay.channel() as calling:
+        offering.say("advertise_service", service=name, type=TRIGGER, source="a case")
+        if not stands(offering, "advertise_service", "advertised_service"):
+            not_offered("services of clients in its graph")
+        request = {"cdr": base64.b64encode(CDR + b"\0").decode()}
+        calling.say("call_service", id="mine", service=name, type=TRIGGER, timeout=8, **request)
+        asked = offering.expect("call_service", service=name)
+        assert asked["type"] == TRIGGER
+        answer = base64.b64encode(CDR + b"\1\0\0\0" + struct.pack("<I", 5) + b"here\0").decode()
+        offering.say("service_response", id=asked["id"], result=True, cdr=answer)
+        told = calling.expect("service_response", id="mine")
+        assert told["result"] is True
+        assert b"here" in base64.b64decode(told["cdr"])
+        offering.say("unadvertise_service", service=name)
+        calling.say("call_service", id="gone", service=name, type=TRIGGER, timeout=0.5, **request)
+        assert calling.expect("service_response", id="gone")["result"] is False
+
+
+def stands(link: Link, asked: str, answer: str) -> bool:
+    """Whether what was asked for stands; ``failed`` otherwise."""
+    told = link.take(
+        f"'{answer}' or 'failed'", lambda each: isinstance(each, dict) and each["op"] in (answer, "failed")
+    )
+    assert told["op"] == answer or told["what"] == asked
+    return bool(told["op"] == answer)
+
+
 # --- types ---
 
 
@@ -390,6 +437,35 @@ def test_goal_unknown(channel: Link) -> None:
     result = channel.expect("action_result", id="g")
     assert (result["status"], result["result"]) == (0, False)
     assert result["reason"]
+
+
+def fibonacci(relay: LinkRelay, link: Link, order: int, **fields: Any) -> None:
+    """Send a goal, id ``g``, to an action of type Fibonacci."""
+    actions = relay.graph["actions"]
+    found = sorted(name for name, each in actions.items() if FIBONACCI in each["types"])
+    if not found:
+        not_offered(f"no action of type {FIBONACCI}")
+    goal = base64.b64encode(CDR + struct.pack("<i", order)).decode()
+    link.say("send_action_goal", id="g", action=found[0], type=FIBONACCI, cdr=goal, **fields)
+
+
+@case("send_action_goal", "SPEC 2.5 send_action_goal")
+def test_goal(relay: LinkRelay, channel: Link) -> None:
+    """A goal is answered by feedback, where it is wanted, and one result of status 4."""
+    fibonacci(relay, channel, 4, feedback=True)
+    assert base64.b64decode(channel.expect("action_feedback", id="g")["cdr"])
+    result = channel.expect("action_result", id="g")
+    assert (result["status"], result["result"]) == (4, True)
+    assert base64.b64decode(result["cdr"])[4:] == struct.pack("<6i", 5, 0, 1, 1, 2, 3)
+
+
+@case("cancel_action_goal", "SPEC 2.5 cancel_action_goal")
+def test_cancel(relay: LinkRelay, channel: Link) -> None:
+    """A goal that is cancelled ends with a result of status 5."""
+    fibonacci(relay, channel, 200, feedback=True)
+    channel.expect("action_feedback", id="g")
+    channel.say("cancel_action_goal", id="g")
+    assert channel.expect("action_result", id="g")["status"] == 5
 
 
 @case("cancel_action_goal", "SPEC 2.5 cancel_action_goal")
@@ -578,7 +654,7 @@ def test_cut_channel_stops(drive: Wheels) -> None:
 
 
 @case("motion", "SPEC 2.5, Clocks and deadline, 7")
-def test_silent_relay_stops(relay: LinkRelay, drive: Wheels) -> None:
+def test_other_samples_are_no_commands(drive: Wheels) -> None:
     """Samples of another number and pings are no commands: they don't keep it moving."""
     drive.start()
     until = time.monotonic() + 3
@@ -624,6 +700,15 @@ def test_cut(relay: LinkRelay) -> None:
     with relay.channel() as link:
         subscribe(link, relay)
         link.expect_sample(7)
+
+
+@case("reconnect", "SPEC 2.3, nothing for three heartbeats")
+def test_silent_relay(relay: LinkRelay) -> None:
+    """A relay that is silent for three heartbeats is left, and dialled again."""
+    link = relay.control
+    link.answers_pings = False
+    link.wait_end()
+    assert not relay.control.ended
 
 
 @case("reconnect", "SPEC 2.3, with growing random delays")
