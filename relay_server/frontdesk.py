@@ -21,6 +21,7 @@ from relay_server.local import RelayNode
 from relay_server.local.node import milliseconds
 from relay_server.origins import Origins
 from relay_server.registry import Presence, Registry
+from relay_server.rounds import Rounds
 from relay_server.session import ClientTransport, Session, Timing
 from relay_server.store import Store
 
@@ -70,6 +71,7 @@ class FrontDesk:
         self._journal = journal
         self._origins = origins
         self._timing = timing
+        self._rounds = Rounds(clock)
         self._cookie = cookie
         self._clock_ns = clock_ns
         self._wall = wall
@@ -179,6 +181,7 @@ class FrontDesk:
             self._local,
             Freshness(self._clock_ns, opened_ns, lambda: secrets.token_bytes(8)),
             self._timing,
+            self._rounds,
             address=admission.address,
             since=self._wall(),
             ended=self._ended,

@@ -22,11 +22,12 @@ from relay_server.channel import Channel
 from relay_server.channel.goal import Status
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Sample
-from relay_server.clock import Clock, looping
+from relay_server.clock import Clock
 from relay_server.forms import PLAIN, Form, frames
 from relay_server.freshness import Freshness
 from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
+from relay_server.rounds import Round, Rounds
 from relay_server.session.calling import Calling
 from relay_server.session.incoming import Incoming
 from relay_server.session.listening import Listening
@@ -101,6 +102,7 @@ class Session:
         local: LocalNode,
         freshness: Freshness,
         timing: Timing,
+        rounds: Rounds,
         *,
         address: str,
         since: float,
@@ -124,9 +126,10 @@ class Session:
         self._malformed = 0
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
-        self._pinging = looping(clock, self._ping)
+        self._rounds = rounds
+        self._pinging: Round | None = None
         self.incoming = Incoming(clock, lambda: freshness.not_before, self._joined, self._given_up)
-        self.listening = Listening(self, clock, local)
+        self.listening = Listening(self, clock, local, rounds)
         self.publishing = Publishing(self, freshness)
         self.calling = Calling(self, local)
         self.pursuing = Pursuing(self)
@@ -157,7 +160,8 @@ class Session:
     def start(self) -> None:
         """Begin: take a place on the channel, start pinging."""
         self.channel.attach(self)
-        self._pinging.start(self._ping_interval(), now=True)
+        self._pinging = Round(self._ping, self._ping_interval())
+        self._rounds.start(self._pinging)
         self.log.info(
             "client {number}: {user} from {address} works with {robot}",
             number=self.number,
@@ -172,7 +176,7 @@ class Session:
             return
         self._closed = True
         self.outbox.close()
-        if self._pinging.running:
+        if self._pinging is not None:
             self._pinging.stop()
         self.incoming.end()
         self.listening.end()
@@ -326,7 +330,7 @@ class Session:
         self.listening.rights_changed()
         self.pursuing.rights_changed()
         self.channel.forget_denied(self, self.permit)
-        if self._pinging.running:
+        if self._pinging is not None:
             self._pinging.interval = self._ping_interval()
 
     def _revoked(self, reason: str) -> None:

@@ -13,7 +13,8 @@ from relay_server import forms
 from relay_server.channel import resolve
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
-from relay_server.clock import Clock, looping
+from relay_server.clock import Clock
+from relay_server.rounds import Round, Rounds
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
@@ -32,17 +33,17 @@ _OWN = Converter(TypeRegistry(), "", "json", lambda reason: None)
 class Listening:
     """The subscriptions of one session."""
 
-    def __init__(self, session: Session, clock: Clock, local: LocalNode) -> None:
+    def __init__(self, session: Session, clock: Clock, local: LocalNode, rounds: Rounds) -> None:
         self._session = session
         self._clock = clock
         self._local = local
         self._listeners: dict[str, Listener] = {}
-        self._telling = looping(clock, self._publish_local)
+        self._rounds = rounds
+        self._telling: Round | None = None
 
     def end(self) -> None:
         """The client is gone."""
-        if self._telling.running:
-            self._telling.stop()
+        self._stop_telling()
         for listener in self._listeners.values():
             listener.close()
 
@@ -60,8 +61,9 @@ class Listening:
         if self._local.topic(topic) is not None:
             listener.add(ask, form)
             self._listeners[topic] = listener
-            if not self._telling.running:
-                self._telling.start(TELL_SECONDS, now=True)
+            if self._telling is None:
+                self._telling = Round(self._publish_local, TELL_SECONDS)
+                self._rounds.start(self._telling)
             return
         subscriptions = session.channel.subscriptions
         subscriptions.check(topic, normal_type(ask.type))
@@ -111,4 +113,9 @@ class Listening:
                 body = jsontext.encode(make(self._session))
                 self._listeners[name].replay(Sample(body, 0, _OWN))
         if not any(make for _, make in makers):
+            self._stop_telling()
+
+    def _stop_telling(self) -> None:
+        if self._telling is not None:
             self._telling.stop()
+            self._telling = None

@@ -19,6 +19,7 @@ from relay_server.channel import Channel, Channels
 from relay_server.freshness import Freshness
 from relay_server.local import RelayNode
 from relay_server.registry import Presence, Registry
+from relay_server.rounds import Rounds
 from relay_server.session import Session, Timing
 
 M = TypeVar("M", bound=link.Message)
@@ -178,6 +179,7 @@ class World:
     def __init__(self) -> None:
         self.clock = Clock()
         self.clock.advance(1000)
+        self.rounds = Rounds(self.clock)
         self.registry = Registry(lambda: 1.7e9 + self.clock.seconds())
         tickets = itertools.count(1)
         self.channels = Channels(
@@ -262,6 +264,7 @@ class World:
             RelayNode(lambda robot_id: self.people),
             Freshness(self.now_ns, self.now_ns(), lambda: next(self._tokens).to_bytes(8, "big")),
             Timing(client_ping=2.0, driving_ping=0.1, stall_limit=5.0),
+            self.rounds,
             address="192.0.2.7",
             since=1.7e9,
             ended=self.people.remove,
