@@ -177,11 +177,17 @@ class Robot:
             await self.enroll()
         self.me, failures = json.loads(self.options.state.read_text()), 0
         own = asyncio.gather(self.wheels.watch(), self.sense())
-        while not own.done():
-            failures = 0 if await self.control() else min(failures + 1, 5)
-            self.wheels.stop()
-            await asyncio.sleep(random.random() * 0.5 * 2**failures)
-        own.result()  # without its watchdog this robot does not go on
+        try:
+            while True:
+                life = asyncio.create_task(self.control())
+                await asyncio.wait({own, life}, return_when=asyncio.FIRST_COMPLETED)
+                if own.done():  # without its watchdog this robot does not go on
+                    return own.result()
+                failures = 0 if life.result() else min(failures + 1, 5)
+                self.wheels.stop()
+                await asyncio.sleep(random.random() * 0.5 * 2**failures)
+        finally:
+            self.drive(0.0, 0.0)
 
     async def control(self):
         """One life of the control link (SPEC 2.2, 2.4); whether the relay took us in."""

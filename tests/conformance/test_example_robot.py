@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import datetime
+import ipaddress
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
 from robots_under_test import EXAMPLE
 from switchboard_harness import Client, Process, Relay, wait_for
 
@@ -112,8 +118,50 @@ def test_it_comes_back(world: World) -> None:
         client.send(op="subscribe", topic="/temperature", type="std_msgs/msg/Float64")
         client.until(op="publish", topic="/temperature")
         world.restart()
-        wait_for("its log is there", lambda: world.robot.popen.poll() is None)
         assert client.until(30, op="publish", topic="/temperature")
+
+
+def self_signed(folder: Path) -> tuple[str, str]:
+    """Certificate and key of 127.0.0.1, in files."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "relay")])
+    now = datetime.datetime.now(datetime.UTC)
+    address = x509.IPAddress(ipaddress.ip_address("127.0.0.1"))
+    builder = x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+    builder = builder.serial_number(x509.random_serial_number())
+    builder = builder.not_valid_before(now - datetime.timedelta(1)).not_valid_after(
+        now + datetime.timedelta(1)
+    )
+    builder = builder.add_extension(x509.BasicConstraints(True, None), critical=True)
+    builder = builder.add_extension(x509.SubjectAlternativeName([address]), critical=False)
+    own = builder.sign(key, hashes.SHA256())
+    cert_file, key_file = folder / "cert.pem", folder / "key.pem"
+    cert_file.write_bytes(own.public_bytes(serialization.Encoding.PEM))
+    plain = serialization.NoEncryption()
+    key_file.write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, plain)
+    )
+    return str(cert_file), str(key_file)
+
+
+def test_it_speaks_tls(tmp_path: Path) -> None:
+    """With --tls it comes in where the certificate is trusted, and keeps away where it is not."""
+    cert, key = self_signed(tmp_path)
+    relay = Relay(tmp_path, "--tls-cert", cert, "--tls-key", key)
+    code = relay.cli("robot", "add", NAME)["enrolment_code"]
+    command = [sys.executable, str(EXAMPLE), "--relay", f"127.0.0.1:{relay.robots_port}", "--robot", NAME]
+    command += ["--code", code, "--state", str(tmp_path / "robot.json"), "--tls"]
+    stranger = Process(command, tmp_path, "stranger")
+    trusting = None
+    try:
+        assert stranger.popen.wait(20) != 0
+        assert "CERTIFICATE_VERIFY_FAILED" in stranger.log.read_text()
+        trusting = Process([*command, "--ca", cert], tmp_path, "trusting")
+        wait_for("the robot is online", lambda: relay.state_of(NAME) != "offline")
+    finally:
+        for each in (trusting, stranger, relay):
+            if each is not None:
+                each.stop()
 
 
 def test_a_wrong_code_is_refused_in_words(world: World, tmp_path: Path) -> None:

@@ -439,6 +439,29 @@ def test_goal_unknown(channel: Link) -> None:
     assert result["reason"]
 
 
+@case("advertise_action", "SPEC 2.5 advertise_action")
+def test_offer_action(relay: LinkRelay) -> None:
+    """An action the relay offers is pursued from the robot's graph, here by another channel, to its result."""
+    name = f"/conformance_offer_{time.monotonic_ns()}"
+    with relay.channel() as offering, relay.channel() as asking:
+        offering.say("advertise_action", action=name, type=FIBONACCI, source="a case")
+        if not stands(offering, "advertise_action", "advertised_action"):
+            not_offered("actions of clients in its graph")
+        goal = base64.b64encode(CDR + struct.pack("<i", 7)).decode()
+        asking.say("send_action_goal", id="mine", action=name, type=FIBONACCI, feedback=True, cdr=goal)
+        asked = offering.expect("send_action_goal", action=name)
+        assert base64.b64decode(asked["cdr"])[4:8] == struct.pack("<i", 7)
+        sequence = base64.b64encode(CDR + struct.pack("<2i", 1, 42)).decode()
+        offering.say("action_feedback", id=asked["id"], cdr=sequence)
+        assert base64.b64decode(asking.expect("action_feedback", id="mine")["cdr"])[4:] == struct.pack(
+            "<2i", 1, 42
+        )
+        offering.say("action_result", id=asked["id"], status=4, result=True, cdr=sequence)
+        result = asking.expect("action_result", id="mine")
+        assert (result["status"], result["result"]) == (4, True)
+        assert base64.b64decode(result["cdr"])[4:] == struct.pack("<2i", 1, 42)
+
+
 def fibonacci(relay: LinkRelay, link: Link, order: int, **fields: Any) -> None:
     """Send a goal, id ``g``, to an action of type Fibonacci."""
     actions = relay.graph["actions"]
