@@ -29,7 +29,7 @@ except ImportError:
     dumps = json.dumps
 
 BEAMS, POINTS = 1080, 18_750
-ROUND_SECONDS = 0.15
+ROUND_SECONDS = 0.1
 
 
 @dataclass
