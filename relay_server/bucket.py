@@ -13,6 +13,8 @@ class TokenBucket:
     :param seconds: a clock; one that is set back stands still for the bucket
     """
 
+    __slots__ = ("_at", "_burst", "_rate", "_seconds", "_tokens")
+
     def __init__(self, rate: float, burst: float, seconds: Callable[[], float]) -> None:
         self._rate = rate
         self._burst = burst

@@ -8,7 +8,6 @@ holds through stalls of any kind: a frozen relay, a frozen client, a partition t
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -24,10 +23,12 @@ class Freshness:
     :param token: eight unguessable bytes at each call, so that a pong can't be sent in advance
     """
 
+    __slots__ = ("_clock", "_out", "_token", "last_pong", "not_before", "rtt")
+
     def __init__(self, clock: Callable[[], int], opened: int, token: Callable[[], bytes]) -> None:
         self._clock = clock
         self._token = token
-        self._out: OrderedDict[bytes, int] = OrderedDict()
+        self._out: list[tuple[bytes, int]] = []
         self.not_before = opened
         self.last_pong = opened
         self.rtt: int | None = None
@@ -35,20 +36,19 @@ class Freshness:
     def ping(self) -> bytes:
         """The payload of a ping that is sent now."""
         payload = self._token()
-        self._out[payload] = self._clock()
+        self._out.append((payload, self._clock()))
         if len(self._out) > PENDING:
-            self._out.popitem(last=False)
+            del self._out[0]
         return payload
 
     def pong(self, payload: bytes) -> bool:
         """Take a pong; False when it answers no ping of ours (RFC 6455 section 5.5.3 allows that)."""
-        sent = self._out.get(payload)
-        if sent is None:
+        place = next((place for place, (token, _) in enumerate(self._out) if token == payload), None)
+        if place is None:
             return False
-        while self._out:
-            key, _ = self._out.popitem(last=False)
-            if key == payload:
-                break
+        sent = self._out[place][1]
+        # Pings before it were answered too, or never will be.
+        del self._out[: place + 1]
         self.not_before = max(self.not_before, sent)
         self.last_pong = self._clock()
         self.rtt = self.last_pong - sent

@@ -17,6 +17,8 @@ DATA_PER_TOPIC = 128
 DATA_AGE = 1.0
 CONTROL_MESSAGES = 1024
 CONTROL_BYTES = 2 * MIB
+DROPS_OF = 4096
+"""Topics whose drops are counted one by one."""
 
 
 class Parcel(Protocol):
@@ -47,13 +49,28 @@ class Outbox:
     :param overflow: called once when control messages exceed their bound; the receiver must be cut
     """
 
+    __slots__ = (
+        "_closed",
+        "_control",
+        "_control_bytes",
+        "_data",
+        "_data_bytes",
+        "_overflow",
+        "_seconds",
+        "dropped",
+        "drops",
+        "paused_since",
+        "write",
+    )
+
     def __init__(
         self, write: Callable[[bytes], None], seconds: Callable[[], float], overflow: Callable[[], None]
     ) -> None:
         self.write = write
         self._seconds = seconds
         self._overflow = overflow
-        self._control: deque[bytes] = deque()
+        # A deque takes 600 bytes when it is empty; most never have to wait.
+        self._control: deque[bytes] | None = None
         self._control_bytes = 0
         self._data: dict[Hashable, _Queue] = {}
         self._data_bytes = 0
@@ -92,7 +109,7 @@ class Outbox:
     def close(self) -> None:
         """Nothing is written any more; what waited is let go."""
         self._closed = True
-        self._control.clear()
+        self._control = None
         self._data.clear()
         self._control_bytes = self._data_bytes = 0
 
@@ -103,6 +120,8 @@ class Outbox:
         if self.paused_since is None:
             self.write(message)
             return
+        if self._control is None:
+            self._control = deque()
         self._control.append(message)
         self._control_bytes += len(message)
         if len(self._control) > CONTROL_MESSAGES or self._control_bytes > CONTROL_BYTES:
@@ -171,6 +190,8 @@ class Outbox:
         self._take(queue)
         self.dropped += 1
         self.drops[queue.key] = self.drops.get(queue.key, 0) + 1
+        if len(self.drops) > DROPS_OF:
+            del self.drops[next(iter(self.drops))]
 
     def _take(self, queue: _Queue) -> bytes | Parcel:
         _, size, parcel = queue.samples.popleft()

@@ -8,10 +8,11 @@ rosbridge ``auth`` as its first message.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 from urllib.parse import unquote
 
 from autobahn.twisted.websocket import WebSocketServerFactory
+from autobahn.websocket.protocol import TrafficStats
 from autobahn.websocket.types import ConnectionDeny, ConnectionRequest
 from twisted.internet.defer import Deferred
 from twisted.internet.protocol import connectionDone
@@ -36,6 +37,18 @@ HANDSHAKE_STATUS = {
     closing.UNAVAILABLE: 503,
     closing.GOING_AWAY: 503,
 }
+HANDSHAKE_ATTRIBUTES = (
+    "http_headers",
+    "http_request_data",
+    "http_request_host",
+    "http_request_params",
+    "http_request_path",
+    "http_request_uri",
+    "http_response_data",
+    "http_status_line",
+)
+"""What Autobahn has read and answered; a websocket that is open needs none of it."""
+
 EARLY_OVERHEAD = 64
 """What a message before the proof counts for beside its bytes; empty ones take memory too."""
 
@@ -180,6 +193,7 @@ class ClientProtocol(FastProtocol):
             return
         self._open = True
         self._opened_ns = self.factory.clock_ns()
+        self._forget_handshake()
         # Twisted's HTTP channel was the producer of this transport until now.
         self.transport.unregisterProducer()
         self.transport.registerProducer(_Flow(self), True)
@@ -187,6 +201,15 @@ class ClientProtocol(FastProtocol):
             self.close(*self._failure)
         elif self._admission is not None:
             self._begin()
+
+    def _forget_handshake(self) -> None:
+        """Let go of what Autobahn keeps for each connection and nobody reads any more: kilobytes for every client."""
+        for name in HANDSHAKE_ATTRIBUTES:
+            self.__dict__.pop(name, None)
+        # Of these every connection has its own: figures nobody asks for, a queue for writes that are held back (they
+        # go through the writer) and a validator for text that is checked elsewhere.
+        self.trafficStats = self.factory.traffic
+        self.send_queue = self.utf8validator = None
 
     def _nobody(self) -> None:
         self._deadline = None
@@ -386,6 +409,7 @@ class ClientFactory(WebSocketServerFactory):
         self.clock_ns = clock_ns
         self.gate = gate
         self.turns = Turns(clock)
+        self.traffic = TrafficStats()
         self.setProtocolOptions(
             webStatus=False,
             # Text is checked once, as a whole, by relay_protocol.jsontext.
@@ -403,3 +427,7 @@ class ClientFactory(WebSocketServerFactory):
             allowNullOrigin=True,
             maxConnections=0,
         )
+        # Autobahn copies into each connection what its class does not have: options are the class's here.
+        options = {name: getattr(self, name) for name in ClientProtocol.CONFIG_ATTRS}
+        known = {name: staticmethod(each) if callable(each) else each for name, each in options.items()}
+        self.protocol = cast(type[ClientProtocol], type("ClientProtocol", (ClientProtocol,), known))

@@ -204,10 +204,10 @@ def test_the_account_of_waiting_bytes_never_drifts(steps: list[tuple[str, int, i
         else:
             receiver.now += values[0]
         waiting = sum(size for queue in box._data.values() for _, size, _ in queue.samples)
-        assert box.waiting_bytes == waiting + sum(map(len, box._control))
+        assert box.waiting_bytes == waiting + sum(map(len, box._control or ()))
         assert all(queue.samples for queue in box._data.values())
         assert waiting <= 2 * module.DATA_BYTES
-        assert sum(map(len, box._control)) <= module.CONTROL_BYTES
+        assert sum(map(len, box._control or ())) <= module.CONTROL_BYTES
     receiver.resume()
     assert box.waiting_bytes == 0
 

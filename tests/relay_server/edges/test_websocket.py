@@ -12,7 +12,9 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits
 from relay_server import closing, wsframe
+from relay_server.edges import websocket as module
 from relay_server.edges.caps import AddressCap
+from relay_server.edges.websocket import ClientProtocol
 from tests.relay_server.edges.websocket_client import AUTH, Client, MemoryGate
 
 
@@ -301,3 +303,24 @@ def test_bytes_behind_the_handshake_in_one_piece_are_cut(gate: MemoryGate) -> No
     assert not client.transport.connected
     assert not gate.sessions
     assert gate.admitted == 0
+
+
+def test_an_open_websocket_keeps_little(gate: MemoryGate) -> None:
+    """Options are its class's, what the handshake said is forgotten; only what differs is its own."""
+    client = Client(gate, Authorization="Bearer good")
+    options = set(ClientProtocol.CONFIG_ATTRS) & set(vars(client.end))
+    assert options == {"maxFramePayloadSize", "maxMessagePayloadSize"}
+    assert client.end.requireMaskedClientFrames is True
+    assert client.end.perMessageCompressionAccept([]) is None
+    assert not set(module.HANDSHAKE_ATTRIBUTES) & set(vars(client.end))
+    assert "good" not in str(vars(client.end).values())
+
+
+def test_names_of_what_is_forgotten_are_autobahns(gate: MemoryGate) -> None:
+    """Whoever changes Autobahn finds here what it keeps now."""
+    gate.wait = Deferred()
+    client = Client(gate, Authorization="Bearer good")
+    before = set(vars(client.end))
+    gate.wait.callback(None)
+    client.run()
+    assert set(module.HANDSHAKE_ATTRIBUTES) - {"http_response_data"} <= before
