@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from relay_protocol import rosbridge
@@ -24,6 +24,7 @@ def data_of(parts: list[bytes]) -> list[str]:
     return [each["data"] for each in decoded]
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.text(min_size=70), st.integers(64, 200))
 def test_fragments_join_to_the_message(text: str, size: int) -> None:
     """Joined in order they are the message, whatever is in it, and none is larger than asked for."""
