@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cbor2
 import msgspec
 import pytest
 
@@ -185,6 +186,13 @@ def test_cdr_both_ways(case: dict[str, Any]) -> None:
 def test_cdr_to_json(case: dict[str, Any]) -> None:
     """These bytes are read as this JSON."""
     assert json.loads(TYPES.to_json(case["type"], bytes.fromhex(case["cdr"]))) == case["json"]
+
+
+@cases("cdr", "cbor")
+def test_cdr_to_cbor(case: dict[str, Any]) -> None:
+    """These bytes are read as these values in CBOR, typed arrays and all."""
+    wanted = cbor2.loads(bytes.fromhex(case["cbor"]))
+    assert cbor2.loads(TYPES.to_cbor(case["type"], bytes.fromhex(case["cdr"]))) == wanted
 
 
 @cases("cdr", "write")
