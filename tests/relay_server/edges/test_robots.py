@@ -81,6 +81,7 @@ async def test_a_robot_that_fails_too_often_is_refused_before_the_database_is_as
     other = hall.dial()
     other.connection.address = "198.51.100.1"
     assert (await other.registers())["op"] == "welcome"
+    await until(lambda: hall.journal._waiting == 0)
     assert len(await hall.store.read(queries.list_events, kind="robot.refused")) == limiter.FAILURES
 
 
@@ -374,6 +375,7 @@ async def test_two_daemons_with_one_key_flap_ever_more_slowly(hall: Hall) -> Non
         current = hall.dial()
         assert (await current.registers())["op"] == "welcome"
     assert waits == [3, 6, 12, 24, 48, 60, 60]
+    await until(lambda: hall.journal._waiting == 0)
     events = await hall.store.read(queries.list_events, kind="robot.key_used_twice")
     assert len(events) == 6
     assert hall.presence is not None
