@@ -12,6 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
+from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from robot_client.platforms.base import ABORTED, SUCCEEDED, Outcome
 from robot_client.platforms.ros2 import Ros2Platform
@@ -111,4 +112,5 @@ async def test_killed_node_is_followed_when_it_comes_back(ros: Ros2Platform, nod
     pursue(ros, node.action, ends, [])
     await until(lambda: ends)
     assert ends[0].status == SUCCEEDED
-    await until(lambda: ros.graph().topics[node.topic].publishers == ["/robot/peer"])
+    there = link.Topic(types=["std_msgs/msg/String"], publishers=["/robot/peer"])
+    await until(lambda: ros.graph().topics.get(node.topic) == there)
