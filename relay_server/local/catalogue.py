@@ -11,6 +11,9 @@ from typing import NamedTuple
 from relay_protocol.link import Service, Topic
 from relay_protocol.ros_types import TypeRegistry
 
+PACKAGES = ("rosapi_msgs/", "switchboard_msgs/")
+"""How the names of these types begin."""
+
 RELAY = "/relay"
 ROSAPI = "/rosapi"
 

@@ -13,14 +13,13 @@ from collections.abc import Iterator
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from twisted.internet.defer import Deferred, DeferredList
-
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, SwitchboardError, Unavailable
 from relay_protocol.limits import NAME
 from relay_protocol.rights import Operation
 from relay_server.channel import Channel
 from relay_server.local.arguments import absolute, text
+from relay_server.local.together import side_by_side
 from relay_server.local.values import NOT_SET, from_parameter, to_parameter
 from relay_server.local.view import view
 from relay_server.session import Session
@@ -33,9 +32,6 @@ LIST_SECONDS = 2.0
 
 ALL_SECONDS = 10.0
 """All nodes together have this long."""
-
-AT_A_TIME = 16
-"""Nodes that are asked for their lists at a time, for one caller."""
 
 SURVEYS = 16
 """Callers for whom the nodes of one robot are asked at a time."""
@@ -189,8 +185,19 @@ async def get_param_names(session: Session, args: Any) -> Any:
         if name.endswith("/list_parameters") and _LIST in service.types
     ]
     found: dict[str, list[str]] = {}
+    waiting = deque(nodes)
+
+    async def ask(node: str) -> None:
+        # Who does not answer, or not with names, is left out.
+        with contextlib.suppress(SwitchboardError, TypeError, KeyError):
+            answer = await _ask(session, node, "list_parameters", {}, LIST_SECONDS)
+            told = answer["result"]["names"][:NAMES]
+            found[node] = [f"{node}:{each}" for each in told if isinstance(each, str) and len(each) <= NAME]
+        if sum(map(len, found.values())) >= NAMES:
+            waiting.clear()
+
     with _survey(session.channel), contextlib.suppress(Unavailable):
-        await session.channel.within(ALL_SECONDS, _side_by_side(session, deque(nodes), found))
+        await session.channel.within(ALL_SECONDS, side_by_side(waiting, ask))
     return {"names": [name for node in nodes for name in found.get(node, [])][:NAMES]}
 
 
@@ -208,18 +215,3 @@ def _survey(channel: Channel) -> Iterator[None]:
         yield
     finally:
         under_way.remove(mine)
-
-
-async def _side_by_side(session: Session, nodes: deque[str], found: dict[str, list[str]]) -> None:
-    askers = [Deferred.fromCoroutine(_ask_next(session, nodes, found)) for _ in range(AT_A_TIME)]
-    await DeferredList(askers, consumeErrors=True)
-
-
-async def _ask_next(session: Session, nodes: deque[str], found: dict[str, list[str]]) -> None:
-    while nodes and sum(map(len, found.values())) < NAMES:
-        node = nodes.popleft()
-        # Who does not answer, or not with names, is left out.
-        with contextlib.suppress(SwitchboardError, TypeError, KeyError):
-            answer = await _ask(session, node, "list_parameters", {}, LIST_SECONDS)
-            told = answer["result"]["names"][:NAMES]
-            found[node] = [f"{node}:{each}" for each in told if isinstance(each, str) and len(each) <= NAME]

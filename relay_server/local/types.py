@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Iterable
 from typing import Any
-
-from twisted.internet.defer import Deferred, DeferredList
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.local import catalogue
 from relay_server.local.arguments import text
+from relay_server.local.together import side_by_side
 from relay_server.local.view import View, view
 from relay_server.session import Session, normal_type
 
@@ -22,17 +22,17 @@ RAW_CHARACTERS = 8 * MIB
 _CONTAINED = re.compile(r"^MSG: (\w+)/msg/(\w+)[ \t\r]*$", re.MULTILINE)
 
 
-async def _known(session: Session, type_name: str, text: bool = False) -> TypeRegistry:
+async def _known(session: Session, type_name: str, own_text: bool = False) -> TypeRegistry:
     """Where the definition of a type is, once it is there.
 
-    :param text: its own text is wanted
+    :param own_text: its own text is wanted; else one that contains it will do
     :raises NotFound: the robot does not have it
     :raises Invalid: the robot's definition is unusable
     :raises Unavailable: the robot is offline
     """
-    if catalogue.TYPES.knows(type_name):
+    if type_name.startswith(catalogue.PACKAGES) and catalogue.TYPES.knows(type_name):
         return catalogue.TYPES
-    await session.channel.definition(type_name, text)
+    await session.channel.definition(type_name, own_text)
     return session.robot.types
 
 
@@ -104,18 +104,21 @@ async def topics_and_raw_types(session: Session, args: Any) -> Any:
 
 
 async def _texts(session: Session, types: Iterable[str]) -> dict[str, str]:
-    """The full text of each type, all asked for at once."""
-    names = list(dict.fromkeys(types))
-    asked = [Deferred.fromCoroutine(_full_text(session, each)) for each in names]
-    told = await DeferredList(asked, fireOnOneErrback=True, consumeErrors=True)
-    return dict(zip(names, (text for _, text in told), strict=True))
+    """The full text of each type."""
+    texts: dict[str, str] = {}
+
+    async def ask(type_name: str) -> None:
+        texts[type_name] = await _full_text(session, type_name)
+
+    await side_by_side(deque(dict.fromkeys(types)), ask)
+    return texts
 
 
 async def _full_text(session: Session, type_name: str) -> str:
     if not type_name:
         return ""
     try:
-        types = await _known(session, type_name, text=True)
+        types = await _known(session, type_name, own_text=True)
         return _CONTAINED.sub(r"MSG: \1/\2", types.definition(type_name))
     except SwitchboardError as error:
         return f"# no definition: {error}"

@@ -16,7 +16,7 @@ from relay_server.graph import Ends, GraphMirror
 from relay_server.local.catalogue import OWN_SERVICES, OWN_TOPICS, RELAY, ROSAPI
 from relay_server.session import Session
 
-KEPT = 16
+KEPT = 8
 """Views kept of one robot: callers with the same rights share one."""
 
 
@@ -55,7 +55,7 @@ def view(session: Session) -> View:
 def _made(session: Session, graph: GraphMirror, ends: Ends) -> View:
     judge = session.permit.judge
 
-    def callable(name: str) -> bool:
+    def may_call(name: str) -> bool:
         return judge(Operation.CALL, name).allowed
 
     topics = {
@@ -67,12 +67,12 @@ def _made(session: Session, graph: GraphMirror, ends: Ends) -> View:
     services = {
         name: service
         for name, service in _services(graph.services, ends.services).items()
-        if not hidden(name) and callable(name)
+        if not hidden(name) and may_call(name)
     }
     actions = {
         name: action
         for name, action in sorted(_services(graph.actions, ends.actions).items())
-        if not hidden(name) and callable(name)
+        if not hidden(name) and may_call(name)
     }
     # The relay's own services are open to everyone with a right on the robot.
     services = dict(sorted({**services, **OWN_SERVICES}.items()))

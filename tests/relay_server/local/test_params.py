@@ -10,7 +10,8 @@ import pytest
 from relay_protocol import link
 from relay_protocol.rights import Level
 from relay_server.local import params
-from relay_server.local.params import ALL_SECONDS, AT_A_TIME, SURVEYS
+from relay_server.local.params import ALL_SECONDS, SURVEYS
+from relay_server.local.together import AT_A_TIME
 from tests.relay_server.local.asking import answers, ask, asked, begin, fails
 from tests.relay_server.memory import Person, World
 

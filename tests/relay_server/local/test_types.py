@@ -9,6 +9,7 @@ import pytest
 from relay_protocol import link
 from relay_server.local import types
 from relay_server.local.catalogue import TYPE_NAMES
+from relay_server.local.together import AT_A_TIME
 from tests.relay_server.local.asking import ask, begin
 from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World
 
@@ -146,6 +147,25 @@ def test_raw_types_are_of_just_this_type(world: World, operator: Person) -> None
     raw = begin(operator, "/rosapi/topics_and_raw_types")
     world.define(STRING, TWIST)
     assert raw()["typedefs_full_text"][1].startswith("Vector3 linear\n")
+
+
+def test_so_many_types_are_asked_for_at_a_time(world: World, operator: Person) -> None:
+    """Nobody floods a robot with questions; a caller who leaves ends them."""
+    topics = {f"/t{n}": link.Topic(types=[f"a_msgs/msg/T{n}"]) for n in range(100)}
+    topics["/time"] = link.Topic(types=["builtin_interfaces/msg/Time"])
+    world.registry.graph(world.robot, link.Graph(full=True, topics=dict(topics)))
+    got = begin(operator, "/rosapi/topics_and_raw_types")
+    assert len(world.link.all(link.GetType)) == AT_A_TIME
+    while asked := world.link.take(link.GetType):
+        assert len(asked) <= AT_A_TIME
+        for each in asked:
+            world.channel.message(link.TypeDefinition(type=each.type, text="int8 a\n"))
+    texts = got()["typedefs_full_text"]
+    assert texts.count("int8 a\n") == 101
+    other = world.person()
+    world.registry.graph(world.robot, link.Graph(topics={"/u": link.Topic(types=["b_msgs/msg/U"])}))
+    begin(other, "/rosapi/topics_and_raw_types")
+    other.session.end()
 
 
 def test_raw_types_are_bounded(world: World, operator: Person, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,70 @@
+"""Many questions, so many of them at a time."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+from twisted.internet.defer import CancelledError, Deferred
+
+from relay_server.local.together import AT_A_TIME, side_by_side
+
+
+class Work:
+    """Questions whose answers the test gives."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Deferred[None]] = []
+
+    async def ask(self, item: int) -> None:
+        """Wait for the answer."""
+        waiting: Deferred[None] = Deferred()
+        self.waiting.append(waiting)
+        await waiting
+
+
+def test_the_next_begins_when_one_is_done() -> None:
+    """All are done in the end."""
+    work = Work()
+    done = Deferred.fromCoroutine(side_by_side(deque(range(50)), work.ask))
+    for number in range(50):
+        assert len(work.waiting) == min(50, AT_A_TIME + number)
+        work.waiting[number].callback(None)
+    assert done.called
+
+
+def test_nothing_to_do_is_done() -> None:
+    """At once."""
+    assert Deferred.fromCoroutine(side_by_side(deque(), Work().ask)).called
+
+
+def test_thousands_that_are_done_at_once_are_no_recursion() -> None:
+    """A robot that is lost answers all of them at the same time."""
+
+    async def ask(item: int) -> None:
+        """Done already."""
+
+    assert Deferred.fromCoroutine(side_by_side(deque(range(50_000)), ask)).called
+
+
+def test_what_goes_wrong_is_told() -> None:
+    """The error itself, not that there was one."""
+    work = Work()
+    done = Deferred.fromCoroutine(side_by_side(deque(range(3)), work.ask))
+    work.waiting[1].errback(RuntimeError("broken"))
+    errors: list[BaseException] = []
+    done.addErrback(lambda failure: errors.append(failure.value))
+    assert str(errors[0]) == "broken"
+
+
+def test_who_cancels_ends_them_all() -> None:
+    """None begins after that."""
+    work = Work()
+    items = deque(range(50))
+    done = Deferred.fromCoroutine(side_by_side(items, work.ask))
+    done.cancel()
+    with pytest.raises(CancelledError):
+        done.result.raiseException()  # type: ignore[attr-defined]
+    done.addErrback(lambda failure: None)
+    assert len(work.waiting) == AT_A_TIME
+    assert all(each.called for each in work.waiting)
