@@ -11,9 +11,10 @@ from relay_protocol import jsontext, link, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
+from relay_protocol.ros_types import Writer
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
-from relay_server.channel.topics import Encode, Held, Phase, Publication
+from relay_server.channel.topics import Held, Phase, Publication, Send
 from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire, resolve
 from relay_server.clock import Clock
 
@@ -121,15 +122,12 @@ class Publications:
         :param id: of the client's ``publish``
         :param good_for: seconds from now after which it must not be sent any more
         """
-        encode = publication.encode or self._encoder(publication)
-        robot = self._wire.link
-        if encode is not None and robot is not None:
+        send = publication.send or self._sender(publication)
+        if send is not None:
             try:
-                encoded = encode(body)
+                send(body, stamp)
             except SwitchboardError as error:
                 member.tell("error", f"publish {publication.topic}: {error}", id)
-            else:
-                robot.sample(publication.number, stamp, encoded)
         elif publication.phase is Phase.FAILED:
             reason = f"the robot could not advertise {publication.topic}; the message was dropped"
             member.tell("error", reason, id)
@@ -137,21 +135,22 @@ class Publications:
             until = self._clock.seconds() + min(good_for, HELD_SECONDS)
             self._hold(publication, Held(member, body, stamp, id, until))
 
-    def _encoder(self, publication: Publication) -> Encode | None:
-        """What makes the robot's form of a message, if it can be sent now."""
-        if publication.phase in (Phase.WAITING, Phase.FAILED) or self._untyped(publication):
+    def _sender(self, publication: Publication) -> Send | None:
+        """What sends a message in the robot's form, if that can be done now."""
+        robot = self._wire.link
+        if robot is None or publication.phase in (Phase.WAITING, Phase.FAILED) or self._untyped(publication):
             return None
         if self._wire.cdr:
             try:
-                write, now_ns = self._wire.robot.types.writer(publication.type, checked=True), self._now_ns
+                writer = self._wire.robot.types.writer(publication.type, checked=True)
             except SwitchboardError as error:
                 # The robot said it was known: it told of a service's type, or of something else that is no message.
                 self.refused(publication.number, str(error))
                 return None
-            publication.encode = lambda body: write(body, now_ns())
+            publication.send = _as_cdr(writer, self._now_ns, robot.sample, publication.number)
         else:
-            publication.encode = _as_it_came
-        return publication.encode
+            publication.send = _as_it_came(robot.sample, publication.number)
+        return publication.send
 
     def _hold(self, publication: Publication, message: Held) -> None:
         mine = (
@@ -268,7 +267,7 @@ class Publications:
         self._wire.asks.ask(Ask(("advertise", publication.number), message, sent))
 
     def _flush(self, publication: Publication) -> None:
-        if self._encoder(publication) is None:
+        if self._sender(publication) is None:
             return
         held = list(publication.held)
         publication.held.clear()
@@ -297,16 +296,33 @@ def _dropped(publication: Publication, message: Held, reason: str) -> None:
     message.member.tell("error", f"publish {publication.topic}: {reason}", message.id)
 
 
-def _as_it_came(body: bytes) -> bytes:
-    """A message for a robot that speaks JSON: the client's own words, once it is sure that any reader can take them.
+Sample = Callable[[int, int, bytes], None]
+"""Puts a sample on the robot's link; see :meth:`ChannelLink.sample`."""
+
+
+def _as_cdr(write: Writer, now_ns: Callable[[], int], sample: Sample, number: int) -> Send:
+    """Send messages to a robot that speaks CDR."""
+
+    def send(body: bytes, stamp: int) -> None:
+        sample(number, stamp, write(body, now_ns()))
+
+    return send
+
+
+def _as_it_came(sample: Sample, number: int) -> Send:
+    """Send messages to a robot that speaks JSON: in the client's own words, once any reader can take them.
 
     msgspec has skipped the body, which finds all that is not JSON except a number beyond any double; the text around
     it was checked for UTF-8 and depth.
     """
-    if body[:1] != b"{":
-        raise Invalid("'msg' must be an object")
-    try:
-        orjson.loads(body)
-    except ValueError:
-        jsontext.check_range(body)
-    return body
+
+    def send(body: bytes, stamp: int) -> None:
+        if body[:1] != b"{":
+            raise Invalid("'msg' must be an object")
+        try:
+            orjson.loads(body)
+        except ValueError:
+            jsontext.check_range(body)
+        sample(number, stamp, body)
+
+    return send

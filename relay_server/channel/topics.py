@@ -196,8 +196,9 @@ def _keep(samples: deque[Sample], sample: Sample) -> None:
         samples.popleft()
 
 
-Encode = Callable[[bytes], bytes]
-"""Takes a message's JSON, gives what the robot is sent. Raises :class:`Invalid`."""
+Send = Callable[[bytes, int], None]
+"""Takes a message's JSON, part of a text that was checked, and its stamp (the relay's monotonic nanoseconds).
+Raises :class:`Invalid` when the message is not of the topic's type."""
 
 
 class Held(NamedTuple):
@@ -225,12 +226,12 @@ class Publication:
         self.queue_size = 0
         self.qos: QoS | None = None
         self.phase = Phase.WAITING
-        self.encode: Encode | None = None
-        """Makes what the robot is sent of a message's JSON. ``None`` until the first message after a change."""
+        self.send: Send | None = None
+        """Sends a message to the robot; ``None`` while none can be sent, and until the first after a change."""
         self.holders: dict[Member, set[rosbridge.Id]] = {}
         self.held: deque[Held] = deque()
 
     def enter(self, phase: Phase) -> None:
-        """Go on to this phase; how messages are made is found out anew."""
+        """Go on to this phase; how messages are sent is found out anew."""
         self.phase = phase
-        self.encode = None
+        self.send = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from relay_protocol import link, rosbridge
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_protocol.rights import Operation, Rules
 from relay_server.channel import resolve
 from relay_server.channel.publications import HELD_SECONDS
@@ -91,9 +91,14 @@ class Publishing:
                 self._stale(route, age_ms, ask.id)
                 return
             good_for = (deadline_ms - age_ms) / 1000
-        session.channel.publications.publish(
-            session, route.publication, bytes(ask.msg), self._freshness.not_before, ask.id, good_for
-        )
+        publication, body, stamp = route.publication, bytes(ask.msg), self._freshness.not_before
+        if publication.send is None:
+            session.channel.publications.publish(session, publication, body, stamp, ask.id, good_for)
+            return
+        try:
+            publication.send(body, stamp)
+        except SwitchboardError as error:
+            session.tell("error", f"publish {publication.topic}: {error}", ask.id)
 
     def _find(self, ask: rosbridge.Publish) -> Route:
         self._routes.pop(ask.topic, None)
