@@ -185,15 +185,17 @@ async def get_param_names(session: Session, args: Any) -> Any:
         if name.endswith("/list_parameters") and _LIST in service.types
     ]
     found: dict[str, list[str]] = {}
-    waiting = deque(nodes)
+    waiting, room = deque(nodes), NAMES
 
     async def ask(node: str) -> None:
+        nonlocal room
         # Who does not answer, or not with names, is left out.
         with contextlib.suppress(SwitchboardError, TypeError, KeyError):
             answer = await _ask(session, node, "list_parameters", {}, LIST_SECONDS)
             told = answer["result"]["names"][:NAMES]
             found[node] = [f"{node}:{each}" for each in told if isinstance(each, str) and len(each) <= NAME]
-        if sum(map(len, found.values())) >= NAMES:
+            room -= len(found[node])
+        if room <= 0:
             waiting.clear()
 
     with _survey(session.channel), contextlib.suppress(Unavailable):
