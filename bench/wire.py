@@ -299,8 +299,11 @@ class PlainRobot:
             named = {key: message[key] for key in ("number", "topic", "type")}
             channel.tell(link.Advertised(**named, encoding=self.encoding))
         elif op == "get_type":
-            text = self._texts[message["type"]]
-            channel.tell(link.TypeDefinition(type=message["type"], text=text))
+            text = self._texts.get(message["type"])
+            if text is None:
+                channel.tell(link.Failed(what="get_type", ref=message["type"], reason="it is not known here"))
+            else:
+                channel.tell(link.TypeDefinition(type=message["type"], text=text))
 
     def sample(self, topic: str, body: bytes) -> bytes:
         """The frame around a sample of a topic that was asked for."""
