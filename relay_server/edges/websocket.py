@@ -104,6 +104,8 @@ class ClientProtocol(FastProtocol):
         self._asking = False
         self._open = False
         self._opened_ns = 0
+        self._full = False
+        self._unanswered: bytes | None = None
 
     # --- handshake ----------------------------------------------------------------------------------------
 
@@ -292,6 +294,16 @@ class ClientProtocol(FastProtocol):
         if admission is not None:
             self.factory.gate.turn_away(admission)
 
+    def onPing(self, payload: bytes) -> None:
+        """A ping of the client. One that takes nothing gets the latest answered when it does again.
+
+        RFC 6455 section 5.5.3 allows that; the answers to a flood of pings must not pile up here.
+        """
+        if self._full:
+            self._unanswered = payload
+        else:
+            super().onPing(payload)
+
     def onPong(self, payload: bytes) -> None:
         """The answer to a ping."""
         if self._session is not None:
@@ -351,11 +363,16 @@ class ClientProtocol(FastProtocol):
 
     def pause(self) -> None:
         """The transport's buffer is full."""
+        self._full = True
         if self._session is not None:
             self._session.pause()
 
     def resume(self) -> None:
         """The transport takes bytes again."""
+        self._full = False
+        unanswered, self._unanswered = self._unanswered, None
+        if unanswered is not None:
+            self.onPing(unanswered)
         if self._session is not None:
             self._session.resume()
 

@@ -42,10 +42,12 @@ class Route:
 class Publishing:
     """The messages of one session on their way to the robot."""
 
-    __slots__ = ("_freshness", "_routes", "_session", "stale_commands")
+    __slots__ = ("_freshness", "_permit", "_robot", "_routes", "_session", "stale_commands")
 
     def __init__(self, session: Session, freshness: Freshness) -> None:
         self._session = session
+        self._permit = session.permit
+        self._robot = session.robot
         self._freshness = freshness
         self._routes: dict[str, Route] = {}
         self.stale_commands = 0
@@ -71,12 +73,11 @@ class Publishing:
         :raises Unavailable: the robot is offline
         :raises Invalid: no such topic, or of another type
         """
-        session = self._session
-        robot = session.robot
+        session, robot = self._session, self._robot
         route = self._routes.get(ask.topic)
         if (
             route is None
-            or route.rules is not session.permit.rules
+            or route.rules is not self._permit.rules
             or route.description is not robot.description
             or session not in route.publication.holders
             or ask.type != route.type

@@ -324,3 +324,30 @@ def test_names_of_what_is_forgotten_are_autobahns(gate: MemoryGate) -> None:
     gate.wait.callback(None)
     client.run()
     assert set(module.HANDSHAKE_ATTRIBUTES) - {"http_response_data"} <= before
+
+
+def test_pings_of_a_client_that_takes_nothing_are_answered_by_one_pong(gate: MemoryGate) -> None:
+    """The latest, when it takes bytes again: a flood of pings fills nobody's memory."""
+    client = Client(gate, Authorization="Bearer good")
+    flow = client.transport.producer
+    flow.pauseProducing()
+    for number in range(100):
+        client.core.send_ping(b"%d" % number)
+    client.run()
+    assert client.pongs == []
+    flow.resumeProducing()
+    client.core.send_ping(b"later")
+    client.run()
+    assert client.pongs == [b"99", b"later"]
+
+
+def test_a_close_comes_after_all_that_was_sent_before(gate: MemoryGate) -> None:
+    """What Autobahn writes and what goes past it keep their order."""
+    client = Client(gate, Authorization="Bearer good")
+    transport = gate.sessions[0].transport
+    for number in range(3):
+        transport.send(wsframe.text(b"%d" % number))
+    transport.close(closing.FORBIDDEN, "enough")
+    client.run()
+    assert client.heard == [b"0", b"1", b"2"]
+    assert client.closed == closing.FORBIDDEN

@@ -217,6 +217,15 @@ class Client:
         ]
 
     @property
+    def pongs(self) -> list[bytes]:
+        """Payloads of pongs so far."""
+        return [
+            bytes(each.data)
+            for each in self._events()
+            if isinstance(each, Frame) and each.opcode is Opcode.PONG
+        ]
+
+    @property
     def closed(self) -> int | None:
         """The close code, when the relay has closed."""
         return self.core.close_rcvd.code if self.core.close_rcvd else None
