@@ -20,6 +20,10 @@ from relay_protocol import identity
 
 PATIENCE = 10.0
 ABSENCE = 0.4
+HEARTBEAT = 1.0
+RARE = 20.0
+"""A heartbeat so rare that a robot which hangs up within :data:`PATIENCE` did not do so for silence."""
+
 FRAME_LIMIT = 2**24
 COMMAND_FRAME = 2**22
 JSON, SAMPLE, PART = 0, 1, 3
@@ -215,6 +219,7 @@ class LinkRelay:
         self.graph: dict[str, dict[str, Any]] = {"topics": {}, "services": {}, "actions": {}, "nodes": {}}
         self.first_graph: dict[str, Any] | None = None
         self._control: Link | None = None
+        self._heartbeat = HEARTBEAT
         self._dialled: list[Link] = []
         self._change = threading.Condition()
         self.dials = 0
@@ -269,16 +274,25 @@ class LinkRelay:
         link.say("challenge", nonce=base64.b64encode(nonce).decode(), relay=relay)
         return nonce
 
-    def register(self, patience: float = 30.0) -> Link:
+    def register(self, patience: float = 30.0, heartbeat: float = HEARTBEAT) -> Link:
         """Take the robot in when it dials, its proof checked."""
         link, self.hello = self.dialled("hello", patience)
         nonce = self.challenge(link)
         signature = base64.b64decode(link.expect("prove")["signature"], validate=True)
         assert identity.verify(self.public_key, RELAY, self.robot, nonce, signature), "the signature is wrong"
         self.describe, self.first_graph = {}, None
-        link.say("welcome", session=secrets.token_hex(4), heartbeat=1.0, frame_limit=FRAME_LIMIT)
-        self._control = link
+        link.say("welcome", session=secrets.token_hex(4), heartbeat=heartbeat, frame_limit=FRAME_LIMIT)
+        self._control, self._heartbeat = link, heartbeat
         return link
+
+    def control_with(self, heartbeat: float) -> Link:
+        """The control link with this heartbeat, seconds; registered anew if it has another."""
+        if self._control is None or self._control.ended or self._heartbeat != heartbeat:
+            if self._control is not None:
+                self._control.cut()
+            self.register(heartbeat=heartbeat)
+            self.facts()
+        return self.control
 
     @property
     def control(self) -> Link:
