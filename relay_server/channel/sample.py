@@ -68,12 +68,16 @@ class Converter:
         self._type = type_name
         self.cdr = encoding == "cdr"
         self.failed = failed
+        self._known = False
         self._readers: dict[str, Reader] = {}
 
     @property
     def knows(self) -> bool:
         """Whether all that this takes is known."""
-        return not self.cdr or self._types.knows(self._type)
+        if not self._known:
+            # Asked for every sample; what is known stays known.
+            self._known = not self.cdr or self._types.knows(self._type)
+        return self._known
 
     def convert(self, language: str, body: bytes) -> bytes:
         """A sample's body in ``json`` or ``cbor``.
