@@ -144,19 +144,22 @@ has_headers() {
         'import pathlib, sys, sysconfig; sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())'
 }
 
-# What compiling takes, installed where that may be done. Fails, and names in words what is missing, where not.
+headers_package() { $venv/bin/python -c 'import sys; print("python%d.%d-dev" % sys.version_info[:2])'; }
+
+# What compiling takes, where it may be installed and there are generators that need it.
+install_compilers() {
+    can_apt && $venv/bin/python -c 'import rosidl_generator_py' 2>/dev/null || return 0
+    has_compilers || apt_install gcc g++ || true
+    has_headers || apt_install "$(headers_package)" || true
+}
+
+# Fails, and names in words what is missing.
 need_compilers() {
-    local headers
-    headers=python$($venv/bin/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')-dev
-    if can_apt; then
-        has_compilers || apt_install gcc g++ || true
-        has_headers || apt_install "$headers" || true
-    fi
     if ! has_compilers; then
         say "no gcc and g++ (Debian, Ubuntu: apt install gcc g++)"
         return 1
     elif ! has_headers; then
-        say "no Python.h for $venv/bin/python (Debian, Ubuntu: apt install $headers)"
+        say "no Python.h for $venv/bin/python (Debian, Ubuntu: apt install $(headers_package))"
         return 1
     fi
 }
@@ -189,6 +192,7 @@ stage_interfaces() {
 # For the tests alone: packages with one of every kind of field and the examples every ROS 2 has; the roslib of old.
 stage_fixtures() {
     local clients=tests/e2e/clients packages
+    install_compilers
     build_packages fixtures 'packages for the tests' 'tests of services and actions fail' tests/interfaces/*
     need_node
     packages=$(fingerprint $clients/package.json $clients/package-lock.json)
@@ -236,8 +240,9 @@ for stage in "${@:-all}"; do
         all)
             stage_python
             stage_web
-            stage_interfaces
+            # This one may bring the compilers the other makes do without.
             stage_fixtures
+            stage_interfaces
             stage_browser
             ;;
         python | web | interfaces | fixtures | browser | bench) "stage_$stage" ;;
