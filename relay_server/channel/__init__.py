@@ -6,7 +6,8 @@ is remembered, so a robot or a link that goes away and comes back is taken up ag
 """
 
 from relay_server.channel.hub import Channels
-from relay_server.channel.lifecycle import Channel, State
+from relay_server.channel.lifecycle import Channel
+from relay_server.channel.states import State
 from relay_server.channel.wire import ChannelLink, Member, resolve
 
 __all__ = ["Channel", "ChannelLink", "Channels", "Member", "State", "resolve"]

@@ -1,8 +1,7 @@
-"""A channel's life, as a table of states and events, and the messages that pass through it."""
+"""A channel: its life by the table of :mod:`~relay_server.channel.states`, and the messages that pass through it."""
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
@@ -23,7 +22,9 @@ from relay_server.channel.interfaces import Interfaces
 from relay_server.channel.offers import ACTIONS, SERVICES, Offers
 from relay_server.channel.publications import Publications
 from relay_server.channel.robot_clock import RobotClock
+from relay_server.channel.round_trips import RoundTrips
 from relay_server.channel.serving import ServedCalls, call_seconds
+from relay_server.channel.states import NEXT, Event, State
 from relay_server.channel.subscriptions import Subscriptions
 from relay_server.channel.wire import ChannelLink, Member, Wire
 from relay_server.clock import Clock, Timer, cancel
@@ -37,44 +38,6 @@ JOIN_SECONDS = 10.0
 
 REOPEN_SECONDS = 0.5
 """Pause before a broken channel link is asked for anew."""
-
-
-class State(enum.Enum):
-    """Where a channel is in its life."""
-
-    NEW = "new"
-    WAITING = "waiting for the robot"
-    OPENING = "opening"
-    OPEN = "open"
-    CLOSED = "closed"
-
-
-class Event(enum.Enum):
-    """What happens to a channel."""
-
-    WANTED = "somebody is here"
-    ROBOT_ONLINE = "the robot registered"
-    ROBOT_OFFLINE = "the robot is gone"
-    JOINED = "the robot joined"
-    LINK_LOST = "the channel's link broke"
-    LATE = "the robot did not join in time"
-    SHUT = "nobody needs it any more"
-
-
-NEXT: dict[tuple[State, Event], State] = {
-    (State.NEW, Event.WANTED): State.WAITING,
-    (State.WAITING, Event.ROBOT_ONLINE): State.OPENING,
-    (State.WAITING, Event.SHUT): State.CLOSED,
-    (State.OPENING, Event.JOINED): State.OPEN,
-    (State.OPENING, Event.ROBOT_ONLINE): State.OPENING,
-    (State.OPENING, Event.ROBOT_OFFLINE): State.WAITING,
-    (State.OPENING, Event.LATE): State.OPENING,
-    (State.OPENING, Event.SHUT): State.CLOSED,
-    (State.OPEN, Event.LINK_LOST): State.OPENING,
-    (State.OPEN, Event.ROBOT_OFFLINE): State.WAITING,
-    (State.OPEN, Event.SHUT): State.CLOSED,
-}
-"""An event that is not listed for a state changes nothing."""
 
 
 class Channel:
@@ -112,8 +75,8 @@ class Channel:
         self._timer: Timer | None = None
         self._idle: Timer | None = None
         self._opened: list[Deferred[None]] = []
-        self._pinging: list[Deferred[float]] = []
         self.wire = Wire(clock, robot)
+        self._round_trips = RoundTrips(self.wire)
         definitions = Definitions(self.wire, self._typed, self._untypeable)
         self._definitions = definitions
         self._interfaces = Interfaces(self.wire)
@@ -217,26 +180,9 @@ class Channel:
 
         async def work() -> float:
             await self._open()
-            return await self._ping()
+            return await self._round_trips.ask()
 
         return await self.within(limits.CALL_SECONDS, work())
-
-    def _ping(self) -> Deferred[float]:
-        """One ping serves all who ask while it is under way."""
-        waiting: Deferred[float] = Deferred()
-        if self.wire.link is None:
-            waiting.errback(Unavailable(f"robot {self.robot.name} is not connected"))
-            return waiting
-        self._pinging.append(waiting)
-        if len(self._pinging) == 1:
-            self.wire.link.round_trip().addBoth(self._pinged)
-        return waiting
-
-    def _pinged(self, result: float | Failure) -> None:
-        waiting, self._pinging = self._pinging, []
-        for each in waiting:
-            if not each.called:
-                each.errback(result) if isinstance(result, Failure) else each.callback(result)
 
     async def definition(self, type_name: str, text: bool = False) -> None:
         """Wait until the robot's definition of a type is known.

@@ -141,6 +141,8 @@ class Sample:
             else:
                 flaw = Flaw.TOO_LARGE
                 words = f"messages longer than {png.MOST} bytes are not sent as PNG but as plain JSON"
+        if len(texts) == 1:
+            return Ready(divided(texts[0], wish.form.fragment_size), flaw, words)
         return Ready(b"".join(divided(each, wish.form.fragment_size) for each in texts), flaw, words)
 
     def _in(self, language: str) -> bytes | SwitchboardError:

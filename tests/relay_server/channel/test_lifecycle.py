@@ -10,7 +10,8 @@ from twisted.internet.defer import Deferred
 from relay_protocol import link
 from relay_protocol.errors import Refused
 from relay_server.channel import State
-from relay_server.channel.lifecycle import JOIN_SECONDS, NEXT, REOPEN_SECONDS, Event
+from relay_server.channel.lifecycle import JOIN_SECONDS, REOPEN_SECONDS
+from relay_server.channel.states import NEXT, Event
 from tests.relay_server.memory import MemoryLink, World, fails, text
 
 
