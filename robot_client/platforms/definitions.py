@@ -10,10 +10,11 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable
+from itertools import accumulate
 from pathlib import Path
 
 from relay_protocol.errors import Invalid, NotFound
-from relay_protocol.limits import INTERFACES, NAME, TYPE_DEFINITION
+from relay_protocol.limits import INTERFACES, JSON_BODY, KIB, NAME, TYPE_DEFINITION
 
 RULE = "=" * 80
 _TYPE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)\Z")
@@ -80,7 +81,11 @@ def all_names(where: Iterable[Path]) -> list[str]:
             paths = prefix.glob(f"share/*/{kind}/*.{kind}")
             found.update(f"{each.parent.parent.name}/{kind}/{each.name}" for each in paths)
     names = {name.rpartition(".")[0] for name in found if name.endswith((".msg", ".srv", ".action", ".idl"))}
-    return sorted(name for name in names if len(name) <= NAME and _TYPE_NAME.match(name))[:INTERFACES]
+    known = sorted(name for name in names if len(name) <= NAME and _TYPE_NAME.match(name))
+    room = JSON_BODY - KIB
+    # Each takes its length, quotes and a comma; a longer message would cost the link.
+    sizes = accumulate(len(name) + 3 for name in known)
+    return [name for name, size in zip(known, sizes, strict=True) if size <= room][:INTERFACES]
 
 
 def _read_lines(path: Path) -> list[str]:

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.limits import INTERFACES, JSON_BODY
 from robot_client.platforms.definitions import (
     RULE,
     all_names,
@@ -124,3 +126,16 @@ def test_all_names_are_found(tmp_path: Path) -> None:
     (index / "b").write_text("msg/Two.idl\nmsg/Two.msg\nmsg/Idl.idl\nsrv/../../x.srv\n")
     (index / "broken").write_bytes(b"\xff")
     assert all_names([tmp_path, tmp_path / "nowhere"]) == ["a/action/Go", "b/msg/Idl", "b/msg/Two"]
+
+
+def test_names_fit_into_one_message(tmp_path: Path) -> None:
+    """A robot with more types than one message holds names the first of them."""
+    index = tmp_path / "share" / "ament_index" / "resource_index" / "rosidl_interfaces"
+    index.mkdir(parents=True)
+    (index / "long").write_text("\n".join(f"msg/{'X' * 230}{number:05}.msg" for number in range(6000)))
+    (index / "short").write_text("\n".join(f"msg/Y{number:05}.msg" for number in range(9000)))
+    names = all_names([tmp_path])
+    assert 4000 < len(names) < 6000
+    assert len(link.frame(link.Interfaces(types=names))) <= JSON_BODY
+    (index / "long").unlink()
+    assert len(all_names([tmp_path])) == INTERFACES
