@@ -88,9 +88,8 @@ def watched(
     sent = robot.publisher.sent()[TOPIC]
     used = spent_by(pids, seconds)
     sent = robot.publisher.sent()[TOPIC] - sent
-    least = [each.report()["least"] for each in watching]
     # The stand-in may fall behind on a busy machine; then it has spent less than it should have.
-    assert least[0] >= 0.9 * sent - 5, f"viewers got {least[0]} of {sent} samples"
+    watching[0].until_each_has(0.95 * sent)
     return used
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -104,3 +105,14 @@ class Receivers(Native):
         self.popen.stdin.write("\n")
         self.popen.stdin.flush()
         return dict(json.loads(self.line()))
+
+    def until_each_has(self, count: float, seconds: float = 20.0) -> None:
+        """Wait until every client has had so many messages since the report before.
+
+        :raises AssertionError: somebody has not
+        """
+        least, end = 0, time.monotonic() + seconds
+        while least < count:
+            assert time.monotonic() < end, f"a client got {least} messages of {count:.0f}"
+            time.sleep(0.05)
+            least += self.report()["least"]
