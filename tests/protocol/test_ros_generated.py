@@ -7,6 +7,7 @@ import keyword
 import math
 import struct
 import time
+import tracemalloc
 from typing import Any
 
 import cbor2
@@ -363,15 +364,40 @@ def test_deep_texts_are_refused_by_generated_code_too() -> None:
     assert 2 * (deepest + 1) < 64
 
 
-def test_short_texts_can_not_become_many_large_structs() -> None:
-    """A megabyte of ``{}`` is not given to generated code where each would become an object of many fields."""
-    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\n" + many_fields(300))
+@pytest.mark.parametrize("fields", [many_fields(300), "float64[100] a"])
+def test_short_texts_can_not_become_much_memory(fields: str) -> None:
+    """A megabyte of ``{}``, each of which stands for many fields or numbers, is soon left to the closures."""
+    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\n{fields}")
     write = fast_writer.generate(TYPE, compiled.definitions)(passed)
     assert write(b'{"t":[{},{}]}', 0)
+    text = b'{"t":[' + b",".join([b"{}"] * 300_000) + b"]}"
+    tracemalloc.start()
+    try:
+        with pytest.raises(Passed):
+            write(text, 0)
+        assert tracemalloc.get_traced_memory()[1] < 60_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_decoded_values_of_repeating_types_are_left_to_the_closures() -> None:
+    """How much memory they would take can't be told from their length."""
+    compiled = Compiled(TYPE, f"T[] t\n{LINE}\nMSG: a/T\nint8 x")
     with pytest.raises(Passed):
-        write(b'{"t":[' + b",".join([b"{}"] * 100_000) + b"]}", 0)
-    with pytest.raises(Passed):
-        write({"t": [{}]}, 0)
+        fast_writer.generate(TYPE, compiled.definitions)(passed)({"t": [{}]}, 0)
+
+
+@pytest.mark.parametrize("text", ["Point[5] a", "Point[] a"])
+@pytest.mark.parametrize("form", ["json", "cbor"])
+def test_elements_that_are_cut_off_are_missed(text: str, form: str) -> None:
+    """A message that lacks whole elements at its end is not read as one that has fewer."""
+    types = TypeRegistry()
+    types.add(TYPE, f"{text}\n{LINE}\nMSG: a/Point\nfloat64 x\nfloat64 y")
+    cdr = types.from_json(TYPE, {"a": [{}] * 5}, 0)
+    assert types.reader(TYPE, form)(cdr)
+    for lacking in (16, 32, 48, 4, 1):
+        with pytest.raises(Invalid):
+            types.reader(TYPE, form)(cdr[:-lacking])
 
 
 @pytest.mark.parametrize(
