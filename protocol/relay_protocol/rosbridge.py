@@ -184,6 +184,8 @@ ClientOp = (
 )
 
 _LIST = ord("[")
+_SHALLOW = 5 * JSON_DEPTH
+"""Objects in each other take at least five bytes each, ``{"":`` and ``}``; the innermost takes two."""
 
 _decode: Callable[[bytes], ClientOp] = msgspec.json.Decoder(ClientOp).decode
 
@@ -193,9 +195,9 @@ def decode(data: bytes) -> ClientOp:
 
     :raises MalformedMessage: not strict JSON, an unknown ``op``, a field missing or of the wrong type
     """
-    # As jsontext.decode, with fewer calls: this is done for every message of every client. What is ASCII, with no
-    # list and few objects, has passed all that check_text looks for.
-    if _LIST in data or not data.isascii() or data.count(b"{") > JSON_DEPTH:
+    # As jsontext.decode, with fewer calls: this is done for every message of every client. What is ASCII, without a
+    # list, and too short for many objects in each other has passed all that check_text looks for.
+    if _LIST in data or len(data) > _SHALLOW or not data.isascii():
         jsontext.check_text(data)
     try:
         return _decode(data)

@@ -85,4 +85,6 @@ def divided(message: bytes, size: int) -> bytes:
 
     :param size: bytes of ``data``; 0 for no fragments
     """
+    if not size:
+        return wsframe.text(message)
     return b"".join(map(wsframe.text, fragments.divide(message, size)))

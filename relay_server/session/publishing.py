@@ -24,10 +24,10 @@ class Route:
     """What was found out about a topic this client may publish to, and on what that was founded.
 
     :param type: as the client wrote it in ``publish``
-    :param motion: whether the robot's own safety counts the topic as motion
+    :param motion: whether the robot's own safety counts the topic as motion; then commands have a deadline
     """
 
-    __slots__ = ("description", "motion", "publication", "rules", "type")
+    __slots__ = ("deadline_ms", "description", "holders", "publication", "rules", "type")
 
     def __init__(
         self, type: str, rules: Rules, description: link.Describe, publication: Publication, motion: bool
@@ -36,7 +36,8 @@ class Route:
         self.rules = rules
         self.description = description
         self.publication = publication
-        self.motion = motion
+        self.holders = publication.holders
+        self.deadline_ms = description.motion.deadline_ms if motion else None
 
 
 class Publishing:
@@ -79,15 +80,15 @@ class Publishing:
             route is None
             or route.rules is not self._permit.rules
             or route.description is not robot.description
-            or session not in route.publication.holders
+            or session not in route.holders
             or ask.type != route.type
             or robot.control is None
         ):
             route = self._find(ask)
         good_for = HELD_SECONDS
-        if route.motion:
+        deadline_ms = route.deadline_ms
+        if deadline_ms is not None:
             age_ms = self._freshness.age() / 1e6
-            deadline_ms = route.description.motion.deadline_ms
             if age_ms > deadline_ms:
                 self._stale(route, age_ms, ask.id)
                 return
@@ -121,6 +122,6 @@ class Publishing:
         self._session.tell(
             "warning",
             f"a command to {route.publication.topic} was dropped: it may be {age_ms:.0f} ms old, by the last ping "
-            f"answered; the robot takes none older than {route.description.motion.deadline_ms} ms",
+            f"answered; the robot takes none older than {route.deadline_ms} ms",
             id,
         )

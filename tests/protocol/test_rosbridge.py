@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_protocol import rosbridge
+from relay_protocol import limits, rosbridge
 from relay_protocol.errors import MalformedMessage
 
 
@@ -50,7 +50,9 @@ def test_absent_arguments_are_told_from_null() -> None:
 
 def test_an_unknown_op_is_told_with_those_known() -> None:
     """The error names the op and what would have been right."""
-    with pytest.raises(MalformedMessage, match=r"unknown op 'subscrbe'; known are action_feedback, .*unsubscribe"):
+    with pytest.raises(
+        MalformedMessage, match=r"unknown op 'subscrbe'; known are action_feedback, .*unsubscribe"
+    ):
         rosbridge.decode(b'{"op":"subscrbe","topic":"/a"}')
 
 
@@ -79,3 +81,15 @@ def test_what_the_relay_sends_is_json(text: str, ident: rosbridge.Id, result: bo
     assert status["level"] == "error"
     assert status["msg"] == text
     assert status.get("id") == ident
+
+
+@pytest.mark.parametrize("extra", [0, 1, 2, 60])
+def test_objects_in_each_other_are_counted_however_short(extra: int) -> None:
+    """The shortest text of each depth: as deep as allowed is taken, one more is refused."""
+    inner = limits.JSON_DEPTH - 2 + extra
+    text = b'{"op":"publish","topic":"t","msg":' + b'{"":' * inner + b"{}" + b"}" * inner + b"}"
+    if extra == 0:
+        assert isinstance(rosbridge.decode(text), rosbridge.Publish)
+    else:
+        with pytest.raises(MalformedMessage, match="deeper than"):
+            rosbridge.decode(text)
