@@ -89,22 +89,22 @@ class FastProtocol(WebSocketServerProtocol):
         at, have = 0, len(data)
         seconds = self.factory.reactor.seconds
         until = seconds() + SHARE_SECONDS
+        # What can change only by a frame of Autobahn's, or by a message that begins the session, is looked up once.
+        whole, limit = not self._passing and not self.inside_message, self.maxFramePayloadSize
         while at < have:
             first, start = data[at], 0
             # What is shorter than the longest head can be left to Autobahn too.
-            if (
-                first in _READ_HERE
-                and have - at >= _LONGEST_HEAD
-                and self.state == _OPEN
-                and not self._passing
-                and not self.inside_message
-            ):
+            if whole and first in _READ_HERE and have - at >= _LONGEST_HEAD and self.state == _OPEN:
                 length = data[at + 1] - _MASKED
                 if 0 <= length < 126:
                     start = at + 6
-                elif first == _TEXT:
-                    start, length = _long(data, at, length)
-            if start and length <= self.maxFramePayloadSize:
+                elif first == _TEXT and length == 126:
+                    length = data[at + 2] << 8 | data[at + 3]
+                    start = at + 8 if length > 125 else 0
+                elif first == _TEXT and length == 127:
+                    length = _U64(data, at + 2)[0]
+                    start = at + 14 if length > 65535 else 0
+            if start and length <= limit:
                 end = start + length
                 if end > have:
                     self._wait(data, at, end - at)
@@ -112,17 +112,18 @@ class FastProtocol(WebSocketServerProtocol):
                 payload = data[start:end] if length <= _COPIED else memoryview(data)[start:end]
                 payload = apply_mask(payload, data[start - 4 : start])
                 at = end
-                if first == _TEXT:
-                    if self.takes_text is None:
-                        self.onMessage(payload, False)
-                    else:
-                        self.takes_text(payload)
-                else:
+                if first == _PONG:
                     self.onPong(payload)
+                elif self.takes_text is not None:
+                    self.takes_text(payload)
+                else:
+                    self.onMessage(payload, False)
+                    limit = self.maxFramePayloadSize
             else:
                 at = self._pass_on(data, at)
                 if self._waiting is not None or self.state not in _SPEAKING:
                     return
+                whole, limit = not self._passing and not self.inside_message, self.maxFramePayloadSize
             if seconds() > until and at < have:
                 self._rest(data, at)
                 return
@@ -173,20 +174,6 @@ class FastProtocol(WebSocketServerProtocol):
         self._passing -= len(piece)
         super().dataReceived(piece)
         return at + len(piece)
-
-
-def _long(data: bytes, at: int, length: int) -> tuple[int, int]:
-    """Where the payload of a frame with a longer head starts, and how long it is; 0 when it is not in order.
-
-    :param length: 126 or 127, as the seven bits say; negative when the frame is not masked
-    """
-    if length < 0:
-        return 0, 0
-    if length == 126:
-        length = _U16(data, at + 2)[0]
-        return (at + 8 if length > 125 else 0), length
-    length = _U64(data, at + 2)[0]
-    return (at + 14 if length > 65535 else 0), length
 
 
 def _frame(data: bytes, at: int, *, inside: bool) -> int:
