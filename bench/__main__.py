@@ -48,41 +48,48 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="tiny counts: does it run? figures say nothing")
     parser.add_argument("--seconds", type=float, help="length of 'crowd' and 'soak'")
     parser.add_argument(
-        "--json", type=Path, help="where figures go (bench/results/latest.json when all was measured)"
+        "--json",
+        type=Path,
+        help="where figures go, beside those of other measurements (bench/results/latest.json)",
     )
     parser.add_argument("--plot", type=Path, help="where a picture of the ratios goes (SVG)")
     return parser.parse_args()
 
 
-def measure(names: list[str], options: Options) -> tuple[list[Row], dict[str, str], dict[str, float]]:
-    """Run measurements in turn; rows, what is missing and why, the machine's load before each."""
+def measure(name: str, options: Options) -> tuple[list[Row], str]:
+    """Run one measurement; its rows, or why there are none."""
+    began = time.monotonic()
     rows: list[Row] = []
-    missing: dict[str, str] = {}
-    loads: dict[str, float] = {}
-    for name in names:
-        loads[name] = round(load(), 2)
-        began = time.monotonic()
-        print(f"--- {name}: {MEASUREMENTS[name]} (load {loads[name]:.1f})", flush=True)
-        try:
-            rows += importlib.import_module(f"bench.{name}").run(options)
-        except Unavailable as error:
-            missing[name] = str(error)
-        except Exception as error:
-            traceback.print_exc()
-            missing[name] = f"failed: {error!r}"
-        print(f"    {name} took {time.monotonic() - began:.0f} s", flush=True)
-    return rows, missing, loads
+    missing = ""
+    try:
+        rows = importlib.import_module(f"bench.{name}").run(options)
+    except Unavailable as error:
+        missing = str(error)
+    except Exception as error:
+        traceback.print_exc()
+        missing = f"failed: {error!r}"
+    print(f"    {name} took {time.monotonic() - began:.0f} s", flush=True)
+    return rows, missing
 
 
 def main() -> int:
     """Measure and tell; the code is 1 when a measurement failed, not when a bar is missed."""
     asked = arguments()
-    names = asked.names or list(MEASUREMENTS)
-    rows, missing, loads = measure(names, Options(asked.quick, asked.seconds))
+    target = asked.json or (None if asked.quick else RESULTS / "latest.json")
+    options, measured = Options(asked.quick, asked.seconds), commit()
+    rows: list[Row] = []
+    missing: dict[str, str] = {}
+    for name in asked.names or MEASUREMENTS:
+        before = round(load(), 1)
+        print(f"--- {name}: {MEASUREMENTS[name]} (load {before})", flush=True)
+        found, why = measure(name, options)
+        rows += found
+        if why:
+            missing[name] = why
+        if target is not None:
+            save(target, name, found, why, before, measured)
     show(rows, missing)
-    target = asked.json or (RESULTS / "latest.json" if not asked.names and not asked.quick else None)
     if target is not None:
-        save(target, rows, missing, loads, commit())
         print(f"figures: {target}")
     if asked.plot is not None:
         from bench.plot import plot

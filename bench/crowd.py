@@ -27,7 +27,7 @@ from bench.cpu import resident, seconds_of
 from bench.native import Receivers
 from bench.relay import Relay
 from bench.report import Options, Row
-from bench.robot import RealRobot
+from bench.robot import SETTLE_SECONDS, RealRobot
 from bench.viewers import subscribe
 from bench.wire import handshake
 
@@ -172,6 +172,7 @@ def run(options: Options) -> list[Row]:
         stack.callback(lambda: [each.stop() for each in ground.watching.values()])
         ground.come(Group("alone", 1, ALL), 1)
         wait_for("the first client has something of all", lambda: _topics(ground, "alone") == set(ALL), 30)
+        time.sleep(options.pick(0, SETTLE_SECONDS))
         alone = ground.spell(options.pick(1, ALONE_SECONDS))
         for group in GROUPS:
             ground.come(group, max(1, round(group.count * part)))

@@ -23,7 +23,7 @@ from bench.cpu import seconds_of
 from bench.native import Receivers
 from bench.relay import Relay
 from bench.report import Options, Row
-from bench.robot import RealRobot
+from bench.robot import SETTLE_SECONDS, RealRobot
 from bench.viewers import SCAN, STREAM, TOPIC, subscribe
 from bench.wire import handshake
 
@@ -102,8 +102,7 @@ def run(options: Options) -> list[Row]:
         stack.enter_context(running(relay))
         robot = RealRobot(relay, "rover", [STREAM])
         stack.enter_context(running(robot))
-        # A daemon that has just come up is busy for some seconds with what it finds.
-        time.sleep(options.pick(0, 6))
+        time.sleep(options.pick(0, SETTLE_SECONDS))
         rest = spent_by({"daemon": robot.pid, "relay": relay.pid}, seconds / 2)
         ask = subscribe((TOPIC, SCAN, 0))
         request = handshake("/robots/rover", robot.viewer("watcher"))

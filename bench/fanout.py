@@ -101,7 +101,7 @@ def run(options: Options) -> list[Row]:
     loop = Loop()
     with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        relay = Relay(folder, "--heartbeat", "10")
+        relay = Relay(folder, "--heartbeat", "120")
         stack.enter_context(running(relay))
         stack.callback(loop.close)
         ours = relay_side(loop, relay, folder, clients)

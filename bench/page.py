@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 from bench import RESULTS, ROOT
+from bench.__main__ import MEASUREMENTS
 from bench.plot import plot
 from bench.report import Row, figure, ratio_text
 
@@ -18,9 +19,11 @@ _MET = {True: "yes", False: "**no**", None: ""}
 
 
 def rows_of(kept: dict[str, Any]) -> list[Row]:
-    """The rows as they were measured."""
+    """The rows as they were measured, in the order of the measurements."""
     names = {field.name for field in dataclasses.fields(Row)}
-    return [Row(**{name: value for name, value in row.items() if name in names}) for row in kept["rows"]]
+    order = [kept["measurements"][name] for name in MEASUREMENTS if name in kept["measurements"]]
+    rows = [row for measurement in order for row in measurement["rows"]]
+    return [Row(**{name: value for name, value in row.items() if name in names}) for row in rows]
 
 
 def table(rows: list[Row]) -> str:
@@ -42,16 +45,20 @@ def table(rows: list[Row]) -> str:
 
 def figures(kept: dict[str, Any]) -> str:
     """The part of the page that is written by a run."""
-    machine, rows = kept["machine"], rows_of(kept)
-    loads = kept["load_before"].values()
+    machine, measured, rows = kept["machine"], kept["measurements"], rows_of(kept)
+    loads = [each["load_before"] for each in measured.values()]
+    commits = ", ".join(dict.fromkeys(f"`{each['commit']}`" for each in measured.values()))
     missed = sum(row.met is False for row in rows)
     asked = sum(row.met is not None for row in rows)
     notes = dict.fromkeys(f"- {row.measurement}: {row.note}" for row in rows if row.note)
-    left_out = "".join(f"\nNot measured: {name} ({why}).\n" for name, why in kept["missing"].items())
+    left_out = "".join(
+        f"\nNot measured: {name} ({each['missing']}).\n" for name, each in measured.items() if each["missing"]
+    )
     return (
-        f"Measured {kept['when'][:10]} at `{kept['commit']}`, {machine['cores']} cores ({machine['processor']}), Linux "
-        f"{machine['kernel']}, Python {machine['python']}, loopback. Others worked on the machine too: its load was "
-        f"{min(loads):.1f} to {max(loads):.1f} before the measurements. {asked - missed} of {asked} bars are met.\n\n"
+        f"Measured {max(each['when'] for each in measured.values())[:10]} at {commits}, {machine['cores']} cores "
+        f"({machine['processor']}), Linux {machine['kernel']}, Python {machine['python']}, loopback. Others worked on "
+        f"the machine too: its load was {min(loads):.1f} to {max(loads):.1f} before the measurements. "
+        f"{asked - missed} of {asked} bars are met.\n\n"
         f"{table(rows)}\n{left_out}\nBeside the figures:\n\n" + "\n".join(notes)
     )
 

@@ -129,7 +129,7 @@ def machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "processor": model,
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
-        "kernel": platform.release(),
+        "kernel": platform.release().partition("-")[0],
         "python": platform.python_version(),
     }
 
@@ -139,15 +139,22 @@ def load() -> float:
     return os.getloadavg()[0]
 
 
-def save(path: Path, rows: list[Row], missing: dict[str, str], loads: dict[str, float], commit: str) -> None:
-    """Keep the figures as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = {
+def save(path: Path, name: str, rows: list[Row], missing: str, before: float, commit: str) -> None:
+    """Keep the figures of one measurement as JSON; those of others stay as they were.
+
+    :param missing: why there are none; empty when there are
+    :param before: the machine's load before it
+    """
+    content: dict[str, Any] = {"measurements": {}}
+    if path.exists():
+        content = json.loads(path.read_text())
+    content["machine"] = machine()
+    content["measurements"][name] = {
         "when": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "commit": commit,
-        "machine": machine(),
-        "load_before": loads,
+        "load_before": before,
         "missing": missing,
         "rows": [{**asdict(row), "ratio": row.ratio, "met": row.met} for row in rows],
     }
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")

@@ -16,6 +16,9 @@ from bench import ROOT
 from bench.relay import Relay
 from bench.report import Unavailable
 
+SETTLE_SECONDS = 8.0
+"""A daemon that has just come up is busy for some seconds with what it finds."""
+
 
 class CountingProxy(ChaosProxy):
     """A proxy between robot and relay that counts what comes from the robot."""

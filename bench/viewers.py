@@ -18,7 +18,7 @@ from bench.cpu import measured
 from bench.native import Receivers
 from bench.relay import Relay
 from bench.report import Options, Row
-from bench.robot import RealRobot
+from bench.robot import SETTLE_SECONDS, RealRobot
 from bench.wire import handshake, text_frame
 from relay_protocol import jsontext
 
@@ -72,6 +72,7 @@ def run(options: Options) -> list[Row]:
         # The first viewer stays, so that nothing is opened and closed on the robot between the rounds.
         first = Receivers(folder, relay.http_port, 1, request, ask)
         stack.callback(first.stop)
+        time.sleep(options.pick(0, SETTLE_SECONDS))
         for _ in range(rounds):
             costs[1].append(watched(robot, first, seconds))
             others = Receivers(folder, relay.http_port, many - 1, request, ask)

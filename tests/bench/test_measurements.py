@@ -67,8 +67,10 @@ def test_ratios_read_as_people_say_them() -> None:
 def test_what_is_kept_names_no_machine(tmp_path: Path) -> None:
     """Figures, bars and facts of the machine are kept; its name, users and paths are not."""
     path = tmp_path / "figures.json"
-    save(path, [Row("x", "x", "µs", 1.0, 4.0, "y", 0.25)], {"y": "not there"}, {"x": 0.5}, "abc")
+    save(path, "hop", [Row("hop", "x", "µs", 1.0, 4.0, "y", 0.25)], "", 0.5, "abc")
+    save(path, "latency", [], "no HAProxy", 0.5, "abc")
     content = json.loads(path.read_text())
     assert set(content["machine"]) == {"cores", "processor", "memory_gib", "kernel", "python"}
-    assert content["rows"][0]["met"] is True
+    assert content["measurements"]["hop"]["rows"][0]["met"] is True
+    assert content["measurements"]["latency"]["missing"] == "no HAProxy"
     assert str(Path.home()) not in path.read_text()

@@ -18,7 +18,9 @@ ROWS = [
 def kept(tmp_path: Path) -> dict[str, object]:
     """What a run with these rows leaves."""
     path = tmp_path / "figures.json"
-    save(path, ROWS, {"latency": "no HAProxy"}, {"hop": 0.5, "fanout": 2.0}, "abc")
+    for row in ROWS:
+        save(path, row.measurement, [row], "", 0.5, "abc")
+    save(path, "latency", [], "no HAProxy", 2.0, "abc")
     return dict(json.loads(path.read_text()))
 
 
