@@ -571,14 +571,13 @@ class Wheels:
                 if self.speed(report) == 0.2:
                     return report
 
-    def stands(self) -> float:
-        """Wait until it stands; seconds from the last report of moving to the first of standing."""
-        last = None
+    def stands(self, moving: Sample) -> float:
+        """Wait until it stands; seconds from the last report of moving, no earlier than ``moving``, to that."""
         while True:
             report = self.watching.expect_sample(1, 3)
             if self.speed(report) == 0:
-                return 0.0 if last is None else (report.stamp - last) / 1e9
-            last = report.stamp
+                return (report.stamp - moving.stamp) / 1e9
+            moving = report
 
     def never_moves(self, seconds: float = ABSENCE) -> None:
         """Nothing but standing is reported within this time."""
@@ -603,26 +602,25 @@ def test_motion_is_known(drive: Wheels) -> None:
 @case("motion", "SPEC 2.5, Clocks and deadline, 3")
 def test_fresh_commands(drive: Wheels) -> None:
     """Fresh commands are obeyed, and a command of zero stops."""
-    drive.start()
+    moving = drive.start()
     drive.command(0.0)
-    drive.stands()
+    drive.stands(moving)
 
 
 @case("motion", "SPEC 2.5, Clocks and deadline, 7")
 def test_stops_when_commands_cease(drive: Wheels) -> None:
     """When commands cease the robot stands still within stop_within_ms, while its links live."""
-    drive.start()
+    moving = drive.start()
     for _ in range(3):
         drive.command(0.2)
-    took = drive.stands()
+    took = drive.stands(moving)
     assert took <= drive.stop_within + 0.25, f"it took {took * 1000:.0f} ms"
 
 
 @case("motion", "SPEC 2.5, Clocks and deadline, 6")
 def test_says_zero_again(drive: Wheels) -> None:
     """Zero is said several times, because a best-effort subscriber may miss the first."""
-    drive.start()
-    drive.stands()
+    drive.stands(drive.start())
     if drive.next_speed(0.5) is None:
         not_offered("zero is said once only (SHOULD)")
 
@@ -630,8 +628,7 @@ def test_says_zero_again(drive: Wheels) -> None:
 @case("motion", "SPEC 2.5, Clocks and deadline, 3")
 def test_old_commands(drive: Wheels) -> None:
     """Commands older than deadline_ms are dropped."""
-    drive.start()
-    drive.stands()
+    drive.stands(drive.start())
     for _ in range(5):
         drive.command(0.2, age=drive.deadline + 0.05)
     drive.never_moves()
@@ -653,8 +650,7 @@ def test_old_commands_do_not_keep_it_moving(drive: Wheels) -> None:
 @case("motion", "SPEC 2.5, Clocks and deadline, 3")
 def test_commands_of_the_future(drive: Wheels) -> None:
     """Commands that lie in the future are dropped."""
-    drive.start()
-    drive.stands()
+    drive.stands(drive.start())
     for _ in range(5):
         drive.command(0.2, age=-60)
     drive.never_moves()
@@ -663,8 +659,7 @@ def test_commands_of_the_future(drive: Wheels) -> None:
 @case("motion", "SPEC 2.5, Clocks and deadline, 4")
 def test_no_number(drive: Wheels) -> None:
     """A command with what is no finite number is dropped, and the next one is obeyed."""
-    drive.start()
-    drive.stands()
+    drive.stands(drive.start())
     for _ in range(3):
         drive.not_finite()
     drive.never_moves()
@@ -685,9 +680,9 @@ def test_unadvertise_stops(drive: Wheels) -> None:
     """unadvertise stops what this publisher left moving, without waiting for the watchdog."""
     took = []
     for _ in range(4):
-        drive.start()
+        moving = drive.start()
         drive.driving.say("unadvertise", number=2)
-        took.append(drive.stands())
+        took.append(drive.stands(moving))
         drive.never_moves()
         drive.advertise()
     assert min(took) < 0.6 * drive.stop_within, f"it took {[f'{each * 1000:.0f}' for each in took]} ms"
@@ -696,9 +691,9 @@ def test_unadvertise_stops(drive: Wheels) -> None:
 @case("motion", "SPEC 2.5, Clocks and deadline, 7")
 def test_cut_channel_stops(drive: Wheels) -> None:
     """When the channel link that drives is cut the robot stands still within stop_within_ms."""
-    drive.start()
+    moving = drive.start()
     drive.driving.cut()
-    took = drive.stands()
+    took = drive.stands(moving)
     assert took <= drive.stop_within + 0.25, f"it took {took * 1000:.0f} ms"
 
 
