@@ -29,7 +29,7 @@ def plot(rows: list[Row], path: Path) -> None:
         axes.plot([bar, bar], [at - 0.38, at + 0.38], color=BAR, linewidth=2)
         axes.annotate(
             ratio_text(ratio),
-            (min(ratio, 1), at),
+            (min(ratio, 1, bar), at),
             xytext=(-5, 0),
             textcoords="offset points",
             ha="right",
@@ -37,6 +37,8 @@ def plot(rows: list[Row], path: Path) -> None:
         )
     axes.axvline(1, color="#999999", linewidth=0.8)
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value >= 1 else f"1/{1 / value:g}")
+    axes.set_ylim(-0.8, len(drawn) - 0.2)
     axes.set_xlim(min([row.ratio or 1 for row in drawn], default=0.1) / 4, 6)
     axes.set_yticks(range(len(drawn)), [f"{row.what}\nagainst {row.against}" for row in drawn], fontsize=7)
     axes.set_xlabel("ours in parts of the alternative's (less is better); upright lines are the bars")
