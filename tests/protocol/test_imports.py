@@ -11,11 +11,11 @@ PROTOCOL = Path(__file__).parents[2] / "protocol"
 
 
 def test_the_robot_needs_nothing_of_the_servers() -> None:
-    """All modules but the ROS types work without numpy, orjson, pybase64 and rosbags."""
+    """All modules but the ROS types work without numpy, pybase64, cbor2 and rosbags."""
     program = f"""
 import importlib, sys
 sys.path.insert(0, {str(PROTOCOL)!r})
-for name in ("numpy", "orjson", "pybase64", "rosbags"):
+for name in ("numpy", "pybase64", "cbor2", "rosbags"):
     sys.modules[name] = None
 for name in {ROBOT_NEEDS!r}.split():
     importlib.import_module("relay_protocol." + name)
