@@ -6,12 +6,13 @@ checked there. So the text is checked once, as a whole, before anything is decod
 
 from __future__ import annotations
 
+import json
+import math
 import re
 from itertools import accumulate
 from typing import Any, TypeVar, get_args
 
 import msgspec
-import orjson
 
 from relay_protocol.errors import MalformedMessage
 from relay_protocol.limits import JSON_DEPTH
@@ -88,21 +89,20 @@ def decode_any(data: bytes) -> Any:
     """Decode a checked message without a schema; see :func:`decode`."""
     value = decode(_ANY, data)
     if len(data) >= _DIGITS_OF_DOUBLE and _LONG_RUN in data.translate(_ALL_DIGITS_ALIKE):
-        check_range(data)
+        _check_range(data)
     return value
 
 
-def check_range(data: bytes) -> None:
-    """Refuse JSON with a number that no double can hold.
+def _check_range(data: bytes) -> None:
+    """Refuse JSON with a number that no double can hold: msgspec takes integers of any length."""
+    json.loads(data, parse_int=_in_range, parse_float=_in_range)
 
-    msgspec takes integers of any length, and where it skips a value it looks at no number's size.
 
-    :raises MalformedMessage: such a number, or no JSON at all
-    """
-    try:
-        orjson.loads(data)
-    except orjson.JSONDecodeError as error:
-        raise MalformedMessage(f"the message can't be read: {error}") from None
+def _in_range(digits: str) -> float:
+    value = float(digits)
+    if math.isinf(value):
+        raise MalformedMessage("the message is not JSON: a number is out of range")
+    return value
 
 
 _DIGITS_OF_DOUBLE = 309

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import orjson
 
-from relay_protocol import jsontext, link, rosbridge
+from relay_protocol import link, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
@@ -321,8 +321,8 @@ def _as_it_came(sample: Sample, number: int) -> Send:
             raise Invalid("'msg' must be an object")
         try:
             orjson.loads(body)
-        except ValueError:
-            jsontext.check_range(body)
+        except ValueError as error:
+            raise Invalid(f"the message can't be read: {error}") from None
         sample(number, stamp, body)
 
     return send

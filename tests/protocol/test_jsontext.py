@@ -106,8 +106,6 @@ def test_a_number_that_no_double_can_hold_is_refused(text: bytes) -> None:
     """However it is written; the longest that fits is taken."""
     with pytest.raises(MalformedMessage):
         jsontext.decode_any(text)
-    with pytest.raises(MalformedMessage):
-        jsontext.check_range(text)
     for fits in (b"1" * 309, b"1" * 400 + b"e-300", b'"%s"' % (b"1" * 400)):
         jsontext.decode_any(fits)
 

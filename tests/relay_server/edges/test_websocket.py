@@ -351,3 +351,13 @@ def test_a_close_comes_after_all_that_was_sent_before(gate: MemoryGate) -> None:
     client.run()
     assert client.heard == [b"0", b"1", b"2"]
     assert client.closed == closing.FORBIDDEN
+
+
+def test_what_comes_in_one_piece_with_the_proof_is_taken_as_after_it(gate: MemoryGate) -> None:
+    """The session has begun when the next message is looked at: its limit is the larger one."""
+    client = Client(gate)
+    large = "x" * (limits.UNPROVEN_BYTES + 1)
+    for text in (AUTH, "first message", large, "last message"):
+        client.core.send_text(text.encode())
+    client.end.dataReceived(b"".join(client.core.data_to_send()))
+    assert gate.sessions[0].got == ["start", b"first message", large.encode(), b"last message"]
