@@ -1,50 +1,46 @@
 """Writing without delay and without waste: at once when nothing waits, else joined, once a turn of the reactor.
 
 Twisted keeps what is written until the socket is reported writable: one more turn, and two calls to the kernel to
-ask for the report and to take that back. Here the first message of a turn goes to the socket directly. What follows in
-the same turn is joined and goes at its end: a flood costs one call to the kernel, not one a message. What the socket
-does not take goes into Twisted's own buffer, which pauses the producer as ever.
+ask for the report and to take that back. Here a message goes to the socket directly. What follows closely is joined
+and goes at the end of the turn: a flood costs one call to the kernel, not one a message. What the socket does not take
+goes into Twisted's own buffer, which pauses the producer as ever.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 from twisted.internet.tcp import Server
 
 from relay_server.clock import Clock
 
+APART_SECONDS = 0.0005
+"""Messages that come so far apart are sent one by one. To ask the reactor where a turn begins would cost more."""
+
 JOINED_BYTES = 32 * 1024
 """So much is not held until the end of the turn: the socket takes it now, or Twisted has to know that it is full."""
 
 
 class Turns:
-    """Knows when a turn of the reactor is over. One for all writers of a listening port.
+    """Flushes writers when a turn of the reactor is over. One for all writers of a listening port.
 
     :param clock: the reactor, or one in a test
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self.number = 0
-        self._ending = False
+        self.seconds = clock.seconds
         self._held: list[SocketWriter] = []
 
-    def begin(self) -> int:
-        """Something is sent in this turn; its number."""
-        if not self._ending:
-            self._ending = True
+    def hold(self, writer: SocketWriter) -> None:
+        """Flush this writer at the end of the turn."""
+        if not self._held:
             # The reactor makes due calls before it looks for events again.
             self._clock.callLater(0, self._over)
-        return self.number
-
-    def hold(self, writer: SocketWriter) -> None:
-        """Flush this writer at the end of the turn that has begun."""
         self._held.append(writer)
 
     def _over(self) -> None:
-        self._ending = False
-        self.number += 1
         held, self._held = self._held, []
         for writer in held:
             writer.flush()
@@ -63,25 +59,25 @@ class Writer(Protocol):
 class SocketWriter:
     """In front of a plain TCP connection."""
 
-    __slots__ = ("_held", "_held_bytes", "_sent_in", "_socket", "_transport", "_turns")
+    __slots__ = ("_held", "_held_bytes", "_sent_at", "_socket", "_transport", "_turns")
 
     def __init__(self, transport: Any, turns: Turns) -> None:
         self._transport = transport
         self._socket = transport.getHandle()
         self._turns = turns
-        self._sent_in = -1
+        self._sent_at = -math.inf
         self._held: list[bytes] = []
         self._held_bytes = 0
 
     def write(self, data: bytes) -> None:
-        """At once if nothing was sent in this turn, else at its end."""
-        turns = self._turns
-        if self._sent_in != turns.number:
-            self._sent_in = turns.begin()
-            self._put(data)
-            return
+        """At once if nothing was sent just before, else at the end of the turn."""
         if not self._held:
-            turns.hold(self)
+            now = self._turns.seconds()
+            if now - self._sent_at >= APART_SECONDS:
+                self._sent_at = now
+                self._put(data)
+                return
+            self._turns.hold(self)
         self._held.append(data)
         self._held_bytes += len(data)
         if self._held_bytes >= JOINED_BYTES:
