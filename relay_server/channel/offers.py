@@ -101,7 +101,7 @@ class Offers:
         self._offers: dict[str, Offer] = {}
 
     def standing(self, name: str) -> Offer | None:
-        """The offer of this name, unless the robot could not make it good."""
+        """The offer of this name, unless the robot could not make it good, or has it itself."""
         offer = self._offers.get(name)
         return None if offer is None or offer.phase is Phase.FAILED else offer
 
@@ -173,7 +173,10 @@ class Offers:
     def opened(self) -> None:
         """The robot is there: offer everything."""
         for offer in list(self._offers.values()):
-            self._ask(offer)
+            if self._provided(offer):
+                self._give_way(offer)
+            else:
+                self._ask(offer)
 
     def lost(self) -> None:
         """The robot's side is gone."""
@@ -181,9 +184,11 @@ class Offers:
             offer.phase = Phase.WAITING
 
     def graph_changed(self) -> None:
-        """What the robot could not offer may be possible now."""
+        """What the robot has itself now gives way to it; what it could not offer may be possible now."""
         for offer in list(self._offers.values()):
-            if offer.phase is Phase.FAILED:
+            if self._provided(offer):
+                self._give_way(offer)
+            elif offer.phase is Phase.FAILED:
                 self._ask(offer)
 
     def advertised(self, name: str) -> None:
@@ -198,10 +203,7 @@ class Offers:
         """The robot can't offer it."""
         offer = self._answered(name)
         if offer is not None:
-            offer.phase = Phase.FAILED
-            if offer.trouble != reason:
-                offer.trouble = reason
-                offer.member.tell("error", f"{self._kind.op} {name}: {reason}")
+            self._fail(offer, reason)
         self._wire.asks.answered((self._kind.op, name))
 
     def _answered(self, name: str) -> Offer | None:
@@ -228,10 +230,31 @@ class Offers:
 
         self._wire.asks.ask(Ask((self._kind.op, offer.name), message, sent))
 
+    def _fail(self, offer: Offer, reason: str) -> None:
+        offer.phase = Phase.FAILED
+        if offer.trouble != reason:
+            offer.trouble = reason
+            offer.member.tell("error", f"{self._kind.op} {offer.name}: {reason}")
+
+    def _provided(self, offer: Offer) -> bool:
+        return self._kind.provided(self._wire.robot.graph, offer.name)
+
+    def _give_way(self, offer: Offer) -> None:
+        """Who calls what the robot has must not be answered by a client that was there before it."""
+        if offer.phase is Phase.FAILED:
+            return
+        reason = f"the robot offers the {self._kind.word} {offer.name} itself"
+        self._withdraw(offer)
+        self._fail(offer, reason)
+        self._ended(offer, reason)
+
     def _end(self, offer: Offer, reason: str) -> None:
         del self._offers[offer.name]
         self._wire.names -= 1
+        self._withdraw(offer)
+        self._ended(offer, reason)
+
+    def _withdraw(self, offer: Offer) -> None:
         self._wire.asks.withdraw((self._kind.op, offer.name))
         if offer.phase in (Phase.ASKED, Phase.ACTIVE):
             self._wire.send(self._kind.withdraw(offer.name))
-        self._ended(offer, reason)

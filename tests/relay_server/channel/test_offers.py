@@ -185,6 +185,62 @@ def test_what_the_robot_can_not_offer_is_told_and_tried_again(world: World, kind
     assert not world.link.all(ASKED[kind])
 
 
+def appear(world: World, kind: str, name: str = "/mine") -> None:
+    """A node of the robot offers it."""
+    provided = {name: link.Service(types=[TYPES[kind]], providers=["/base"])}
+    world.registry.graph(world.robot, link.Graph(**{f"{kind}s": provided}))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_offer_gives_way_to_the_robots_own(world: World, kind: str) -> None:
+    """Nobody is answered by a client that was there first; when the robot's is gone it is offered again."""
+    person = at_work(world)
+    offer(person, kind)
+    world.define()
+    confirm(world, kind)
+    ask(world.person(), kind)
+    ask(person, kind, 2)
+    assert len([each for each in person.client.take() if each["op"] in REQUESTS]) == 2
+    appear(world, kind)
+    told = person.client.take()
+    assert next(each["msg"] for each in told if each["op"] == "status") == (
+        f"advertise_{kind} /mine: the robot offers the {kind} /mine itself"
+    )
+    assert [each["id"] for each in told if each["op"] in ANSWERS] == [2]
+    assert [getattr(each, kind) for each in world.link.take(ENDED[kind])] == ["/mine"]
+    ask(person, kind, 3)
+    assert len(world.link.all(link.CallService) + world.link.all(link.SendActionGoal)) == 1
+    assert not [each for each in person.client.take() if each["op"] in REQUESTS]
+    world.link.take(ASKED[kind])
+    world.registry.graph(world.robot, link.Graph(**{f"{kind}s": {"/mine": None}}))
+    assert len(world.link.all(ASKED[kind])) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_the_robot_has_when_it_comes_is_not_offered(world: World, kind: str) -> None:
+    """Whoever waited for it with an offer of that name."""
+    person = world.person()
+    person.says("set_level", level="error")
+    offer(person, kind)
+    world.robot_comes()
+    appear(world, kind)
+    world.robot_joins()
+    assert not world.link.all(ASKED[kind])
+    assert errors(person) == [f"advertise_{kind} /mine: the robot offers the {kind} /mine itself"]
+
+
+REQUESTS = ("call_service", "send_action_goal")
+ANSWERS = ("service_response", "action_result")
+
+
+def ask(person: Person, kind: str, id: int = 1) -> None:
+    """Somebody wants it done."""
+    if kind == "service":
+        person.says("call_service", service="/mine", id=id, args={"a": 1, "b": 2})
+    else:
+        person.says("send_action_goal", action="/mine", id=id, args={"order": 3})
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_answer_to_a_former_offer_is_not_taken_for_the_new_one(world: World, kind: str) -> None:
     """The robot answers in order: what is asked of a name waits for the answer to what was asked before."""
