@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -13,6 +14,7 @@ from relay_protocol.errors import NotFound, SwitchboardError
 from relay_server import closing
 from relay_server.access import Access, Permit, Principal
 from relay_server.auth import Authenticator, BadCredentials, TooManyTries
+from relay_server.budget import Budgets
 from relay_server.channel import Channels
 from relay_server.clock import Clock
 from relay_server.freshness import Freshness
@@ -72,6 +74,7 @@ class FrontDesk:
         self._origins = origins
         self._timing = timing
         self._rounds = Rounds(clock)
+        self._budgets = Budgets(clock.seconds, time.thread_time)
         self._cookie = cookie
         self._clock_ns = clock_ns
         self._wall = wall
@@ -182,6 +185,7 @@ class FrontDesk:
             Freshness(self._clock_ns, opened_ns, lambda: secrets.token_bytes(8)),
             self._timing,
             self._rounds,
+            self._budgets.of(admission.permit.principal.user_id),
             address=admission.address,
             since=self._wall(),
             ended=self._ended,

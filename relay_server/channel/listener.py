@@ -6,9 +6,10 @@ from typing import NamedTuple, Protocol
 
 from relay_protocol import rosbridge
 from relay_protocol.errors import Refused
+from relay_server.budget import Allowance
 from relay_server.channel.sample import Flaw, Sample, Wish
 from relay_server.clock import Clock, Timer
-from relay_server.forms import PLAIN, Form
+from relay_server.forms import PLAIN, TOO_COSTLY, Form
 
 THROTTLE_SECONDS = 3600.0
 """Longest throttle; a client that asks for more gets this."""
@@ -16,11 +17,21 @@ THROTTLE_SECONDS = 3600.0
 ASKS = 64
 """Subscriptions of one client to one topic, merged into one listener."""
 
+PLAINLY_SECONDS = 60.0
+"""How often a client is told that it gets plain JSON because it has used up its share of the processor."""
+
 _LEVELS = {Flaw.BROKEN: "error", Flaw.NOT_CDR: "error", Flaw.TOO_LARGE: "warning"}
 
 
 class Receiver(Protocol):
     """A session, as a topic's listeners use it."""
+
+    plain_instead: int
+    """Messages sent as plain JSON because a costlier form was not affordable."""
+
+    @property
+    def allowance(self) -> Allowance:
+        """What its user may have of the processor."""
 
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Queue a sample for the client."""
@@ -54,9 +65,15 @@ class Listener:
         """The names the topic is subscribed by, latest compression and least size of fragments."""
         self._asks: dict[tuple[str, rosbridge.Id], Asked] = {}
         self._told: set[Flaw] = set()
+        self._plainly_at = -PLAINLY_SECONDS
         self._sent_at = -THROTTLE_SECONDS
         self._waiting: Sample | None = None
         self._timer: Timer | None = None
+
+    @property
+    def allowance(self) -> Allowance:
+        """What its user may have of the processor."""
+        return self._receiver.allowance
 
     @property
     def raw(self) -> bool:
@@ -126,6 +143,14 @@ class Listener:
         if flaw not in self._told:
             self._told.add(flaw)
             self._receiver.tell(_LEVELS[flaw], f"{self.topic}: {words}")
+
+    def plainly(self) -> None:
+        """A sample comes as plain JSON for once: tell the client now and then."""
+        self._receiver.plain_instead += 1
+        now = self._clock.seconds()
+        if now >= self._plainly_at + PLAINLY_SECONDS:
+            self._plainly_at = now
+            self._receiver.tell("warning", f"{self.topic}: {TOO_COSTLY}")
 
     def close(self) -> None:
         """Stop; nothing more is sent."""

@@ -15,6 +15,7 @@ from twisted.logger import Logger
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import SwitchboardError
+from relay_server.budget import Budgets
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Sample
 from relay_server.channel.subscriptions import Subscriptions
@@ -40,6 +41,9 @@ class RobotClock:
 
     log = Logger()
     user = _NOBODY
+    plain_instead = 0
+    allowance = Budgets(lambda: 0.0, lambda: 0.0).of(_NOBODY)
+    """Nothing is taken from it: ticks are read as the robot sends them."""
 
     def __init__(
         self, clock: Clock, wire: Wire, subscriptions: Subscriptions, wall_ns: Callable[[], int]

@@ -13,13 +13,16 @@ from relay_protocol.errors import Invalid, SwitchboardError
 from relay_protocol.limits import KIB
 from relay_protocol.ros_types import Reader, TypeRegistry
 from relay_server import wsframe
-from relay_server.forms import Form, cbor, divided, png
+from relay_server.forms import PLAIN, Form, cbor, divided, png
 
 if TYPE_CHECKING:
     from relay_server.channel.listener import Listener
 
 _SPARE = 64 * KIB
 """What is made ready of one sample may take four times its size, and so much more; it can be made again."""
+
+_HEAD = 32
+"""Bytes of a ``publish`` around its ``msg``, at least."""
 
 
 class Wish(NamedTuple):
@@ -112,13 +115,33 @@ class Sample:
 
     def open(self, listener: Listener) -> bytes | None:
         """The websocket frames for a client that listens so; ``None`` when it can't be converted."""
-        ready = self._ready.get(listener.wish)
-        if ready is None:
-            ready = self._make(listener.wish)
-            self._keep(listener.wish, ready)
+        ready = self._ready.get(listener.wish) or self._ready_for(listener)
         if ready.flaw is not None:
             listener.complain(ready.flaw, ready.words)
         return ready.frames
+
+    def _ready_for(self, listener: Listener) -> Ready:
+        """Make it ready: at the cost of the client's user where that is much, else as plain JSON.
+
+        Others who want the same form get it without cost.
+        """
+        wish, allowance = listener.wish, listener.allowance
+        if not self._costly(wish.form):
+            return self._keep(wish, self._make(wish))
+        if allowance.may_form:
+            with allowance.forming():
+                return self._keep(wish, self._make(wish))
+        listener.plainly()
+        wish = Wish(wish.names, PLAIN)
+        return self._ready.get(wish) or self._keep(wish, self._make(wish))
+
+    def _costly(self, form: Form) -> bool:
+        if form.compression in ("cbor", "cbor-raw"):
+            return form.compression == "cbor" and not self._converter.cdr
+        if form == PLAIN:
+            return False
+        body = self._in("json")
+        return not isinstance(body, SwitchboardError) and form.costly(len(body) + _HEAD)
 
     def _make(self, wish: Wish) -> Ready:
         compression = wish.form.compression
@@ -129,6 +152,9 @@ class Sample:
                 language = compression
             else:
                 flaw, words = Flaw.NOT_CDR, "its messages are JSON, not CDR, so cbor-raw is plain JSON here"
+        if language == "cbor" and not self._converter.cdr and self.size > cbor.MOST:
+            language, flaw = "json", Flaw.TOO_LARGE
+            words = f"messages that are JSON and longer than {cbor.MOST} bytes are sent not as CBOR but as they are"
         body = self._in(language)
         if isinstance(body, SwitchboardError):
             return Ready(None, Flaw.BROKEN, f"a message can't be converted: {body}")
@@ -166,13 +192,14 @@ class Sample:
             found = self._pictures[name] = png.encode(text)
         return found
 
-    def _keep(self, wish: Wish, ready: Ready) -> None:
+    def _keep(self, wish: Wish, ready: Ready) -> Ready:
         """Latched samples stay for long: what was made ready of them must not grow with what clients think of."""
         self._ready[wish] = ready
         self._ready_bytes += len(ready.frames or b"")
         while self._ready_bytes > 4 * self.size + _SPARE and len(self._ready) > 1:
             gone = self._ready.pop(next(iter(self._ready)))
             self._ready_bytes -= len(gone.frames or b"")
+        return ready
 
 
 def _decoded(body: bytes) -> object:

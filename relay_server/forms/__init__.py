@@ -22,8 +22,21 @@ class Form(NamedTuple):
     compression: str = "none"
     fragment_size: int = 0
 
+    def costly(self, size: int) -> bool:
+        """Whether it takes much of the processor to put JSON in this form.
+
+        :param size: of the JSON, bytes
+        """
+        return self.compression == "png" or 0 < self.fragment_size < size
+
 
 PLAIN = Form()
+
+TOO_COSTLY = (
+    "PNG, fragments and CBOR made of JSON take much of the relay's processor, and your share is used up; "
+    "plain JSON is sent until there is some left"
+)
+"""What a client is told that gets plain JSON for a while."""
 
 
 class Asking(Protocol):
@@ -66,14 +79,15 @@ def asked(ask: Asking, tell: Tell, *, topic: bool = False) -> Form:
     return Form(compression, size)
 
 
-def frames(message: bytes, form: Form) -> bytes:
+def frames(message: bytes, form: Form = PLAIN) -> bytes:
     """The websocket frames of one message.
 
-    :param message: JSON. In PNG it goes only if it is no longer than :data:`relay_server.forms.png.MOST`.
+    :param message: JSON. In PNG it goes only if it is no longer than :data:`relay_server.forms.png.MOST`, in CBOR only
+        up to :data:`relay_server.forms.cbor.MOST`.
     """
     if form == PLAIN:
         return wsframe.text(message)
-    if form.compression in ("cbor", "cbor-raw"):
+    if form.compression in ("cbor", "cbor-raw") and len(message) <= cbor.MOST:
         return wsframe.binary(cbor.from_json(message))
     if form.compression == "png" and len(message) <= png.MOST:
         message = png.encode(message)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-import re
+from json.encoder import encode_basestring_ascii
 
 import pybase64
 
@@ -15,8 +15,6 @@ MOST = 512 * KIB
 
 LEVEL = 1
 """Of deflate. Level 6 takes up to twice the time of level 1 and saves less than a tenth of the bytes."""
-
-_NOT_ASCII = re.compile(r"[^\x00-\x7f]")
 
 
 def encode(message: bytes) -> bytes:
@@ -43,9 +41,9 @@ def picture(message: bytes) -> bytes:
 
 def _escaped(message: bytes) -> bytes:
     """The same JSON in ASCII: in browsers roslib 1.x takes each byte for a character."""
-    return _NOT_ASCII.sub(_escape, message.decode()).encode()
-
-
-def _escape(match: re.Match[str]) -> str:
-    units = match[0].encode("utf-16-be").hex()
-    return "".join(f"\\u{units[at : at + 4]}" for at in range(0, len(units), 4))
+    # In one go, a hundred times as fast as character by character. This also escapes quotes, backslashes and the
+    # white space between values, which is taken back. Each backslash came out as two, so no pair is parted here.
+    parts = encode_basestring_ascii(message.decode())[1:-1].split("\\\\")
+    for escaped, plain in (('\\"', '"'), ("\\n", "\n"), ("\\r", "\r"), ("\\t", "\t")):
+        parts = [part.replace(escaped, plain) for part in parts]
+    return "\\".join(parts).encode()

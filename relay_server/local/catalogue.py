@@ -94,6 +94,7 @@ Client[] clients
 RoundTrips rtt_ms
 uint64 drops
 TopicDrops[] topic_drops
+uint64 plain_instead
 uint64 refusals
 uint64 stale_commands
 Uplink uplink

@@ -61,6 +61,7 @@ class RelayNode:
             "topic_drops": [
                 {"topic": topic, "drops": drops} for topic, drops in session.listening.drops().items()
             ],
+            "plain_instead": session.plain_instead,
             "refusals": session.refusals,
             "stale_commands": session.stale_commands,
             "uplink": self._uplink(session),

@@ -9,7 +9,7 @@ from twisted.internet.defer import CancelledError, Deferred
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Refused, SwitchboardError
-from relay_protocol.limits import MIB
+from relay_protocol.limits import KIB, MIB
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
 from relay_server.forms import asked
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 CALLS = 256
 CALL_BYTES = 2 * MIB
 """Arguments of calls that wait, over all of them."""
+LOCAL_BYTES = 64 * KIB
+"""Arguments of one call to the relay itself: lists in lists take 30 ms to read, in which it does nothing else."""
 
 
 class Calling:
@@ -58,6 +60,8 @@ class Calling:
                 service, normal_type(ask.type, "srv"), raw, ask.timeout
             )
         else:
+            if size > LOCAL_BYTES:
+                raise Refused(f"arguments for the relay's own services may have {LOCAL_BYTES} bytes")
             args = jsontext.decode_any(raw) if raw else {}
             answer = self._call_local(local, args)
         running = Deferred.fromCoroutine(self._finish(ask, answer))

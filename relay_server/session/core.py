@@ -14,16 +14,18 @@ from twisted.logger import Logger
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import MalformedMessage, PeerError, Refused, SwitchboardError
+from relay_protocol.limits import KIB
 from relay_protocol.rights import Level, Operation
 from relay_server import closing
 from relay_server.access import Permit
 from relay_server.bucket import TokenBucket
+from relay_server.budget import DEBT, Allowance
 from relay_server.channel import Channel
 from relay_server.channel.goal import Status
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Sample
 from relay_server.clock import Clock
-from relay_server.forms import PLAIN, Form, frames
+from relay_server.forms import PLAIN, TOO_COSTLY, Form, frames
 from relay_server.freshness import Freshness
 from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
@@ -43,6 +45,12 @@ CHANGES_AT_ONCE = 1000.0
 LINES_A_SECOND = 1.0
 LINES_AT_ONCE = 20.0
 """Lines of the log one client's refusals may cause."""
+
+SMALL = 4 * KIB
+"""Shorter messages take little time to read. That of publishing them is not counted."""
+
+REFUSAL = 20e-6
+"""Seconds it takes to refuse something."""
 
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
@@ -103,6 +111,7 @@ class Session:
         freshness: Freshness,
         timing: Timing,
         rounds: Rounds,
+        allowance: Allowance,
         *,
         address: str,
         since: float,
@@ -114,7 +123,10 @@ class Session:
         self.channel = channel
         self.address = address
         self.since = since
+        self.allowance = allowance
         self.refusals = 0
+        self.plain_instead = 0
+        self._counting = False
         self._clock = clock
         self._transport = transport
         self._freshness = freshness
@@ -205,29 +217,23 @@ class Session:
         """
         if self._closed:
             return
+        if len(data) > SMALL and not self._counting:
+            # Even to read it takes time.
+            self._count(self.message, data, joined=joined)
+            return
         try:
             operation = rosbridge.decode(data)
             if joined and isinstance(operation, rosbridge.Fragment):
                 raise MalformedMessage("a message in fragments can't be a fragment itself")
         except PeerError as error:
-            self._malformed += 1
-            if self._malformed == 1 and self._noise.take():
-                self.log.info(
-                    "client {number} sent what is not rosbridge: {reason}",
-                    number=self.number,
-                    reason=str(error),
-                )
-            self.tell("error", str(error))
-            if self._malformed >= MALFORMED:
-                self.close(
-                    closing.TOO_MANY_ERRORS,
-                    f"{MALFORMED} messages in a row were not rosbridge: {error}"[:120],
-                )
+            self._no_rosbridge(error)
             return
         try:
             if type(operation) is rosbridge.Publish:
                 # Nearly all that clients send: not counted, not a change, no table to look into.
                 self._malformed = 0
+                if self._counting:
+                    self._check_budget()
                 self.publishing.publish(operation)
                 return
             if not isinstance(operation, rosbridge.Fragment):
@@ -238,9 +244,56 @@ class Session:
                 raise Refused(f"'{operation.__struct_config__.tag}' is not carried to robots by this relay")
             if type(operation) in _CHANGES and not self._changes.take():
                 raise Refused(f"too many changes at once; at most {CHANGES_A_SECOND:g} a second are followed")
-            handler(self, operation)
+            if type(operation) in _REFUSED_WHEN_BUSY:
+                self._check_budget()
+            self._count(handler, self, operation)
         except SwitchboardError as error:
             self.refuse(operation, error)
+            self._spent(REFUSAL)
+
+    def _no_rosbridge(self, error: PeerError) -> None:
+        self._malformed += 1
+        self._spent(0.0 if self._counting else REFUSAL)
+        if self._malformed == 1 and self._noise.take():
+            self.log.info(
+                "client {number} sent what is not rosbridge: {reason}", number=self.number, reason=str(error)
+            )
+        self.tell("error", str(error))
+        if self._malformed >= MALFORMED:
+            self.close(
+                closing.TOO_MANY_ERRORS,
+                f"{MALFORMED} messages in a row were not rosbridge: {error}"[:120],
+            )
+
+    # --- its share of the processor -----------------------------------------------------------------------
+
+    def _check_budget(self) -> None:
+        """:raises Refused: the user has used up his share of the processor"""
+        if self.allowance.requests.left <= 0:
+            raise Refused(
+                "too much at once: your share of the relay's processor is used up; try again in a moment"
+            )
+
+    def _count(self, work: Callable[..., None], *args: Any, **more: Any) -> None:
+        """Do some work on the user's account. What is done within it is counted along."""
+        if self._counting:
+            work(*args, **more)
+            return
+        self._counting = True
+        began = self.allowance.worked()
+        try:
+            work(*args, **more)
+        finally:
+            self._counting = False
+            self._spent(self.allowance.worked() - began)
+
+    def _spent(self, work: float) -> None:
+        requests = self.allowance.requests
+        requests.spend(work)
+        if requests.left < -DEBT:
+            self.close(
+                closing.TOO_MANY_ERRORS, "far too much at once: more than the relay can do beside its work"
+            )
 
     def pong(self, payload: bytes) -> None:
         """The client answered a ping."""
@@ -265,7 +318,22 @@ class Session:
 
         :param message: JSON
         """
-        self.outbox.control(frames(message, form))
+        self.outbox.control(self.framed(message, form))
+
+    def framed(self, message: bytes, form: Form) -> bytes:
+        """The websocket frames of a message, in a costly form only while the user has a share of the processor left.
+
+        :param message: JSON
+        """
+        if form == PLAIN:
+            return frames(message)
+        if not self.allowance.may_form:
+            self.plain_instead += 1
+            if self._noise.take():
+                self.tell("warning", TOO_COSTLY)
+            return frames(message)
+        with self.allowance.forming():
+            return frames(message, form)
 
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """A status, if the client asked for that level (roslibpy breaks on any it did not ask for)."""
@@ -337,6 +405,16 @@ class Session:
         code = closing.FORBIDDEN if "right" in reason else closing.UNAUTHENTICATED
         self.close(code, reason)
 
+
+_REFUSED_WHEN_BUSY = {
+    rosbridge.Subscribe,
+    rosbridge.Advertise,
+    rosbridge.AdvertiseService,
+    rosbridge.AdvertiseAction,
+    rosbridge.CallService,
+    rosbridge.SendActionGoal,
+}
+"""What asks for work. What takes back, cancels or answers is always done."""
 
 _CHANGES = {
     rosbridge.Subscribe,

@@ -10,7 +10,7 @@ from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
 from relay_server.channel.goal import ClientGoal, Status
-from relay_server.forms import Form, asked, frames
+from relay_server.forms import Form, asked
 from relay_server.session.calling import untold
 from relay_server.session.names import normal_type
 
@@ -100,7 +100,7 @@ class Pursuing:
     def tell_feedback(self, goal: _Goal, values: bytes) -> None:
         """Tell how far a goal has come. To a client that reads slowly, the newest counts."""
         message = rosbridge.action_feedback(goal.ask.action, goal.ask.id, values)
-        self._session.outbox.data(goal, frames(message, goal.form), 1)
+        self._session.outbox.data(goal, self._session.framed(message, goal.form), 1)
 
     def goal_ended(self, goal: _Goal, status: int, result: bool, values: bytes) -> None:
         """Take a goal off the list. Feedback that still waits would come behind the result; it is let go."""

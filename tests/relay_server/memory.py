@@ -15,6 +15,7 @@ from relay_protocol import link
 from relay_protocol.errors import Unavailable
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
+from relay_server.budget import Budgets
 from relay_server.channel import Channel, Channels
 from relay_server.freshness import Freshness
 from relay_server.local import RelayNode
@@ -180,6 +181,8 @@ class World:
         self.clock = Clock()
         self.clock.advance(1000)
         self.rounds = Rounds(self.clock)
+        self.worked = 0.0
+        self.budgets = Budgets(self.clock.seconds, lambda: self.worked)
         self.registry = Registry(lambda: 1.7e9 + self.clock.seconds())
         tickets = itertools.count(1)
         self.channels = Channels(
@@ -265,6 +268,7 @@ class World:
             Freshness(self.now_ns, self.now_ns(), lambda: next(self._tokens).to_bytes(8, "big")),
             Timing(client_ping=2.0, driving_ping=0.1, stall_limit=5.0),
             self.rounds,
+            self.budgets.of(user),
             address="192.0.2.7",
             since=1.7e9,
             ended=self.people.remove,

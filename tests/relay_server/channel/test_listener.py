@@ -8,6 +8,7 @@ from twisted.internet.task import Clock
 
 from relay_protocol import rosbridge
 from relay_protocol.ros_types import TypeRegistry
+from relay_server.budget import Budgets
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
 from relay_server.forms import Form
@@ -18,6 +19,8 @@ class Desk:
 
     def __init__(self) -> None:
         self.got: list[Sample] = []
+        self.plain_instead = 0
+        self.allowance = Budgets(lambda: 0.0, lambda: 0.0).of(1)
 
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Keep it."""
