@@ -54,6 +54,7 @@ class Pursuing:
         """Have a goal pursued."""
         session, action = self._session, resolve(ask.action)
         session.judge(Operation.CALL, action)
+        type_name = normal_type(ask.action_type, "action")
         self._check_room(ask)
         goal = _Goal(self, ask, asked(ask, session.tell))
         self._goals.append(goal)
@@ -61,7 +62,7 @@ class Pursuing:
             session,
             goal,
             action,
-            normal_type(ask.action_type, "action"),
+            type_name,
             bytes(ask.args or b""),
             feedback=ask.feedback,
         )

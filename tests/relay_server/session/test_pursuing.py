@@ -239,3 +239,13 @@ def test_answers_come_in_the_form_that_was_asked_for(
         ("cbor", 100),
         ("none", 200),
     ]
+
+
+def test_a_goal_with_a_type_that_is_none_takes_no_place(world: World) -> None:
+    """Neither its id nor one of those that may be under way."""
+    person = at_work(world)
+    for _ in range(module.GOALS + 1):
+        send(person, action_type="no type")
+    ends(person)
+    send(person)
+    assert len(world.link.all(link.SendActionGoal)) == 1
