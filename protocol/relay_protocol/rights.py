@@ -53,6 +53,12 @@ _NEEDED = {
 
 _ALL = "*"
 
+_PARTS = "/_action/"
+"""In the names of the topics and services that an action is made of (ROS 2 design, actions)."""
+
+_OF_ACTION = {Operation.PUBLISH: Operation.PROVIDE}
+"""What one needs for the action to do something to its parts, where that is not the same."""
+
 
 class Grant(NamedTuple):
     """One right as it stands in the database.
@@ -128,6 +134,11 @@ class Rules:
     def _decide(self, operation: Operation, resource: str) -> Verdict:
         if self.level is None:
             return Verdict(False, "you have no right on this robot")
+        action, part, _ = resource.partition(_PARTS)
+        if part:
+            whole = self._decide(_OF_ACTION.get(operation, operation), action)
+            if not whole.allowed:
+                return whole
         for pattern in self._deny:
             if pattern.matches(operation, resource):
                 return Verdict(False, f"{operation} on {resource} is denied to you by '{pattern.text}'")

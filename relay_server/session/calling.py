@@ -31,7 +31,7 @@ class Calling:
     def __init__(self, session: Session, local: LocalNode) -> None:
         self._session = session
         self._local = local
-        self._calls: set[Deferred[None]] = set()
+        self._calls: dict[Deferred[None], rosbridge.CallService] = {}
         self._bytes = 0
         self._ended = False
 
@@ -40,6 +40,14 @@ class Calling:
         self._ended = True
         for call in list(self._calls):
             call.cancel()
+
+    def rights_changed(self) -> None:
+        """Who may not call a service any more does not hear its answer either. The relay's own are open to all."""
+        for call, ask in list(self._calls.items()):
+            service = resolve(ask.service)
+            may = self._session.permit.judge(Operation.CALL, service).allowed
+            if not may and self._local.service(service) is None:
+                call.cancel()
 
     def call(self, ask: rosbridge.CallService) -> None:
         """Call a service of the robot, or one of the relay's own."""
@@ -55,7 +63,7 @@ class Calling:
             )
         local = self._local.service(service)
         if local is None:
-            self._judge(service)
+            self._session.judge(Operation.CALL, service)
             answer: Awaitable[bytes] = self._session.channel.call(
                 service, normal_type(ask.type, "srv"), raw, ask.timeout
             )
@@ -65,17 +73,10 @@ class Calling:
             args = jsontext.decode_any(raw) if raw else {}
             answer = self._call_local(local, args)
         running = Deferred.fromCoroutine(self._finish(ask, answer))
-        self._calls.add(running)
+        self._calls[running] = ask
         self._bytes += size
         running.addErrback(self._unexpected, ask)
         running.addBoth(self._call_ended, running, size)
-
-    def _judge(self, service: str) -> None:
-        """An action's hidden services are the action: who may not call it may not send or cancel its goals so."""
-        self._session.judge(Operation.CALL, service)
-        action, hidden, _ = service.partition("/_action/")
-        if hidden:
-            self._session.judge(Operation.CALL, action)
 
     def answer(self, call: rosbridge.CallService, result: bool, values: bytes) -> None:
         """Answer one call in the form it asked for; ``values`` is JSON, a string when ``result`` is false."""
@@ -83,7 +84,7 @@ class Calling:
         self._session.say(message, asked(call, untold))
 
     def _call_ended(self, _: Any, running: Deferred[None], size: int) -> None:
-        self._calls.discard(running)
+        self._calls.pop(running, None)
         self._bytes -= size
 
     async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
@@ -96,7 +97,10 @@ class Calling:
             self._session.refuse(ask, error)
 
     def _unexpected(self, failure: Any, ask: rosbridge.CallService) -> None:
-        if self._ended and failure.check(CancelledError):
+        if failure.check(CancelledError):
+            if not self._ended:
+                verdict = self._session.permit.judge(Operation.CALL, resolve(ask.service))
+                self._session.refuse(ask, Refused(verdict.reason))
             return
         self._session.log.failure("a call of {service} failed", failure, service=ask.service)
         self.answer(ask, False, jsontext.encode("the relay failed on this call; its log tells more"))

@@ -396,6 +396,7 @@ class Session:
 
     def _rights_changed(self) -> None:
         self.listening.rights_changed()
+        self.calling.rights_changed()
         self.pursuing.rights_changed()
         self.channel.forget_denied(self, self.permit)
         if self._pinging is not None:

@@ -48,6 +48,28 @@ def test_deny_beats_allow_beats_level(grants: list[Grant], operation: Operation,
     assert rules.judge(operation, resource) == rules.judge(operation, resource)
 
 
+@pytest.mark.parametrize(
+    ("operation", "part", "deny"),
+    [
+        (Operation.CALL, "send_goal", "call:/arm"),
+        (Operation.SUBSCRIBE, "feedback", "subscribe:/arm"),
+        (Operation.SUBSCRIBE, "status", "*:/arm"),
+        (Operation.PUBLISH, "feedback", "provide:/arm"),
+        (Operation.PUBLISH, "status", "*:/arm"),
+    ],
+)
+def test_the_parts_of_an_action_need_a_right_on_the_action(
+    operation: Operation, part: str, deny: str
+) -> None:
+    """Or its goals, its feedback and its status would be a way around what is denied."""
+    name = f"/arm/_action/{part}"
+    assert Rules([Grant(Level.OPERATOR)]).judge(operation, name).allowed
+    verdict = Rules([Grant(Level.OWNER, deny=(deny,))]).judge(operation, name)
+    assert not verdict.allowed
+    assert verdict.reason.endswith(f"on /arm is denied to you by '{deny}'")
+    assert not Rules([Grant(Level.OPERATOR, deny=(f"*:{name}",))]).judge(operation, name).allowed
+
+
 def test_nobody_has_no_channel() -> None:
     """Without any right there is no level, and the reason says so."""
     rules = Rules()

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
+from relay_protocol.rights import Grant, Level, Rules
 from relay_server.channel import bodies
 from relay_server.channel import calls as module
 from relay_server.session import calling as session_module
@@ -211,3 +212,18 @@ def test_a_robot_of_json_is_called_with_json(world: World) -> None:
     assert (call.cdr, bytes(call.args)) == (None, b'{"hard":true}')  # type: ignore[arg-type]
     answer(world, cdr=None, values=link.msgspec.Raw(b'{"done": 1}'))
     assert person.hears("service_response")[0]["values"] == {"done": 1}
+
+
+def test_a_right_that_is_revoked_ends_the_calls_that_wait(world: World) -> None:
+    """At once and in words; the robot's answer goes to nobody, and calls that are still allowed go on."""
+    person = at_work(world)
+    for id, service in (("mine", "/reset"), ("other", "/vault/open"), ("own", "/relay/ping")):
+        person.says("call_service", service=service, id=id, args={"robot": True} if id == "own" else {})
+    person.session.permit.rules = Rules([Grant(Level.OPERATOR, (), ("call:/reset", "call:/relay/*"))])
+    person.session.permit.on_change()
+    (reply,) = person.hears("service_response")
+    assert (reply["id"], reply["result"]) == ("mine", False)
+    assert reply["values"] == "call on /reset is denied to you by 'call:/reset'"
+    answer(world)
+    world.link.pings[0].callback(0.001)
+    assert [each["id"] for each in person.hears("service_response")] == ["other", "own"]
