@@ -28,10 +28,11 @@ def rows_of(kept: dict[str, Any]) -> list[Row]:
 
 def table(rows: list[Row]) -> str:
     """Markdown."""
-    lines = ["| What | Bar | Ours | Alternative | Ratio | Met |", "|---|---|---|---|---|---|"]
+    lines = ["| | What | Bar | Ours | Alternative | Ratio | Met |", "|---|---|---|---|---|---|---|"]
     for row in rows:
         other = "" if row.other is None else f"{figure(row.other)} {row.unit}, {row.against}"
         cells = (
+            f"`{row.measurement}`",
             row.what,
             row.bar_text,
             f"{figure(row.ours)} {row.unit}",
@@ -56,8 +57,8 @@ def figures(kept: dict[str, Any]) -> str:
     )
     return (
         f"Measured {max(each['when'] for each in measured.values())[:10]} at {commits}, {machine['cores']} cores "
-        f"({machine['processor']}), Linux {machine['kernel']}, Python {machine['python']}, loopback. Others worked on "
-        f"the machine too: its load was {min(loads):.1f} to {max(loads):.1f} before the measurements. "
+        f"({machine['processor']}), Linux {machine['kernel']}, Python {machine['python']}, loopback. The "
+        f"machine's load before the measurements was {min(loads):.1f} to {max(loads):.1f}. "
         f"{asked - missed} of {asked} bars are met.\n\n"
         f"{table(rows)}\n{left_out}\nBeside the figures:\n\n" + "\n".join(notes)
     )

@@ -32,7 +32,7 @@ def test_figures_survive_being_kept(tmp_path: Path) -> None:
 def test_missed_bars_and_missing_measurements_are_told(tmp_path: Path) -> None:
     """A missed bar is a plain no, the sum is stated, and what was not measured is named with its reason."""
     text = figures(kept(tmp_path))
-    assert "| fan-out | ≤ 2× | 9 µs | 4 µs, a loop | 2.25× | **no** |" in text
+    assert "| `fanout` | fan-out | ≤ 2× | 9 µs | 4 µs, a loop | 2.25× | **no** |" in text
     assert "2 of 3 bars are met" in text
     assert "Not measured: latency (no HAProxy)." in text
     assert "- hop: a remark" in text
