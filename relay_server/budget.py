@@ -18,7 +18,7 @@ DEBT = 5.0
 
 FORMS = 0.25
 FORMS_OF_USER = 0.1
-FORMS_RESERVE = 0.25
+FORMS_RESERVE = 0.05
 """The same for the costly forms of messages (SPEC section 1.6): of all together, of one user, and what may be saved."""
 
 

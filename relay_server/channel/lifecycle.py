@@ -19,6 +19,7 @@ from relay_server.channel.errands import Errands
 from relay_server.channel.goal import Asker, ClientGoal
 from relay_server.channel.goals import Goals
 from relay_server.channel.interfaces import Interfaces
+from relay_server.channel.line import Line
 from relay_server.channel.offers import ACTIONS, SERVICES, Offers
 from relay_server.channel.publications import Publications
 from relay_server.channel.robot_clock import RobotClock
@@ -76,6 +77,8 @@ class Channel:
         self._idle: Timer | None = None
         self._opened: list[Deferred[None]] = []
         self.wire = Wire(clock, robot)
+        self.line = Line(clock)
+        """For what is made for clients when the robot has answered."""
         self._round_trips = RoundTrips(self.wire)
         definitions = Definitions(self.wire, self._typed, self._untypeable)
         self._definitions = definitions

@@ -62,12 +62,15 @@ async def _ask(session: Session, node: str, service: str, request: Any, seconds:
     :raises NotFound: the node is not there, or has no such service
     """
     name = f"{node}/{service}"
-    session.judge(Operation.CALL, name)
-    found = view(session).services.get(name)
-    if found is None or not found.types:
-        raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
+    with session.counted():
+        session.judge(Operation.CALL, name)
+        found = view(session).services.get(name)
+        if found is None or not found.types:
+            raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
+    session.asks_robot()
     answer = await session.channel.call(name, found.types[0], jsontext.encode(request), seconds)
-    return jsontext.decode_any(answer)
+    with session.counted():
+        return jsontext.decode_any(answer)
 
 
 async def _value(session: Session, node: str, parameter: str) -> Any:

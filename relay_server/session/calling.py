@@ -64,6 +64,7 @@ class Calling:
         local = self._local.service(service)
         if local is None:
             self._session.judge(Operation.CALL, service)
+            self._session.asks_robot()
             answer: Awaitable[bytes] = self._session.channel.call(
                 service, normal_type(ask.type, "srv"), raw, ask.timeout
             )
@@ -88,7 +89,9 @@ class Calling:
         self._bytes -= size
 
     async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
-        return jsontext.encode(await local(self._session, args))
+        answer = await local(self._session, args)
+        with self._session.counted():
+            return jsontext.encode(answer)
 
     async def _finish(self, ask: rosbridge.CallService, answer: Awaitable[bytes]) -> None:
         try:

@@ -6,7 +6,8 @@ Bytes come in as whole websocket messages and go out as frames; every message is
 from __future__ import annotations
 
 import itertools
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -51,6 +52,9 @@ SMALL = 4 * KIB
 
 REFUSAL = 20e-6
 """Seconds it takes to refuse something."""
+
+ROUND_TRIP = 150e-6
+"""Seconds it takes to send a question to a robot and to hand on the answer, beside what is timed."""
 
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
@@ -276,13 +280,40 @@ class Session:
 
     def _count(self, work: Callable[..., None], *args: Any, **more: Any) -> None:
         """Do some work on the user's account. What is done within it is counted along."""
-        if self._counting:
+        with self._counted():
             work(*args, **more)
+
+    @contextmanager
+    def counted(self) -> Iterator[None]:
+        """Around work for the client that is done later than its message is handled.
+
+        :raises Refused: the user has used up his share of the processor
+        """
+        self._check_budget()
+        with self._counted():
+            yield
+
+    async def own_turn(self) -> None:
+        """Wait for a turn of the reactor in which nobody else's answer is made, unless the message is still handled.
+
+        Many may wait for the same word of a robot; it must not take all of their work at once.
+        """
+        if not self._counting:
+            await self.channel.line.turn()
+
+    def asks_robot(self) -> None:
+        """A question goes to the robot: what its way there and back takes is counted."""
+        self._spent(ROUND_TRIP)
+
+    @contextmanager
+    def _counted(self) -> Iterator[None]:
+        if self._counting:
+            yield
             return
         self._counting = True
         began = self.allowance.worked()
         try:
-            work(*args, **more)
+            yield
         finally:
             self._counting = False
             self._spent(self.allowance.worked() - began)

@@ -14,8 +14,9 @@ from PIL import Image
 from twisted.logger import LogLevel, globalLogPublisher
 
 from relay_protocol import link
+from relay_server import budget
 from relay_server.channel import sample as module
-from relay_server.forms import png
+from relay_server.forms import cbor, png
 from tests.relay_server.channel.test_subscriptions import counting, heard, watching
 from tests.relay_server.memory import STRING, Person, World, text
 
@@ -185,6 +186,84 @@ def test_fifty_clients_cost_one_conversion_a_form(world: World, monkeypatch: pyt
     assert sorted(converted) == ["cbor", "json"]
     assert len(pictures) == 1
     assert all(person.client.sent for person in people)
+
+
+COSTLY: list[dict[str, Any]] = [
+    {"compression": "png"},
+    {"fragment_size": 64},
+    {"compression": "png", "fragment_size": 64},
+]
+
+
+def op(payload: bytes) -> str:
+    """The operation of a text message."""
+    return str(json.loads(payload)["op"])
+
+
+@pytest.mark.parametrize("ask", COSTLY)
+def test_who_has_used_up_his_share_gets_plain_json(world: World, ask: dict[str, Any]) -> None:
+    """Told now and then, and counted, until there is some left; another user's form goes on, and is shared."""
+    number, (person,) = watching(world, ask)
+    person.says("set_level", level="warning")
+    body = text("x" * 500)
+    world.channel.sample(number, body)
+    (in_form, *_) = person.client.sent
+    assert op(in_form) != "publish"
+    person.client.sent.clear()
+    spend_forms(world, person)
+    for _ in range(3):
+        world.channel.sample(number, body)
+    assert [op(each) for each in person.client.sent] == ["status", "publish", "publish", "publish"]
+    assert "your share is used up" in errors(person)[0]
+    assert person.session.plain_instead == 3
+    world.clock.advance(1.0)
+    person.client.sent.clear()
+    world.channel.sample(number, body)
+    assert op(person.client.sent[0]) == op(in_form)
+
+
+def spend_forms(world: World, person: Person) -> None:
+    """The user has used up his share; something is left of that of all."""
+    with person.session.allowance.forming():
+        world.worked += budget.FORMS_RESERVE + 0.05
+    world.clock.advance(0.3)
+    assert not person.session.allowance.may_form
+    assert world.budgets.of(99).may_form
+
+
+def test_what_others_have_in_a_form_already_is_had_without_cost(world: World) -> None:
+    """One picture for all who come after the one whose share it took."""
+    number, (poor,) = watching(world, {"compression": "png"})
+    rich, later = world.person(user=8), world.person(user=7)
+    for each in (rich, later):
+        each.says("subscribe", topic="/chatter", compression="png")
+    spend_forms(world, poor)
+    world.channel.sample(number, text("x"))
+    assert [op(each.client.sent[-1]) for each in (poor, rich, later)] == ["publish", "png", "png"]
+    assert (poor.session.plain_instead, later.session.plain_instead) == (1, 0)
+
+
+def test_answers_come_plain_from_who_has_used_up_his_share(world: World) -> None:
+    """Told as well; CBOR of an answer is made of JSON."""
+    (person,) = watching(world, {})[1]
+    person.says("set_level", level="warning")
+    spend_forms(world, person)
+    for compression in ("png", "cbor"):
+        person.client.sent.clear()
+        person.says("call_service", service="/rosapi/topics", compression=compression)
+        told, reply = map(json.loads, person.client.sent)
+        assert (told["op"], told["level"], reply["op"]) == ("status", "warning", "service_response")
+    assert person.session.plain_instead == 2
+
+
+def test_json_that_is_too_long_for_cbor_comes_plain(world: World) -> None:
+    """Where it is made of JSON; told once."""
+    number, (person,) = watching(world, {"compression": "cbor"})
+    person.says("set_level", level="warning")
+    world.subscribed(number, encoding="json")
+    for _ in range(2):
+        world.channel.sample(number, b'{"data":"' + b"x" * cbor.MOST + b'"}')
+    assert [op(each) for each in person.client.sent] == ["status", "publish", "publish"]
 
 
 def test_nothing_is_converted_while_everybody_is_paused(world: World) -> None:

@@ -41,6 +41,14 @@ def test_characters_beyond_ascii_are_escaped() -> None:
     assert json.loads(data) == json.loads(message)
 
 
+def test_what_is_ascii_already_stays_as_it_is() -> None:
+    """Quotes, backslashes and white space, also next to characters that are escaped."""
+    message = '{"a\\"é\\\\é\\\\": "\\\\\\"\\n\\u00e9",\r\n\t"b" : ["\\/", "é\\\\"]}'
+    data = picture_of(png.encode(message.encode())).tobytes().rstrip(b"\n")
+    assert data.decode() == message.replace("é", "\\u00e9")
+    assert json.loads(data) == json.loads(message)
+
+
 def test_nothing_but_pixels() -> None:
     """No chunk tells a browser to change the colours, which are letters here."""
     data = base64.b64decode(json.loads(png.encode(b'{"op":"status"}'))["data"])

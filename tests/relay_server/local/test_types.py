@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
+from relay_server import budget
 from relay_server.local import types
 from relay_server.local.catalogue import TYPE_NAMES
 from relay_server.local.together import AT_A_TIME
@@ -146,6 +147,7 @@ def test_raw_types_are_of_just_this_type(world: World, operator: Person) -> None
     assert len(got()["typedefs"]) == 3
     raw = begin(operator, "/rosapi/topics_and_raw_types")
     world.define(STRING, TWIST)
+    world.clock.advance(0)
     assert raw()["typedefs_full_text"][1].startswith("Vector3 linear\n")
 
 
@@ -187,6 +189,7 @@ def test_interfaces_are_asked_for_once(world: World, operator: Person, viewer: P
     world.channel.message(link.Interfaces(types=["z_msgs/msg/Z", "a_msgs/msg/A"]))
     told = {"interfaces": ["a_msgs/msg/A", *TYPE_NAMES, "z_msgs/msg/Z"]}
     assert first() == told
+    world.clock.advance(0)
     assert second() == told
     assert ask(operator, "/rosapi/interfaces") == told
     assert len(world.link.all(link.GetInterfaces)) == 1
@@ -220,3 +223,16 @@ def test_a_robot_that_tells_no_interfaces_shows_those_of_its_graph(world: World)
     world.robot_joins()
     assert ask(person, "/rosapi/interfaces")["interfaces"] == sorted({*TYPE_NAMES, STRING, TRIGGER})
     assert not world.link.all(link.GetInterfaces)
+
+
+def test_the_answers_of_many_who_wait_for_one_type_are_made_in_turns(world: World, operator: Person) -> None:
+    """One word of the robot does not make the relay do all their work at once; past the share it is refused."""
+    type_name = {"type": "geometry_msgs/TwistStamped"}
+    first = begin(operator, "/rosapi/message_details", type_name)
+    begin(operator, "/rosapi/message_details", type_name)
+    define(world, "geometry_msgs/msg/TwistStamped", TWIST_STAMPED)
+    assert len(first()["typedefs"]) == 3
+    operator.session.allowance.requests.spend(2 * budget.REQUESTS_RESERVE)
+    world.clock.advance(0)
+    refused = operator.hears("service_response")[0]["values"]
+    assert refused.startswith("too much at once")

@@ -1,0 +1,146 @@
+"""Shares of the processor: what is used up comes back with time, and nobody uses up what is another's."""
+
+from __future__ import annotations
+
+import pytest
+from twisted.internet.task import Clock
+
+from relay_protocol.rights import Level
+from relay_server import budget, closing
+from relay_server.budget import Budget, Budgets
+from relay_server.session import calling, core
+from tests.relay_server.memory import Person, World
+
+QUESTION = {"service": "/rosapi/topics", "id": "q"}
+
+
+def test_what_is_spent_comes_back_with_time() -> None:
+    """At its share of the time, up to the reserve; what is done last may overdraw it."""
+    clock = Clock()
+    mine = Budget(0.25, 1.0, clock.seconds)
+    mine.spend(3.0)
+    assert mine.left == -2.0
+    clock.advance(4.0)
+    assert mine.left == -1.0
+    clock.advance(100.0)
+    assert mine.left == 1.0
+
+
+def test_a_clock_that_is_set_back_gives_and_takes_nothing() -> None:
+    """What was left stays."""
+    now = [100.0]
+    mine = Budget(0.25, 1.0, lambda: now[0])
+    mine.spend(0.5)
+    now[0] = 0.0
+    assert mine.left == 0.5
+    now[0] = 1.0
+    assert mine.left == 0.75
+
+
+def test_one_user_cannot_use_up_the_forms_of_all() -> None:
+    """His own share is less; others go on until the share of all is used up."""
+    worked = [0.0]
+    budgets = Budgets(lambda: 0.0, lambda: worked[0])
+    one, two, three = budgets.of(1), budgets.of(2), budgets.of(3)
+    assert budgets.of(1) is one
+    with one.forming():
+        worked[0] += budget.FORMS_RESERVE * 0.9
+    assert one.may_form and two.may_form
+    with two.forming():
+        worked[0] += budget.FORMS_RESERVE * 0.2
+    assert not three.may_form
+    assert budget.FORMS_OF_USER < budget.FORMS
+
+
+def busy(world: World, work: float, user: int = 7) -> None:
+    """The user's requests took so many seconds of work."""
+    world.budgets.of(user).requests.spend(work)
+
+
+def answer(person: Person) -> str:
+    """What a question is answered: its words when it is refused."""
+    person.says("call_service", **QUESTION)
+    (reply,) = person.hears("service_response")
+    return "" if reply["result"] else str(reply["values"])
+
+
+def test_who_has_used_up_his_share_is_refused_until_there_is_some_left(world: World) -> None:
+    """Over all connections of the user; another user's questions are answered."""
+    first, second, other = world.person(), world.person(), world.person(user=8)
+    assert answer(first) == ""
+    busy(world, budget.REQUESTS_RESERVE + 0.5)
+    for each in (first, second):
+        assert answer(each).startswith("too much at once: your share of the relay's processor is used up")
+    assert answer(other) == ""
+    world.clock.advance(2.1)
+    assert answer(second) == ""
+
+
+def test_the_time_a_request_takes_is_counted(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when it fails, and once although parts of it are counted themselves."""
+    person = world.person()
+
+    def slow(session: object, ask: object) -> None:
+        world.worked += 0.25
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(calling.Calling, "call", slow)
+    before = person.session.allowance.requests.left
+    with pytest.raises(ZeroDivisionError):
+        person.says("call_service", args="x" * 2 * core.SMALL, **QUESTION)
+    assert person.session.allowance.requests.left == pytest.approx(before - 0.25)
+
+
+def test_what_is_small_to_publish_and_what_takes_back_is_always_done(world: World) -> None:
+    """A robot must be stopped, and a goal cancelled, whatever else was asked for; long messages have to wait."""
+    world.robot_comes()
+    person = world.person(Level.OPERATOR)
+    world.robot_joins()
+    person.says("subscribe", topic="/chatter")
+    person.says("publish", topic="/cmd_vel", msg={})
+    world.define()
+    person.says("set_level", level="error")
+    busy(world, budget.REQUESTS_RESERVE + 1.0)
+    sent = len(world.link.samples)
+    person.says("publish", topic="/cmd_vel", msg={})
+    assert len(world.link.samples) == sent + 1
+    person.says("publish", topic="/cmd_vel", msg={}, id="x" * core.SMALL)
+    assert len(world.link.samples) == sent + 1
+    person.says("unsubscribe", topic="/chatter")
+    assert not world.channel.ends().subscribes
+    person.says("cancel_action_goal", action="/dock", id="g")
+    told = [each["msg"] for each in person.hears("status")]
+    assert told[0].startswith("too much at once")
+    assert told[1] == "no goal of yours with the id 'g' is under way"
+
+
+def test_who_is_far_over_his_share_is_cut(world: World) -> None:
+    """It is remembered when he comes back; some seconds later he is welcome."""
+    person = world.person()
+    busy(world, budget.REQUESTS_RESERVE + budget.DEBT)
+    person.says("publish", topic="/nowhere", msg={})
+    assert person.client.closed is not None
+    assert person.client.closed[0] == closing.TOO_MANY_ERRORS
+    again = world.person()
+    assert answer(again).startswith("too much at once")
+    again.session.end()
+    world.clock.advance(budget.DEBT / budget.REQUESTS + 1)
+    assert answer(world.person()) == ""
+
+
+@pytest.mark.parametrize("junk", [{"op": "dance"}, {"op": "publish", "topic": "/nowhere"}])
+def test_what_is_refused_is_counted_too(world: World, junk: dict[str, str]) -> None:
+    """Small as it is, the relay has read it and answered."""
+    person = world.person()
+    before = person.session.allowance.requests.left
+    person.says(**junk)
+    assert person.session.allowance.requests.left < before
+
+
+def test_long_arguments_for_the_relay_are_refused(world: World) -> None:
+    """Its own services need few; to read many lists takes long."""
+    person = world.person()
+    person.says("call_service", args=["x" * calling.LOCAL_BYTES], **QUESTION)
+    (reply,) = person.hears("service_response")
+    assert reply["result"] is False
+    assert str(calling.LOCAL_BYTES) in reply["values"]
