@@ -52,6 +52,9 @@ HANDSHAKE_ATTRIBUTES = (
 EARLY_OVERHEAD = 64
 """What a message before the proof counts for beside its bytes; empty ones take memory too."""
 
+PIECES = 16_384
+"""Frames of one message, and chunks they came in: also the empty ones take memory."""
+
 REASON_BYTES = 123
 """Room for words in a close frame (RFC 6455 section 5.5.1)."""
 
@@ -104,6 +107,7 @@ class ClientProtocol(FastProtocol):
         self._asking = False
         self._open = False
         self._opened_ns = 0
+        self._begun_ns = 0
         self._full = False
         self._unanswered: bytes | None = None
 
@@ -229,12 +233,12 @@ class ClientProtocol(FastProtocol):
         self._stop_deadline()
         self._known()
         self._take_at_most(limits.CLIENT_MESSAGE)
-        self._session = self.factory.gate.open(admission, self, self._opened_ns)
-        self._session.start()
-        self.takes_text = self._session.message
+        session = self._session = self.factory.gate.open(admission, self, self._opened_ns)
+        session.start()
+        self.takes_text = session.message
         early, self._early = self._early, []
         for message in early:
-            self.onMessage(message, False)
+            session.message(message)
 
     def _failed(self, failure: Any) -> None:
         error = failure.value
@@ -249,6 +253,27 @@ class ClientProtocol(FastProtocol):
 
     # --- messages -----------------------------------------------------------------------------------------
 
+    def onMessageBegin(self, isBinary: bool) -> None:
+        """The first frame of a message. Pongs may come before the last one, and say nothing of when this was sent."""
+        super().onMessageBegin(isBinary)
+        self._begun_ns = self._opened_ns if self._session is None else self._session.not_before
+
+    def onMessageFrameBegin(self, length: int) -> None:
+        """One more frame of a message."""
+        super().onMessageFrameBegin(length)
+        self._check_pieces()
+
+    def onMessageFrameData(self, payload: bytes) -> None:
+        """One more piece of it."""
+        super().onMessageFrameData(payload)
+        self._check_pieces()
+
+    def _check_pieces(self) -> None:
+        pieces = len(self.message_data) + len(self.frame_data)
+        if pieces > PIECES and not self.failedByMe:
+            self.wasMaxMessagePayloadSizeExceeded = True
+            self._max_message_size_exceeded(pieces, PIECES, f"a message came in more than {PIECES} pieces")
+
     def onMessage(self, payload: bytes, isBinary: bool) -> None:
         """One whole message."""
         if isBinary:
@@ -256,7 +281,7 @@ class ClientProtocol(FastProtocol):
                 closing.FORBIDDEN, "binary messages are not taken; send rosbridge JSON as text"
             )
         elif self._session is not None:
-            self._session.message(payload)
+            self._session.message(payload, since=self._begun_ns)
         elif self._open:
             self._message_early(payload)
 

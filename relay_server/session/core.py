@@ -211,15 +211,24 @@ class Session:
 
     def _joined(self, data: bytes, since: int) -> None:
         """A message that came in fragments, the first of which can't have been sent before ``since``."""
-        with self._freshness.as_of(since):
-            self.message(data, joined=True)
+        self.message(data, joined=True, since=since)
 
-    def message(self, data: bytes, *, joined: bool = False) -> None:
+    @property
+    def not_before(self) -> int:
+        """What the client says now can't have been sent before this moment, the relay's monotonic nanoseconds."""
+        return self._freshness.not_before
+
+    def message(self, data: bytes, *, joined: bool = False, since: int | None = None) -> None:
         """One message of the client.
 
         :param joined: whether it came in fragments
+        :param since: a moment before which its beginning can't have been sent, where other things came in between
         """
         if self._closed:
+            return
+        if since is not None and since < self._freshness.not_before:
+            with self._freshness.as_of(since):
+                self.message(data, joined=joined)
             return
         if len(data) > SMALL and not self._counting:
             # Even to read it takes time.

@@ -361,3 +361,37 @@ def test_what_comes_in_one_piece_with_the_proof_is_taken_as_after_it(gate: Memor
         client.core.send_text(text.encode())
     client.end.dataReceived(b"".join(client.core.data_to_send()))
     assert gate.sessions[0].got == ["start", b"first message", large.encode(), b"last message"]
+
+
+def test_a_message_in_frames_is_as_old_as_the_first_of_them(gate: MemoryGate) -> None:
+    """Control frames may come in between: a pong there says nothing of when the message was begun."""
+    client = Client(gate, Authorization="Bearer good")
+    (session,) = gate.sessions
+    client.core.send_pong(b"before")
+    client.core.send_text(b'{"op":', fin=False)
+    client.core.send_pong(b"between")
+    client.run()
+    client.core.send_continuation(b'"x"}', fin=True)
+    client.run()
+    assert session.got[-1] == b'{"op":"x"}'
+    assert session.since == [1_000_000_000]
+    assert session.not_before == 2_000_000_000
+
+
+@pytest.mark.parametrize("payload", [b"", b"{}"])
+def test_the_frames_of_a_message_are_bounded(
+    gate: MemoryGate, payload: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also those with nothing in them: they come for nothing and take memory."""
+    monkeypatch.setattr(module, "PIECES", 10)
+    client = Client(gate, Authorization="Bearer good")
+    client.core.send_text(b"", fin=False)
+    for _ in range(9):
+        client.core.send_continuation(payload, fin=False)
+    client.run()
+    assert client.closed is None
+    for _ in range(100):
+        client.core.send_continuation(payload, fin=False)
+    client.run()
+    assert client.closed == closing.TOO_BIG
+    assert len(client.end.message_data) <= 11

@@ -28,17 +28,21 @@ class MemorySession:
     def __init__(self, transport: Any) -> None:
         self.transport = transport
         self.got: list[Any] = []
+        self.not_before = 0
+        self.since: list[int | None] = []
 
     def start(self) -> None:
         """The client is in."""
         self.got.append("start")
 
-    def message(self, payload: bytes) -> None:
+    def message(self, payload: bytes, since: int | None = None) -> None:
         """One message."""
         self.got.append(payload)
+        self.since.append(since)
 
     def pong(self, payload: bytes) -> None:
-        """A pong."""
+        """A pong, to a ping that was sent a second after the one before."""
+        self.not_before += 1_000_000_000
         self.got.append(("pong", payload))
 
     def pause(self) -> None:

@@ -184,15 +184,20 @@ def test_junk_in_fragments_is_counted(person: Person) -> None:
     assert person.client.closed is not None
 
 
-def test_a_command_is_as_old_as_its_first_fragment(person: Person, world: World) -> None:
-    """What was begun long ago moves no robot, however late its end was sent; the next one in one piece does."""
+def motion(person: Person, world: World) -> bytes:
+    """A robot that moves, and a command for it."""
     world.robot.description = link.Describe(motion=link.MotionPolicy(types=[TWIST]))
     person.says("advertise", topic="/cmd_vel", type=TWIST)
     number = world.link.all(link.Advertise)[0].number
     world.define()
     world.channel.message(link.Advertised(number=number, topic="/cmd_vel", type=TWIST, encoding="cdr"))
     person.answers_pings()
-    command = json.dumps({"op": "publish", "topic": "/cmd_vel", "msg": {}})
+    return json.dumps({"op": "publish", "topic": "/cmd_vel", "msg": {}}).encode()
+
+
+def test_a_command_is_as_old_as_its_first_fragment(person: Person, world: World) -> None:
+    """What was begun long ago moves no robot, however late its end was sent; the next one in one piece does."""
+    command = motion(person, world).decode()
     send(person, "m", command[:9], command[9:], order=[0])
     for _ in range(10):
         world.clock.advance(0.1)
@@ -202,3 +207,18 @@ def test_a_command_is_as_old_as_its_first_fragment(person: Person, world: World)
     assert person.session.stale_commands == 1
     send(person, "m", command[:9], command[9:])
     assert len(world.link.samples) == 1
+
+
+def test_a_command_in_frames_is_as_old_as_its_first_frame(person: Person, world: World) -> None:
+    """The websocket may have brought pongs between its frames; what comes after them is as young as they say."""
+    command = motion(person, world)
+    begun = person.session.not_before
+    for _ in range(10):
+        world.clock.advance(0.1)
+        person.answers_pings()
+    person.session.message(command, since=begun)
+    assert not world.link.samples
+    assert person.session.stale_commands == 1
+    person.session.message(command, since=person.session.not_before)
+    person.session.message(command)
+    assert len(world.link.samples) == 2
