@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from rclpy.serialization import deserialize_message, serialize_message
@@ -86,10 +87,9 @@ class Types:
             return text
         package, kind, short = name.split("/")
         try:
-            found = _load(package, kind, short, name)
-        except NotFound:
+            return introspected(_load(package, kind, short, name), kind)
+        except (NotFound, AttributeError):  # the latter for a part of a service, which its package has too
             return None
-        return introspected(found, kind)
 
     def judge(self, type: str, body: bytes) -> Motion:
         """What a command of this type would do."""
@@ -121,6 +121,8 @@ def parse(body: bytes, kind: Any, what: str) -> Any:
 
 
 def _load(package: str, kind: str, short: str, name: str) -> Any:
+    if not _has_interfaces(package, kind):
+        raise NotFound(f"the type {name} is not installed on this robot")
     try:
         found = getattr(importlib.import_module(f"{package}.{kind}"), short)
     except (ImportError, AttributeError):
@@ -133,6 +135,16 @@ def _load(package: str, kind: str, short: str, name: str) -> Any:
             f"the type {name} is installed on this robot, but its library can't be loaded"
         ) from None
     return found
+
+
+def _has_interfaces(package: str, kind: str) -> bool:
+    """Whether this looks like a package of interfaces: to import any other, as a client names it, runs its code."""
+    try:
+        spec = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        return False
+    places = (spec and spec.submodule_search_locations) or ()
+    return any(Path(place, kind).is_dir() for place in places)
 
 
 def _judge(value: Any) -> Motion:
