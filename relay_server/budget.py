@@ -60,7 +60,7 @@ class Allowance:
     :param worked: seconds of processor time so far
     """
 
-    __slots__ = ("_everyone", "_forms", "requests", "worked")
+    __slots__ = ("__weakref__", "_everyone", "_forms", "requests", "worked")
 
     def __init__(self, everyone: Budget, seconds: Callable[[], float], worked: Callable[[], float]) -> None:
         self.worked = worked

@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Iterator
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, SwitchboardError, Unavailable
 from relay_protocol.limits import NAME
 from relay_protocol.rights import Operation
-from relay_server.channel import Channel
 from relay_server.local.arguments import absolute, text
-from relay_server.local.together import side_by_side
+from relay_server.local.together import Places, side_by_side
 from relay_server.local.values import NOT_SET, from_parameter, to_parameter
 from relay_server.local.view import view
 from relay_server.session import Session
@@ -40,7 +37,9 @@ _LIST = "rcl_interfaces/srv/ListParameters"
 NAMES = 65_536
 """Most names in one answer; longer ones than a name may be are left out."""
 
-_surveys: WeakKeyDictionary[Channel, set[object]] = WeakKeyDictionary()
+_surveys = Places(
+    SURVEYS, f"{SURVEYS} callers are asking all nodes for their parameters; try again in a moment"
+)
 
 
 def _split(args: Any) -> tuple[str, str]:
@@ -201,22 +200,6 @@ async def get_param_names(session: Session, args: Any) -> Any:
         if room <= 0:
             waiting.clear()
 
-    with _survey(session.channel), contextlib.suppress(Unavailable):
+    with _surveys.take(session.channel), contextlib.suppress(Unavailable):
         await session.channel.within(ALL_SECONDS, side_by_side(waiting, ask))
     return {"names": [name for node in nodes for name in found.get(node, [])][:NAMES]}
-
-
-@contextlib.contextmanager
-def _survey(channel: Channel) -> Iterator[None]:
-    """:raises Unavailable: too many ask all nodes of this robot already"""
-    under_way = _surveys.setdefault(channel, set())
-    if len(under_way) >= SURVEYS:
-        raise Unavailable(
-            f"{SURVEYS} callers are asking all nodes for their parameters; try again in a moment"
-        )
-    mine = object()
-    under_way.add(mine)
-    try:
-        yield
-    finally:
-        under_way.remove(mine)

@@ -3,15 +3,46 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 from twisted.internet.defer import Deferred, DeferredList, FirstError
+
+from relay_protocol.errors import Unavailable
 
 T = TypeVar("T")
 
 AT_A_TIME = 16
 """Questions that one caller may have under way."""
+
+
+class Places:
+    """So many callers at a time for each robot, user or whatever they have in common.
+
+    :param words: for who finds no place
+    """
+
+    def __init__(self, most: int, words: str) -> None:
+        self._most = most
+        self._words = words
+        self._taken: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
+
+    @contextmanager
+    def take(self, common: Any) -> Iterator[None]:
+        """One place, for as long as the work takes.
+
+        :raises Unavailable: all are taken
+        """
+        if self._taken.get(common, 0) >= self._most:
+            raise Unavailable(self._words)
+        self._taken[common] = self._taken.get(common, 0) + 1
+        try:
+            yield
+        finally:
+            # Where what they have in common has gone, so has the count.
+            self._taken[common] = self._taken.get(common, 1) - 1
 
 
 async def side_by_side(items: deque[T], work: Callable[[T], Coroutine[Deferred[Any], Any, None]]) -> None:

@@ -12,12 +12,19 @@ from relay_protocol.limits import MIB
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.local import catalogue
 from relay_server.local.arguments import text
-from relay_server.local.together import side_by_side
+from relay_server.local.together import Places, side_by_side
 from relay_server.local.view import View, view
 from relay_server.session import Session, normal_type
 
 RAW_CHARACTERS = 4 * MIB
 """Most characters of definitions in one answer, which take 40 ms; what is beyond is left out, with a remark instead."""
+
+SURVEYS = 16
+"""Questions of one user for all types that may wait for the robot."""
+
+_surveys = Places(
+    SURVEYS, f"{SURVEYS} questions of yours for the types of all topics wait already; try again in a moment"
+)
 
 _CONTAINED = re.compile(r"\nMSG: (\w+)/msg/(\w+)[ \t\r]*$", re.MULTILINE)
 """It begins with what is rare and never at the start: so it is found ten times as fast."""
@@ -97,7 +104,8 @@ async def topics_and_raw_types(session: Session, args: Any) -> Any:
     """``/rosapi/topics_and_raw_types``: one type that is not to be had spoils nothing."""
     found = view(session).topics
     types = [next(iter(topic.types), "") for topic in found.values()]
-    texts = await _texts(session, types)
+    with _surveys.take(session.allowance):
+        texts = await _texts(session, types)
     await session.own_turn()
     with session.counted():
         return {"topics": list(found), "types": types, "typedefs_full_text": _given(types, texts)}

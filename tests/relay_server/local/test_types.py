@@ -236,3 +236,16 @@ def test_the_answers_of_many_who_wait_for_one_type_are_made_in_turns(world: Worl
     world.clock.advance(0)
     refused = operator.hears("service_response")[0]["values"]
     assert refused.startswith("too much at once")
+
+
+def test_so_many_questions_of_one_user_for_all_types_may_wait(world: World, operator: Person) -> None:
+    """Each hears every word of the robot; another user still has room, and so has he when the answers have come."""
+    for number in range(types.SURVEYS):
+        operator.says("call_service", service="/rosapi/topics_and_raw_types", id=number)
+    assert "types of all topics wait already" in ask(operator, "/rosapi/topics_and_raw_types")
+    other = begin(world.person(user=8), "/rosapi/topics_and_raw_types")
+    world.define()
+    world.clock.advance(0)
+    assert other()["topics"]
+    assert len(operator.hears("service_response")) == types.SURVEYS
+    assert ask(operator, "/rosapi/topics_and_raw_types")["topics"]
