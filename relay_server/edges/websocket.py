@@ -55,6 +55,9 @@ EARLY_OVERHEAD = 64
 PIECES = 16_384
 """Frames of one message, and chunks they came in: also the empty ones take memory."""
 
+LEAVING_SECONDS = 2.0
+"""What was sent before the end has so long to go out; a client that takes nothing would stay for ever."""
+
 REASON_BYTES = 123
 """Room for words in a close frame (RFC 6455 section 5.5.1)."""
 
@@ -103,6 +106,7 @@ class ClientProtocol(FastProtocol):
         self._early: list[bytes] = []
         self._early_bytes = 0
         self._deadline: Timer | None = None
+        self._leaving: Timer | None = None
         self._place: Place | None = None
         self._asking = False
         self._open = False
@@ -339,6 +343,7 @@ class ClientProtocol(FastProtocol):
         self.factory.cap.leave(self._address())
         self._known()
         self._stop_deadline()
+        cancel(self._leaving)
         super().connectionLost(reason)
 
     def onClose(self, wasClean: bool, code: int | None, reason: str | None) -> None:
@@ -360,6 +365,8 @@ class ClientProtocol(FastProtocol):
         self._writer.flush()
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()
+        if not abort and self._leaving is None:
+            self._leaving = self.factory.clock.callLater(LEAVING_SECONDS, self.transport.abortConnection)
         super()._closeConnection(abort)
 
     # --- ClientTransport ----------------------------------------------------------------------------------

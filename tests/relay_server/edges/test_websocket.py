@@ -15,7 +15,7 @@ from relay_server import closing, wsframe
 from relay_server.edges import websocket as module
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.websocket import ClientProtocol
-from tests.relay_server.edges.websocket_client import AUTH, Client, MemoryGate
+from tests.relay_server.edges.websocket_client import AUTH, Client, MemoryGate, Transport
 
 
 @pytest.fixture
@@ -395,3 +395,22 @@ def test_the_frames_of_a_message_are_bounded(
     client.run()
     assert client.closed == closing.TOO_BIG
     assert len(client.end.message_data) <= 11
+
+
+@pytest.mark.parametrize("how", ["close", "refused"])
+def test_a_client_that_leaves_and_takes_nothing_is_cut(
+    gate: MemoryGate, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """TCP waits until all is sent before it closes, for ever if need be."""
+    monkeypatch.setattr(Transport, "stuck", True)
+    if how == "refused":
+        client = Client(gate, Authorization="Bearer bad")
+    else:
+        client = Client(gate, Authorization="Bearer good")
+        client.core.send_close(1000)
+        client.run()
+    assert client.transport.connected
+    client.clock.advance(module.LEAVING_SECONDS)
+    assert not client.transport.connected
+    assert how == "refused" or gate.sessions[0].got[-1] == "end"
+    assert not client.clock.getDelayedCalls()

@@ -120,7 +120,12 @@ class MemoryGate:
 
 
 class Transport(StringTransportWithDisconnection):
-    """TCP in memory; like TLS it does not close while a producer is registered."""
+    """TCP in memory; like TLS it does not close while a producer is registered.
+
+    :attr stuck: whether something is left to send that the client does not take
+    """
+
+    stuck = False
 
     def __init__(self) -> None:
         super().__init__()
@@ -131,8 +136,8 @@ class Transport(StringTransportWithDisconnection):
         """As TCP."""
 
     def loseConnection(self) -> None:
-        """Close, unless a producer still holds it."""
-        if self.connected and self.producer is None:
+        """Close, unless a producer still holds it, or what is left to send."""
+        if self.connected and self.producer is None and not self.stuck:
             super().loseConnection()
 
     def unregisterProducer(self) -> None:
@@ -142,7 +147,7 @@ class Transport(StringTransportWithDisconnection):
     def abortConnection(self) -> None:
         """Close at once."""
         if self.connected:
-            super().abortConnection()
+            super().loseConnection()
 
 
 class Client:
