@@ -8,6 +8,8 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
+import msgspec
+
 from relay_protocol.errors import FrameTooLarge, MalformedMessage
 from relay_protocol.limits import PARTS_BYTES
 
@@ -16,10 +18,10 @@ SAMPLE = 1
 VIDEO = 2
 PART = 3
 
-_LENGTH = struct.Struct("!I")
+_LENGTH = struct.Struct("!I").unpack_from
 _HEAD = struct.Struct("!IB")
 _SAMPLE_HEAD = struct.Struct("!IBIQ")
-_NUMBERED = struct.Struct("!IQ")
+_NUMBERED = struct.Struct("!IQ").unpack_from
 _PART_HEAD = struct.Struct("!IBIQII")
 _PART = struct.Struct("!IQII")
 
@@ -33,13 +35,17 @@ UNFINISHED = 1024
 """Most samples that have come in part only, over one link."""
 
 
-class JsonFrame(NamedTuple):
+class _Frame(msgspec.Struct, frozen=True):
+    """A struct is made in a third of the time of a named tuple, and there is one for every sample."""
+
+
+class JsonFrame(_Frame, frozen=True, order=True, gc=False):
     """Kind 0: one JSON message, not yet decoded."""
 
     body: bytes
 
 
-class SampleFrame(NamedTuple):
+class SampleFrame(_Frame, frozen=True, order=True, gc=False):
     """Kind 1: one message of a topic.
 
     :param number: subscription (robot to relay) or publication (relay to robot) it belongs to
@@ -53,7 +59,7 @@ class SampleFrame(NamedTuple):
     body: bytes
 
 
-class VideoFrame(NamedTuple):
+class VideoFrame(_Frame, frozen=True, order=True, gc=False):
     """Kind 2: one JPEG picture of a stream; ``stamp`` is the robot's wall clock in nanoseconds."""
 
     number: int
@@ -98,6 +104,8 @@ class FrameDecoder:
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._buffer = bytearray()
+        self._enough = 0
+        """With fewer bytes in the buffer nothing new can be said."""
         self._parts = _Parts()
 
     @property
@@ -114,30 +122,40 @@ class FrameDecoder:
             follow each other
         """
         buffer = self._buffer
-        buffer += data
+        if buffer:
+            buffer += data
+            if len(buffer) < self._enough:
+                return []
+            # Bytes, because a slice of them is a body; one of a bytearray has to be copied once more.
+            data = bytes(buffer)
+            buffer.clear()
         frames: list[Frame] = []
-        start = 0
-        have = len(buffer)
+        start, have, limit = 0, len(data), self.limit
         while have - start >= 4:
-            (length,) = _LENGTH.unpack_from(buffer, start)
-            if length > self.limit:
+            (length,) = _LENGTH(data, start)
+            if length > limit:
                 raise FrameTooLarge(
-                    f"a frame of {length} bytes was announced; at most {self.limit} are taken here"
+                    f"a frame of {length} bytes was announced; at most {limit} are taken here"
                 )
             if length == 0:
                 raise MalformedMessage("a frame of length 0 has no kind")
             end = start + 4 + length
             if end > have:
                 break
-            if buffer[start + 4] == PART:
-                sample = self._parts.join(buffer, start + 4, end, self.limit)
+            kind = data[start + 4]
+            if kind == SAMPLE and length >= SAMPLE_HEAD:
+                number, stamp = _NUMBERED(data, start + 5)
+                frames.append(SampleFrame(number, stamp, data[start + 17 : end]))
+            elif kind == PART:
+                sample = self._parts.join(data, start + 4, end, limit)
                 if sample is not None:
                     frames.append(sample)
             else:
-                frames.append(_parse(buffer, start + 4, end))
+                frames.append(_parse(data, start + 4, end))
             start = end
-        if start:
-            del buffer[:start]
+        if start < have:
+            buffer += memoryview(data)[start:]
+            self._enough = 4 + length if have - start >= 4 else 4
         return frames
 
 
@@ -154,7 +172,7 @@ class _Parts:
         self.size = 0
         self._unfinished: dict[int, _Unfinished] = {}
 
-    def join(self, buffer: bytearray, start: int, end: int, limit: int) -> SampleFrame | None:
+    def join(self, buffer: bytes, start: int, end: int, limit: int) -> SampleFrame | None:
         """Take one part; return the sample it completes."""
         if end - start < 22:
             raise MalformedMessage(
@@ -205,15 +223,15 @@ class _Parts:
             self.size -= len(known.body)
 
 
-def _parse(buffer: bytearray, start: int, end: int) -> Frame:
+def _parse(buffer: bytes, start: int, end: int) -> Frame:
     kind = buffer[start]
     if kind == JSON:
-        return JsonFrame(bytes(buffer[start + 1 : end]))
+        return JsonFrame(buffer[start + 1 : end])
     if kind in (SAMPLE, VIDEO):
         if end - start < SAMPLE_HEAD:
             raise MalformedMessage(f"a frame of kind {kind} needs 12 bytes of number and stamp")
-        number, stamp = _NUMBERED.unpack_from(buffer, start + 1)
-        body = bytes(buffer[start + 13 : end])
+        number, stamp = _NUMBERED(buffer, start + 1)
+        body = buffer[start + 13 : end]
         return SampleFrame(number, stamp, body) if kind == SAMPLE else VideoFrame(number, stamp, body)
     raise MalformedMessage(
         f"frame kind {kind} is not known; 0 is JSON, 1 a sample, 2 a picture, 3 a part of a sample"

@@ -29,8 +29,8 @@ def encode(frame: Frame) -> bytes:
     if isinstance(frame, JsonFrame):
         return frames.encode_json(frame.body)
     if isinstance(frame, SampleFrame):
-        return frames.encode_sample(*frame)
-    return frames.encode_video(*frame)
+        return frames.encode_sample(frame.number, frame.stamp, frame.body)
+    return frames.encode_video(frame.number, frame.stamp, frame.body)
 
 
 def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
@@ -65,6 +65,18 @@ def test_junk_ends_the_same_way_however_it_is_cut(data: bytes, cuts: list[int]) 
         return None
 
     assert outcome([data]) == outcome(pieces(data, cuts))
+
+
+def test_a_frame_that_trickles_in_costs_no_more_than_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What has come of it is looked at when it is whole, not with each byte."""
+    read: list[int] = []
+    real = frames._LENGTH
+    monkeypatch.setattr(frames, "_LENGTH", lambda data, start: read.append(len(data)) or real(data, start))
+    decoder = FrameDecoder(limit=1000)
+    data = frames.encode_sample(1, 2, b"x" * 500)
+    got = [frame for byte in data for frame in decoder.feed(bytes([byte]))]
+    assert got == [SampleFrame(1, 2, b"x" * 500)]
+    assert read == [4, len(data)]
 
 
 def test_a_huge_length_is_refused_before_its_body_comes() -> None:
