@@ -31,7 +31,8 @@ ALL_SECONDS = 10.0
 """All nodes together have this long."""
 
 SURVEYS = 16
-"""Callers for whom the nodes of one robot are asked at a time."""
+SURVEYS_OF_USER = 4
+"""Questions for which the nodes of one robot are asked at a time, and those of one user."""
 
 _LIST = "rcl_interfaces/srv/ListParameters"
 NAMES = 65_536
@@ -39,6 +40,10 @@ NAMES = 65_536
 
 _surveys = Places(
     SURVEYS, f"{SURVEYS} callers are asking all nodes for their parameters; try again in a moment"
+)
+_surveys_of_user = Places(
+    SURVEYS_OF_USER,
+    f"{SURVEYS_OF_USER} questions of yours for all parameters wait already; try again in a moment",
 )
 
 
@@ -200,6 +205,7 @@ async def get_param_names(session: Session, args: Any) -> Any:
         if room <= 0:
             waiting.clear()
 
-    with _surveys.take(session.channel), contextlib.suppress(Unavailable):
+    mine, places = _surveys_of_user.take(session.allowance), _surveys.take(session.channel)
+    with mine, places, contextlib.suppress(Unavailable):
         await session.channel.within(ALL_SECONDS, side_by_side(waiting, ask))
     return {"names": [name for node in nodes for name in found.get(node, [])][:NAMES]}

@@ -50,7 +50,7 @@ LINES_AT_ONCE = 20.0
 SMALL = 4 * KIB
 """Shorter messages take little time to read. That of publishing them is not counted."""
 
-REFUSAL = 20e-6
+REFUSAL = 5e-6
 """Seconds it takes to refuse something."""
 
 ROUND_TRIP = 150e-6
@@ -351,7 +351,13 @@ class Session:
 
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Queue a message of a topic, opened when its turn comes."""
-        self.outbox.data(listener, parcel, listener.depth or DATA_PER_TOPIC)
+        outbox = self.outbox
+        if outbox.passing:
+            frames = parcel.open(listener)
+            if frames is not None:
+                outbox.write(frames)
+        else:
+            outbox.data(listener, parcel, listener.depth or DATA_PER_TOPIC)
 
     def say(self, message: bytes, form: Form = PLAIN) -> None:
         """Queue a message that must not be lost.

@@ -10,7 +10,7 @@ import pytest
 from relay_protocol import link
 from relay_protocol.rights import Level
 from relay_server.local import params
-from relay_server.local.params import ALL_SECONDS, SURVEYS
+from relay_server.local.params import ALL_SECONDS, SURVEYS, SURVEYS_OF_USER
 from relay_server.local.together import AT_A_TIME
 from tests.relay_server.local.asking import answers, ask, asked, begin, fails
 from tests.relay_server.memory import Person, World
@@ -279,13 +279,23 @@ def test_a_caller_who_leaves_is_asked_for_no_more(world: World, crowd: Person) -
 
 def test_so_many_callers_are_asked_for_at_a_time(world: World, crowd: Person) -> None:
     """The others are told to try again; a place is free when one is done."""
-    callers = [world.person() for _ in range(SURVEYS)]
+    callers = [world.person(user=100 + number) for number in range(SURVEYS)]
     for caller in callers:
         begin(caller, "/rosapi/get_param_names")
     assert "try again in a moment" in ask(crowd, "/rosapi/get_param_names")
     callers[3].session.end()
     begin(crowd, "/rosapi/get_param_names")
     assert not crowd.hears("service_response")
+
+
+def test_one_user_leaves_room_for_others(world: World, crowd: Person) -> None:
+    """However many connections he has."""
+    for _ in range(SURVEYS_OF_USER):
+        begin(world.person(), "/rosapi/get_param_names")
+    assert "questions of yours" in ask(crowd, "/rosapi/get_param_names")
+    other = world.person(user=8)
+    begin(other, "/rosapi/get_param_names")
+    assert not other.hears("service_response")
 
 
 def test_the_types_of_parameters_come_from_the_robot(world: World) -> None:
