@@ -1,317 +1,275 @@
-"""A robot without ROS: the robot link (protocol/SPEC.md, section 2) spoken in JSON. docs/robots.md goes through it.
+"""A robot without ROS: a sensor, wheels with a watchdog, a service. docs/robots.md explains it from top to bottom.
 
-One sensor (/temperature), wheels with a watchdog of their own (/cmd_vel), one service (/beep). It needs Python and
-``cryptography``:  python json_robot.py --relay HOST:9091 --robot tin-man --code CODE --state robot.json [--tls]
+python json_robot.py HOST PORT ROBOT CODE FILE    (the enrolment code is needed once; the file keeps the key)
 """
 
-import argparse
-import asyncio
 import base64
-import contextlib
 import hashlib
 import json
 import math
 import random
-import ssl
+import secrets
+import select
+import signal
+import socket
 import struct
+import sys
 import time
 from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+MS, SECOND = 1_000_000, 1_000_000_000  # nanoseconds
+CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # nobody sets it, and it goes on in a suspend
 TWIST, FLOAT, TRIGGER = "geometry_msgs/msg/Twist", "std_msgs/msg/Float64", "std_srvs/srv/Trigger"
-OFFERED = {"/temperature": FLOAT, "/cmd_vel/heard": TWIST}
-MS, DEADLINE, STOP_WITHIN = 1_000_000, 500, 500
-SMALL, LARGE = 16 * 1024, 4 * 1024 * 1024  # frames before the proof, and after (SPEC 2.1)
-TROUBLE = (
-    OSError,
-    EOFError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    asyncio.TimeoutError,
-    struct.error,
-)
+SENSORS = {
+    "/temperature": (FLOAT, lambda: {"data": 20 + math.sin(time.time())}),
+    "/cmd_vel/heard": (TWIST, lambda: robot.told),
+}
+MOTION = {"types": [TWIST], "deadline_ms": 500, "stop_within_ms": 500}
+HOST, PORT, NAME, CODE, FILE = sys.argv[1:]
+robot = SimpleNamespace(v=0.0, w=0.0, until=0, told={}, heartbeat=2.0, wait=0.5)
 
 
-def clock():
-    """Nanoseconds of a clock that nobody sets and that goes on in a suspend, where there is one."""
-    return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+def now():
+    return time.clock_gettime_ns(CLOCK)
 
 
-class Link:
-    """Frames on one connection (SPEC 2.1); pings answered, silence noticed, clocks compared (2.3, 2.5)."""
+# 1. The wheels, driven by a timer that interrupts whatever the rest of the program is doing
 
-    def __init__(self, reader, writer):
-        self.reader, self.writer, self.limit, self.heartbeat = reader, writer, SMALL, 2.0
-        self.exchanges = deque(maxlen=16)
 
-    def frame(self, kind, body):
-        self.writer.write(struct.pack("!IB", len(body) + 1, kind) + body)
+def motors(v, w):
+    """A real robot talks to its motors here. This one says on a topic what they were told."""
+    robot.told = {"linear": {"x": v, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": w}}
 
-    def say(self, op, **fields):
-        if self.writer.transport.get_write_buffer_size() > LARGE:
-            raise ValueError("the relay takes nothing")
-        self.frame(0, json.dumps({"op": op, **fields}).encode())
 
-    async def read(self):
-        length, kind = struct.unpack("!IB", await self.reader.readexactly(5))
-        if not 1 <= length <= self.limit or kind > 1:  # judged before a byte of it is awaited
+def every_20_ms(*_):
+    if now() > robot.until:  # the watchdog
+        robot.v = robot.w = 0.0
+    motors(robot.v, robot.w)
+
+
+# 2. Frames: four bytes of length, one of kind, the body
+
+
+def dial(address, limit):
+    connection = socket.create_connection(address, timeout=6)
+    # With TLS: connection = ssl.create_default_context().wrap_socket(connection, server_hostname=HOST)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    link = SimpleNamespace(socket=connection, limit=limit, buffer=bytearray(), heard=now(), ping_due=math.inf)
+    link.subscriptions, link.commands, link.exchanges = {}, set(), deque(maxlen=16)
+    return link
+
+
+def send(link, kind, body):
+    link.socket.sendall(struct.pack("!IB", len(body) + 1, kind) + body)
+
+
+def say(link, op, **fields):
+    send(link, 0, json.dumps({"op": op, **fields}).encode())
+
+
+def receive(link):
+    """The messages that have come. The length of a frame is judged before the rest of it is awaited."""
+    data = link.socket.recv(65536)
+    if not data:
+        raise EOFError("the relay hung up")
+    link.heard = now()
+    link.buffer += data
+    while len(link.buffer) >= 5:
+        length, kind = struct.unpack_from("!IB", link.buffer)
+        if not 1 <= length <= link.limit or kind > 1:
             raise ValueError(f"a frame of kind {kind} with {length} bytes breaks the contract")
-        return kind, await self.reader.readexactly(length - 1)
-
-    async def message(self):
-        """The next message (a dict), or sample (number, stamp, body)."""
-        while True:
-            kind, body = await asyncio.wait_for(self.read(), 3 * self.heartbeat)
-            if kind == 1:
-                return (*struct.unpack("!IQ", body[:12]), body[12:])
-            said = json.loads(body)
-            if said["op"] == "ping":
-                self.say("pong", t=said["t"], at=clock())
-            elif said["op"] == "pong":
-                self.compare(said["t"], said["at"], clock())
-            elif said["op"] in ("bye", "refused"):
-                raise EOFError(f"the relay says {said['op']}: {said['reason']}")
-            else:
-                return said
-
-    def compare(self, t, at, now):
-        """The relay read its clock as ``at``, after we sent at ``t`` and before we heard at ``now``."""
-        if self.exchanges and self.ahead(now) < at - now:
-            self.exchanges.clear()  # both can't be true: a clock stood still
-        self.exchanges.append((t, at))
-
-    def ahead(self, now):
-        """How far the relay's clock can be ahead of ours, at most."""
-        return min(at - t + (now - t) // 1000 for t, at in self.exchanges)
-
-    async def ping(self, seconds):
-        while True:
-            self.say("ping", t=clock())
-            await asyncio.sleep(seconds)
-
-
-class Wheels:
-    """What moves. It comes to a standstill by itself, whatever became of everybody else."""
-
-    def __init__(self, drive):
-        self.drive, self.moving, self.zeros, self.last, self.driver = drive, False, 0, 0, None
-
-    def command(self, driver, stamp, body, link):
-        """Obey a command that is fresh by the worst we know of the clocks, and made of numbers."""
-        now, twist = clock(), json.loads(body)
-        age = now + link.ahead(now) - stamp
-        v, w = (float(twist.get(part, {}).get(axis, 0)) for part, axis in (("linear", "x"), ("angular", "z")))
-        if not 0 <= age <= DEADLINE * MS or not math.isfinite(v) or not math.isfinite(w):
-            print("a command was too old or no number; dropped", flush=True)
-        elif v or w:
-            self.moving, self.zeros, self.last, self.driver = True, 0, now, driver
-            self.drive(v, w)
+        if len(link.buffer) < 4 + length:
+            return
+        body = bytes(link.buffer[5 : 4 + length])
+        del link.buffer[: 4 + length]
+        if kind == 0:
+            yield json.loads(body)
         else:
-            self.stop()
-
-    def stop(self, driver=None):
-        """Stand still; with ``driver`` only what this one has left moving. It is said five times (SPEC 2.5, 6)."""
-        if self.moving and driver in (None, self.driver):
-            self.moving, self.zeros = False, 5
-
-    async def watch(self):
-        while True:
-            if self.moving and clock() - self.last > (STOP_WITHIN - 50) * MS:
-                self.stop()
-            if self.zeros:
-                self.zeros -= 1
-                self.drive(0.0, 0.0)
-            await asyncio.sleep(0.02)
+            number, stamp = struct.unpack_from("!IQ", body)
+            yield {"op": "sample", "number": number, "stamp": stamp, "message": body[12:]}
 
 
-class Robot:
-    def __init__(self, options):
-        self.options, self.subscriptions, self.latest = options, {}, {}
-        self.wheels = Wheels(self.drive)
-        self.drive(0.0, 0.0)
+# 3. The control link: enrol once, prove who we are, say what we are, open channels
 
-    def drive(self, v, w):
-        """A real robot talks to its motors here. This one says on a topic what they were told."""
-        self.publish(
-            "/cmd_vel/heard", {"linear": {"x": v, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": w}}
-        )
 
-    async def sense(self):
-        while True:
-            self.publish("/temperature", {"data": 20 + math.sin(time.time())})
-            await asyncio.sleep(0.05)
+def greet(control):
+    public = key.public_key().public_bytes_raw()
+    if "relay" in me:
+        short = hashlib.sha256(public).hexdigest()[:16]
+        say(control, "hello", version=1, robot=me["robot"], key=short, encodings=["json"])
+    else:
+        public_key = base64.b64encode(public).decode()
+        say(control, "enroll", version=1, robot=me["robot"], code=CODE, public_key=public_key)
 
-    def publish(self, topic, message):
-        self.latest[topic] = message
-        for (link, number), each in self.subscriptions.items():
-            free = link.writer.transport.get_write_buffer_size() < LARGE  # who takes nothing gets nothing
-            if each["topic"] == topic and clock() >= each["due"] and free:
-                each["due"] = clock() + each["every"] * MS
-                self.send(link, number, message)
 
-    def send(self, link, number, message):
-        link.frame(1, struct.pack("!IQ", number, time.time_ns()) + json.dumps(message).encode())
+def prove(control, nonce):
+    parts = me["relay"].encode(), me["robot"].encode(), base64.b64decode(nonce)
+    text = b"switchboard robot link 1\0" + b"".join(struct.pack("!H", len(part)) + part for part in parts)
+    say(control, "prove", signature=base64.b64encode(key.sign(text)).decode())
 
-    async def dial(self):
-        host, _, port = self.options.relay.rpartition(":")
-        tls = ssl.create_default_context(cafile=self.options.ca) if self.options.tls else None
-        return Link(*await asyncio.wait_for(asyncio.open_connection(host, int(port), ssl=tls), 10))
 
-    async def enroll(self):
-        """Make a key pair; only its public half leaves the robot."""
-        key, link = Ed25519PrivateKey.generate(), await self.dial()
-        public = base64.b64encode(key.public_key().public_bytes_raw()).decode()
-        link.say("enroll", version=1, robot=self.options.robot, code=self.options.code, public_key=public)
-        enrolled = await link.message()
-        self.options.state.touch(0o600)
-        kept = {"robot": enrolled["robot"], "relay": enrolled["relay"], "key": key.private_bytes_raw().hex()}
-        self.options.state.write_text(json.dumps(kept))
-        link.writer.close()
+def describe(control):
+    topics = {name: {"types": [kind], "publishers": ["/robot"]} for name, (kind, _) in SENSORS.items()}
+    topics["/cmd_vel"] = {"types": [TWIST], "subscribers": ["/robot"]}
+    services = {"/beep": {"types": [TRIGGER], "providers": ["/robot"]}}
+    say(control, "describe", platform="json", motion=MOTION)
+    say(control, "graph", full=True, topics=topics, services=services, nodes={"/robot": {}})
 
-    async def run(self):
-        if not self.options.state.exists():
-            await self.enroll()
-        self.me, failures = json.loads(self.options.state.read_text()), 0
-        own = asyncio.gather(self.wheels.watch(), self.sense())
+
+def order(links, control, op, said):
+    if op == "enrolled":
+        me["relay"] = said["relay"]
+        Path(FILE).touch(0o600)
+        Path(FILE).write_text(json.dumps(me))
+        raise EOFError("enrolled, now to dial again")
+    if op == "challenge" and said["relay"] == me["relay"]:
+        prove(control, said["nonce"])
+    elif op == "welcome":
+        robot.heartbeat, robot.wait, control.ping_due = said["heartbeat"], 0.5, 0
+        describe(control)
+    elif op == "open_channel" and len(links) < 10:
+        links.append(dial(control.socket.getpeername()[:2], 4 * 1024 * 1024))
+        say(links[-1], "join", version=1, ticket=said["ticket"])
+    elif op != "close_channel":  # the relay then hangs up on the channel's own link, too
+        raise ValueError(f"the relay says {said}")  # also if it has another name: nothing was signed
+
+
+# 4. Channel links: what clients want
+
+
+def request(link, op, said):
+    number, topic = said.get("number"), said.get("topic")
+    room = len(link.subscriptions) + len(link.commands) < 100
+    if op == "joined":
+        link.ping_due = 0
+    elif op == "subscribe" and topic in SENSORS and room:
+        every = max(50, said.get("throttle_ms", 0)) * MS
+        link.subscriptions[number] = {"topic": topic, "every": every, "due": 0}
+        say(link, "subscribed", number=number, topic=topic, type=SENSORS[topic][0], encoding="json")
+    elif op == "unsubscribe":
+        link.subscriptions.pop(number, None)
+    elif op == "advertise" and topic == "/cmd_vel" and said["type"] == TWIST and room:
+        link.commands.add(number)
+        say(link, "advertised", number=number, topic=topic, type=TWIST, encoding="json", motion=True)
+    elif op == "unadvertise":
+        link.commands.discard(number)
+        robot.until = 0
+    elif op == "sample":
+        if number in link.commands:
+            command(link, said["stamp"], said["message"])
+    elif op == "call_service" and said["service"] == "/beep":
+        say(link, "service_response", id=said["id"], result=True, values={"success": True, "message": "beep"})
+    elif op == "call_service":
+        say(link, "service_response", id=said["id"], result=False, reason="there is only /beep")
+    elif op == "send_action_goal":
+        say(link, "action_result", id=said["id"], status=0, result=False, reason="there are no actions")
+    elif not op.startswith(("unadvertise_", "cancel_")):  # these want no answer
+        ref = next((str(said[each]) for each in ("number", "service", "action", "type") if each in said), "")
+        say(link, "failed", what=op, ref=ref, reason="this small robot does not have that")
+
+
+def publish(link):
+    for number, each in link.subscriptions.items():
+        if now() >= each["due"] and select.select([], [link.socket], [], 0)[1]:  # never wait to send a sample
+            each["due"] = now() + each["every"]
+            sample = json.dumps(SENSORS[each["topic"]][1]()).encode()
+            send(link, 1, struct.pack("!IQ", number, time.time_ns()) + sample)
+
+
+# 5. Commands: how old can one be, by what the pings say of the relay's clock?
+
+
+def ahead(link):
+    """The relay's clock showed `at` after ours had shown `t`, so it is ahead by no more than `at - t`."""
+    return min(at - t + (now() - t) // 1000 for t, at in link.exchanges)
+
+
+def compare(link, t, at):
+    if link.exchanges and ahead(link) < at - now():
+        link.exchanges.clear()  # both can't be true: a clock stood still
+    link.exchanges.append((t, at))
+
+
+def command(link, stamp, body):
+    try:
+        twist = json.loads(body)
+        speeds = [float(twist.get(part, {}).get(axis, 0)) for part in ("linear", "angular") for axis in "xyz"]
+        age = now() + ahead(link) - stamp
+        if not 0 <= age <= MOTION["deadline_ms"] * MS or not all(map(math.isfinite, speeds)):
+            raise ValueError(f"speeds {speeds}, up to {age / SECOND:.3f} s old")
+    except Exception as error:
+        print(f"a command was dropped: {error}", flush=True)
+    else:
+        robot.until = now() + (MOTION["stop_within_ms"] - 100) * MS
+        robot.v, robot.w = speeds[0], speeds[5]
+
+
+# 6. All links in turn, for ever
+
+
+def serve(links, link, ready):
+    for said in receive(link) if ready else ():
+        if said["op"] == "ping":
+            say(link, "pong", t=said["t"], at=now())
+        elif said["op"] == "pong":
+            compare(link, said["t"], said["at"])
+        elif link is links[0]:
+            order(links, link, said["op"], said)
+        else:
+            request(link, said["op"], said)
+    if now() - link.heard > 3 * robot.heartbeat * SECOND:
+        raise TimeoutError("the relay is silent")
+    if now() >= link.ping_due:
+        link.ping_due = now() + min(1, robot.heartbeat) * SECOND
+        say(link, "ping", t=now())
+    publish(link)
+
+
+def leave(links, link):
+    links.remove(link)
+    link.socket.close()
+    robot.until = 0
+
+
+def live(links):
+    links.append(dial((HOST, int(PORT)), 16 * 1024))  # the first is the control link
+    greet(links[0])
+    while True:
+        ready = select.select([link.socket for link in links], [], [], 0.02)[0]
+        for link in list(links):
+            try:
+                serve(links, link, link.socket in ready)
+            except Exception as error:
+                if link is links[0]:
+                    raise
+                print(f"a channel ended: {error}", flush=True)
+                leave(links, link)
+
+
+me = {"robot": NAME, "key": secrets.token_hex(32)}
+if Path(FILE).exists():
+    me = json.loads(Path(FILE).read_text())
+key = Ed25519PrivateKey.from_private_bytes(bytes.fromhex(me["key"]))
+signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+signal.signal(signal.SIGALRM, every_20_ms)
+signal.setitimer(signal.ITIMER_REAL, 0.02, 0.02)
+try:
+    while True:
+        links, robot.wait = [], min(2 * robot.wait, 30)
         try:
-            while True:
-                life = asyncio.create_task(self.control())
-                await asyncio.wait({own, life}, return_when=asyncio.FIRST_COMPLETED)
-                if own.done():  # without its watchdog this robot does not go on
-                    return own.result()
-                failures = 0 if life.result() else min(failures + 1, 5)
-                self.wheels.stop()
-                await asyncio.sleep(random.random() * 0.5 * 2**failures)
-        finally:
-            self.drive(0.0, 0.0)
-
-    async def control(self):
-        """One life of the control link (SPEC 2.2, 2.4); whether the relay took us in."""
-        jobs, link, welcome = set(), None, {}
-        try:
-            link, key = await self.dial(), Ed25519PrivateKey.from_private_bytes(bytes.fromhex(self.me["key"]))
-            short = hashlib.sha256(key.public_key().public_bytes_raw()).hexdigest()[:16]
-            link.say(
-                "hello", version=1, robot=self.me["robot"], key=short, encodings=["json"], agent="json_robot"
-            )
-            challenge = await link.message()
-            if challenge["relay"] != self.me["relay"]:
-                raise ValueError(f"this is {challenge['relay']}, not {self.me['relay']}; nothing was signed")
-            parts = self.me["relay"].encode(), self.me["robot"].encode(), base64.b64decode(challenge["nonce"])
-            text = b"switchboard robot link 1\0" + b"".join(len(p).to_bytes(2, "big") + p for p in parts)
-            link.say("prove", signature=base64.b64encode(key.sign(text)).decode())
-            welcome = await link.message()
-            link.heartbeat, link.limit = welcome["heartbeat"], LARGE
-            motion = {"types": [TWIST], "deadline_ms": DEADLINE, "stop_within_ms": STOP_WITHIN}
-            link.say("describe", platform="json", agent="json_robot", motion=motion)
-            topics = {name: {"types": [kind], "publishers": ["/robot"]} for name, kind in OFFERED.items()}
-            topics["/cmd_vel"] = {"types": [TWIST], "subscribers": ["/robot"]}
-            services = {"/beep": {"types": [TRIGGER], "providers": ["/robot"]}}
-            link.say("graph", full=True, topics=topics, services=services, nodes={"/robot": {}})
-            jobs.add(asyncio.create_task(link.ping(link.heartbeat)))
-            while True:
-                order = await link.message()
-                if order["op"] == "open_channel":
-                    jobs.add(asyncio.create_task(self.channel(order["ticket"], link.heartbeat)))
-                elif order["op"] != "close_channel":  # that one also closes the channel's own link
-                    raise ValueError(f"'{order['op']}' is not known here")
-        except TROUBLE as error:
-            print(f"the link is lost: {error or type(error).__name__}", flush=True)
-        finally:
-            for job in jobs:
-                job.cancel()
-            if link:
-                link.writer.close()
-        return bool(welcome)
-
-    async def channel(self, ticket, heartbeat):
-        """One life of a channel link (SPEC 2.5)."""
-        link, commands, pinging = await self.dial(), set(), None
-        link.heartbeat, link.limit = heartbeat, LARGE
-        try:
-            asked = clock()
-            link.say("join", version=1, ticket=ticket)
-            link.compare(asked, (await link.message())["at"], clock())
-            pinging = asyncio.create_task(link.ping(1.0))
-            while True:
-                said = await link.message()
-                if isinstance(said, dict):
-                    self.request(link, said, commands)
-                elif said[0] in commands:
-                    with contextlib.suppress(ValueError, TypeError, AttributeError):  # no command at all
-                        self.wheels.command((link, said[0]), said[1], said[2], link)
-        except TROUBLE as error:
-            print(f"a channel is lost: {error or type(error).__name__}", flush=True)
-        finally:
-            for number in commands:
-                self.wheels.stop((link, number))
-            self.subscriptions = {key: each for key, each in self.subscriptions.items() if key[0] is not link}
-            if pinging:
-                pinging.cancel()
-            link.writer.close()
-
-    def request(self, link, said, commands):
-        op, number, topic = said["op"], said.get("number"), said.get("topic")
-        room = len(commands) + len(self.subscriptions) < 100
-        if op == "subscribe" and topic in OFFERED and room:
-            again = (link, number) in self.subscriptions
-            self.subscriptions[link, number] = {"topic": topic, "every": said.get("throttle_ms", 0), "due": 0}
-            link.say(
-                "subscribed", number=number, topic=topic, type=OFFERED[topic], encoding="json", publishers=1
-            )
-            if not again:
-                self.send(link, number, self.latest[topic])
-        elif op == "unsubscribe":
-            self.subscriptions.pop((link, number), None)
-        elif op == "advertise" and topic == "/cmd_vel" and said["type"] == TWIST and room:
-            commands.add(number)
-            link.say("advertised", number=number, topic=topic, type=TWIST, encoding="json", motion=True)
-        elif op == "unadvertise":
-            commands.discard(number)
-            self.wheels.stop((link, number))
-        elif op == "call_service":
-            known = said["service"] == "/beep"
-            answer = (
-                {"values": {"success": True, "message": "beep"}}
-                if known
-                else {"reason": "there is only /beep"}
-            )
-            link.say("service_response", id=said["id"], result=known, **answer)
-        elif op == "send_action_goal":
-            link.say(
-                "action_result", id=said["id"], status=0, result=False, reason="this robot has no actions"
-            )
-        elif op in (
-            "subscribe",
-            "advertise",
-            "advertise_service",
-            "advertise_action",
-            "get_type",
-            "get_interfaces",
-        ):
-            ref = next((str(said[key]) for key in ("number", "service", "action", "type") if key in said), "")
-            link.say("failed", what=op, ref=ref, reason="this small robot does not have that")
-        elif op not in (
-            "unadvertise_service",
-            "unadvertise_action",
-            "cancel_action_goal",
-            "service_response",
-        ):
-            link.say("bye", reason=f"'{op}' is not known here")
-            raise ValueError(f"'{op}' is not known here")
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="a robot that speaks JSON only")
-    parser.add_argument("--relay", required=True, help="HOST:PORT of the relay's robot port")
-    parser.add_argument("--robot", required=True, help="its name there")
-    parser.add_argument("--code", default="", help="enrolment code, needed once")
-    parser.add_argument("--state", required=True, type=Path, help="file for its key")
-    parser.add_argument("--tls", action="store_true", help="the relay speaks TLS")
-    parser.add_argument("--ca", help="certificate of your own authority")
-    with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(Robot(parser.parse_args()).run())
+            live(links)
+        except Exception as error:
+            print(f"no link: {error}", flush=True)
+        for link in list(links):
+            leave(links, link)
+        if "relay" not in me:
+            sys.exit("not enrolled")
+        time.sleep(robot.wait * random.uniform(0.5, 1))
+finally:
+    robot.until = 0
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    motors(0.0, 0.0)

@@ -24,6 +24,10 @@ HEARTBEAT = 1.0
 RARE = 20.0
 """A heartbeat so rare that a robot which hangs up within :data:`PATIENCE` did not do so for silence."""
 
+PATIENCE_TO_DIAL = 30.0
+PATIENCE_AFTER_ANOTHER_NAME = 90.0
+"""Seconds until a robot is back: after a loss, and after a relay of another name (SPEC 2.2)."""
+
 FRAME_LIMIT = 2**24
 COMMAND_FRAME = 2**22
 JSON, SAMPLE, PART = 0, 1, 3
@@ -223,6 +227,7 @@ class LinkRelay:
         self._dialled: list[Link] = []
         self._change = threading.Condition()
         self.dials = 0
+        self.patience = PATIENCE_TO_DIAL
         self._listener = socket.create_server((host, port))
         self.host, self.port = self._listener.getsockname()[:2]
         threading.Thread(target=self._accept, daemon=True).start()
@@ -274,9 +279,10 @@ class LinkRelay:
         link.say("challenge", nonce=base64.b64encode(nonce).decode(), relay=relay)
         return nonce
 
-    def register(self, patience: float = 30.0, heartbeat: float = HEARTBEAT) -> Link:
+    def register(self, patience: float = 0.0, heartbeat: float = HEARTBEAT) -> Link:
         """Take the robot in when it dials, its proof checked."""
-        link, self.hello = self.dialled("hello", patience)
+        link, self.hello = self.dialled("hello", max(patience, self.patience))
+        self.patience = PATIENCE_TO_DIAL
         nonce = self.challenge(link)
         signature = base64.b64decode(link.expect("prove")["signature"], validate=True)
         assert identity.verify(self.public_key, RELAY, self.robot, nonce, signature), "the signature is wrong"

@@ -52,8 +52,8 @@ class JsonRobot:
     """Cases about what it does not offer; with ``--listen`` a robot finds that out by itself."""
 
     def __init__(self, folder: Path, name: str, port: int) -> None:
-        command = [sys.executable, str(EXAMPLE), "--relay", f"127.0.0.1:{port}", "--robot", name]
-        command += ["--code", ENROLMENT_CODE, "--state", str(folder / "robot.json")]
+        command = [sys.executable, str(EXAMPLE), "127.0.0.1", str(port), name, ENROLMENT_CODE]
+        command.append(str(folder / "robot.json"))
         self._process = Process(command, folder, "json_robot")
 
     def run(self) -> None:

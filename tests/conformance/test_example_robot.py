@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
+import os
+import ssl
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,8 +17,14 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from robots_under_test import EXAMPLE
 from switchboard_harness import Client, Process, Relay, wait_for
+from websockets.sync.client import connect
 
 NAME = "tin-man"
+
+
+def command(relay: Relay, code: str, state: Path, program: Path = EXAMPLE) -> list[str]:
+    """How the robot is started."""
+    return [sys.executable, str(program), "127.0.0.1", str(relay.robots_port), NAME, code, str(state)]
 
 
 class World:
@@ -25,12 +33,11 @@ class World:
     def __init__(self, folder: Path) -> None:
         self.relay = Relay(folder)
         code = self.relay.cli("robot", "add", NAME)["enrolment_code"]
-        command = [sys.executable, str(EXAMPLE), "--relay", f"127.0.0.1:{self.relay.robots_port}"]
-        self._command = [*command, "--robot", NAME, "--state", str(folder / "robot.json")]
+        self._command = command(self.relay, code, folder / "robot.json")
         self._folder = folder
         self.token = self.relay.user("driver")
         self.relay.cli("right", "grant", "driver", NAME, "operator")
-        self.robot = Process([*self._command, "--code", code], folder, "robot")
+        self.robot = Process(self._command, folder, "robot")
         self.wait()
 
     def wait(self) -> None:
@@ -38,7 +45,7 @@ class World:
         wait_for("the robot is online", lambda: self.relay.state_of(NAME) != "offline")
 
     def restart(self) -> None:
-        """Start it again, without a code."""
+        """Start it again; its code is used up."""
         self.robot.stop()
         self.robot = Process(self._command, self._folder, "robot")
 
@@ -113,7 +120,7 @@ def test_it_stops_when_its_driver_leaves(world: World, client: Client) -> None:
 
 
 def test_it_comes_back(world: World) -> None:
-    """Started again it needs no code, and its clients go on."""
+    """Started again it needs no new code, and its clients go on."""
     with world.relay.connect(NAME, world.token) as client:
         client.send(op="subscribe", topic="/temperature", type="std_msgs/msg/Float64")
         client.until(op="publish", topic="/temperature")
@@ -145,19 +152,29 @@ def self_signed(folder: Path) -> tuple[str, str]:
 
 
 def test_it_speaks_tls(tmp_path: Path) -> None:
-    """With --tls it comes in where the certificate is trusted, and keeps away where it is not."""
+    """With its line for TLS it serves where the certificate is trusted, and says why where it is not."""
+    program = tmp_path / "tls_robot.py"
+    program.write_text(
+        EXAMPLE.read_text().replace("# With TLS: ", "").replace("import socket", "import socket, ssl")
+    )
     cert, key = self_signed(tmp_path)
     relay = Relay(tmp_path, "--tls-cert", cert, "--tls-key", key)
     code = relay.cli("robot", "add", NAME)["enrolment_code"]
-    command = [sys.executable, str(EXAMPLE), "--relay", f"127.0.0.1:{relay.robots_port}", "--robot", NAME]
-    command += ["--code", code, "--state", str(tmp_path / "robot.json"), "--tls"]
-    stranger = Process(command, tmp_path, "stranger")
+    start = command(relay, code, tmp_path / "robot.json", program)
+    stranger = Process(start, tmp_path, "stranger")
     trusting = None
     try:
         assert stranger.popen.wait(20) != 0
-        assert "CERTIFICATE_VERIFY_FAILED" in stranger.log.read_text()
-        trusting = Process([*command, "--ca", cert], tmp_path, "trusting")
+        assert "CERTIFICATE_VERIFY_FAILED" in stranger.said()
+        trusting = Process(start, tmp_path, "trusting", {**os.environ, "SSL_CERT_FILE": cert})
         wait_for("the robot is online", lambda: relay.state_of(NAME) != "offline")
+        token = relay.user("driver")
+        relay.cli("right", "grant", "driver", NAME, "operator")
+        url, trust = relay.url(NAME).replace("ws:", "wss:"), ssl.create_default_context(cafile=cert)
+        headers = {"Authorization": f"Bearer {token}"}
+        with Client(connect(url, ssl=trust, additional_headers=headers, close_timeout=1)) as client:
+            drive(client)
+            wait_for("it stands", lambda: speed(client) == 0)
     finally:
         for each in (trusting, stranger, relay):
             if each is not None:
@@ -167,13 +184,19 @@ def test_it_speaks_tls(tmp_path: Path) -> None:
 def test_a_wrong_code_is_refused_in_words(world: World, tmp_path: Path) -> None:
     """With a code that is none it ends, and keeps no key."""
     state = tmp_path / "robot.json"
-    command = [sys.executable, str(EXAMPLE), "--relay", f"127.0.0.1:{world.relay.robots_port}"]
-    stranger = Process(
-        [*command, "--robot", NAME, "--code", "guess", "--state", str(state)], tmp_path, "stranger"
-    )
+    stranger = Process(command(world.relay, "guess", state), tmp_path, "stranger")
     try:
         assert stranger.popen.wait(20) != 0
-        assert "refused" in stranger.log.read_text()
+        assert "refused" in stranger.said()
         assert not state.exists()
     finally:
         stranger.stop()
+
+
+def test_it_ends_in_order(world: World) -> None:
+    """A robot that is told to end while it drives ends in order, with status 0."""
+    with world.relay.connect(NAME, world.token) as client:
+        drive(client)
+        assert world.robot.stop() == 0
+    world.restart()
+    world.wait()

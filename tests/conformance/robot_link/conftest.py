@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from link_relay import ENROLMENT_CODE, LinkRelay
+from link_relay import ENROLMENT_CODE, Link, LinkRelay
 from robots_under_test import ROBOTS
 
 
@@ -17,6 +17,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         ours = [name for name, each in ROBOTS.items() if case not in each.lacks]
         robots = ["dialled"] if metafunc.config.getoption("--listen", "") else ours
         metafunc.parametrize("relay", robots, indirect=True, scope="session")
+
+
+@pytest.fixture
+def channel(relay: LinkRelay) -> Iterator[Link]:
+    """A channel link of its own for each case."""
+    with relay.channel() as link:
+        yield link
 
 
 @pytest.fixture(scope="session")

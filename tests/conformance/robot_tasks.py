@@ -1,0 +1,153 @@
+"""What cases of the robot link do with a robot: find what it offers, subscribe, call, drive it."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import struct
+import time
+from typing import Any
+
+from conformance_suite import not_offered
+from link_relay import ABSENCE, Link, LinkRelay, Sample
+
+TWIST = "geometry_msgs/msg/Twist"
+TRIGGER = "std_srvs/srv/Trigger"
+FIBONACCI = "example_interfaces/action/Fibonacci"
+CDR = b"\0\1\0\0"
+
+
+def sensor(relay: LinkRelay) -> tuple[str, str]:
+    """A topic it publishes often, and its type."""
+    topics = relay.graph["topics"]
+    published = [
+        name for name, each in topics.items() if each.get("publishers") and not name.endswith("/heard")
+    ]
+    likely = sorted(
+        published, key=lambda name: ("counter" not in name, "rosout" in name, "parameter" in name, name)
+    )
+    if not likely:
+        not_offered("the robot publishes no topic")
+    return likely[0], topics[likely[0]]["types"][0]
+
+
+def service(relay: LinkRelay) -> str:
+    """A service of type Trigger."""
+    found = sorted(name for name, each in relay.graph["services"].items() if TRIGGER in each["types"])
+    if not found:
+        not_offered(f"no service of type {TRIGGER}")
+    return str(found[0])
+
+
+def subscribe(link: Link, relay: LinkRelay, number: int = 7, **fields: Any) -> dict[str, Any]:
+    """Subscribe to the sensor; what the robot answers."""
+    topic, type_name = sensor(relay)
+    link.say("subscribe", number=number, topic=topic, type=type_name, **fields)
+    return link.expect("subscribed", number=number)
+
+
+def stands(link: Link, asked: str, answer: str) -> bool:
+    """Whether what was asked for stands; ``failed`` otherwise."""
+    told = link.take(
+        f"'{answer}' or 'failed'", lambda each: isinstance(each, dict) and each["op"] in (answer, "failed")
+    )
+    assert told["op"] == answer or told["what"] == asked
+    return bool(told["op"] == answer)
+
+
+def fibonacci(relay: LinkRelay, link: Link, order: int, **fields: Any) -> None:
+    """Send a goal, id ``g``, to an action of type Fibonacci."""
+    actions = relay.graph["actions"]
+    found = sorted(name for name, each in actions.items() if FIBONACCI in each["types"])
+    if not found:
+        not_offered(f"no action of type {FIBONACCI}")
+    goal = base64.b64encode(CDR + struct.pack("<i", order)).decode()
+    link.say("send_action_goal", id="g", action=found[0], type=FIBONACCI, cdr=goal, **fields)
+
+
+def wheels(relay: LinkRelay) -> str:
+    """The topic of type Twist that moves it and that it reports on as ``…/heard``."""
+    topics = relay.graph["topics"]
+    for name, each in topics.items():
+        if f"{name}/heard" in topics and TWIST in each["types"]:
+            return str(name)
+    not_offered("no topic of type Twist with a topic …/heard beside it")
+    raise AssertionError
+
+
+class Wheels:
+    """Drives the robot by one channel link, and watches by another what it was told."""
+
+    def __init__(self, relay: LinkRelay, driving: Link, watching: Link) -> None:
+        topic = wheels(relay)
+        policy = relay.facts().get("motion", {})
+        self.deadline = policy.get("deadline_ms", 500) / 1000
+        self.stop_within = policy.get("stop_within_ms", 500) / 1000
+        self.driving, self.watching = driving, watching
+        watching.say("subscribe", number=1, topic=f"{topic}/heard", type=TWIST)
+        self._heard_encoding = watching.expect("subscribed", number=1)["encoding"]
+        self.topic = topic
+        self.advertise()
+        # What the case before has left moving stops by itself.
+        while self.next_speed(self.stop_within + 0.1):
+            pass
+
+    def advertise(self) -> None:
+        """Announce commands."""
+        self.driving.say("advertise", number=2, topic=self.topic, type=TWIST)
+        self.told = self.driving.expect("advertised", number=2)
+
+    def command(self, speed: float, age: float = 0.0) -> None:
+        """One command."""
+        if self.told["encoding"] == "json":
+            twist = {"linear": {"x": speed, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}
+            body = json.dumps(twist).encode()
+        else:
+            body = CDR + struct.pack("<6d", speed, 0, 0, 0, 0, 0)
+        self.driving.sample(2, body, age)
+
+    def not_finite(self) -> None:
+        """Commands whose speed is no finite number."""
+        for speed in (float("nan"), float("inf"), float("-inf")):
+            self.command(speed)
+        if self.told["encoding"] == "json":
+            for text in (b"null", b"1e999", b"-1e999"):
+                self.driving.sample(2, b'{"linear": {"x": ' + text + b'}, "angular": {}}')
+
+    def speed(self, sample: Sample) -> float:
+        """The forward speed of a report."""
+        if self._heard_encoding == "json":
+            return float(json.loads(sample.body)["linear"]["x"])
+        return float(struct.unpack_from("<d" if sample.body[1] & 1 else ">d", sample.body, 4)[0])
+
+    def next_speed(self, seconds: float) -> float | None:
+        """The next report, if one comes."""
+        with contextlib.suppress(AssertionError):
+            return self.speed(self.watching.expect_sample(1, seconds))
+        return None
+
+    def start(self) -> Sample:
+        """Command until it moves; the first report of it."""
+        until = time.monotonic() + 10
+        while True:
+            assert time.monotonic() < until, "commands, sent again and again, did not move the robot"
+            self.command(0.2)
+            with contextlib.suppress(AssertionError):
+                report = self.watching.expect_sample(1, 0.05)
+                if self.speed(report) == 0.2:
+                    return report
+
+    def stands(self, moving: Sample) -> float:
+        """Wait until it stands; seconds from the last report of moving, no earlier than ``moving``, to that."""
+        while True:
+            report = self.watching.expect_sample(1, 3)
+            if self.speed(report) == 0:
+                return (report.stamp - moving.stamp) / 1e9
+            moving = report
+
+    def never_moves(self, seconds: float = ABSENCE) -> None:
+        """Nothing but standing is reported within this time."""
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            assert not self.next_speed(left), "it moves"
