@@ -25,6 +25,11 @@ def text(payload: bytes) -> bytes:
     return _head(TEXT, len(payload)) + payload
 
 
+def text_of(head: bytes, body: bytes, tail: bytes) -> bytes:
+    """The frame of one text message that is made of three pieces: what is long is copied once only."""
+    return b"".join((_head(TEXT, len(head) + len(body) + len(tail)), head, body, tail))
+
+
 def binary(payload: bytes) -> bytes:
     """The frame of one binary message."""
     return _head(BINARY, len(payload)) + payload

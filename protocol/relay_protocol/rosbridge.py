@@ -207,7 +207,12 @@ def decode(data: bytes) -> ClientOp:
 
 def publish(topic: str, body: bytes) -> bytes:
     """A ``publish`` towards a client, around a body that is JSON already."""
-    return b'{"op":"publish","topic":' + jsontext.encode(topic) + b',"msg":' + body + b"}"
+    return publish_head(topic) + body + b"}"
+
+
+def publish_head(topic: str) -> bytes:
+    """What comes before the body in :func:`publish`; behind it comes a brace."""
+    return b'{"op":"publish","topic":' + jsontext.encode(topic) + b',"msg":'
 
 
 def service_response(service: str, id: Id, result: bool, values: bytes) -> bytes:

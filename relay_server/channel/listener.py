@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 from relay_protocol import rosbridge
 from relay_protocol.errors import Refused
 from relay_server.budget import Allowance
-from relay_server.channel.sample import Flaw, Sample, Wish
+from relay_server.channel.sample import Flaw, Sample, wish_for
 from relay_server.clock import Clock, Timer
 from relay_server.forms import PLAIN, TOO_COSTLY, Form
 
@@ -61,7 +61,7 @@ class Listener:
         """Least seconds between two samples: the least any of the subscriptions asks for."""
         self.depth = 0
         """Samples that may wait for this client; 0 leaves it to the relay."""
-        self.wish = Wish((topic,), PLAIN)
+        self.wish = wish_for((topic,), PLAIN)
         """The names the topic is subscribed by, latest compression and least size of fragments."""
         self._asks: dict[tuple[str, rosbridge.Id], Asked] = {}
         self._told: set[Flaw] = set()
@@ -114,7 +114,7 @@ class Listener:
         self.depth = max(0, max(ask.queue_length for ask in asks))
         size = min((form.fragment_size for form in forms if form.fragment_size), default=0)
         names = tuple(dict.fromkeys(ask.topic for ask in asks))
-        self.wish = Wish(names, Form(forms[-1].compression, size))
+        self.wish = wish_for(names, Form(forms[-1].compression, size))
         if self._timer is not None:
             self._timer.cancel()
             self._wait()
@@ -130,8 +130,9 @@ class Listener:
                     self._wait()
                 return
             self._sent_at = now
-        # What waited under a longer throttle is older than this one.
-        self.close()
+        if self._timer is not None:
+            # What waited under a longer throttle is older than this one.
+            self.close()
         self._receiver.deliver(self, sample)
 
     def replay(self, sample: Sample) -> None:

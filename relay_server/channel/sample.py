@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import cbor2
@@ -29,10 +30,19 @@ class Wish(NamedTuple):
     """What a client wants to get of each sample.
 
     :param names: the topic as the client writes it; one message goes under each
+    :param head: what comes before the body, where the wish is for one message in plain JSON; else empty
     """
 
     names: tuple[str, ...]
     form: Form
+    head: bytes
+
+
+@lru_cache(maxsize=1024)
+def wish_for(names: tuple[str, ...], form: Form) -> Wish:
+    """What a client wants. Nearly all who want the same share one object, so that it is known at a glance."""
+    plain = form == PLAIN and len(names) == 1
+    return Wish(names, form, rosbridge.publish_head(names[0]) if plain else b"")
 
 
 class Flaw(enum.Enum):
@@ -71,16 +81,16 @@ class Converter:
         self._type = type_name
         self.cdr = encoding == "cdr"
         self.failed = failed
-        self._known = False
+        self.known = False
+        """What was known when it was last asked for; what is known stays known."""
         self._readers: dict[str, Reader] = {}
 
     @property
     def knows(self) -> bool:
         """Whether all that this takes is known."""
-        if not self._known:
-            # Asked for every sample; what is known stays known.
-            self._known = not self.cdr or self._types.knows(self._type)
-        return self._known
+        if not self.known:
+            self.known = not self.cdr or self._types.knows(self._type)
+        return self.known
 
     def convert(self, language: str, body: bytes) -> bytes:
         """A sample's body in ``json`` or ``cbor``.
@@ -101,24 +111,62 @@ class Sample:
     :param stamp: when it reached the robot, nanoseconds since 1970
     """
 
-    __slots__ = ("_bodies", "_converter", "_pictures", "_ready", "_ready_bytes", "_stamp", "body", "size")
+    __slots__ = (
+        "_converter",
+        "_json",
+        "_others",
+        "_pictures",
+        "_plain",
+        "_plain_wish",
+        "_ready",
+        "_ready_bytes",
+        "_stamp",
+        "body",
+        "size",
+    )
 
     def __init__(self, body: bytes, stamp: int, converter: Converter) -> None:
         self.body = body
         self._stamp = stamp
         self._converter = converter
         self.size = len(body)
-        self._bodies: dict[str, bytes | SwitchboardError] = {}
-        self._pictures: dict[str, bytes] = {}
-        self._ready: dict[Wish, Ready] = {}
+        # The first plain form, which is most often the only one, needs no table. The others are made when it is not.
+        self._json: bytes | SwitchboardError | None = None
+        self._plain_wish: Wish | None = None
+        self._plain = b""
+        self._others: dict[str, bytes | SwitchboardError] | None = None
+        self._pictures: dict[str, bytes] | None = None
+        self._ready: dict[Wish, Ready] | None = None
         self._ready_bytes = 0
 
     def open(self, listener: Listener) -> bytes | None:
         """The websocket frames for a client that listens so; ``None`` when it can't be converted."""
-        ready = self._ready.get(listener.wish) or self._ready_for(listener)
+        wish = listener.wish
+        if wish is self._plain_wish:
+            return self._plain
+        if wish.head and self._plain_wish is None:
+            frames = self._first_plain(wish)
+            if frames is not None:
+                return frames
+        ready = self._found(wish) or self._ready_for(listener)
         if ready.flaw is not None:
             listener.complain(ready.flaw, ready.words)
         return ready.frames
+
+    def _first_plain(self, wish: Wish) -> bytes | None:
+        """What :meth:`_make` would make for the first who wants one message in plain JSON, unless it is broken."""
+        body = self._in("json")
+        if isinstance(body, SwitchboardError):
+            return None
+        self._plain_wish = wish
+        self._plain = wsframe.text_of(wish.head, body, b"}")
+        self._ready_bytes += len(self._plain)
+        return self._plain
+
+    def _found(self, wish: Wish) -> Ready | None:
+        if wish == self._plain_wish:
+            return Ready(self._plain)
+        return None if self._ready is None else self._ready.get(wish)
 
     def _ready_for(self, listener: Listener) -> Ready:
         """Make it ready: at the cost of the client's user where that is much, else as plain JSON.
@@ -132,8 +180,8 @@ class Sample:
             with allowance.forming():
                 return self._keep(wish, self._make(wish))
         listener.plainly()
-        wish = Wish(wish.names, PLAIN)
-        return self._ready.get(wish) or self._keep(wish, self._make(wish))
+        wish = wish_for(wish.names, PLAIN)
+        return self._found(wish) or self._keep(wish, self._make(wish))
 
     def _costly(self, form: Form) -> bool:
         if form.compression in ("cbor", "cbor-raw"):
@@ -172,9 +220,15 @@ class Sample:
         return Ready(b"".join(divided(each, wish.form.fragment_size) for each in texts), flaw, words)
 
     def _in(self, language: str) -> bytes | SwitchboardError:
-        found = self._bodies.get(language)
+        if language == "json":
+            if self._json is None:
+                self._json = self._converted(language)
+            return self._json
+        if self._others is None:
+            self._others = {}
+        found = self._others.get(language)
         if found is None:
-            found = self._bodies[language] = self._converted(language)
+            found = self._others[language] = self._converted(language)
         return found
 
     def _converted(self, language: str) -> bytes | SwitchboardError:
@@ -187,6 +241,8 @@ class Sample:
             return error
 
     def _picture(self, name: str, text: bytes) -> bytes:
+        if self._pictures is None:
+            self._pictures = {}
         found = self._pictures.get(name)
         if found is None:
             found = self._pictures[name] = png.encode(text)
@@ -194,6 +250,8 @@ class Sample:
 
     def _keep(self, wish: Wish, ready: Ready) -> Ready:
         """Latched samples stay for long: what was made ready of them must not grow with what clients think of."""
+        if self._ready is None:
+            self._ready = {}
         self._ready[wish] = ready
         self._ready_bytes += len(ready.frames or b"")
         while self._ready_bytes > 4 * self.size + _SPARE and len(self._ready) > 1:

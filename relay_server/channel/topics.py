@@ -160,10 +160,11 @@ class TopicUplink:
 
     def sample(self, body: bytes, stamp: int) -> None:
         """Take a sample from the robot and hand it to the listeners."""
-        sample = Sample(body, stamp, self._converter)
+        converter = self._converter
+        sample = Sample(body, stamp, converter)
         if self.latched:
             _keep(self._recent, sample)
-        if self._converter.knows:
+        if converter.known or converter.knows:
             for listener in self.served:
                 listener.offer(sample)
             return

@@ -324,6 +324,7 @@ class ChannelEnd:
     def __init__(self, channel: Channel, connection: RobotConnection) -> None:
         self._channel = channel
         self._connection = connection
+        self._subscriptions = channel.subscriptions
 
     def message(self, body: bytes) -> None:
         """An answer, or a definition."""
@@ -341,7 +342,7 @@ class ChannelEnd:
 
     def sample(self, frame: SampleFrame) -> None:
         """A sample of a subscribed topic."""
-        self._channel.sample(frame.number, frame.body, frame.stamp)
+        self._subscriptions.sample(frame.number, frame.body, frame.stamp)
 
     def lost(self, reason: str) -> None:
         """The link has ended."""

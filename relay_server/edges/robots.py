@@ -150,7 +150,11 @@ class RobotConnection(TwistedProtocol):
 
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Queue a sample; when the robot is slow the newest survive."""
-        self._outbox.data(number, encode_sample(number, stamp, body))
+        frame = encode_sample(number, stamp, body)
+        if self._outbox.passing:
+            self._outbox.write(frame)
+        else:
+            self._outbox.data(number, frame)
 
     def newest(self, key: str, message: link.Message) -> None:
         """Queue a message of which, under one key, only the newest must survive."""
@@ -200,9 +204,10 @@ class RobotConnection(TwistedProtocol):
     # --- inside -------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        while self._waiting and not self._busy and self._role is not None:
-            frame = self._waiting.popleft()
-            if isinstance(frame, SampleFrame):
+        waiting = self._waiting
+        while waiting and not self._busy and self._role is not None:
+            frame = waiting.popleft()
+            if type(frame) is SampleFrame:
                 self._role.sample(frame)
             elif isinstance(frame, JsonFrame):
                 self._role.message(frame.body)

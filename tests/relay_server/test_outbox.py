@@ -45,6 +45,16 @@ def paused() -> Receiver:
     return receiver
 
 
+def test_it_says_whether_what_is_sent_passes() -> None:
+    """Only while the transport takes bytes and nobody has closed."""
+    outbox = Receiver().outbox
+    said = [outbox.passing]
+    for change in (outbox.pause, outbox.resume, outbox.pause, outbox.close, outbox.resume):
+        change()
+        said.append(outbox.passing)
+    assert said == [True, False, True, False, False, False]
+
+
 def test_what_is_sent_to_a_fast_receiver_passes_straight_through() -> None:
     """Nothing waits while the transport takes bytes."""
     receiver = Receiver()

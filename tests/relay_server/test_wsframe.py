@@ -19,6 +19,13 @@ def test_a_message_is_read_back_whole(length: int) -> None:
     assert read == [(Opcode.TEXT, payload, True), (Opcode.BINARY, payload, True)]
 
 
+@pytest.mark.parametrize("length", [0, 123, 124, 125, 126, 65532, 65533, 70000])
+def test_pieces_make_the_same_frame_as_the_whole(length: int) -> None:
+    """At and around every length at which the head changes its form."""
+    body = b"x" * length
+    assert wsframe.text_of(b"a", body, b"c") == wsframe.text(b"a" + body + b"c")
+
+
 def test_a_ping_is_read_back() -> None:
     """With its payload."""
     reader = Protocol(CLIENT, state=OPEN, max_size=None)

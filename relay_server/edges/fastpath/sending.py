@@ -59,12 +59,15 @@ class Writer(Protocol):
 class SocketWriter:
     """In front of a plain TCP connection."""
 
-    __slots__ = ("_held", "_held_bytes", "_sent_at", "_socket", "_transport", "_turns")
+    __slots__ = ("_behind", "_held", "_held_bytes", "_seconds", "_sent_at", "_socket", "_transport", "_turns")
 
     def __init__(self, transport: Any, turns: Turns) -> None:
         self._transport = transport
         self._socket = transport.getHandle()
         self._turns = turns
+        self._seconds = turns.seconds
+        self._behind = True
+        """Whether Twisted may have bytes of this connection: whoever had it before may have left some."""
         self._sent_at = -math.inf
         self._held: list[bytes] = []
         self._held_bytes = 0
@@ -72,7 +75,7 @@ class SocketWriter:
     def write(self, data: bytes) -> None:
         """At once if nothing was sent just before, else at the end of the turn."""
         if not self._held:
-            now = self._turns.seconds()
+            now = self._seconds()
             if now - self._sent_at >= APART_SECONDS:
                 self._sent_at = now
                 self._put(data)
@@ -92,19 +95,22 @@ class SocketWriter:
             self._put(data)
 
     def _put(self, data: bytes) -> None:
-        transport = self._transport
-        # Bytes that Twisted still has go first. ``_tempDataLen`` (written, not yet joined) and ``dataBuffer`` (being
-        # sent) are all it keeps; they are only read here, and the tests notice when they are not that any more.
-        if transport._tempDataLen or transport.dataBuffer:
-            transport.write(data)
-            return
+        if self._behind:
+            # Bytes that Twisted still has go first. ``_tempDataLen`` (written, not yet joined) and ``dataBuffer`` (being
+            # sent) are all it keeps; they are only read here, and the tests notice when they are not that any more.
+            transport = self._transport
+            if transport._tempDataLen or transport.dataBuffer:
+                transport.write(data)
+                return
+            self._behind = False
         try:
             sent = self._socket.send(data)
         except OSError:
             # Full, broken or closed: Twisted finds out which when it writes, and tells the protocol.
             sent = 0
         if sent < len(data):
-            transport.write(data[sent:])
+            self._behind = True
+            self._transport.write(data[sent:])
 
 
 class PlainWriter:

@@ -51,6 +51,26 @@ def test_the_same_in_each_form(world: World, compression: str) -> None:
     assert person.client.sent[0].startswith(b'{"op":"png"') == (compression == "png")
 
 
+FORMS: list[dict[str, Any]] = [{}, {"topic": "chatter"}, *({"compression": each} for each in ("png", "cbor"))]
+
+
+@pytest.mark.parametrize("first", FORMS)
+@pytest.mark.parametrize("second", FORMS)
+def test_who_asked_first_makes_no_difference(
+    world: World, first: dict[str, Any], second: dict[str, Any]
+) -> None:
+    """What is made ready for one is right for the other, under his own name for the topic and in his form."""
+    number, (one, other) = watching(world, first, second)
+    plain = {"op": "publish", "msg": {"data": "hi"}}
+    for word in ("hi", "hi"):
+        world.channel.sample(number, text(word))
+    for person, ask in ((one, first), (other, second)):
+        assert [opened(each) for each in person.client.sent] == [
+            {**plain, "topic": ask.get("topic", "/chatter")}
+        ] * 2
+        assert person.client.sent[0].startswith(b'{"op":"png"') == (ask.get("compression") == "png")
+
+
 def test_raw_is_what_the_robot_sent(world: World) -> None:
     """The time at which the sample reached the robot, and its bytes untouched."""
     number, (person,) = watching(world, {"compression": "cbor-raw"})
@@ -291,7 +311,9 @@ def test_what_is_made_ready_of_a_sample_is_bounded(world: World) -> None:
         person.says("subscribe", topic="/chatter", fragment_size=size)
         listener = person.session.listening._listeners["/chatter"]
         person.session.deliver(listener, kept)
-    assert sum(len(each.frames or b"") for each in kept._ready.values()) == kept._ready_bytes
+    assert kept._plain and kept._ready is not None
+    others = sum(len(each.frames or b"") for each in kept._ready.values())
+    assert len(kept._plain) + others == kept._ready_bytes
     assert kept._ready_bytes <= 4 * kept.size + module._SPARE
 
 
