@@ -11,6 +11,7 @@ import json
 import os
 import random
 import selectors
+import shutil
 import signal
 import socket
 import ssl
@@ -60,6 +61,15 @@ def ros_environment(domain: int) -> dict[str, str]:
     return {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
+def mortal(command: list[str]) -> list[str]:
+    """The same command, ended by SIGTERM as soon as the thread that starts it is gone, however that went.
+
+    So a test run that is killed leaves no robots and relays behind.
+    """
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", "TERM", "--", *command] if setpriv else command
+
+
 class Process:
     """One child process with its output in files."""
 
@@ -73,7 +83,12 @@ class Process:
         with self.out.open("ab") as out, self.log.open("ab") as log:
             self._start = out.tell()
             self.popen = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=out, stderr=log, env=env, start_new_session=True
+                mortal(command),
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=log,
+                env=env,
+                start_new_session=True,
             )
 
     def said(self) -> str:

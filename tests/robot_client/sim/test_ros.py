@@ -27,6 +27,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
 from std_srvs.srv import Trigger
+from switchboard_harness import mortal
 
 PATIENCE = 30.0
 """Seconds; only a failure takes that long."""
@@ -38,7 +39,7 @@ SETTINGS = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCA
 def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
     """A running simulator that has said READY; ended and reaped afterwards."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "robot_client.sim.main", *options],
+        mortal([sys.executable, "-m", "robot_client.sim.main", *options]),
         env={**os.environ, **SETTINGS},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
