@@ -129,13 +129,17 @@ def order(links, control, op, said):
     if op == "challenge" and said["relay"] == me["relay"]:
         prove(control, said["nonce"])
     elif op == "welcome":
-        robot.heartbeat, robot.wait, control.ping_due = said["heartbeat"], 0.5, 0
+        robot.heartbeat = min(max(0.1, float(said["heartbeat"])), 60)
+        robot.wait, control.ping_due = 0.5, 0
         describe(control)
     elif op == "open_channel" and len(links) < 10:
         links.append(dial(control.socket.getpeername()[:2], 4 * 1024 * 1024))
         say(links[-1], "join", version=1, ticket=said["ticket"])
     elif op != "close_channel":  # the relay then hangs up on the channel's own link, too
-        raise ValueError(f"the relay says {said}")  # also if it has another name: nothing was signed
+        if op in ("refused", "challenge"):  # a challenge of another relay: nothing was signed
+            seconds = float(said.get("retry_after") or 30)  # without a time only a person can help
+            robot.wait = min(max(0.5, 2 * seconds), 3600)
+        raise ValueError(f"the relay says {said}")
 
 
 # 4. Channel links: what clients want
@@ -259,7 +263,7 @@ signal.signal(signal.SIGALRM, every_20_ms)
 signal.setitimer(signal.ITIMER_REAL, 0.02, 0.02)
 try:
     while True:
-        links, robot.wait = [], min(2 * robot.wait, 30)
+        links, robot.heartbeat, robot.wait = [], 2.0, min(2 * robot.wait, 30)
         try:
             live(links)
         except Exception as error:
