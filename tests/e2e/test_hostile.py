@@ -298,26 +298,6 @@ def test_a_flood_of_malformed_messages_ends_the_connection(world: Any) -> None:
     assert world.relay.log[since:].count("\n") < 200
 
 
-def test_who_asks_for_far_more_than_his_share_of_the_processor_is_cut(world: Any) -> None:
-    """Messages that are lawful but laborious, one after the other: 4429 and words, while others are served."""
-    since = len(world.relay.log)
-    token = world.relay.user("greedy")
-    world.relay.cli("right", "grant", "greedy", "rover", "viewer")
-    nested = "[" * 60 + "]" * 60
-    laborious = '{"op":"publish","topic":"/x","msg":[' + ",".join([nested] * 8_000) + "]}"
-    assert len(laborious) < limits.CLIENT_MESSAGE
-    with world.relay.connect("rover", token) as client, world.relay.connect("rover", world.viewer) as other:
-        with contextlib.suppress(ConnectionClosed):
-            for number in range(5_000):
-                client.connection.send(laborious)
-                if not number % 50:
-                    assert other.call("/rosapi/get_time")["result"]
-        closed = close_of(client)
-        assert closed.code == 4429
-        assert "too much" in closed.reason
-    logs(world, "is cut: far too much", since)
-
-
 def test_a_binary_message_ends_the_connection(world: Any) -> None:
     """Binary websocket messages are not taken, and the close says so."""
     since = len(world.relay.log)
