@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from twisted.logger import Logger
@@ -61,8 +62,7 @@ class Channel:
         self._offset = offset
         self._platform = platform
         self._motion = motion
-        self._wall = wall
-        self._sending = Sending(wire, clock, platform.after_samples, frame_limit)
+        self._sending = Sending(wire, clock, platform.after_samples, frame_limit, wall)
         self.uplink = self._sending.uplink
         self._listening: dict[int, _Listening] = {}
         self._publishing: dict[int, _Publishing] = {}
@@ -155,7 +155,7 @@ class Channel:
             message.topic,
             message.type,
             message.qos,
-            lambda body: self._sampled(number, body),
+            partial(self._sending.offer, number),
             lambda: self._confirm(number),
         )
         self._listening[number] = _Listening(source, message)
@@ -242,9 +242,6 @@ class Channel:
             what = link.lower_tag(type(message).__name__)
             ref = getattr(message, _REFERENCE.get(type(message), "number"), "")
             self._wire.say(link.Failed(what=what, ref=str(ref), reason=reason))
-
-    def _sampled(self, number: int, body: bytes) -> None:
-        self._sending.offer(number, self._wall(), body)
 
 
 _REFERENCE: dict[type, str] = {

@@ -131,7 +131,8 @@ class Link:
         self.heartbeat = heartbeat
         self.offset = Offset()
         self._frames = frames.FrameDecoder(HANDSHAKE_FRAME)
-        self._out: list[bytes] = []
+        self.unsaid: list[bytes] = []
+        """What :meth:`take` gives."""
         self._heard = clock()
 
     def begin(self) -> None:
@@ -140,11 +141,11 @@ class Link:
 
     def say(self, message: link.Message) -> None:
         """Queue one message."""
-        self._out.append(link.frame(message))
+        self.unsaid.append(link.frame(message))
 
     def take(self) -> list[bytes]:
         """What is to be written now."""
-        out, self._out = self._out, []
+        out, self.unsaid = self.unsaid, []
         return out
 
     def ping(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from relay_protocol.limits import KIB
@@ -19,28 +20,35 @@ class Sending:
 
     :param after: takes what is to be called when the samples that came together are all there; they share a write
     :param frame_limit: largest frame the relay takes, bytes
+    :param wall: what samples are stamped by, nanoseconds
     """
 
     def __init__(
-        self, wire: Wire, clock: Clock, after: Callable[[Callable[[], None]], None], frame_limit: int
+        self,
+        wire: Wire,
+        clock: Clock,
+        after: Callable[[Callable[[], None]], None],
+        frame_limit: int,
+        wall: Callable[[], int] = time.time_ns,
     ) -> None:
         self.uplink = Uplink(clock.seconds, frame_limit)
         self._wire = wire
         self._clock = clock
         self._after = after
+        self._wall = wall
         self._awaited = False
         self._closed = False
         self._flush: Timer | None = None
         self._release: Timer | None = None
 
-    def offer(self, number: int, stamp: int, body: bytes) -> None:
+    def offer(self, number: int, body: bytes) -> None:
         """Take one sample; see :meth:`robot_client.uplink.Uplink.offer`."""
-        self.uplink.offer(number, stamp, body)
-        if self.uplink.throttled:
+        taken = self.uplink.offer(number, self._wall(), body)
+        if self.uplink.held:
             self.arm()
-        if not self._awaited and self.uplink.ready and not self.uplink.paused:
+        if taken and not self._awaited and not self.uplink.paused:
             self._awaited = True
-            self._after(self._all_there)
+            self._after(self.flush)
 
     def end(self, number: int) -> None:
         """End a subscription; see :meth:`robot_client.uplink.Uplink.close`."""
@@ -49,19 +57,19 @@ class Sending:
 
     def flush(self) -> None:
         """Write what waits, as far as the transport takes it."""
+        self._awaited = False
         if self._closed:
             return
         if self._flush is not None and self._flush.active():
             self._flush.cancel()
         self._flush = None
         for _ in range(AT_ONCE):
-            if not self.uplink.ready or self.uplink.paused:
-                return
             chunk = self.uplink.take(CHUNK)
             if chunk:
                 self._wire.write(chunk)
-        if self.uplink.ready and not self.uplink.paused:
-            self._flush = self._clock.callLater(0, self.flush)
+            if self.uplink.paused or not self.uplink.ready:
+                return
+        self._flush = self._clock.callLater(0, self.flush)
 
     def pause(self) -> None:
         """The transport is full."""
@@ -90,10 +98,6 @@ class Sending:
         self._release = None
         if due is not None:
             self._release = self._clock.callLater(max(0.0, due - self._clock.seconds()), self._let_go)
-
-    def _all_there(self) -> None:
-        self._awaited = False
-        self.flush()
 
     def _let_go(self) -> None:
         self._release = None

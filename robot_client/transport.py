@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import sys
 from collections.abc import Callable
@@ -123,8 +122,9 @@ class LinkProtocol(TwistedProtocol):
 
     def write(self, frames: list[bytes]) -> None:
         """Write sample frames behind all that was said before."""
-        out = self.link.take()
-        self._put(b"".join([*out, *frames]))
+        if self.link.unsaid:
+            frames = [*self.link.take(), *frames]
+        self._put(b"".join(frames))
 
     def _put(self, data: bytes) -> None:
         """Write at once where that can be.
@@ -138,10 +138,13 @@ class LinkProtocol(TwistedProtocol):
             transport.write(data)
             return
         if not (transport._tempDataLen or transport.dataBuffer):
-            with contextlib.suppress(OSError):  # full, or broken: Twisted finds out which, and tells
-                data = data[self._socket.send(data) :]
-            if not data:
+            try:
+                sent = self._socket.send(data)
+            except OSError:  # full, or broken: Twisted finds out which, and tells
+                sent = 0
+            if sent == len(data):
                 return
+            data = data[sent:]
         transport.write(data)
         if not transport.producerPaused:
             # Twisted would take some more first; what is small would wait behind it.

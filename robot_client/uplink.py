@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from typing import NamedTuple
+
+import msgspec
 
 from relay_protocol import frames
 from relay_protocol.limits import KIB, MIB, ROBOT_FRAME
@@ -24,7 +25,7 @@ WHOLE = 64 * KIB
 PART = 32 * KIB
 
 
-class _Sample(NamedTuple):
+class _Sample(msgspec.Struct, frozen=True, gc=False):
     number: int
     arrived: float
     stamp: int
@@ -70,8 +71,11 @@ class Uplink:
         """Bytes of all samples whose parts have begun, whole."""
         self._ends: list[bytes] = []
         self._serial = 0
+        self._since = 0.0
+        """Nothing that waits came before."""
         self._size = 0
-        self._held = 0
+        self.held = 0
+        """Samples held back by a throttle."""
 
     def open(self, number: int, throttle: float = 0.0, latched: bool = False) -> None:
         """Begin a subscription, or change the throttle (seconds) of one."""
@@ -88,7 +92,7 @@ class Uplink:
         lane = self._lanes.pop(number, None)
         if lane is None:
             return
-        self._held -= lane.held is not None
+        self.held -= lane.held is not None
         for serial in lane.waiting:
             self._size -= len(self._pop(serial).body)
         if lane.large or lane.begun:
@@ -98,31 +102,31 @@ class Uplink:
             # SPEC 2.1: what is unfinished would stay with the relay until the link ends.
             self._ends.append(frames.encode_part(number, lane.begun.stamp, 1, 0, b"\0"))
 
-    def offer(self, number: int, stamp: int, body: bytes) -> None:
-        """Take one sample; ``stamp`` is the wall clock in nanoseconds."""
+    def offer(self, number: int, stamp: int, body: bytes) -> bool:
+        """Take one sample.
+
+        :param stamp: the wall clock, nanoseconds
+        :return: whether it may go now, as far as its throttle is concerned
+        """
         lane = self._lanes.get(number)
         if lane is None:
-            return
+            return False
         if len(body) + frames.SAMPLE_HEAD > self._limit:
             self.oversized += 1
             self.dropped += 1
-            return
+            return False
         now = self._now()
         sample = _Sample(number, now, stamp, body)
         if lane.throttle and now < lane.next_at:
-            self._held += lane.held is None
+            self.held += lane.held is None
             lane.held = sample
-            return
+            return False
         self._admit(lane, sample, now)
-
-    @property
-    def throttled(self) -> bool:
-        """Whether a sample is held back by a throttle."""
-        return self._held > 0
+        return True
 
     def next_due(self) -> float | None:
         """When the next sample held back by a throttle may go, on the clock given; ``None`` for none."""
-        if not self._held:
+        if not self.held:
             return None
         return min((lane.next_at for lane in self._lanes.values() if lane.held), default=None)
 
@@ -139,11 +143,16 @@ class Uplink:
         """
         if self.paused:
             return []
-        self._trim_old()
+        if self._now() - self._since > MAX_AGE:
+            self._trim_old()
         out, self._ends = self._ends, []
         taken = 0
         while self._small and taken < at_least:
-            sample = self._remove(next(iter(self._small)))
+            serial, sample = self._small.popitem(last=False)
+            lane, size = self._lanes[sample.number], len(sample.body)
+            lane.waiting.remove(serial)
+            lane.size -= size
+            self._size -= size
             frame = frames.encode_sample(sample.number, sample.stamp, sample.body)
             taken += len(frame)
             out.append(frame)
@@ -170,8 +179,10 @@ class Uplink:
     def _admit(self, lane: _Lane, sample: _Sample, now: float) -> None:
         if lane.held is not None:
             lane.held = None
-            self._held -= 1
+            self.held -= 1
         lane.next_at = now + lane.throttle
+        if sample.arrived < self._since or not (self._small or self._large):
+            self._since = sample.arrived
         self._serial += 1
         if lane.large or lane.begun or len(sample.body) > WHOLE:
             if not lane.large and lane.begun is None:
@@ -211,7 +222,7 @@ class Uplink:
 
     def _part(self, number: int, lane: _Lane) -> bytes:
         assert lane.begun is not None
-        _, _, stamp, body = lane.begun
+        stamp, body = lane.begun.stamp, lane.begun.body
         total = len(body)
         if total <= WHOLE:
             frame, lane.sent = frames.encode_sample(number, stamp, body), total

@@ -134,6 +134,7 @@ class Ros2Platform(Platform):
         self._lingering = Lingering(self._node, self._reactor)
         self._calls = Calls(self._node, self._hop, self._types, self._reactor)
         self._goals = Goals(self._node, self._hop, self._spinner, self._types, self._reactor)
+        self._hop.open(self._reactor)
         self._spinner.start()
 
     def stop(self) -> None:
@@ -155,6 +156,7 @@ class Ros2Platform(Platform):
         for action in list(self._actions.values()):
             action.go()
         self._spinner.stop()
+        self._hop.close()
         self._lingering.end(FAREWELL)
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+from twisted.internet.interfaces import IReadDescriptor
 from twisted.logger import Logger
+from zope.interface import implementer  # type: ignore[import-untyped]
 
 from relay_protocol.limits import MIB
 
-TURN = 0.05
-"""Seconds of one turn of the executor. ``spin`` of rclpy 7.1's EventsExecutor hangs; single turns don't."""
+TURN = 0.5
+"""Seconds of one turn of the executor; the first callback ends it. ``spin`` of rclpy 7.1's EventsExecutor hangs; single
+turns don't.
+"""
+
+BREATH = 0.05
+"""Seconds without a turn after one that failed."""
 
 STUCK_SECONDS = 5.0
 BACKLOG = 32 * MIB
@@ -49,7 +59,7 @@ class Spinner:
     ) -> None:
         self._executor = executor
         self._clock = clock
-        self._stop = threading.Event()
+        self._stopping = False
         self._served = clock()
         self._thread = threading.Thread(target=self._turn, name="ros2-executor", daemon=True)
         self._timer = node.create_timer(1.0, self._beat, clock=timer_clock)
@@ -66,8 +76,9 @@ class Spinner:
 
     def stop(self) -> None:
         """Turn no more; waits for the turn under way, not for ever."""
-        self._stop.set()
+        self._stopping = True
         if self._thread.is_alive():
+            self._executor.create_task(_nothing)  # ends the turn
             self._thread.join(2.0)
         if not self._thread.is_alive():
             self._do_all()
@@ -81,7 +92,7 @@ class Spinner:
         """
         with self._lock:
             self._work.append((function, arguments))
-            if self._scheduled or self._stop.is_set():
+            if self._scheduled or self._stopping:
                 return
             self._scheduled = True
         # One task for all: the single-threaded executor runs tasks in no order.
@@ -108,14 +119,61 @@ class Spinner:
         self._served = self._clock()
 
     def _turn(self) -> None:
-        while not self._stop.is_set():
+        while not self._stopping:
             try:
                 self._executor.spin_once(timeout_sec=TURN)
             except Exception:
-                if self._stop.is_set():
-                    return
-                self._log.failure("a ROS callback failed")
-                time.sleep(TURN)  # an executor that fails at once each time must not take the processor
+                self._turn_failed()
+
+    def _turn_failed(self) -> None:
+        if not self._stopping:
+            self._log.failure("a ROS callback failed")
+            time.sleep(BREATH)  # an executor that fails at once each time must not take the processor
+
+
+def _nothing() -> None:
+    pass
+
+
+@implementer(IReadDescriptor)
+class Doorbell:
+    """Wakes the reactor from any thread by an eventfd (eventfd(2)).
+
+    The reactor's own way costs the ringing thread and the reactor some twenty Python calls more each time.
+
+    :param answer: called on the reactor's thread, once for all rings so far
+    :param lost: called when the reactor no longer listens
+    :raises OSError: there is no file descriptor left
+    """
+
+    def __init__(self, reactor: Any, answer: Callable[[], None], lost: Callable[[], None]) -> None:
+        self._reactor = reactor
+        self._answer = answer
+        self._lost = lost
+        # A closed file refuses what a bare number would write into the next file of that number.
+        made = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._file = os.fdopen(made, "r+b", buffering=0)
+        self.fileno = self._file.fileno
+        self.ring: Callable[[], Any] = partial(self._file.write, (1).to_bytes(8, sys.byteorder))
+        reactor.addReader(self)
+
+    def doRead(self) -> None:
+        """Somebody rang."""
+        self._file.read(8)
+        self._answer()
+
+    def logPrefix(self) -> str:
+        """Name for the reactor's log."""
+        return "ros2"
+
+    def connectionLost(self, reason: Any) -> None:
+        """The reactor listens no more."""
+        self._lost()
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._reactor.removeReader(self)
+        self._file.close()
 
 
 class Hop:
@@ -126,39 +184,67 @@ class Hop:
 
     def __init__(self, call_from_thread: Callable[[Callable[[], None]], Any]) -> None:
         self.dropped = 0
-        self._call_from_thread = call_from_thread
-        self._queue: deque[tuple[Callable[[Any], None], Any, int]] = deque()
+        self._call_from_thread: Callable[[], Any] = partial(call_from_thread, self._drain)
+        self._wake: Callable[[], Any] = self._call_from_thread
+        self._bell: Doorbell | None = None
+        self._queue: deque[tuple[Callable[[Any], None], Any]] = deque()
         self._size = 0
         self._lock = threading.Lock()
         self._scheduled = False
         self._after: list[Callable[[], None]] = []
 
+    def open(self, reactor: Any) -> None:
+        """Wake the reactor by a bell of our own, where the system has one."""
+        if not hasattr(os, "eventfd"):  # not Linux
+            return
+        try:
+            self._bell = Doorbell(reactor, self._drain, self.close)
+        except OSError as error:
+            Logger("ros2").warn("there is no eventfd: {why}", why=error.strerror)
+            return
+        self._wake = self._bell.ring
+
+    def close(self) -> None:
+        """Wake the reactor by its own means from now on."""
+        bell, self._bell = self._bell, None
+        if bell is None:
+            return
+        self._wake = self._call_from_thread
+        bell.close()
+        with self._lock:
+            unheard = self._scheduled
+        if unheard:
+            self._call_from_thread()
+
     def after(self, call: Callable[[], None]) -> None:
         """Call once at the end of the batch that is being passed on; on the reactor's thread."""
         self._after.append(call)
 
-    def put(self, function: Callable[[Any], None], argument: Any, size: int = 0) -> None:
+    def put(self, function: Callable[[Any], None], argument: Any, size: int | None = 0) -> None:
         """Have ``function(argument)`` called on the reactor's thread; from any thread.
 
-        :param size: bytes of a sample, which is dropped when too many wait; 0 for what must arrive
+        :param size: bytes of a sample, which is dropped when too many wait; ``None`` if the argument is the sample,
+            0 for what must arrive
         """
+        if size is None:
+            size = len(argument)
         with self._lock:
             if size and self._size + size > BACKLOG:
                 self.dropped += 1
                 return
             self._size += size
-            self._queue.append((function, argument, size))
+            self._queue.append((function, argument))
             if self._scheduled:
                 return
             self._scheduled = True
-        self._call_from_thread(self._drain)
+        self._wake()
 
     def _drain(self) -> None:
         with self._lock:
             batch, self._queue = self._queue, deque()
             self._size = 0
             self._scheduled = False
-        for function, argument, _ in batch:
+        for function, argument in batch:
             try:
                 function(argument)
             except Exception:  # one receiver's fault must not lose the others their samples

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from rclpy.duration import Duration
@@ -165,11 +166,8 @@ class RosSource:
         self._generation += 1
         generation = self._generation
         profile = ros2_qos.for_subscription(self._match, self._asked)
-        put = self._hop.put
-
-        def arrived(body: bytes) -> None:
-            put(lambda sample: self._deliver(generation, sample), body, len(body))
-
+        # Called for each sample: without a function of Python's around it.
+        arrived = partial(self._hop.put, partial(self._deliver, generation), size=None)
         self._retire()
         self._passed_on.clear()
         self._former = self._subscription
@@ -187,8 +185,9 @@ class RosSource:
             return
         # Finding the publishers takes a new subscription a while: until it hears something the former one counts.
         if generation == self._generation:
-            self._retire()
-            if self._repeats(body):
+            if self._former is not None:
+                self._retire()
+            if self._passed_on and self._repeats(body):
                 return
         elif self._former is None or generation != self._generation - 1:
             return

@@ -52,11 +52,11 @@ class SlowLink:
 def test_odometry_waits_for_one_part_of_a_cloud(size: int) -> None:
     """While a cloud or picture is on its way, each odometry sample goes before the next part of it."""
     slow = SlowLink()
-    slow.sending.offer(1, 0, bytes(size))
+    slow.sending.offer(1, bytes(size))
     slow.turn()
     while slow.sending.uplink.ready:
         before = len(slow.order)
-        slow.sending.offer(2, 0, b"odometry")
+        slow.sending.offer(2, b"odometry")
         slow.turn()
         assert slow.order[before] == (SAMPLE, 2)
         assert slow.order[before + 1 :].count((PART, 1)) <= 1
@@ -143,9 +143,9 @@ async def test_what_is_small_overtakes_a_picture_on_a_real_connection(listener: 
             robot.sending.uplink.open(number)
         relay.sendall(link.frame(link.Joined(channel="c", at=1)))
         await until(lambda: robot.joined)
-        robot.sending.offer(1, 0, bytes(PICTURE))
+        robot.sending.offer(1, bytes(PICTURE))
         await until(lambda: robot.sending.uplink.paused)
-        robot.sending.offer(2, 0, b"odometry")
+        robot.sending.offer(2, b"odometry")
         wire.say(link.Failed(what="get_type", ref="x", reason="no such type"))
         got = await deferToThread(read, relay, lambda got: got.count((PART, 1)) == -(-PICTURE // (32 * 1024)))
     finally:

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import threading
+import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from robot_client.platforms.ros2_executor import BACKLOG, STUCK_SECONDS, Hop, Spinner
+import pytest
+import pytest_twisted
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.signals import SignalHandlerOptions
+from twisted.internet import reactor as real_reactor
+
+from robot_client.platforms.ros2_executor import BACKLOG, STUCK_SECONDS, TURN, Hop, Spinner, make_executor
+from tests.robot_client.ros import until
 
 
 class Reactor:
@@ -61,6 +72,91 @@ def test_nothing_is_lost_between_threads() -> None:
         reactor.turn()
     reactor.turn()
     assert sorted(got) == sorted([*range(5000)] * 3)
+
+
+def test_sample_alone_is_as_large_as_it_is() -> None:
+    """Bytes that are put as they are count with their length."""
+    reactor, got = Reactor(), list[bytes]()
+    hop = Hop(reactor)
+    sample = bytes(BACKLOG // 2)
+    for _ in range(3):
+        hop.put(got.append, sample, None)
+    reactor.turn()
+    assert hop.dropped == 1
+    assert len(got) == 2
+
+
+def in_threads(count: int, put: Callable[[int], None]) -> list[threading.Thread]:
+    threads = [threading.Thread(target=lambda: [put(each) for each in range(2000)]) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    return threads
+
+
+@pytest_twisted.ensureDeferred
+async def test_bell_wakes_the_reactor_and_loses_nothing() -> None:
+    """What threads put arrives by the bell, each thread's in its order, without the reactor's own way."""
+    reactor, got = Reactor(), list[int]()
+    hop = Hop(reactor)
+    hop.open(real_reactor)
+    try:
+        threads = in_threads(3, partial(hop.put, got.append))
+        await until(lambda: len(got) == 6000)
+    finally:
+        hop.close()
+    for thread in threads:
+        thread.join()
+    assert sorted(got) == sorted([*range(2000)] * 3)
+    assert not reactor.calls
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_put_while_the_bell_goes_arrives() -> None:
+    """Calls put before, while and after the bell is taken away arrive, then by the reactor's own way."""
+    got = list[int]()
+    hop = Hop(real_reactor.callFromThread)  # type: ignore[attr-defined]
+    hop.open(real_reactor)
+    hop.put(got.append, -1)
+    hop.close()
+    hop.close()
+    hop.put(got.append, -2)
+    await until(lambda: len(got) == 2)
+    assert got == [-1, -2]
+
+
+@pytest_twisted.ensureDeferred
+async def test_bell_the_reactor_gave_up_is_replaced() -> None:
+    """When the reactor drops its readers, the hop goes on by the reactor's own way."""
+    reactor, got = Reactor(), list[int]()
+    hop = Hop(reactor)
+    hop.open(real_reactor)
+    bell = hop._bell
+    assert bell is not None
+    hop.put(got.append, 1)
+    bell.connectionLost(None)
+    assert bell not in real_reactor.getReaders()  # type: ignore[attr-defined]
+    hop.put(got.append, 2)
+    reactor.turn()
+    assert got == [1, 2]
+
+
+def test_no_bell_is_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an eventfd, of the system or at all, the reactor's own way is used."""
+    reactor, got = Reactor(), list[int]()
+    hop = Hop(reactor)
+
+    def refuse(*_: int) -> int:
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(os, "eventfd", refuse)
+    hop.open(real_reactor)
+    hop.put(got.append, 1)
+    monkeypatch.delattr(os, "eventfd")
+    hop.open(real_reactor)
+    reactor.turn()
+    hop.put(got.append, 2)
+    reactor.turn()
+    assert got == [1, 2]
 
 
 def test_failing_receiver_costs_nobody_else() -> None:
@@ -135,3 +231,40 @@ def test_work_that_fails_costs_no_other() -> None:
     spinner.do(done.append, 1)
     tasks.turn()
     assert done == [1]
+
+
+@pytest.mark.parametrize("kind", ["events", "single"])
+def test_executor_at_rest_serves_and_ends(kind: str, environment: dict[str, str]) -> None:
+    """While nothing happens in the graph, work is done, the node's timer beats, and the thread ends when told."""
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("spun", context=context, start_parameter_services=False, enable_rosout=False)
+    turns = list[float]()
+    executor = make_executor(kind, context)
+
+    class Counted:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(executor, name)
+
+        def spin_once(self, timeout_sec: float) -> None:
+            turns.append(timeout_sec)
+            executor.spin_once(timeout_sec=timeout_sec)
+
+    spinner = Spinner(Counted(), node, Clock(clock_type=ClockType.STEADY_TIME))
+    try:
+        spinner.start()
+        done = threading.Event()
+        spinner.do(done.set)
+        assert done.wait(10)
+        served = spinner._served
+        end = time.monotonic() + 10
+        while spinner._served == served and time.monotonic() < end:
+            time.sleep(0.01)
+        assert spinner._served > served
+        assert spinner.trouble() is None
+        assert set(turns) == {TURN}
+    finally:
+        spinner.stop()
+        assert not spinner._thread.is_alive()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
