@@ -187,6 +187,12 @@ _LIST = ord("[")
 _SHALLOW = 5 * JSON_DEPTH
 """Objects in each other take at least five bytes each, ``{"":`` and ``}``; the innermost takes two."""
 
+_NULL_MET = "got `null`"
+"""In msgspec's words about a field that must not be null."""
+
+_BODIES = frozenset(("msg", "args", "values"))
+"""Fields whose null is a value like any other."""
+
 _decode: Callable[[bytes], ClientOp] = msgspec.json.Decoder(ClientOp).decode
 
 
@@ -202,7 +208,20 @@ def decode(data: bytes) -> ClientOp:
     try:
         return _decode(data)
     except jsontext.FAULTS as error:
-        raise jsontext.malformed(error, ClientOp) from None
+        fault = error
+    if _NULL_MET in str(fault):
+        try:
+            return _decode(_without_nulls(data))
+        except jsontext.FAULTS as error:
+            fault = error
+    raise jsontext.malformed(fault, ClientOp) from None
+
+
+def _without_nulls(data: bytes) -> bytes:
+    """The same message without the fields that are null, for clients that write out what they leave open."""
+    fields = msgspec.json.decode(data, type=dict[str, msgspec.Raw])
+    kept = {name: each for name, each in fields.items() if name in _BODIES or bytes(each) != b"null"}
+    return msgspec.json.encode(kept)
 
 
 def publish(topic: str, body: bytes) -> bytes:

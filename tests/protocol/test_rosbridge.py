@@ -48,6 +48,48 @@ def test_absent_arguments_are_told_from_null() -> None:
     assert bytes(null.args) == b"null"
 
 
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ('{"op":"subscribe","topic":"/a","type":"p/T","throttle_rate":null,"queue_length":null,"compression":null}',
+         rosbridge.Subscribe(topic="/a", type="p/T")),
+        ('{"op":"advertise","topic":"/a","type":"p/T","latch":null,"queue_size":null,"qos":null,"id":null}',
+         rosbridge.Advertise(topic="/a", type="p/T")),
+        ('{"op":"call_service","service":"/s","id":"1","type":null,"compression":null,"fragment_size":null}',
+         rosbridge.CallService(service="/s", id="1")),
+        ('{"op":"send_action_goal","action":"/f","id":2,"feedback":null,"action_type":null}',
+         rosbridge.SendActionGoal(action="/f", id=2)),
+    ],
+)  # fmt: skip
+def test_a_field_that_is_null_counts_as_left_out(text: str, plain: object) -> None:
+    """Many JSON libraries write out what was left open; such a call must not be lost."""
+    assert rosbridge.decode(text.encode()) == plain
+
+
+def test_a_null_beside_other_fields_keeps_the_body_as_it_came() -> None:
+    """The body is the client's own text still, and a null body stays one."""
+    message = rosbridge.decode(b'{"op":"publish","topic":"/a","latch":null,"msg":{"x" : 1.50}}')
+    assert isinstance(message, rosbridge.Publish)
+    assert bytes(message.msg) == b'{"x" : 1.50}'
+    message = rosbridge.decode(b'{"op":"publish","topic":"/a","latch":null,"msg":null}')
+    assert isinstance(message, rosbridge.Publish)
+    assert bytes(message.msg) == b"null"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"op":"subscribe","topic":null}',
+        '{"op":null,"topic":"/a"}',
+        '{"op":"subscribe","topic":"/a","throttle_rate":null,"queue_length":"a"}',
+    ],
+)
+def test_a_null_hides_no_other_fault(text: str) -> None:
+    """What must be there, and what is of a wrong type, is told as ever."""
+    with pytest.raises(MalformedMessage):
+        rosbridge.decode(text.encode())
+
+
 def test_an_unknown_op_is_told_with_those_known() -> None:
     """The error names the op and what would have been right."""
     with pytest.raises(
