@@ -211,7 +211,7 @@ class Hand:
         assert len(found) >= count, f"the robot heard {len(found)} messages on {name}, not {count}"
         return found
 
-    def publishers(self, name: str, count: int) -> list[dict[str, str]]:
+    def publishers(self, name: str, count: int) -> list[dict[str, Any]]:
         """Wait until a topic has so many publishers in the robot's graph, and return what is known of them."""
         found = [json.loads(each) for each in self.do("publishers", name, str(count))]
         assert len(found) == count, f"{name} has {len(found)} publishers in the robot's graph, not {count}"

@@ -248,6 +248,8 @@ class Fixture(Node):
                     "type": each.topic_type,
                     "reliability": each.qos_profile.reliability.name.lower(),
                     "durability": each.qos_profile.durability.name.lower(),
+                    "deadline": each.qos_profile.deadline.nanoseconds / 1e9,
+                    "lifespan": each.qos_profile.lifespan.nanoseconds / 1e9,
                 }
             )
             for each in self.get_publishers_info_by_topic(topic)

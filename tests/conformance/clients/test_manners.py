@@ -139,6 +139,14 @@ def test_unknown_fields(client: Client) -> None:
     assert answer["result"] is True
 
 
+@case("any op", "SPEC 1.2, null", suite=SPEC_ONLY)
+def test_null(client: Client) -> None:
+    """A field that is null counts as left out: the call is answered."""
+    left_open = {"type": None, "compression": None, "fragment_size": None, "timeout": None}
+    answer = client.call("/conformance/invert", {"data": True}, **left_open)
+    assert answer["result"] is True
+
+
 @case("any op", "SPEC 1, numbers within the range", suite=NO_STATUS)
 def test_large_number(told: Client) -> None:
     """A number beyond double and 64 bits is answered with an error in words."""

@@ -132,6 +132,14 @@ def test_advertise_best_effort(client: Client, hand: Hand, topic: str) -> None:
     assert hand.publishers(topic, 1)[0]["reliability"] == "best_effort"
 
 
+@case("advertise", "SPEC 1.2 advertise, qos")
+def test_advertise_times(client: Client, hand: Hand, topic: str) -> None:
+    """The qos asked for is the qos of the publisher: deadline and lifespan, in seconds."""
+    client.send("advertise", topic=topic, type=STRING, qos={"deadline": 1.5, "lifespan": 2})
+    found = hand.publishers(topic, 1)[0]
+    assert (found["deadline"], found["lifespan"]) == (1.5, 2)
+
+
 @case("advertise", "SPEC 1.2 advertise, qos", suite=NO_STATUS)
 def test_advertise_bad_qos(told: Client, topic: str) -> None:
     """A qos with a value that doesn't exist is an error in words."""
