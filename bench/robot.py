@@ -10,7 +10,8 @@ import sys
 import threading
 from typing import Any
 
-from switchboard_harness import BIN, ChaosProxy, Process, free_domain, ros_environment, wait_for
+from switchboard_domains import free_domain
+from switchboard_harness import BIN, ChaosProxy, Process, ros_environment, wait_for
 
 from bench import ROOT
 from bench.relay import Relay

@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 from conformance_suite import Server
-from switchboard_harness import BIN, Process, Relay, free_domain, ros_environment, wait_for
+from switchboard_domains import free_domain
+from switchboard_harness import BIN, Process, Relay, ros_environment, wait_for
 
 ROBOT = "conformance"
 

@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 from link_relay import ENROLMENT_CODE
-from switchboard_harness import BIN, Process, free_domain, ros_environment
+from switchboard_domains import free_domain
+from switchboard_harness import BIN, Process, ros_environment
 
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parents[1] / "docs" / "examples" / "json_robot.py"

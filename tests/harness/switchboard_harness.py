@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from switchboard_domains import free_domain
 from websockets.sync.client import ClientConnection, connect
 
 from relay_protocol import PROTOCOL_VERSION, identity, limits, link
@@ -42,18 +43,6 @@ def wait_for(what: str, condition: Callable[[], Any], seconds: float = 20.0) -> 
         if time.monotonic() > until:
             raise AssertionError(f"not within {seconds:g} s: {what}")
         time.sleep(0.02)
-
-
-def free_domain() -> int:
-    """A ROS domain nobody on this machine uses now."""
-    for domain in random.sample(range(1, 100), 99):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("127.0.0.1", 7400 + 250 * domain + 10))
-            except OSError:
-                continue
-            return domain
-    raise AssertionError("no ROS domain is free on this machine")
 
 
 def ros_environment(domain: int) -> dict[str, str]:

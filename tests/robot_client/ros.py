@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import subprocess
 import sys
 import threading
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from switchboard_domains import free_domain
 from twisted.internet import reactor, task
 
 PATIENCE = 20.0
@@ -22,7 +22,7 @@ PATIENCE = 20.0
 @contextmanager
 def domain() -> Iterator[dict[str, str]]:
     """An environment with a ROS domain nobody else has, set for this process too."""
-    ours = {"ROS_DOMAIN_ID": str(random.randint(20, 200)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    ours = {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
     try:

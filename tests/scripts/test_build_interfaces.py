@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from switchboard_domains import free_domain
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "build_interfaces.py"
 PACKAGE = "built_for_test_interfaces"
@@ -60,7 +61,7 @@ def run(prefix: Path, *command: str) -> subprocess.CompletedProcess[str]:
             **os.environ,
             "PYTHONPATH": str(site),
             "LD_LIBRARY_PATH": libraries,
-            "ROS_DOMAIN_ID": str(20 + os.getpid() % 80),
+            "ROS_DOMAIN_ID": str(free_domain()),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         },
         capture_output=True,

@@ -27,11 +27,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
 from std_srvs.srv import Trigger
+from switchboard_domains import free_domain
 from switchboard_harness import mortal
 
 PATIENCE = 30.0
 """Seconds; only a failure takes that long."""
-DOMAIN = 20 + os.getpid() % 80
+DOMAIN = free_domain()
 SETTINGS = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
