@@ -76,6 +76,7 @@ class Receivers(Native):
     :param frames: what each sends then, masked frames
     :param rate: bytes a second each reads; 0 all, -1 none
     :param again: whether who is cut comes again
+    :param every_ms: how often they look for what has come; 0: whoever sends wakes them
     """
 
     _serial = 0
@@ -90,14 +91,14 @@ class Receivers(Native):
         *,
         rate: float = 0,
         again: bool = False,
+        every_ms: int = 0,
     ) -> None:
         Receivers._serial += 1
         head_file, frames_file = (folder / f"{kind}-{Receivers._serial}" for kind in ("head", "frames"))
         head_file.write_bytes(head)
         frames_file.write_bytes(frames)
-        super().__init__(
-            "receivers", str(port), str(count), str(head_file), str(frames_file), str(rate), str(int(again))
-        )
+        numbers = (str(each) for each in (rate, int(again), every_ms))
+        super().__init__("receivers", str(port), str(count), str(head_file), str(frames_file), *numbers)
 
     def report(self) -> dict[str, Any]:
         """What has come since the report before."""

@@ -1,11 +1,13 @@
 /* Many websocket clients in one process, quick enough never to be what is measured.
  *
- *   receivers PORT COUNT HEAD FRAMES RATE COME_AGAIN
+ *   receivers PORT COUNT HEAD FRAMES RATE COME_AGAIN EVERY
  *
  * HEAD        file with the HTTP request that opens a websocket
  * FRAMES      file with what each client sends then: masked frames, ready made
  * RATE        bytes a second each client reads; 0: all there is, -1: none
  * COME_AGAIN  1: who is cut connects again after a second; 0: it stays away
+ * EVERY       milliseconds after which is looked again for what has come; 0: at once when something comes. To wake
+ *             somebody is work of the sender's processor; who looks by himself costs no sender anything
  *
  * Prints "READY" when all are connected. A line on the standard input is answered by one line of JSON: what has come
  * since the line before. Ends with the standard input. Pings are answered. Messages that hold "#<number>" in their first
@@ -55,7 +57,7 @@ struct client {
 };
 
 static struct client *clients;
-static int count, port, come_again, poller;
+static int count, port, come_again, every, poller;
 static double rate;
 static char *head, *frames;
 static size_t head_size, frames_size;
@@ -312,7 +314,7 @@ static void tell(void) {
     memset(delays, 0, sizeof delays);
 }
 
-static void serve(int wait_ms, int asked) {
+static int serve(int wait_ms, int asked) {
     struct epoll_event events[256];
     int n = epoll_wait(poller, events, 256, wait_ms);
     if (n < 0 && errno != EINTR) die("epoll_wait");
@@ -327,11 +329,12 @@ static void serve(int wait_ms, int asked) {
             if (c->fd >= 0) take(c, CHUNK);
         }
     }
+    return n;
 }
 
 int main(int argc, char **argv) {
-    if (argc != 7) {
-        fprintf(stderr, "receivers PORT COUNT HEAD FRAMES RATE COME_AGAIN\n");
+    if (argc != 8) {
+        fprintf(stderr, "receivers PORT COUNT HEAD FRAMES RATE COME_AGAIN EVERY\n");
         return 2;
     }
     port = atoi(argv[1]);
@@ -340,6 +343,7 @@ int main(int argc, char **argv) {
     frames = file(argv[4], &frames_size);
     rate = atof(argv[5]);
     come_again = atoi(argv[6]);
+    every = atoi(argv[7]);
     clients = calloc(count, sizeof *clients);
     poller = epoll_create1(EPOLL_CLOEXEC);
     struct epoll_event event = {.events = EPOLLIN, .data.u32 = UINT32_MAX};
@@ -352,7 +356,12 @@ int main(int argc, char **argv) {
     fflush(stdout);
     double last = now();
     for (;;) {
-        serve(50, 1);
+        if (every) {
+            usleep(every * 1000);
+            while (serve(0, 1) > 0) continue;
+        } else {
+            serve(50, 1);
+        }
         double t = now();
         if (t - last >= 0.05) {
             tick(t - last);

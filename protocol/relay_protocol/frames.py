@@ -20,7 +20,7 @@ PART = 3
 
 _LENGTH = struct.Struct("!I").unpack_from
 _HEAD = struct.Struct("!IB")
-_SAMPLE_HEAD = struct.Struct("!IBIQ")
+_SAMPLE_HEAD = struct.Struct("!IBIQ").pack
 _NUMBERED = struct.Struct("!IQ").unpack_from
 _PART_HEAD = struct.Struct("!IBIQII")
 _PART = struct.Struct("!IQII")
@@ -78,12 +78,12 @@ def encode_json(body: bytes) -> bytes:
 
 def encode_sample(number: int, stamp: int, body: bytes) -> bytes:
     """The frame around one topic sample; see :class:`SampleFrame`."""
-    return _SAMPLE_HEAD.pack(len(body) + 13, SAMPLE, number, stamp) + body
+    return _SAMPLE_HEAD(len(body) + 13, SAMPLE, number, stamp) + body
 
 
 def encode_video(number: int, stamp: int, body: bytes) -> bytes:
     """The frame around one picture; see :class:`VideoFrame`."""
-    return _SAMPLE_HEAD.pack(len(body) + 13, VIDEO, number, stamp) + body
+    return _SAMPLE_HEAD(len(body) + 13, VIDEO, number, stamp) + body
 
 
 def encode_part(number: int, stamp: int, total: int, offset: int, piece: bytes) -> bytes:

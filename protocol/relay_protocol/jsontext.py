@@ -93,6 +93,17 @@ def decode_any(data: bytes) -> Any:
     return value
 
 
+def in_range(data: bytes) -> bool:
+    """Whether no number of a JSON text can be beyond any double, seen without reading it.
+
+    Only a number that grows by its exponent can, or one with more digits than the largest double has. False says that
+    the text has to be read to know: it may also be letters in a string that look so.
+
+    :param data: JSON, but for the range of its numbers
+    """
+    return len(data) < _DIGITS_OF_DOUBLE and _LARGE_E not in data and _exponent(data) is None
+
+
 def _check_range(data: bytes) -> None:
     """Refuse JSON with a number that no double can hold: msgspec takes integers of any length."""
     json.loads(data, parse_int=_in_range, parse_float=_in_range)
@@ -108,6 +119,11 @@ def _in_range(digits: str) -> float:
 _DIGITS_OF_DOUBLE = 309
 _LONG_RUN = b"0" * _DIGITS_OF_DOUBLE
 _ALL_DIGITS_ALIKE = bytes.maketrans(b"123456789", b"000000000")
+
+
+_LARGE_E = ord("E")
+_exponent = re.compile(rb"e[+0-9]").search
+"""A pattern that begins with one certain letter is searched for as fast as the letter."""
 
 
 _UNKNOWN_OP = re.compile(r"Invalid value '(.*)' - at `\$\.op`\Z", re.DOTALL)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import orjson
 
-from relay_protocol import link, rosbridge
+from relay_protocol import jsontext, link, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
@@ -309,6 +309,9 @@ def _as_cdr(write: Writer, now_ns: Callable[[], int], sample: Sample, number: in
     return send
 
 
+_BRACE = ord("{")
+
+
 def _as_it_came(sample: Sample, number: int) -> Send:
     """Send messages to a robot that speaks JSON: in the client's own words, once any reader can take them.
 
@@ -317,12 +320,13 @@ def _as_it_came(sample: Sample, number: int) -> Send:
     """
 
     def send(body: bytes, stamp: int) -> None:
-        if body[:1] != b"{":
+        if body[0] != _BRACE:
             raise Invalid("'msg' must be an object")
-        try:
-            orjson.loads(body)
-        except ValueError as error:
-            raise Invalid(f"the message can't be read: {error}") from None
+        if not jsontext.in_range(body):
+            try:
+                orjson.loads(body)
+            except ValueError as error:
+                raise Invalid(f"the message can't be read: {error}") from None
         sample(number, stamp, body)
 
     return send

@@ -16,6 +16,9 @@ from relay_server.session.names import normal_type
 if TYPE_CHECKING:
     from relay_server.session.core import Session
 
+NO_DEADLINE = round(HELD_SECONDS * 1e9)
+"""Nanoseconds a message that is no command may wait to be sent."""
+
 ROUTES = 256
 """Topics of which one client's routes are kept."""
 
@@ -27,7 +30,7 @@ class Route:
     :param motion: whether the robot's own safety counts the topic as motion; then commands have a deadline
     """
 
-    __slots__ = ("deadline_ms", "description", "holders", "publication", "rules", "type")
+    __slots__ = ("deadline", "description", "holders", "publication", "rules", "type")
 
     def __init__(
         self, type: str, rules: Rules, description: link.Describe, publication: Publication, motion: bool
@@ -37,7 +40,8 @@ class Route:
         self.description = description
         self.publication = publication
         self.holders = publication.holders
-        self.deadline_ms = description.motion.deadline_ms if motion else None
+        self.deadline = description.motion.deadline_ms * 1_000_000 if motion else None
+        """Nanoseconds; the greatest age a command may have."""
 
 
 class Publishing:
@@ -85,20 +89,21 @@ class Publishing:
             or robot.control is None
         ):
             route = self._find(ask)
-        good_for = HELD_SECONDS
-        deadline_ms = route.deadline_ms
-        if deadline_ms is not None:
-            age_ms = self._freshness.age() / 1e6
-            if age_ms > deadline_ms:
-                self._stale(route, age_ms, ask.id)
+        freshness, deadline, left = self._freshness, route.deadline, NO_DEADLINE
+        if deadline is not None:
+            # Each message by a reading of the clock of its own: an earlier one, of the chunk it came in, would make it
+            # too young.
+            left = deadline - freshness.age()
+            if left < 0:
+                self._stale(route, deadline - left, ask.id)
                 return
-            good_for = (deadline_ms - age_ms) / 1000
-        publication, body, stamp = route.publication, bytes(ask.msg), self._freshness.not_before
-        if publication.send is None:
-            session.channel.publications.publish(session, publication, body, stamp, ask.id, good_for)
+        publication = route.publication
+        send, body, stamp = publication.send, bytes(ask.msg), freshness.not_before
+        if send is None:
+            session.channel.publications.publish(session, publication, body, stamp, ask.id, left / 1e9)
             return
         try:
-            publication.send(body, stamp)
+            send(body, stamp)
         except SwitchboardError as error:
             session.tell("error", f"publish {publication.topic}: {error}", ask.id)
 
@@ -117,11 +122,12 @@ class Publishing:
         route = self._routes[ask.topic] = Route(ask.type, rules, robot.description, publication, motion)
         return route
 
-    def _stale(self, route: Route, age_ms: float, id: rosbridge.Id) -> None:
+    def _stale(self, route: Route, age: int, id: rosbridge.Id) -> None:
         self.stale_commands += 1
+        deadline_ms = route.description.motion.deadline_ms
         self._session.tell(
             "warning",
-            f"a command to {route.publication.topic} was dropped: it may be {age_ms:.0f} ms old, by the last ping "
-            f"answered; the robot takes none older than {route.deadline_ms} ms",
+            f"a command to {route.publication.topic} was dropped: it may be {age / 1e6:.0f} ms old, by the last ping "
+            f"answered; the robot takes none older than {deadline_ms} ms",
             id,
         )

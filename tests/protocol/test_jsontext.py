@@ -6,11 +6,12 @@ import json
 from typing import Any
 
 import msgspec
+import orjson
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_protocol import jsontext
+from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import MalformedMessage
 from relay_protocol.limits import JSON_DEPTH
 
@@ -151,3 +152,57 @@ def test_what_is_kept_undecoded_or_skipped_is_json_all_the_same(around: bytes, i
 
 def _no(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
+
+
+DIGITS = st.text("0123456789", min_size=1, max_size=20)
+NUMBERS = st.builds(
+    "".join,
+    st.tuples(
+        st.sampled_from(["", "-"]),
+        st.one_of(
+            st.just("0"), st.builds("{}{}".format, st.integers(1, 9), st.one_of(DIGITS, st.just("9" * 307)))
+        ),
+        st.one_of(st.just(""), st.builds(".{}".format, DIGITS)),
+        st.one_of(
+            st.just(""),
+            st.builds("{}{}{}".format, st.sampled_from("eE"), st.sampled_from(["", "+", "-"]), DIGITS),
+        ),
+    ),
+)
+JSON = st.recursive(
+    st.one_of(NUMBERS, st.sampled_from(["true", "null", '"e5"', '"\\ud800"', "1e400", "-1E309", "NaN"])),
+    lambda each: st.one_of(
+        st.lists(each, max_size=3).map(lambda some: f"[{','.join(some)}]"),
+        st.lists(each, max_size=3).map(lambda some: "{" + ",".join(f'"e":{one}' for one in some) + "}"),
+    ),
+    max_leaves=5,
+)
+
+
+@given(JSON, st.text('0123456789eE+-.,[]{}"', max_size=3), st.integers(0, 1000))
+@settings(max_examples=1000)
+def test_what_is_in_range_at_a_glance_any_reader_takes(text: str, junk: str, at: int) -> None:
+    """What msgspec has skipped as JSON, and has no number that could be too large, orjson and json read without fault."""
+    at %= len(text) + 1
+    body = (text[:at] + junk + text[at:]).encode()
+    try:
+        rosbridge.decode(b'{"op":"publish","topic":"/x","msg":' + body + b"}")
+    except MalformedMessage:
+        return
+    if jsontext.in_range(body):
+        orjson.loads(body)
+        json.loads(body, parse_float=jsontext._in_range, parse_int=jsontext._in_range)
+
+
+@pytest.mark.parametrize(
+    "usual", [b"0.5", b"-12", b"1e-05", b"1.5e-300", b'{"linear":{"x":0.1}}', b"9" * 308]
+)
+def test_usual_numbers_are_known_at_a_glance(usual: bytes) -> None:
+    """Or every message would be read once more."""
+    assert jsontext.in_range(usual)
+
+
+@pytest.mark.parametrize("large", [b"1e5", b"1e+400", b"1E400", b"-1e309", b"9" * 309, b"0.1e999"])
+def test_what_may_be_too_large_has_to_be_read(large: bytes) -> None:
+    """Whether it is."""
+    assert not jsontext.in_range(large)

@@ -31,7 +31,6 @@ _SPEAKING = frozenset({_OPEN, WebSocketServerProtocol.STATE_CLOSING})
 _TEXT = 0x81
 _CLOSE = 0x88
 _PONG = 0x8A
-_READ_HERE = frozenset({_TEXT, _PONG})
 _MASKED = 0x80
 _BEGINNINGS = frozenset({0x01, 0x02, 0x81, 0x82})
 """First byte of a frame that begins a text or binary message."""
@@ -91,10 +90,16 @@ class FastProtocol(WebSocketServerProtocol):
         until = seconds() + SHARE_SECONDS
         # What can change only by a frame of Autobahn's, or by a message that begins the session, is looked up once.
         whole, limit = not self._passing and not self.inside_message, self.maxFramePayloadSize
+        takes_text = self.takes_text
         while at < have:
             first, start = data[at], 0
             # What is shorter than the longest head can be left to Autobahn too.
-            if whole and first in _READ_HERE and have - at >= _LONGEST_HEAD and self.state == _OPEN:
+            if (
+                whole
+                and (first == _TEXT or first == _PONG)
+                and have - at >= _LONGEST_HEAD
+                and self.state == _OPEN
+            ):
                 length = data[at + 1] - _MASKED
                 if 0 <= length < 126:
                     start = at + 6
@@ -114,16 +119,17 @@ class FastProtocol(WebSocketServerProtocol):
                 at = end
                 if first == _PONG:
                     self.onPong(payload)
-                elif self.takes_text is not None:
-                    self.takes_text(payload)
+                elif takes_text is not None:
+                    takes_text(payload)
                 else:
                     self.onMessage(payload, False)
-                    limit = self.maxFramePayloadSize
+                    limit, takes_text = self.maxFramePayloadSize, self.takes_text
             else:
                 at = self._pass_on(data, at)
                 if self._waiting is not None or self.state not in _SPEAKING:
                     return
                 whole, limit = not self._passing and not self.inside_message, self.maxFramePayloadSize
+                takes_text = self.takes_text
             if seconds() > until and at < have:
                 self._rest(data, at)
                 return

@@ -96,8 +96,9 @@ class SocketWriter:
 
     def _put(self, data: bytes) -> None:
         if self._behind:
-            # Bytes that Twisted still has go first. ``_tempDataLen`` (written, not yet joined) and ``dataBuffer`` (being
-            # sent) are all it keeps; they are only read here, and the tests notice when they are not that any more.
+            # Bytes that Twisted still has go first. ``_tempDataLen`` (written, not yet joined) and ``dataBuffer``
+            # (being sent) are all it keeps; they are only read here, and the tests notice when they are not that any
+            # more.
             transport = self._transport
             if transport._tempDataLen or transport.dataBuffer:
                 transport.write(data)
