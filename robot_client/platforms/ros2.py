@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import platform as machine
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import metadata
 from typing import Any
 
@@ -60,6 +60,9 @@ from robot_client.topics import TypedTopic
 BATTERY = "sensor_msgs/msg/BatteryState"
 # The executor would hold on to a publisher by its events after its end, and with it to the topic's type.
 _NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
+LOOK_EVERY = 3
+"""Looks at the graph from one time all subscriptions look at what their publishers offer to the next."""
+
 FAREWELL = 0.3
 """Seconds the last messages have to arrive when the daemon leaves; a stop is among them."""
 
@@ -99,6 +102,8 @@ class Ros2Platform(Platform):
         self._sinks: list[RosSink] = []
         self._services: dict[str, RosService] = {}
         self._actions: dict[str, RosAction] = {}
+        self._seen: Mapping[str, link.Topic] = {}
+        self._looks = 0
         self._battery: RosSource | None = None
         self._battery_sample: bytes | None = None
         self._context: Any = None
@@ -177,14 +182,25 @@ class Ros2Platform(Platform):
 
     def graph(self) -> GraphView:
         """Read the graph; subscriptions follow what changed in it."""
-        for source in list(self._sources):
-            source.refresh()
+        view = ros2_graph.read(self._node, self._own)
+        self._follow(view)
         self._calls.sweep()
         self._goals.sweep()
-        view = ros2_graph.read(self._node, self._own)
         if self._want_battery:
             self._find_battery(view)
         return view
+
+    def _follow(self, view: GraphView) -> None:
+        """Have subscriptions look at their publishers, which costs more than the whole graph: where others publish than
+        before, and all of them now and then, for a node may change its mind.
+        """
+        before, self._seen = self._seen, view.topics
+        self._looks += 1
+        every = self._looks % LOOK_EVERY == 0
+        for source in list(self._sources):
+            now, then = view.topics.get(source.topic), before.get(source.topic)
+            if every or now is None or then is None or now.publishers != then.publishers:
+                source.refresh()
 
     def subscribe(
         self,

@@ -108,7 +108,7 @@ class RosSource:
         self.type = type
         self._node = node
         self._hop = hop
-        self._topic = topic
+        self.topic = topic
         self._class = types.message(type)
         self._asked = qos
         self._on_sample: OnSample | None = on_sample
@@ -156,7 +156,7 @@ class RosSource:
         self._on_close(self)
 
     def _look(self) -> ros2_qos.Match:
-        infos = self._node.get_publishers_info_by_topic(self._topic)
+        infos = self._node.get_publishers_info_by_topic(self.topic)
         ignored = self._ignore or None
         return ros2_qos.match(
             [each.qos_profile for each in infos if not (ignored and each.node_name.startswith(ignored))]
@@ -172,7 +172,7 @@ class RosSource:
         self._passed_on.clear()
         self._former = self._subscription
         self._subscription = self._node.create_subscription(
-            self._class, self._topic, arrived, profile, raw=True
+            self._class, self.topic, arrived, profile, raw=True
         )
 
     def _retire(self) -> None:

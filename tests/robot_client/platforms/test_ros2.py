@@ -18,7 +18,7 @@ from twisted.internet import reactor, task
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from robot_client.platforms.base import GraphView, Motion
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.ros2 import LOOK_EVERY, Ros2Platform
 from robot_client.platforms.ros2_types import introspected
 from robot_client.topics import TypedTopic
 from tests.robot_client.ros import Peer, domain
@@ -124,6 +124,35 @@ async def test_best_effort_publisher_is_heard(ros: Ros2Platform, peer: Peer) -> 
     listener = Listener(ros, "/lossy")
     await until(lambda: peer.do("publish", "/lossy", "x") or listener.texts)
     assert not listener.source.latched
+
+
+@pytest_twisted.ensureDeferred
+async def test_publisher_that_changes_its_mind_is_followed(ros: Ros2Platform, peer: Peer) -> None:
+    """A node that publishes a topic anew with another quality of service is heard, though the graph looks as before."""
+    peer.do("advertise", "/mind", "reliable")
+    await seen(ros, lambda graph: "/mind" in graph.topics)
+    listener = Listener(ros, "/mind")
+    assert not listener.source.latched
+    peer.do("unadvertise", "/mind")
+    peer.do("advertise", "/mind", "latched")
+    peer.do("publish", "/mind", "kept")
+    await until(lambda: ros.graph() and "kept" in listener.texts)
+    assert listener.source.latched
+
+
+@pytest_twisted.ensureDeferred
+async def test_publishers_are_looked_at_when_there_is_a_reason(
+    ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the graph stays as it is, what the publishers of a topic offer is asked for in every third look only."""
+    peer.do("advertise", "/steady", "reliable")
+    await seen(ros, lambda graph: "/steady" in graph.topics)
+    listener = Listener(ros, "/steady")
+    asked = list[int]()
+    monkeypatch.setattr(listener.source, "refresh", lambda: asked.append(1))
+    for _ in range(2 * LOOK_EVERY):
+        ros.graph()
+    assert len(asked) == 2
 
 
 @pytest_twisted.ensureDeferred
