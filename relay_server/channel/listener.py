@@ -53,6 +53,21 @@ class Listener:
     :param topic: its full name
     """
 
+    __slots__ = (
+        "_asks",
+        "_clock",
+        "_plainly_at",
+        "_receiver",
+        "_sent_at",
+        "_timer",
+        "_told",
+        "_waiting",
+        "depth",
+        "throttle",
+        "topic",
+        "wish",
+    )
+
     def __init__(self, clock: Clock, receiver: Receiver, topic: str) -> None:
         self._clock = clock
         self._receiver = receiver

@@ -238,6 +238,9 @@ class ClientProtocol(FastProtocol):
         self._known()
         self._take_at_most(limits.CLIENT_MESSAGE)
         session = self._session = self.factory.gate.open(admission, self, self._opened_ns)
+        # What the session sends goes to the socket without a look at the state; what follows a close is held off by
+        # closing the outbox, see _nothing_more.
+        session.outbox.write = self._writer.write
         session.start()
         self.takes_text = session.message
         early, self._early = self._early, []
@@ -361,7 +364,19 @@ class ClientProtocol(FastProtocol):
         """What Autobahn itself sends, in order with what does not go through it."""
         self._writer.write(data)
 
+    def sendCloseFrame(
+        self, code: int | None = None, reasonUtf8: bytes | None = None, isReply: bool = False
+    ) -> None:
+        """Our close, or the answer to the client's. Nothing may follow it (RFC 6455 section 5.5.1)."""
+        super().sendCloseFrame(code, reasonUtf8, isReply)
+        self._nothing_more()
+
+    def _nothing_more(self) -> None:
+        if self._session is not None:
+            self._session.outbox.close()
+
     def _closeConnection(self, abort: bool = False) -> None:
+        self._nothing_more()
         self._writer.flush()
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()

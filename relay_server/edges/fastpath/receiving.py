@@ -31,6 +31,7 @@ _SPEAKING = frozenset({_OPEN, WebSocketServerProtocol.STATE_CLOSING})
 _TEXT = 0x81
 _CLOSE = 0x88
 _PONG = 0x8A
+_READ_HERE = frozenset({_TEXT, _PONG})
 _MASKED = 0x80
 _BEGINNINGS = frozenset({0x01, 0x02, 0x81, 0x82})
 """First byte of a frame that begins a text or binary message."""
@@ -94,12 +95,7 @@ class FastProtocol(WebSocketServerProtocol):
         while at < have:
             first, start = data[at], 0
             # What is shorter than the longest head can be left to Autobahn too.
-            if (
-                whole
-                and (first == _TEXT or first == _PONG)
-                and have - at >= _LONGEST_HEAD
-                and self.state == _OPEN
-            ):
+            if whole and first in _READ_HERE and have - at >= _LONGEST_HEAD and self.state == _OPEN:
                 length = data[at + 1] - _MASKED
                 if 0 <= length < 126:
                     start = at + 6

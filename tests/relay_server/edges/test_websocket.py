@@ -189,6 +189,32 @@ def test_samples_for_a_client_that_is_closing_are_let_go(gate: MemoryGate) -> No
     assert gate.sessions[0].got == ["start", "end"]
 
 
+@pytest.mark.parametrize("ours", [True, False])
+def test_nothing_follows_a_close_whoever_began_it(gate: MemoryGate, ours: bool) -> None:
+    """What the session's outbox lets through goes to the socket without another look."""
+    client = Client(gate, Authorization="Bearer good")
+    session = gate.sessions[0]
+    session.outbox.control(wsframe.text(b'{"n":1}'))
+    client.transport.loseConnection = lambda: None  # type: ignore[method-assign]
+    if ours:
+        session.transport.close(closing.GOING_AWAY, "going down")
+    else:
+        client.core.send_close(1000)
+        client.run()
+    closed_at = len(client.transport.value())
+    session.outbox.control(wsframe.text(b'{"n":2}'))
+    session.outbox.data("t", wsframe.text(b'{"n":3}'))
+    assert not session.outbox.passing
+    assert len(client.transport.value()) == closed_at
+
+
+def test_a_dropped_client_is_sent_nothing_more(gate: MemoryGate) -> None:
+    """Also while Twisted has yet to tell that the connection is gone."""
+    client = Client(gate, Authorization="Bearer good")
+    client.end.dropConnection(abort=True)
+    assert not gate.sessions[0].outbox.passing
+
+
 def test_the_transports_pauses_reach_the_session(gate: MemoryGate) -> None:
     """And pongs do, as they were sent."""
     client = Client(gate, Authorization="Bearer good")

@@ -17,6 +17,7 @@ from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import BadCredentials, Principal
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.websocket import ClientFactory
+from relay_server.outbox import Outbox
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 AUTH = '{"op":"auth","mac":"good"}'
@@ -27,6 +28,7 @@ class MemorySession:
 
     def __init__(self, transport: Any) -> None:
         self.transport = transport
+        self.outbox = Outbox(transport.send, lambda: 0.0, lambda: None)
         self.got: list[Any] = []
         self.not_before = 0
         self.since: list[int | None] = []
