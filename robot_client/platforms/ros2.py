@@ -63,6 +63,9 @@ _NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 LOOK_EVERY = 3
 """Looks at the graph from one time all subscriptions look at what their publishers offer to the next."""
 
+_ACTIONS = "_actions"
+"""What the name of the node for actions adds to ours."""
+
 FAREWELL = 0.3
 """Seconds the last messages have to arrive when the daemon leaves; a stop is among them."""
 
@@ -109,6 +112,7 @@ class Ros2Platform(Platform):
         self._context: Any = None
         self._node: Any = None
         self._spinner: Any = None
+        self._acting: tuple[Any, Spinner] | None = None
         self._calls: Any = None
         self._goals: Any = None
         self._lingering: Any = None
@@ -124,23 +128,39 @@ class Ros2Platform(Platform):
         self._context = rclpy.Context()
         try:
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-            self._node = rclpy.create_node(
-                self._name,
-                context=self._context,
-                start_parameter_services=False,
-                enable_rosout=False,
-                parameter_overrides=[Parameter("use_sim_time", value=self._sim_time)],
-            )
-            # The node's clock stands still when a simulation pauses.
-            steady = Clock(clock_type=ClockType.STEADY_TIME)
-            self._spinner = Spinner(make_executor(self._kind, self._context), self._node, steady)
+            self._node, self._spinner = self._spun(self._name, self._kind)
         except Exception as error:
             raise Unavailable(f"ROS 2 does not start: {error}") from error
         self._lingering = Lingering(self._node, self._reactor)
         self._calls = Calls(self._node, self._hop, self._types, self._reactor)
-        self._goals = Goals(self._node, self._hop, self._spinner, self._types, self._reactor)
+        self._goals = Goals(self._for_actions, self._hop, self._types, self._reactor)
         self._hop.open(self._reactor)
         self._spinner.start()
+
+    def _spun(self, name: str, executor: str) -> tuple[Any, Spinner]:
+        node = rclpy.create_node(
+            name,
+            context=self._context,
+            start_parameter_services=False,
+            enable_rosout=False,
+            parameter_overrides=[Parameter("use_sim_time", value=self._sim_time)],
+        )
+        # The node's clock stands still when a simulation pauses.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        return node, Spinner(make_executor(executor, self._context), node, steady)
+
+    def _for_actions(self) -> tuple[Any, Spinner]:
+        """The node that actions are on, made when it is first needed, and what turns its executor.
+
+        Action servers and clients are what rclpy calls waitables. When one goes while something for it waits in an
+        EventsExecutor, that ends the process (rclpy 7.1): it calls Python without the interpreter's lock.
+        """
+        if self._kind != "events":
+            return self._node, self._spinner
+        if self._acting is None:
+            self._acting = self._spun(self._name + _ACTIONS, "single")
+            self._acting[1].start()
+        return self._acting
 
     def stop(self) -> None:
         """Leave the graph."""
@@ -160,6 +180,11 @@ class Ros2Platform(Platform):
         self._goals.leave()
         for action in list(self._actions.values()):
             action.go()
+        if self._acting is not None:
+            node, spinner = self._acting
+            self._acting = None
+            spinner.stop()
+            node.destroy_node()
         self._spinner.stop()
         self._hop.close()
         self._lingering.end(FAREWELL)
@@ -313,11 +338,12 @@ class Ros2Platform(Platform):
         kind = self._types.action(name)
         if former is not None:
             former.go()
+        node, spinner = self._for_actions()
         try:
             offer = RosAction(
-                self._node,
+                node,
                 self._hop,
-                self._spinner,
+                spinner,
                 self._reactor,
                 full,
                 name,
@@ -341,7 +367,7 @@ class Ros2Platform(Platform):
     def _check_free(self, what: str, service: str, ours: bool) -> None:
         if ours:
             raise Invalid(f"somebody at the relay offers the {what} already")
-        other = ros2_graph.provider(self._node, service, self._name)
+        other = ros2_graph.provider(self._node, service, (self._name, self._name + _ACTIONS))
         if other is not None:
             raise Invalid(f"the robot has the {what} already: {other} offers it")
 
@@ -384,6 +410,8 @@ class Ros2Platform(Platform):
     def trouble(self) -> str | None:
         """Whether the executor is stuck."""
         trouble: str | None = self._spinner.trouble()
+        if trouble is None and self._acting is not None:
+            trouble = self._acting[1].trouble()
         return trouble
 
     def _find_battery(self, view: GraphView) -> None:

@@ -40,13 +40,15 @@ _ENDS = frozenset((SUCCEEDED, CANCELED, ABORTED))
 class Goals:
     """All goals of one node.
 
+    :param place: gives the node and what turns its executor, when they are needed
     :param clock: timers and seconds
     """
 
-    def __init__(self, node: Any, hop: Hop, spinner: Spinner, types: Types, clock: Clock) -> None:
-        self.node = node
+    def __init__(
+        self, place: Callable[[], tuple[Any, Spinner]], hop: Hop, types: Types, clock: Clock
+    ) -> None:
         self.hop = hop
-        self.spinner = spinner
+        self._place = place
         self.clock = clock
         self._types = types
         self._clients: dict[tuple[str, str], _Client] = {}
@@ -60,13 +62,24 @@ class Goals:
             raise Unavailable(f"{MAX_GOALS} goals are under way on this robot; wait until some end")
         client = self._clients.get((action, type))
         if client is None:
-            client = self._clients[action, type] = _Client(ActionClient(self.node, kind, action), action)
+            ros = ActionClient(self.node, kind, action)
+            client = self._clients[action, type] = _Client(ros, action)
         goal = RosGoal(self, client, message, on_feedback)
         client.goals.add(goal)
         if self._watching is None:
             self._watching = self.clock.callLater(WATCH, self._watch)
         goal.begin()
         return goal
+
+    @property
+    def node(self) -> Any:
+        """The node they are on."""
+        return self._place()[0]
+
+    @property
+    def spinner(self) -> Spinner:
+        """What turns its executor."""
+        return self._place()[1]
 
     def sweep(self) -> None:
         """Destroy the clients nobody used for a while."""

@@ -89,16 +89,16 @@ def _split(
     return plain, actions
 
 
-def provider(node: Any, service: str, own: str) -> str | None:
+def provider(node: Any, service: str, own: tuple[str, ...]) -> str | None:
     """Which node provides a service, the full name; ``None`` if no other does.
 
     Asked node by node: the list of all services has those too that somebody only waits for.
 
     :param node: an rclpy node
-    :param own: name of our own node, which doesn't count
+    :param own: names of our own nodes, which don't count
     """
     for name, namespace in node.get_node_names_and_namespaces():
-        if name == own:
+        if name in own:
             continue
         if service in _served(node, name, namespace):
             return f"{namespace.rstrip('/')}/{name}"

@@ -10,6 +10,11 @@ from typing import Any
 
 from rclpy.duration import Duration
 
+try:
+    from rclpy.event_handler import SubscriptionEventCallbacks
+except ImportError:  # Humble
+    from rclpy.qos_event import SubscriptionEventCallbacks
+
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.link import QoS
 from robot_client.platforms import ros2_qos
@@ -21,6 +26,9 @@ from robot_client.platforms.ros2_types import Types
 from robot_client.reactors import Clock, Timer
 
 LINGER = 0.5
+
+# What tells of such events ends the process when it goes at the wrong moment; see Ros2Platform._for_actions.
+_NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 
 
 def check_name(resolve: Callable[[str], str], name: str, what: str) -> str:
@@ -172,7 +180,7 @@ class RosSource:
         self._passed_on.clear()
         self._former = self._subscription
         self._subscription = self._node.create_subscription(
-            self._class, self.topic, arrived, profile, raw=True
+            self._class, self.topic, arrived, profile, event_callbacks=_NO_EVENTS, raw=True
         )
 
     def _retire(self) -> None:

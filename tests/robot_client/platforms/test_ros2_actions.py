@@ -151,8 +151,9 @@ async def test_withdrawn_action_aborts_its_goals(ros: Ros2Platform, peer: Peer) 
     await until(lambda: peer.do("send", action, 2) or pursued())
     assert peer.told("result", action)[1]["status"] == SUCCEEDED
     again.offer.close()
+    node, _ = ros._for_actions()
     served = ros._node.get_service_names_and_types_by_node
-    await until(lambda: not [name for name, _ in served("switchboard_test", "/") if name.startswith(action)])
+    await until(lambda: not [name for name, _ in served(node.get_name(), "/") if name.startswith(action)])
 
 
 @pytest_twisted.ensureDeferred
@@ -162,9 +163,38 @@ async def test_open_goals_cost_nothing(ros: Ros2Platform, peer: Peer) -> None:
     peer.do("send", "/idle", 1)
     await until(lambda: client.goals)
     await task.deferLater(reactor, 0.2)
-    assert ros._spinner._work == type(ros._spinner._work)()
-    assert not getattr(ros._spinner._executor, "_tasks", [])
+    _, spinner = ros._for_actions()
+    assert not spinner._work
+    assert not getattr(spinner._executor, "_tasks", [])
     client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_events_executor_has_nothing_that_ends_the_process_when_it_goes(
+    ros: Ros2Platform, peer: Peer
+) -> None:
+    """A waitable that goes while something for it waits there does so; actions are on a node of their own for it."""
+    before = set(ros._node.waitables)
+    client = Client(ros, "/apart")
+    goal = ros.pursue("/nobody", FIBONACCI, bytes(serialize_message(Fibonacci.Goal())), None)
+    sink = ros.advertise("/said", "std_msgs/msg/String", False, None)
+    source = ros.subscribe("/said", "std_msgs/msg/String", None, lambda body: None, lambda: None)
+    if ros._kind == "events":
+        assert set(ros._node.waitables) == before
+        assert [name for name in ros.graph().nodes if "switchboard_test" in name] == []
+        with pytest.raises(Invalid, match="somebody at the relay offers"):
+            Client(ros, "/apart")
+    goal.cancel()
+    for each in (client.offer, sink, source):
+        each.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_action_can_be_offered_again_at_once(ros: Ros2Platform, peer: Peer) -> None:
+    """The one that is on its way out is nobody else's."""
+    for _ in range(3):
+        client = Client(ros, "/again")
+        client.offer.close()
 
 
 @pytest_twisted.ensureDeferred
