@@ -239,6 +239,12 @@ class Fixture(Node):
         getattr(self, f"destroy_{kind}")(self._ends.pop((kind, topic)))
         return []
 
+    def do_declare(self, name: str, text: str) -> list[str]:
+        """Have a parameter, with this value (JSON) if it is new."""
+        if not self.has_parameter(name):
+            self.declare_parameter(name, json.loads(text), ParameterDescriptor(dynamic_typing=True))
+        return []
+
     def do_publishers(self, topic: str, count: str) -> list[str]:
         """Wait until a topic has so many publishers; what there is to know of each, as JSON."""
         wait_for(lambda: self.count_publishers(topic) == int(count))

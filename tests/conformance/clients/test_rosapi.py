@@ -322,14 +322,13 @@ def test_has_param(client: Client) -> None:
 
 
 @case("rosapi params", SECTION.format("DeleteParam"))
-def test_delete_param(client: Client) -> None:
+def test_delete_param(client: Client, hand: Hand) -> None:
     """delete_param takes a parameter away, where the node lets it."""
-    name = f"{NODE}:conformance.ratio"
-    try:
-        client.values("/rosapi/delete_param", {"name": name})
-        assert client.values("/rosapi/has_param", {"name": name})["exists"] is False
-    finally:
-        client.values("/rosapi/set_param", {"name": name, "value": "0.5"})
+    hand.do("declare", "conformance.fleeting", "0.5")
+    name = f"{NODE}:conformance.fleeting"
+    assert client.values("/rosapi/has_param", {"name": name})["exists"] is True
+    client.values("/rosapi/delete_param", {"name": name})
+    assert client.values("/rosapi/has_param", {"name": name})["exists"] is False
 
 
 @case("rosapi params", SECTION.format("GetParamNames"))
