@@ -245,6 +245,7 @@ class PlainRobot:
         self._heard: list[dict[str, Any]] = []
         self.subscriptions: dict[str, int] = {}
         self.channel: _LinkEnd | None = None
+        self._joining = False
         code = relay.cli("robot", "add", name)["enrolment_code"]
         enrolling = _LinkEnd(loop, self._port, self._note)
         public = link.to_base64(identity.public_half(self._key))
@@ -278,6 +279,10 @@ class PlainRobot:
 
     def _control_message(self, control: _LinkEnd, message: dict[str, Any]) -> None:
         if message["op"] == "open_channel":
+            if self._joining:
+                # Asked again, because nobody turned the loop for so long: the first ticket is still good.
+                return
+            self._joining = True
             self.channel = _LinkEnd(self.loop, self._port, self._channel_message)
             self.channel.tell(link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"]))
         else:
@@ -285,7 +290,9 @@ class PlainRobot:
 
     def _channel_message(self, channel: _LinkEnd, message: dict[str, Any]) -> None:
         op = message["op"]
-        if op == "subscribe" and message["topic"] not in self.subscriptions:
+        if op == "joined":
+            self._joining = False
+        elif op == "subscribe" and message["topic"] not in self.subscriptions:
             self.subscriptions[message["topic"]] = message["number"]
             channel.tell(
                 link.Subscribed(
