@@ -1,4 +1,4 @@
-"""Robots for the link's cases without ``--listen``: our daemon on ROS 2 with the fixture node, and the JSON example."""
+"""Robots for the link's cases without ``--listen``: our daemon on ROS 2 with the fixture node, and the examples."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from switchboard_domains import free_domain
 from switchboard_harness import BIN, Process, ros_environment
 
 HERE = Path(__file__).parent
-EXAMPLE = HERE.parents[1] / "docs" / "examples" / "json_robot.py"
+EXAMPLES = HERE.parents[1] / "docs" / "examples"
+EXAMPLE = EXAMPLES / "json_robot.py"
+SENSOR = EXAMPLES / "sensor_robot.py"
 
 
 class Daemon:
     """``switchboard-robot`` in a ROS graph of its own."""
 
     lacks: frozenset[str] = frozenset()
+    graph_grows = True
 
     def __init__(self, folder: Path, name: str, port: int) -> None:
         self._environment = ros_environment(free_domain())
@@ -44,6 +47,8 @@ class Daemon:
 class JsonRobot:
     """The example of a robot that speaks JSON only."""
 
+    program = EXAMPLE
+    graph_grows = False
     lacks = frozenset(
         (
             *("test_publish", "test_large_sample", "test_get_type", "test_get_interfaces"),
@@ -53,9 +58,9 @@ class JsonRobot:
     """Cases about what it does not offer; with ``--listen`` a robot finds that out by itself."""
 
     def __init__(self, folder: Path, name: str, port: int) -> None:
-        command = [sys.executable, str(EXAMPLE), "127.0.0.1", str(port), name, ENROLMENT_CODE]
+        command = [sys.executable, str(self.program), "127.0.0.1", str(port), name, ENROLMENT_CODE]
         command.append(str(folder / "robot.json"))
-        self._process = Process(command, folder, "json_robot")
+        self._process = Process(command, folder, self.program.stem)
 
     def run(self) -> None:
         """It dials by itself."""
@@ -65,4 +70,24 @@ class JsonRobot:
         self._process.stop()
 
 
-ROBOTS = {"daemon": Daemon, "json_robot": JsonRobot}
+class SensorRobot(JsonRobot):
+    """The example of a robot that only measures."""
+
+    program = SENSOR
+    lacks = JsonRobot.lacks | frozenset(
+        (
+            *("test_two_channels", "test_call", "test_get_interfaces"),
+            *("test_motion_is_known", "test_fresh_commands", "test_stops_when_commands_cease"),
+            *("test_says_zero_again", "test_old_commands", "test_old_commands_do_not_keep_it_moving"),
+            *("test_commands_of_the_future", "test_no_number", "test_nonsense_for_a_command"),
+            *("test_unadvertise_stops", "test_cut_channel_stops", "test_other_samples_are_no_commands"),
+            "test_cut_control_stops",
+        )
+    )
+
+
+ROBOTS: dict[str, type[Daemon] | type[JsonRobot]] = {
+    "daemon": Daemon,
+    "json_robot": JsonRobot,
+    "sensor_robot": SensorRobot,
+}

@@ -1,4 +1,4 @@
-"""docs/examples/json_robot.py at a real relay: enrolled, watched, driven, called."""
+"""The robots of docs/examples at a real relay: enrolled, watched, driven, called."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from robots_under_test import EXAMPLE
+from robots_under_test import EXAMPLE, SENSOR
 from switchboard_harness import Client, Process, Relay, wait_for
 from websockets.sync.client import connect
 
@@ -126,6 +126,27 @@ def test_it_comes_back(world: World) -> None:
         client.until(op="publish", topic="/temperature")
         world.restart()
         assert client.until(30, op="publish", topic="/temperature")
+
+
+def test_a_sensor_is_watched(world: World, tmp_path: Path) -> None:
+    """The robot that only measures serves subscribers, refuses the rest in words, and comes back without a code."""
+    name = "thermometer"
+    code = world.relay.cli("robot", "add", name)["enrolment_code"]
+    world.relay.cli("right", "grant", "driver", name, "operator")
+    start = command(world.relay, code, tmp_path / "sensor.json", SENSOR)
+    start[start.index(NAME)] = name
+    robot = Process(start, tmp_path, "sensor")
+    try:
+        wait_for("the sensor is online", lambda: world.relay.state_of(name) != "offline")
+        with world.relay.connect(name, world.token) as client:
+            client.send(op="subscribe", topic="/temperature", type="std_msgs/msg/Float32")
+            assert 19 <= client.until(op="publish", topic="/temperature")["msg"]["data"] <= 21
+            assert client.call("/no_such_service")["result"] is False
+            robot.stop()
+            robot = Process(start, tmp_path, "sensor")
+            assert client.until(30, op="publish", topic="/temperature")
+    finally:
+        robot.stop()
 
 
 def self_signed(folder: Path) -> tuple[str, str]:
