@@ -185,13 +185,16 @@ async def main():
         except Refused as error:
             reason, wait = error.args
         except Exception as error:
-            reason, wait = error, min(2 * wait, 15)
+            reason, wait = str(error) or "the relay does not answer", min(2 * wait, 15)
         print(f"no link: {reason}", flush=True)
         await asyncio.sleep(random.uniform(wait, 2 * wait))
 
 
 if not Path(FILE).exists():
-    state = asyncio.run(enrol())
+    try:
+        state = asyncio.run(enrol())
+    except Exception as error:
+        sys.exit(f"not enrolled: {error.args[0] if error.args else 'the relay does not answer'}")
     Path(FILE).touch(0o600)
     Path(FILE).write_text(json.dumps(state))
 me = json.loads(Path(FILE).read_text())

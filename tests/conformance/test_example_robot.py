@@ -202,13 +202,15 @@ def test_it_speaks_tls(tmp_path: Path) -> None:
                 each.stop()
 
 
-def test_a_wrong_code_is_refused_in_words(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", [EXAMPLE, SENSOR], ids=["json_robot", "sensor_robot"])
+def test_a_wrong_code_is_refused_in_words(world: World, tmp_path: Path, program: Path) -> None:
     """With a code that is none it ends, and keeps no key."""
     state = tmp_path / "robot.json"
-    stranger = Process(command(world.relay, "guess", state), tmp_path, "stranger")
+    stranger = Process(command(world.relay, "guess", state, program), tmp_path, "stranger")
     try:
         assert stranger.popen.wait(20) != 0
-        assert "refused" in stranger.said()
+        assert "enrolment code" in stranger.said() + stranger.log.read_text()
+        assert "Traceback" not in stranger.log.read_text()
         assert not state.exists()
     finally:
         stranger.stop()
