@@ -41,6 +41,7 @@ from robot_client.platforms.base import (
 from robot_client.platforms.definitions import normalise
 from robot_client.platforms.ros2_actions import RosAction
 from robot_client.platforms.ros2_calls import Calls
+from robot_client.platforms.ros2_errors import in_words
 from robot_client.platforms.ros2_executor import Hop, Spinner, make_executor
 from robot_client.platforms.ros2_goals import Goals, RosGoal
 from robot_client.platforms.ros2_services import RosService
@@ -253,7 +254,7 @@ class Ros2Platform(Platform):
         except SwitchboardError:
             raise
         except Exception as error:
-            raise Invalid(f"ROS 2 refuses the subscription of {topic} as {full}: {error}") from None
+            raise Invalid(f"ROS 2 refuses the subscription of {topic} as {full}: {in_words(error)}") from None
         self._sources.append(source)
         return source
 
@@ -288,7 +289,7 @@ class Ros2Platform(Platform):
         try:
             publisher = self._node.create_publisher(kind, topic, profile, event_callbacks=_NO_EVENTS)
         except Exception as error:
-            raise Invalid(f"ROS 2 refuses to publish {topic} as {full}: {error}") from None
+            raise Invalid(f"ROS 2 refuses to publish {topic} as {full}: {in_words(error)}") from None
         sink = RosSink(publisher, self._sunk)
         self._sinks.append(sink)
         return sink
@@ -325,7 +326,7 @@ class Ros2Platform(Platform):
                 self._withdrawn,
             )
         except Exception as error:
-            raise Invalid(f"ROS 2 refuses the service {service} as {name}: {error}") from None
+            raise Invalid(f"ROS 2 refuses the service {service} as {name}: {in_words(error)}") from None
         self._services[full] = offer
         return offer
 
@@ -353,7 +354,7 @@ class Ros2Platform(Platform):
                 self._gone,
             )
         except Exception as error:
-            raise Invalid(f"ROS 2 refuses the action {action} as {name}: {error}") from None
+            raise Invalid(f"ROS 2 refuses the action {action} as {name}: {in_words(error)}") from None
         self._actions[full] = offer
         return offer
 

@@ -9,6 +9,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from robot_client.platforms.ros2_errors import in_words
 from robot_client.platforms.ros2_executor import Hop
 from robot_client.platforms.ros2_types import Types
 from robot_client.reactors import Clock, Timer
@@ -149,7 +150,7 @@ class _Call:
         try:
             body = bytes(serialize_message(future.result()))
         except Exception as error:
-            self.give_up(Unavailable(f"the call of {self._service} failed: {error}"))
+            self.give_up(Unavailable(f"the call of {self._service} failed: {in_words(error)}"))
             return
         self._end()
         self.result.callback(body)

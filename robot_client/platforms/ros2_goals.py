@@ -12,6 +12,7 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import Unavailable
 from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, OnSample, Outcome
+from robot_client.platforms.ros2_errors import in_words
 from robot_client.platforms.ros2_executor import Hop, Spinner
 from robot_client.platforms.ros2_types import Types, parse
 from robot_client.reactors import Clock, Timer
@@ -211,7 +212,7 @@ class RosGoal:
         try:
             future = self._client.ros.send_goal_async(self._message, feedback_callback=tell)
         except Exception as error:
-            self._goals.hop.put(self._failed, str(error))
+            self._goals.hop.put(self._failed, in_words(error))
             return
         self._pending.append(future)
         future.add_done_callback(self._guarded(self._taken))
@@ -240,7 +241,7 @@ class RosGoal:
             try:
                 step(future)
             except Exception as error:
-                self._goals.hop.put(self._failed, str(error))
+                self._goals.hop.put(self._failed, in_words(error))
 
         return run
 

@@ -20,6 +20,7 @@ from relay_protocol.link import QoS
 from robot_client.platforms import ros2_qos
 from robot_client.platforms.base import OnSample
 from robot_client.platforms.definitions import normalise
+from robot_client.platforms.ros2_errors import in_words
 from robot_client.platforms.ros2_executor import Hop
 from robot_client.platforms.ros2_graph import GOAL, GOAL_TYPE
 from robot_client.platforms.ros2_types import Types
@@ -40,7 +41,7 @@ def check_name(resolve: Callable[[str], str], name: str, what: str) -> str:
     try:
         return resolve(name)
     except Exception as error:
-        reason = str(error).splitlines()[0].rstrip(".:") if str(error) else "not allowed"
+        reason = in_words(error).splitlines()[0].rstrip(".:")
         raise Invalid(f"'{name}' is no {what} name: {reason}") from None
 
 
