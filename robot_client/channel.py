@@ -196,7 +196,7 @@ class Channel:
             self._publishing[number] = publishing = self._advertise_motion(number, on)
             self._log.info("{who} may drive by {topic}", who=message.source or "a client", topic=on.topic)
         else:
-            sink = self._platform.advertise(*on, message.latch, message.qos)
+            sink = self._platform.advertise(*on, message.latch, message.qos, message.queue_size)
             self._publishing[number] = publishing = _Publishing(sink, on.topic, None)
         self._wire.say(
             link.Advertised(

@@ -183,8 +183,13 @@ class Platform(Protocol):
         :param type: empty to take the topic's one type from the graph
         """
 
-    def advertise(self, topic: str, type: str, latch: bool, qos: link.QoS | None) -> Sink:
-        """Make a publisher."""
+    def advertise(
+        self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
+    ) -> Sink:
+        """Make a publisher.
+
+        :param queue_size: messages kept for subscribers that are slow, unless ``qos`` says it; the usual below 1
+        """
 
     def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
         """Call a service once; fails with a sentence. Cancelling the result gives the call up."""

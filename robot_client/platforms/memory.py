@@ -56,11 +56,17 @@ class MemorySink:
     """A publisher; what it publishes is in :attr:`MemoryPlatform.published`."""
 
     def __init__(
-        self, platform: MemoryPlatform, topic: str, latch: bool = False, qos: link.QoS | None = None
+        self,
+        platform: MemoryPlatform,
+        topic: str,
+        latch: bool = False,
+        qos: link.QoS | None = None,
+        queue_size: int = 0,
     ) -> None:
         self.topic = topic
         self.latch = latch
         self.qos = qos
+        self.queue_size = queue_size
         self._platform = platform
 
     def publish(self, body: bytes) -> None:
@@ -256,9 +262,11 @@ class MemoryPlatform(Platform):
             raise Invalid(f"{topic} can't be advertised without a type")
         return TypedTopic(full, normalise(type) if type or known is None else known.types[0])
 
-    def advertise(self, topic: str, type: str, latch: bool, qos: link.QoS | None) -> MemorySink:
+    def advertise(
+        self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
+    ) -> MemorySink:
         """Make a recording publisher."""
-        sink = MemorySink(self, self.resolve(topic, type).topic, latch, qos)
+        sink = MemorySink(self, self.resolve(topic, type).topic, latch, qos, queue_size)
         self.sinks.append(sink)
         return sink
 

@@ -279,13 +279,15 @@ class Ros2Platform(Platform):
         types = theirs or (set() if type else ours)
         return TypedTopic(full, topic_type(full, type, sorted(types)))
 
-    def advertise(self, topic: str, type: str, latch: bool, qos: link.QoS | None) -> RosSink:
+    def advertise(
+        self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
+    ) -> RosSink:
         """Make a publisher."""
         topic, full = self.resolve(topic, type)
         kind = self._types.message(full)
         self._lingering.give_way(topic, kind)
         listening = self._node.get_subscriptions_info_by_topic(topic)
-        profile = ros2_qos.for_publisher([each.qos_profile for each in listening], latch, qos)
+        profile = ros2_qos.for_publisher([each.qos_profile for each in listening], latch, qos, queue_size)
         try:
             publisher = self._node.create_publisher(kind, topic, profile, event_callbacks=_NO_EVENTS)
         except Exception as error:

@@ -14,8 +14,12 @@ from relay_protocol.link import QoS
 DEPTH = 512
 """Messages the middleware keeps for us: half a second at 1000 a second, while other processes have the processor."""
 
-PUBLISHED = 64
 MAX_DEPTH = 1000
+
+QUEUE_SIZE = 100
+"""Messages a publisher keeps for its subscribers when nobody says how many."""
+
+MAX_QUEUE_SIZE = 10_000
 
 
 class Match(NamedTuple):
@@ -52,9 +56,12 @@ def for_subscription(found: Match, asked: QoS | None) -> QoSProfile:
     return _override(profile, asked)
 
 
-def for_publisher(subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | None) -> QoSProfile:
+def for_publisher(
+    subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | None, queue_size: int = 0
+) -> QoSProfile:
     """The profile to publish with: reliable serves every subscriber; durable if asked or if all want it.
 
+    :param queue_size: messages kept for subscribers that are slow; the usual below 1. Latched is the last one alone
     :raises Invalid: a wish that can't be met
     """
     if asked is not None and asked.history == "keep_all":
@@ -64,12 +71,16 @@ def for_publisher(subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | N
         bool(subscribers) and all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in subscribers)
     )
     profile = QoSProfile(
-        depth=1 if latch else PUBLISHED,
+        depth=1 if latch else _queue(queue_size),
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
     )
     return _override(profile, asked)
+
+
+def _queue(size: int) -> int:
+    return min(size, MAX_QUEUE_SIZE) if size > 0 else QUEUE_SIZE
 
 
 def _override(profile: QoSProfile, asked: QoS | None) -> QoSProfile:

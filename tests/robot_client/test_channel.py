@@ -120,11 +120,11 @@ def test_no_spelling_leads_past_the_watchdog(topic: str, type: str) -> None:
 def test_client_has_no_say_in_how_motion_is_published(scene: Scene) -> None:
     """Motion is reliable, volatile and short, whatever was asked; elsewhere the client is asked."""
     wish = link.QoS(history="keep_all", durability="transient_local", reliability="best_effort")
-    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST, latch=True, qos=wish))
-    scene.ask(link.Advertise(number=6, topic="/chat", type=STRING, latch=True, qos=wish))
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST, latch=True, qos=wish, queue_size=9))
+    scene.ask(link.Advertise(number=6, topic="/chat", type=STRING, latch=True, qos=wish, queue_size=3))
     motion, chat = scene.platform.sinks
-    assert (motion.latch, motion.qos) == (False, MOTION_QOS)
-    assert (chat.latch, chat.qos) == (True, wish)
+    assert (motion.latch, motion.qos, motion.queue_size) == (False, MOTION_QOS, 0)
+    assert (chat.latch, chat.qos, chat.queue_size) == (True, wish, 3)
 
 
 def test_too_many_motion_topics_are_refused_in_words(scene: Scene) -> None:

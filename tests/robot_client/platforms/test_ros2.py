@@ -17,6 +17,7 @@ from twisted.internet import reactor, task
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from robot_client.motion import MOTION_QOS
 from robot_client.platforms.base import GraphView, Motion
 from robot_client.platforms.ros2 import LOOK_EVERY, Ros2Platform
 from robot_client.platforms.ros2_types import introspected
@@ -319,6 +320,40 @@ def test_publisher_that_could_block_is_refused(ros: Ros2Platform) -> None:
     """A publisher that keeps all would make the daemon wait for its slowest subscriber; it is refused in words."""
     with pytest.raises(Invalid, match="keep_last"):
         ros.advertise("/all", STRING, False, link.QoS(history="keep_all"))
+
+
+@pytest.mark.parametrize(
+    ("queue_size", "latch", "qos", "depth"),
+    [
+        (0, False, None, 100),
+        (-3, False, None, 100),
+        (1, False, None, 1),
+        (250, False, None, 250),
+        (10**30, False, None, 10_000),
+        (250, False, link.QoS(depth=7), 7),
+        (250, True, None, 1),
+        (250, True, link.QoS(depth=7), 7),
+        (250, False, MOTION_QOS, 1),
+    ],
+)
+def test_queue_of_a_publisher_is_as_deep_as_asked(
+    ros: Ros2Platform, queue_size: int, latch: bool, qos: link.QoS | None, depth: int
+) -> None:
+    """Within bounds; a depth in the quality of service counts more, and what is latched is the last one alone."""
+    sink = ros.advertise("/queue", STRING, latch, qos, queue_size)
+    assert sink.publisher.qos_profile.depth == depth
+    sink.close()
+
+
+def test_refusal_of_ros_names_no_file(ros: Ros2Platform, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reason is told, without where ROS was built."""
+
+    def refuse(*args: Any, **more: Any) -> None:
+        raise RuntimeError("incompatible type, at /project/src/rcl/publisher.cpp:145")
+
+    monkeypatch.setattr(ros._node, "create_publisher", refuse)
+    with pytest.raises(Invalid, match=r"as std_msgs/msg/String: incompatible type$"):
+        ros.advertise("/refused", STRING, False, None)
 
 
 @pytest_twisted.ensureDeferred
