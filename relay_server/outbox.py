@@ -194,8 +194,12 @@ class Outbox:
 
     def _drop_oldest(self, queue: _Queue) -> None:
         self._take(queue)
+        self.count_drop(queue.key)
+
+    def count_drop(self, key: Hashable) -> None:
+        """A sample of this topic is dropped, here or before it came here."""
         self.dropped += 1
-        self.drops[queue.key] = self.drops.get(queue.key, 0) + 1
+        self.drops[key] = self.drops.get(key, 0) + 1
         if len(self.drops) > DROPS_OF:
             del self.drops[next(iter(self.drops))]
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple, Protocol
 
 from relay_protocol import rosbridge
 from relay_protocol.errors import Refused
+from relay_protocol.limits import MIB
 from relay_server.budget import Allowance
 from relay_server.channel.sample import Flaw, Sample, wish_for
 from relay_server.clock import Clock, Timer
@@ -16,6 +18,15 @@ THROTTLE_SECONDS = 3600.0
 
 ASKS = 64
 """Subscriptions of one client to one topic, merged into one listener."""
+
+QUEUE_LENGTH = 1000
+"""Longest queue; a client that asks for more gets this."""
+
+QUEUE_BYTES = 2 * MIB
+"""Most bytes that wait within the throttle of one listener; the newest sample may be larger."""
+
+QUEUES_BYTES = 8 * MIB
+"""Most bytes that wait within the throttles of one client; the newest sample of each topic may be beyond it."""
 
 PLAINLY_SECONDS = 60.0
 """How often a client is told that it gets plain JSON because it has used up its share of the processor."""
@@ -29,12 +40,18 @@ class Receiver(Protocol):
     plain_instead: int
     """Messages sent as plain JSON because a costlier form was not affordable."""
 
+    queued_bytes: int
+    """Bytes that wait within the throttles of all its listeners; they keep it."""
+
     @property
     def allowance(self) -> Allowance:
         """What its user may have of the processor."""
 
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Queue a sample for the client."""
+
+    def dropped(self, listener: Listener) -> None:
+        """Count a sample that the client will not get."""
 
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """Report something in words, to clients that want to hear it."""
@@ -57,6 +74,7 @@ class Listener:
         "_asks",
         "_clock",
         "_plainly_at",
+        "_queued_bytes",
         "_receiver",
         "_sent_at",
         "_timer",
@@ -75,20 +93,27 @@ class Listener:
         self.throttle = 0.0
         """Least seconds between two samples: the least any of the subscriptions asks for."""
         self.depth = 0
-        """Samples that may wait for this client; 0 leaves it to the relay."""
+        """Samples that may wait for this client: the most any subscription asks for; 0 leaves it to the relay."""
         self.wish = wish_for((topic,), PLAIN)
         """The names the topic is subscribed by, latest compression and least size of fragments."""
         self._asks: dict[tuple[str, rosbridge.Id], Asked] = {}
         self._told: set[Flaw] = set()
         self._plainly_at = -PLAINLY_SECONDS
         self._sent_at = -THROTTLE_SECONDS
-        self._waiting: Sample | None = None
+        # A deque takes 600 bytes when it is empty; most never have a throttle.
+        self._waiting: deque[Sample] | None = None
+        self._queued_bytes = 0
         self._timer: Timer | None = None
 
     @property
     def allowance(self) -> Allowance:
         """What its user may have of the processor."""
         return self._receiver.allowance
+
+    @property
+    def spared(self) -> float:
+        """Least seconds between two samples of the robot that this one needs: who wants them queued needs all."""
+        return 0.0 if self.depth else self.throttle
 
     @property
     def raw(self) -> bool:
@@ -126,28 +151,33 @@ class Listener:
         forms = [each.form for each in self._asks.values()]
         least = min(ask.throttle_rate for ask in asks) / 1000
         self.throttle = min(max(0.0, least), THROTTLE_SECONDS)
-        self.depth = max(0, max(ask.queue_length for ask in asks))
+        self.depth = min(max(0, max(ask.queue_length for ask in asks)), QUEUE_LENGTH)
         size = min((form.fragment_size for form in forms if form.fragment_size), default=0)
         names = tuple(dict.fromkeys(ask.topic for ask in asks))
         self.wish = wish_for(names, Form(forms[-1].compression, size))
         if self._timer is not None:
+            self._make_room()
             self._timer.cancel()
             self._wait()
 
     def offer(self, sample: Sample) -> None:
-        """A new sample. Within the throttle the newest waits, so the last of a burst always arrives."""
+        """A new sample. Within the throttle it waits, in a queue or as the newest, so the last of a burst arrives.
+
+        Source: rosbridge v2 protocol, section 3.4.4, ``queue_length``.
+        """
         throttle = self.throttle
         if throttle:
             now = self._clock.seconds()
-            if now < self._sent_at + throttle:
-                self._waiting = sample
-                if self._timer is None:
-                    self._wait()
+            if now < self._sent_at + throttle or (self.depth and self._waiting):
+                self._queue(sample)
                 return
             self._sent_at = now
         if self._timer is not None:
             # What waited under a longer throttle is older than this one.
-            self.close()
+            if self.depth:
+                self._send_all()
+            else:
+                self.close()
         self._receiver.deliver(self, sample)
 
     def replay(self, sample: Sample) -> None:
@@ -173,7 +203,41 @@ class Listener:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._waiting = None
+        while self._waiting:
+            self._take()
+
+    def _queue(self, sample: Sample) -> None:
+        if self._waiting is None:
+            self._waiting = deque()
+        elif self._waiting and not self.depth:
+            # It gives way to a newer one by the client's own wish: no drop.
+            self._take()
+        self._waiting.append(sample)
+        self._queued_bytes += sample.size
+        self._receiver.queued_bytes += sample.size
+        self._make_room()
+        if self._timer is None:
+            self._wait()
+
+    def _make_room(self) -> None:
+        """The oldest give way; the newest always stays."""
+        receiver = self._receiver
+        while self._waiting and (
+            len(self._waiting) > max(self.depth, 1)
+            or (
+                len(self._waiting) > 1
+                and (self._queued_bytes > QUEUE_BYTES or receiver.queued_bytes > QUEUES_BYTES)
+            )
+        ):
+            self._take()
+            receiver.dropped(self)
+
+    def _take(self) -> Sample:
+        assert self._waiting
+        sample = self._waiting.popleft()
+        self._queued_bytes -= sample.size
+        self._receiver.queued_bytes -= sample.size
+        return sample
 
     def _wait(self) -> None:
         left = self._sent_at + self.throttle - self._clock.seconds()
@@ -181,7 +245,19 @@ class Listener:
 
     def _due(self) -> None:
         self._timer = None
-        sample, self._waiting = self._waiting, None
-        if sample is not None:
+        if not self.throttle:
+            self._send_all()
+        elif self._waiting:
             self._sent_at = self._clock.seconds()
-            self._receiver.deliver(self, sample)
+            self._receiver.deliver(self, self._take())
+            # The client may be gone by what was sent.
+            if self._waiting and self._timer is None:
+                self._wait()
+
+    def _send_all(self) -> None:
+        """The throttle was lifted."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        while self._waiting:
+            self._receiver.deliver(self, self._take())

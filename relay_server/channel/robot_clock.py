@@ -42,6 +42,7 @@ class RobotClock:
     log = Logger()
     user = _NOBODY
     plain_instead = 0
+    queued_bytes = 0
     allowance = Budgets(lambda: 0.0, lambda: 0.0).of(_NOBODY)
     """Nothing is taken from it: ticks are read as the robot sends them."""
 
@@ -85,6 +86,9 @@ class RobotClock:
         self.log.warn(
             "the simulated time of {robot}: {text}", robot=self._wire.robot.name, text=text, severity=level
         )
+
+    def dropped(self, listener: Listener) -> None:
+        """None is queued."""
 
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Keep the newest."""

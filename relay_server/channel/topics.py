@@ -110,7 +110,7 @@ class TopicUplink:
 
     def least_throttle_ms(self) -> int:
         """The throttle that still satisfies everyone who is served."""
-        return int(min((listener.throttle for listener in self.served), default=0.0) * 1000)
+        return int(min((listener.spared for listener in self.served), default=0.0) * 1000)
 
     # --- the robot's side ---------------------------------------------------------------------------------
 

@@ -130,6 +130,7 @@ class Session:
         self.allowance = allowance
         self.refusals = 0
         self.plain_instead = 0
+        self.queued_bytes = 0
         self._counting = False
         self._clock = clock
         self._transport = transport
@@ -358,6 +359,10 @@ class Session:
                 outbox.write(frames)
         else:
             outbox.data(listener, parcel, listener.depth or DATA_PER_TOPIC)
+
+    def dropped(self, listener: Listener) -> None:
+        """Count a sample that gave way before it was queued here."""
+        self.outbox.count_drop(listener)
 
     def say(self, message: bytes, form: Form = PLAIN) -> None:
         """Queue a message that must not be lost.

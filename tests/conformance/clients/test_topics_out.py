@@ -144,6 +144,20 @@ def test_subscribe_last_of_burst(client: Client, hand: Hand, topic: str) -> None
     assert client.until("publish", msg={"data": 9})
 
 
+@case("subscribe", "rosbridge v2, 3.4.4 Subscribe, queue_length")
+def test_subscribe_queue(client: Client, hand: Hand, topic: str) -> None:
+    """With throttle_rate and queue_length, what comes within the throttle is queued and sent, the oldest give way."""
+    hand.topic(topic, INT)
+    client.send("subscribe", topic=topic, type=INT, throttle_rate=200, queue_length=5)
+    client.lives()
+    hand.publish(topic, *({"data": number} for number in range(10)))
+    numbers = []
+    while not numbers or numbers[-1] < 9:
+        numbers.append(client.until("publish", topic=topic)["msg"]["data"])
+    assert numbers == sorted(set(numbers))
+    assert numbers[-5:] == [5, 6, 7, 8, 9]
+
+
 @case("subscribe", SUBSCRIBE + ", several subscriptions")
 def test_subscribe_least_throttle(client: Client) -> None:
     """Of several subscriptions of one client the least throttle_rate counts, and samples come once."""

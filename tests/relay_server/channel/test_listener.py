@@ -9,6 +9,7 @@ from twisted.internet.task import Clock
 from relay_protocol import rosbridge
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.budget import Budgets
+from relay_server.channel import listener as module
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
 from relay_server.forms import Form
@@ -20,11 +21,17 @@ class Desk:
     def __init__(self) -> None:
         self.got: list[Sample] = []
         self.plain_instead = 0
+        self.queued_bytes = 0
+        self.drops = 0
         self.allowance = Budgets(lambda: 0.0, lambda: 0.0).of(1)
 
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Keep it."""
         self.got.append(parcel)
+
+    def dropped(self, listener: Listener) -> None:
+        """Count it."""
+        self.drops += 1
 
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """Nobody listens."""
@@ -44,9 +51,20 @@ def add(listener: Listener, form: Form = Form(), **fields: Any) -> None:  # noqa
     listener.add(rosbridge.Subscribe(**{"topic": "/scan", **fields}), form)
 
 
-def sample() -> Sample:
+def sample(body: bytes = b"{}") -> Sample:
     """Some sample."""
-    return Sample(b"{}", 0, Converter(TypeRegistry(), "", "json", print))
+    return Sample(body, 0, Converter(TypeRegistry(), "", "json", print))
+
+
+def burst(listener: Listener, *bodies: bytes) -> None:
+    """Samples that come at once."""
+    for body in bodies:
+        listener.offer(sample(body))
+
+
+def bodies(desk: Desk) -> list[bytes]:
+    """What has come."""
+    return [each.body for each in desk.got]
 
 
 def test_the_least_and_the_latest_count() -> None:
@@ -109,3 +127,109 @@ def test_a_longer_throttle_counts_at_once() -> None:
     assert len(desk.got) == 1
     clock.advance(0.1)
     assert len(desk.got) == 2
+
+
+def test_a_queue_is_sent_one_a_throttle() -> None:
+    """In order; of more than its length the oldest give way and are counted."""
+    clock, desk, listener = listening({"throttle_rate": 250, "queue_length": 3})
+    burst(listener, b"0", b"1", b"2", b"3", b"4", b"5")
+    for count in (1, 2, 3, 4, 4):
+        assert len(desk.got) == count
+        clock.advance(0.125)
+        assert len(desk.got) == count
+        clock.advance(0.125)
+    assert bodies(desk) == [b"0", b"3", b"4", b"5"]
+    assert (desk.drops, desk.queued_bytes) == (2, 0)
+    assert not clock.getDelayedCalls()
+    burst(listener, b"6", b"7")
+    assert bodies(desk)[4:] == [b"6"]
+
+
+def test_nothing_overtakes_a_queue() -> None:
+    """Not even what comes when the throttle is over but the timer has not come yet."""
+    clock, desk, listener = listening({"throttle_rate": 125, "queue_length": 5})
+    burst(listener, b"0", b"1", b"2")
+    clock.rightNow += 0.1875
+    burst(listener, b"3")
+    for _ in range(4):
+        clock.advance(0.125)
+    assert bodies(desk) == [b"0", b"1", b"2", b"3"]
+
+
+def test_the_longest_queue_counts() -> None:
+    """Of several subscriptions; when it ends, what is beyond the other's gives way."""
+    clock, desk, listener = listening(
+        {"throttle_rate": 125, "queue_length": 2}, {"throttle_rate": 125, "queue_length": 4}
+    )
+    burst(listener, b"0", b"1", b"2", b"3", b"4")
+    listener.remove("/scan", 1)
+    assert (listener.depth, desk.drops) == (2, 2)
+    for _ in range(3):
+        clock.advance(0.125)
+    assert bodies(desk) == [b"0", b"3", b"4"]
+
+
+def test_without_a_queue_the_newest_waits_and_nothing_is_dropped() -> None:
+    """A throttle alone leaves out what the client does not want."""
+    clock, desk, listener = listening({"throttle_rate": 125})
+    burst(listener, b"0", b"1", b"2")
+    clock.advance(0.125)
+    assert bodies(desk) == [b"0", b"2"]
+    assert (desk.drops, desk.queued_bytes) == (0, 0)
+
+
+def test_a_queue_comes_whole_when_the_throttle_is_lifted() -> None:
+    """In order, before what comes then, or at once when nothing comes."""
+    clock, desk, listener = listening({"throttle_rate": 1250, "queue_length": 5})
+    burst(listener, b"0", b"1", b"2")
+    add(listener, id="now")
+    burst(listener, b"3")
+    assert bodies(desk) == [b"0", b"1", b"2", b"3"]
+    listener.remove("/scan", "now")
+    burst(listener, b"4", b"5", b"6")
+    add(listener, id="now")
+    clock.advance(0)
+    assert bodies(desk)[4:] == [b"4", b"5", b"6"]
+    assert not clock.getDelayedCalls()
+
+
+def test_a_queue_is_bounded_in_bytes() -> None:
+    """For one topic and for one client; the newest of each topic stays."""
+    _, desk, listener = listening({"throttle_rate": 1250, "queue_length": 100})
+    other = Listener(listener._clock, desk, "/other")
+    add(other, throttle_rate=1000, queue_length=10)
+    half = b"x" * (module.QUEUE_BYTES // 2)
+    burst(listener, b"first", half, half, half)
+    assert (desk.queued_bytes, desk.drops) == (2 * len(half), 1)
+    burst(other, b"first", bytes(module.QUEUES_BYTES))
+    assert desk.drops == 1
+    burst(other, b"newest")
+    assert (desk.queued_bytes, desk.drops) == (2 * len(half) + len(b"newest"), 2)
+    other.close()
+    listener.close()
+    assert desk.queued_bytes == 0
+
+
+def test_a_queue_has_a_longest_length() -> None:
+    """Whatever is written."""
+    _, desk, listener = listening({"throttle_rate": 1250, "queue_length": 10**30})
+    burst(listener, *[b"{}"] * (module.QUEUE_LENGTH + 3))
+    assert desk.queued_bytes == 2 * module.QUEUE_LENGTH
+    assert desk.drops == 2
+
+
+def test_nothing_of_a_queue_is_sent_after_the_end() -> None:
+    """It is let go with its timer."""
+    clock, desk, listener = listening({"throttle_rate": 125, "queue_length": 5})
+    burst(listener, b"0", b"1", b"2")
+    listener.close()
+    assert not clock.getDelayedCalls()
+    assert (bodies(desk), desk.queued_bytes) == ([b"0"], 0)
+
+
+def test_a_latched_sample_passes_a_queue() -> None:
+    """It is a late joiner's, of another publisher, and no throttle holds it."""
+    _, desk, listener = listening({"throttle_rate": 125, "queue_length": 5})
+    burst(listener, b"0", b"1")
+    listener.replay(sample(b"latched"))
+    assert bodies(desk) == [b"0", b"latched"]

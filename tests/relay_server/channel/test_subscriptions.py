@@ -78,6 +78,27 @@ def test_the_robot_throttles_by_the_least_that_satisfies_everyone(world: World) 
     assert len({ask.number for ask in world.link.all(link.Subscribe)}) == 1
 
 
+def test_the_robot_does_not_thin_out_what_is_to_be_queued(world: World) -> None:
+    """Who has a throttle and a queue needs every sample; what does not fit is counted as dropped."""
+    ask = {"throttle_rate": 100, "queue_length": 2, "id": "queue"}
+    number, (person,) = watching(world, {"throttle_rate": 100})
+    person.says("subscribe", topic="/chatter", **ask)
+    world.subscribed(number)
+    person.says("unsubscribe", topic="/chatter", id="queue")
+    world.subscribed(number)
+    person.says("subscribe", topic="/chatter", **ask)
+    assert [each.throttle_ms for each in world.link.all(link.Subscribe)] == [100, 0, 100, 0]
+    for word in ("a", "b", "c", "d"):
+        world.channel.sample(number, text(word))
+    assert person.session.listening.drops() == {"/chatter": 1}
+    assert person.session.outbox.dropped == 1
+    came = []
+    for _ in range(4):
+        came.append(heard(person))
+        world.clock.advance(0.1)
+    assert came == [["a"], ["c"], ["d"], []]
+
+
 def test_a_throttle_keeps_the_last_of_a_burst(world: World) -> None:
     """The first passes, the newest waits and is sent at the end."""
     number, (person,) = watching(world, {"throttle_rate": 100})
