@@ -13,7 +13,8 @@ import msgspec
 
 from relay_protocol import jsontext
 from relay_protocol.limits import JSON_DEPTH
-from relay_protocol.link import Message, QoS
+from relay_protocol.link import Message
+from relay_protocol.qos import QoS
 
 Id = str | int | None
 """rosbridge says a string; some clients number their calls."""
@@ -187,11 +188,15 @@ _LIST = ord("[")
 _SHALLOW = 5 * JSON_DEPTH
 """Objects in each other take at least five bytes each, ``{"":`` and ``}``; the innermost takes two."""
 
-_NULL_MET = "got `null`"
-"""In msgspec's words about a field that must not be null."""
+_MAY_BE_MEANT = ("got `null`", "got `float`")
+"""In msgspec's words about a field that must not be null, or must be an integer."""
 
 _BODIES = frozenset(("msg", "args", "values"))
 """Fields whose null is a value like any other."""
+
+_INTEGERS = frozenset(("id", "queue_size", "queue_length", "fragment_size", "num", "total", "status"))
+_EXACT = 2**53
+"""Larger integers are not exact as a double."""
 
 _decode: Callable[[bytes], ClientOp] = msgspec.json.Decoder(ClientOp).decode
 
@@ -209,19 +214,74 @@ def decode(data: bytes) -> ClientOp:
         return _decode(data)
     except jsontext.FAULTS as error:
         fault = error
-    if _NULL_MET in str(fault):
+    if any(words in str(fault) for words in _MAY_BE_MEANT):
         try:
-            return _decode(_without_nulls(data))
+            return _decode(_as_meant(data))
         except jsontext.FAULTS as error:
             fault = error
     raise jsontext.malformed(fault, ClientOp) from None
 
 
-def _without_nulls(data: bytes) -> bytes:
-    """The same message without the fields that are null, for clients that write out what they leave open."""
+def _as_meant(data: bytes) -> bytes:
+    """The same message without the fields that are null, for clients that write out what they leave open.
+
+    Integers written as ``2.0`` become integers: some languages know no others.
+    """
     fields = msgspec.json.decode(data, type=dict[str, msgspec.Raw])
-    kept = {name: each for name, each in fields.items() if name in _BODIES or bytes(each) != b"null"}
+    kept = {
+        name: _integer(each) if name in _INTEGERS else each
+        for name, each in fields.items()
+        if name in _BODIES or bytes(each) != b"null"
+    }
     return msgspec.json.encode(kept)
+
+
+def _integer(text: msgspec.Raw) -> Any:
+    """The integer a number stands for; any other text as it is."""
+    try:
+        number = msgspec.json.decode(text, type=float)
+    except jsontext.FAULTS:
+        return text
+    return int(number) if number.is_integer() and abs(number) <= _EXACT else text
+
+
+class _Request(msgspec.Struct, frozen=True):
+    """What can be told of a message with a fault."""
+
+    op: Any = None
+    id: Any = None
+    service: Any = None
+    action: Any = None
+
+
+def unreadable_request(data: bytes) -> CallService | SendActionGoal | None:
+    """The call or goal that somebody waits for an answer to, although :func:`decode` refused the message.
+
+    :return: nothing but its name and ``id``, as far as they can be read; ``None`` for any other op, and without either
+    """
+    try:
+        request = msgspec.json.decode(data, type=_Request)
+    except jsontext.FAULTS:
+        return None
+    if request.op == "call_service":
+        name = request.service
+    elif request.op == "send_action_goal":
+        name = request.action
+    else:
+        return None
+    id = _usable(request.id)
+    if id is None and not isinstance(name, str):
+        return None
+    name = name if isinstance(name, str) else ""
+    if request.op == "call_service":
+        return CallService(service=name, id=id)
+    return SendActionGoal(action=name, id=id)
+
+
+def _usable(id: Any) -> Id:
+    if isinstance(id, float) and id.is_integer() and abs(id) <= _EXACT:
+        return int(id)
+    return id if isinstance(id, (str, int)) and not isinstance(id, bool) else None
 
 
 def publish(topic: str, body: bytes) -> bytes:

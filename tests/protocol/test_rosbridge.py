@@ -90,6 +90,70 @@ def test_a_null_hides_no_other_fault(text: str) -> None:
         rosbridge.decode(text.encode())
 
 
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ('{"op":"subscribe","topic":"/a","queue_length":2.0,"fragment_size":1e3,"id":7.0,"type":null}',
+         rosbridge.Subscribe(topic="/a", queue_length=2, fragment_size=1000, id=7)),
+        ('{"op":"advertise","topic":"/a","type":"p/T","queue_size":10.0}',
+         rosbridge.Advertise(topic="/a", type="p/T", queue_size=10)),
+        ('{"op":"fragment","id":"f","data":"{}","num":0.0,"total":1.0}',
+         rosbridge.Fragment(id="f", data="{}", num=0, total=1)),
+        ('{"op":"action_result","action":"/f","id":"1","status":4.0}',
+         rosbridge.ActionResult(action="/f", id="1", status=4)),
+    ],
+)  # fmt: skip
+def test_integers_may_be_written_with_a_point(text: str, plain: object) -> None:
+    """Some languages know no other numbers."""
+    assert rosbridge.decode(text.encode()) == plain
+
+
+def test_a_point_beside_other_fields_keeps_the_body_as_it_came() -> None:
+    """Numbers in the body are the type's to judge."""
+    message = rosbridge.decode(b'{"op":"publish","topic":"/a","queue_size":1.0,"msg":{"id" : 2.0}}')
+    assert isinstance(message, rosbridge.Publish)
+    assert (message.queue_size, bytes(message.msg)) == (1, b'{"id" : 2.0}')
+
+
+@pytest.mark.parametrize("number", ["2.5", "1e300", "-0.5", '"2.0"', "true"])
+def test_what_is_no_integer_is_refused(number: str) -> None:
+    """Nothing is rounded, and no text is taken for a number."""
+    with pytest.raises(MalformedMessage, match="queue_length"):
+        rosbridge.decode(f'{{"op":"subscribe","topic":"/a","queue_length":{number}}}'.encode())
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ('{"op":"call_service","service":"/s","id":"1","timeout":"x"}', rosbridge.CallService(service="/s", id="1")),
+        ('{"op":"call_service","service":"/s","id":3.0,"type":5}', rosbridge.CallService(service="/s", id=3)),
+        ('{"op":"call_service","service":"/s","id":[1]}', rosbridge.CallService(service="/s")),
+        ('{"op":"call_service","id":"1"}', rosbridge.CallService(service="", id="1")),
+        ('{"op":"send_action_goal","action":"/f","id":2,"feedback":"yes"}',
+         rosbridge.SendActionGoal(action="/f", id=2)),
+        ('{"op":"send_action_goal","action":7,"id":"g"}', rosbridge.SendActionGoal(action="", id="g")),
+        ('{"op":"call_service","id":true}', None),
+        ('{"op":"call_service"}', None),
+        ('{"op":"subscribe","topic":5,"id":"1","service":"/s"}', None),
+        ('{"op":["call_service"],"service":"/s"}', None),
+        ('{"op":"call_service","service":"/s","id":"1"', None),
+        ('["call_service"]', None),
+        ('', None),
+    ],
+)  # fmt: skip
+def test_who_waits_for_an_answer_is_seen_in_what_is_malformed(text: str, wanted: object) -> None:
+    """A call or a goal is known by its op, and by its name or its id."""
+    with pytest.raises(MalformedMessage):
+        rosbridge.decode(text.encode())
+    assert rosbridge.unreadable_request(text.encode()) == wanted
+
+
+@given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
+def test_nobody_waits_for_an_answer_to_junk(data: bytes) -> None:
+    """No bytes make the look fail."""
+    assert rosbridge.unreadable_request(data) is None
+
+
 def test_an_unknown_op_is_told_with_those_known() -> None:
     """The error names the op and what would have been right."""
     with pytest.raises(

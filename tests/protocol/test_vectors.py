@@ -134,6 +134,8 @@ def test_rosbridge(case: dict[str, Any]) -> None:
     assert message.__struct_config__.tag == case["op"]
     for name, wanted in case["fields"].items():
         value = getattr(message, name)
+        if isinstance(value, msgspec.Struct):
+            value = msgspec.to_builtins(value)
         assert (bytes(value).decode() if isinstance(value, msgspec.Raw) else value) == wanted
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
-from relay_protocol.link import QoS
+from relay_protocol.qos import QoS
 from relay_server.channel import publications as module
 from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World, words
 
