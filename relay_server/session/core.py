@@ -240,7 +240,7 @@ class Session:
             if joined and isinstance(operation, rosbridge.Fragment):
                 raise MalformedMessage("a message in fragments can't be a fragment itself")
         except PeerError as error:
-            self._no_rosbridge(error)
+            self._no_rosbridge(error, data)
             return
         try:
             if type(operation) is rosbridge.Publish:
@@ -265,14 +265,17 @@ class Session:
             self.refuse(operation, error)
             self._spent(REFUSAL)
 
-    def _no_rosbridge(self, error: PeerError) -> None:
+    def _no_rosbridge(self, error: PeerError, data: bytes) -> None:
         self._malformed += 1
         self._spent(0.0 if self._counting else REFUSAL)
         if self._malformed == 1 and self._noise.take():
             self.log.info(
                 "client {number} sent what is not rosbridge: {reason}", number=self.number, reason=str(error)
             )
-        self.tell("error", str(error))
+        request = rosbridge.unreadable_request(data)
+        self.tell("error", str(error), None if request is None else request.id)
+        if request is not None:
+            self._fail(request, error)
         if self._malformed >= MALFORMED:
             self.close(
                 closing.TOO_MANY_ERRORS,
@@ -401,6 +404,10 @@ class Session:
                 "client {number}: {what} refused: {reason}", number=self.number, what=what, reason=str(error)
             )
         self.tell("error", str(error), operation.id)
+        self._fail(operation, error)
+
+    def _fail(self, operation: rosbridge.ClientOp, error: Exception) -> None:
+        """Answer what has to be answered; nobody may wait in vain."""
         if isinstance(operation, rosbridge.CallService):
             self.calling.answer(operation, False, jsontext.encode(str(error)))
         elif isinstance(operation, rosbridge.SendActionGoal):

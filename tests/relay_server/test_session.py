@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from relay_protocol import link
@@ -56,6 +57,45 @@ def test_a_refused_call_is_answered_even_to_those_who_asked_for_no_status(world:
     (reply,) = person.client.take()
     assert (reply["op"], reply["id"], reply["result"]) == ("service_response", "x", False)
     assert reply["values"] == "call on /reset needs the level operator; you are viewer on this robot"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"timeout": "x"}, {"fragment_size": "big"}, {"compression": 1}, {"type": []}, {"service": 5}]
+)
+def test_a_call_that_makes_no_sense_is_answered(world: World, wrong: dict[str, Any]) -> None:
+    """Nobody may wait in vain for a field of a wrong type; the reason is in the answer."""
+    person = world.person()
+    person.says("call_service", **{"service": "/reset", "id": "x", **wrong})
+    (reply,) = person.client.take()
+    assert (reply["op"], reply["id"], reply["result"]) == ("service_response", "x", False)
+    assert reply["service"] == ("" if "service" in wrong else "/reset")
+    assert f"$.{next(iter(wrong))}" in reply["values"]
+
+
+def test_calls_that_make_no_sense_are_counted(world: World) -> None:
+    """Each is answered, and a hundred in a row cut the client all the same."""
+    person = world.person()
+    for _ in range(module.MALFORMED):
+        assert person.client.closed is None
+        person.says("call_service", service="/reset", timeout="x")
+    assert person.client.closed is not None
+    assert len(person.hears("service_response")) == module.MALFORMED
+
+
+def test_a_qos_goes_to_the_robot_in_one_form(world: World) -> None:
+    """As rosbridge clients write it, the robot hears it in the words of the robot link."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    qos = {
+        "reliability": "BEST_EFFORT",
+        "deadline": {"secs": 1, "nsecs": 0},
+        "lifespan": "infinite",
+        "depth": 3.0,
+    }
+    person.says("subscribe", topic="/chatter", qos=qos)
+    (asked,) = world.link.all(link.Subscribe)
+    assert msgspec.to_builtins(asked.qos) == {"reliability": "best_effort", "depth": 3, "deadline": 1}
 
 
 def test_status_comes_only_when_asked_for(world: World) -> None:

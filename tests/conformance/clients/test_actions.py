@@ -175,6 +175,16 @@ def test_cancel_of_another(client: Client, server: Server) -> None:
         assert client.until("action_result", id="goal")["status"] == SUCCEEDED
 
 
+@case("send_action_goal", "SPEC 1.2 send_action_goal, always answered", suite=SPEC_ONLY)
+def test_goal_wrong_fields(client: Client) -> None:
+    """Fields of a wrong type are answered too: status 0, result false and a string."""
+    for number, wrong in enumerate(({"feedback": "yes"}, {"fragment_size": "big"})):
+        pursue(client, 3, id=number, **wrong)
+        result = client.until("action_result", id=number)
+        assert (result["action"], result["status"], result["result"]) == (FIBONACCI, NEVER_BEGAN, False)
+        assert isinstance(result["values"], str)
+
+
 @case("cancel_action_goal", "SPEC 1.3 Errors", suite=NO_STATUS)
 def test_cancel_unknown(told: Client) -> None:
     """Cancelling a goal that does not exist is told in words."""

@@ -129,6 +129,16 @@ def test_call_wrong_args(client: Client) -> None:
         assert isinstance(answer["values"], str)
 
 
+@case("call_service", "SPEC 1.2 call_service, always answered", suite=SPEC_ONLY)
+def test_call_wrong_fields(client: Client) -> None:
+    """Fields of a wrong type are answered too, with result false and a string, with the id and the name."""
+    for number, wrong in enumerate(({"timeout": "x"}, {"fragment_size": "big"}, {"compression": 1})):
+        client.send("call_service", id=number, service=INVERT, args={"data": True}, **wrong)
+        answer = client.until("service_response", id=number)
+        assert (answer["service"], answer["result"]) == (INVERT, False), wrong
+        assert isinstance(answer["values"], str)
+
+
 @case("call_service", CALL + ", timeout")
 def test_call_timeout(client: Client) -> None:
     """A service that is slower than the timeout is answered with result false and a string."""

@@ -94,6 +94,18 @@ def test_what_makes_no_sense_is_answered_in_words(world: World, wrong: dict[str,
     assert not world.link.all(link.SendActionGoal)
 
 
+@pytest.mark.parametrize("wrong", [{"feedback": "yes"}, {"fragment_size": "big"}, {"action_type": 5}])
+def test_a_field_of_a_wrong_type_ends_the_goal(world: World, wrong: dict[str, Any]) -> None:
+    """Whoever waits for a result gets one, also without ``set_level``; the robot hears nothing."""
+    person = at_work(world)
+    send(person, 7, **wrong)
+    (end,) = person.client.take()
+    assert (end["op"], end["action"], end["id"]) == ("action_result", "count", 7)
+    assert (end["status"], end["result"]) == (0, False)
+    assert f"$.{next(iter(wrong))}" in end["values"]
+    assert not world.link.all(link.SendActionGoal)
+
+
 def test_an_id_in_use_is_refused(world: World) -> None:
     """The first goal goes on; the id is free after its end; others have ids of their own."""
     person, other = at_work(world), world.person()
