@@ -285,6 +285,8 @@ class Channel:
 
         :param stamp: when it reached the robot, nanoseconds since 1970
         """
+        if self.robot.description.sim_time:
+            stamp = self.now_ns()
         self.subscriptions.sample(number, body, stamp)
 
     def message(self, message: link.RobotChannel) -> None:

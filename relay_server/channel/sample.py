@@ -108,7 +108,7 @@ class Sample:
     """One message from the robot. It is converted only if somebody takes it, and then once for all who want it so.
 
     :param body: as the robot sent it
-    :param stamp: when it reached the robot, nanoseconds since 1970
+    :param stamp: the robot's time when it came, nanoseconds: since 1970, or since the simulation began
     """
 
     __slots__ = (

@@ -195,7 +195,10 @@ class Subscriptions:
                         member.tell("error", f"subscribe {uplink.topic}: {reason}")
 
     def sample(self, number: int, body: bytes, stamp: int) -> None:
-        """A sample from the robot; one of a subscription given back already is let go."""
+        """A sample from the robot; one of a subscription given back already is let go.
+
+        :param stamp: the robot's time when it came, nanoseconds
+        """
         uplink = self._numbers.get(number)
         if uplink is not None:
             uplink.sample(body, stamp)

@@ -21,9 +21,9 @@ def publish(topic: str, body: bytes) -> bytes:
 
 
 def raw(stamp: int, body: bytes) -> bytes:
-    """The ``msg`` of ``cbor-raw``: a sample as the robot sent it.
+    """The ``msg`` of ``cbor-raw``: a sample as the robot sent it (rosbridge v2 protocol, section 3.1.4).
 
-    :param stamp: when it reached the robot, nanoseconds since 1970
+    :param stamp: the robot's time when it came, nanoseconds: since 1970, or since the simulation began
     :param body: CDR with its header
     """
     seconds, nanoseconds = divmod(stamp, 10**9)

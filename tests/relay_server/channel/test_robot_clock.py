@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import struct
 
+import cbor2
 import msgspec
 import pytest
 
 from relay_protocol import link
 from relay_server.channel.robot_clock import THROTTLE_MS, TYPE, nanoseconds
-from tests.relay_server.memory import GRAPH, MOTION, STRING, Person, World
+from tests.relay_server.memory import GRAPH, MOTION, STRING, Person, World, text
 
 STAMPED = "a_msgs/msg/Stamped"
 STAMPED_TEXT = (
@@ -82,6 +83,23 @@ def test_stamps_that_clients_leave_out_are_the_robots_time(world: World, person:
     ((_, _, body),) = world.link.samples
     sent = json.loads(world.robot.types.to_json(STAMPED, body))
     assert sent["header"] == {"stamp": {"sec": 77, "nanosec": 9}, "frame_id": "map"}
+
+
+def test_raw_samples_carry_the_robots_time(world: World, person: Person) -> None:
+    """The simulation's while there is one, else when the sample reached the robot."""
+    asked = subscription(world)
+    person.says("subscribe", topic="/chatter", compression="cbor-raw")
+    (number,) = [each.number for each in world.link.all(link.Subscribe) if each.topic == "/chatter"]
+    world.subscribed(number)
+    wall = 1_700_000_000 * 10**9 + 7
+    world.channel.sample(number, text("early"), wall)
+    world.channel.sample(asked.number, tick(77, 9), wall)
+    world.channel.sample(number, text("simulated"), wall)
+    world.registry.described(world.robot, MOTION)
+    world.channel.sample(number, text("real"), wall)
+    came = [cbor2.loads(each)["msg"] for each in person.client.sent]
+    assert [(each["secs"], each["nsecs"]) for each in came] == [(0, 0), (77, 9), (1_700_000_000, 7)]
+    assert [each["bytes"] for each in came] == [text(word) for word in ("early", "simulated", "real")]
 
 
 def test_a_client_hears_the_clock_by_the_same_subscription(world: World, person: Person) -> None:
