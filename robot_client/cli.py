@@ -20,9 +20,20 @@ from relay_protocol.identity import check_robot_name
 from relay_protocol.text import inert
 from robot_client import config, logs
 from robot_client.enrolling import enroll as hand_in
+from robot_client.helptext import examples
 from robot_client.identity import Enrolment, StateFolder
 from robot_client.run import Runner, agent
 from robot_client.tls import endpoint, is_loopback, split_address
+
+_ENROLL = (
+    "switchboard-robot enroll --relay relay.example.org:9091 --tls --robot rover --code - --state ./rover",
+    "switchboard-robot enroll --relay 127.0.0.1:9091 --robot rover --code CODE --state ./rover",
+)
+_RUN = (
+    "switchboard-robot run --state ./rover",
+    "switchboard-robot run --state ./rover --config robot.toml --log-json",
+    "switchboard-robot run --state ./rover --use-sim-time   # beside a simulator that publishes /clock",
+)
 
 state_option = click.option(
     "--state",
@@ -46,13 +57,13 @@ def in_words(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(context_settings={"help_option_names": ["-h", "--help"]}, epilog=examples(_ENROLL[0], _RUN[0]))
 @click.version_option(package_name="robot-switchboard", message="%(version)s")
 def main() -> None:
     """Bring this robot to a Switchboard relay."""
 
 
-@main.command()
+@main.command(epilog=examples(*_ENROLL))
 @click.option("--relay", required=True, metavar="HOST:PORT", help="Where the relay takes robots.")
 @click.option("--robot", required=True, metavar="NAME", help="This robot's name at the relay.")
 @click.option(
@@ -107,7 +118,7 @@ def enroll(
     click.echo(inert(f"enrolled as {robot} at {enrolled.relay}; run: switchboard-robot run --state {state}"))
 
 
-@main.command()
+@main.command(epilog=examples(*_RUN))
 @state_option
 @click.option(
     "--config",

@@ -12,6 +12,7 @@ from typing import IO, Any
 
 import click
 
+from robot_client.helptext import examples
 from robot_client.ros_log import ensure_log_folder
 
 try:
@@ -23,7 +24,14 @@ _LONGEST_SPIN = 0.1
 """Seconds; how long a signal may wait to be seen."""
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=examples(
+        "switchboard-sim",
+        "switchboard-sim --world open --no-camera --seed 1",
+        "switchboard-sim --namespace second --record second.jsonl",
+    ),
+)
 @click.option("--namespace", default="", metavar="NS", help="Put before all names, so that several can run.")
 @click.option(
     "--record",
