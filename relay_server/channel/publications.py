@@ -24,6 +24,9 @@ ADVERTISEMENTS = 1024
 QUEUE_SIZE = 10_000
 """Deepest queue of a publisher on the robot; who asks for more gets this."""
 
+USUAL_QUEUE_SIZE = 100
+"""What it is for who asks for less than one message."""
+
 HELD_MESSAGES = 64
 HELD_BYTES = MIB
 """What may be held of one client, over all topics of a robot."""
@@ -47,26 +50,45 @@ class Publications:
         self._numbers: dict[int, Publication] = {}
 
     def advertise(self, member: Member, ask: rosbridge.Advertise, type_name: str) -> None:
-        """A client is going to publish.
+        """A client is going to publish (rosbridge v2, Advertise).
 
         :raises Invalid: the topic has another type; too many topics
         """
-        publication = self._get(member, resolve(ask.topic), type_name)
-        publication.holders.setdefault(member, set()).add(ask.id)
-        if publication.phase is Phase.WAITING:
-            publication.latch = publication.latch or ask.latch
-            publication.queue_size = min(max(publication.queue_size, ask.queue_size), QUEUE_SIZE)
-            publication.qos = ask.qos or publication.qos
+        self._join(member, ask, resolve(ask.topic), type_name, ask.id)
+
+    def _join(
+        self,
+        member: Member,
+        ask: rosbridge.Advertise | rosbridge.Publish,
+        topic: str,
+        type_name: str,
+        id: rosbridge.Id,
+    ) -> Publication:
+        publication = self._get(member, topic, type_name)
+        # What the robot refused may have been refused for how it was asked.
+        if not publication.holders or publication.phase is Phase.FAILED:
+            _settle(publication, ask)
+        elif ask.latch != publication.latch or ask.qos not in (None, publication.qos):
+            member.tell("warning", f"{topic} is advertised already; its first latch and qos stay", ask.id)
+        publication.holders.setdefault(member, {})[id] = ""
         if publication.phase in (Phase.WAITING, Phase.FAILED):
             self._ask(publication)
+        return publication
 
     def unadvertise(self, member: Member, topic: str, id: rosbridge.Id) -> None:
-        """A client takes one advertisement back, or all of a topic when ``id`` is ``None``."""
+        """A client takes one advertisement back, or all of a topic when ``id`` is ``None``.
+
+        What was never advertised is told by a warning (rosbridge v2, Unadvertise).
+        """
         publication = self._topics.get(topic)
-        if publication is None:
+        ids = publication.holders.get(member) if publication is not None else None
+        if publication is None or ids is None:
+            member.tell("warning", f"unadvertise {topic}: you have not advertised it", id)
             return
-        ids = publication.holders.get(member, set())
-        ids.discard(id)
+        if id is not None and id not in ids:
+            member.tell("warning", f"unadvertise {topic}: you have not advertised it with this id", id)
+            return
+        ids.pop(id, None)
         if id is None or not ids:
             self._let_go(publication, member)
 
@@ -84,8 +106,8 @@ class Publications:
                     self._let_go(publication, member)
                     member.tell("error", f"unadvertised {publication.topic}: {verdict.reason}")
 
-    def get(self, member: Member, topic: str, type_name: str) -> Publication:
-        """The publication a client publishes to, advertised now if it was not.
+    def get(self, member: Member, ask: rosbridge.Publish, topic: str, type_name: str) -> Publication:
+        """The publication a client publishes to, advertised now, as the message says, if it was not.
 
         :raises Invalid: nobody knows the topic's type, or it has another one
         """
@@ -94,10 +116,7 @@ class Publications:
             wanted = type_name or self._known(topic)
             if not wanted:
                 raise Invalid(f"topic {topic} does not exist and no type was given; advertise it first")
-            publication = self._get(member, topic, wanted)
-            publication.holders.setdefault(member, set()).add(None)
-            if publication.phase is Phase.WAITING:
-                self._ask(publication)
+            publication = self._join(member, ask, topic, wanted, None)
         return publication
 
     def active(self) -> tuple[tuple[str, str], ...]:
@@ -168,9 +187,10 @@ class Publications:
             _dropped(publication, oldest, "too much waits for the robot; the oldest was dropped")
 
     def graph_changed(self) -> None:
-        """What the robot could not advertise may be possible now."""
+        """What the robot could not advertise may be possible now, where something has changed."""
+        topics = self._wire.robot.graph.topics
         for publication in list(self._topics.values()):
-            if publication.phase is Phase.FAILED:
+            if publication.phase is Phase.FAILED and topics.get(publication.topic) != publication.seen:
                 self._ask(publication)
 
     def opened(self) -> None:
@@ -185,9 +205,13 @@ class Publications:
             publication.held.clear()
 
     def typed(self, type_name: str) -> None:
-        """A definition has come: what was held for it goes."""
+        """A definition has come: what was held for it goes, and what failed without it is tried again."""
         for publication in list(self._topics.values()):
-            if publication.type == type_name:
+            if publication.type != type_name:
+                continue
+            if publication.phase is Phase.FAILED:
+                self._ask(publication)
+            else:
                 publication.enter(publication.phase)
                 self._flush(publication)
 
@@ -197,20 +221,25 @@ class Publications:
         publication = self._numbers.get(message.number)
         if publication is not None:
             publication.enter(Phase.ACTIVE)
+            for ids in publication.holders.values():
+                ids.update(dict.fromkeys(ids, ""))
 
     def refused(self, number: int, reason: str) -> None:
         """The robot could not advertise."""
         self._wire.asks.answered(("advertise", number))
         publication = self._numbers.get(number)
-        if publication is None:
+        if publication is None or publication.phase is Phase.FAILED:
             return
         publication.enter(Phase.FAILED)
         held = list(publication.held)
         publication.held.clear()
         for each in held:
             _dropped(publication, each, reason)
-        for member in list(publication.holders):
-            member.tell("error", f"advertise {publication.topic}: {reason}")
+        for member, ids in list(publication.holders.items()):
+            for id, told in list(ids.items()):
+                ids[id] = reason
+                if told != reason:
+                    member.tell("error", f"advertise {publication.topic}: {reason}", id)
 
     def type_refused(self, type_name: str, reason: str) -> None:
         """A type is not to be had."""
@@ -249,6 +278,7 @@ class Publications:
         if self._wire.link is None:
             return
         publication.enter(Phase.WAITING)
+        publication.seen = self._wire.robot.graph.topics.get(publication.topic)
         self._definitions.want(publication.type)
         message = link.Advertise(
             number=publication.number,
@@ -290,6 +320,13 @@ class Publications:
         self._wire.asks.withdraw(("advertise", publication.number))
         if publication.phase in (Phase.ASKED, Phase.ACTIVE):
             self._wire.send(link.Unadvertise(number=publication.number))
+
+
+def _settle(publication: Publication, ask: rosbridge.Advertise | rosbridge.Publish) -> None:
+    """Take over how the robot is to publish."""
+    publication.latch = ask.latch
+    publication.queue_size = min(ask.queue_size, QUEUE_SIZE) if ask.queue_size > 0 else USUAL_QUEUE_SIZE
+    publication.qos = ask.qos
 
 
 def _dropped(publication: Publication, message: Held, reason: str) -> None:

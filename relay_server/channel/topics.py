@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from relay_protocol import limits, rosbridge
-from relay_protocol.link import QoS
+from relay_protocol.link import QoS, Topic
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
@@ -229,8 +229,11 @@ class Publication:
         self.phase = Phase.WAITING
         self.send: Send | None = None
         """Sends a message to the robot; ``None`` while none can be sent, and until the first after a change."""
-        self.holders: dict[Member, set[rosbridge.Id]] = {}
+        self.holders: dict[Member, dict[rosbridge.Id, str]] = {}
+        """Advertisements of each client by id, with why the robot could not, as far as its client was told."""
         self.held: deque[Held] = deque()
+        self.seen: Topic | None = None
+        """The topic in the robot's graph when the robot was last asked."""
 
     def enter(self, phase: Phase) -> None:
         """Go on to this phase; how messages are sent is found out anew."""

@@ -115,7 +115,7 @@ class Publishing:
         session.judge(Operation.PUBLISH, topic)
         if robot.control is None:
             raise Unavailable(f"robot {robot.name} is offline; the message was dropped")
-        publication = session.channel.publications.get(session, topic, normal_type(ask.type))
+        publication = session.channel.publications.get(session, ask, topic, normal_type(ask.type))
         motion = robot.is_motion(topic, publication.type)
         if len(self._routes) >= ROUTES:
             self._routes.clear()

@@ -156,6 +156,32 @@ def test_advertise_queue_size(client: Client, hand: Hand, topic: str) -> None:
     assert [each["data"] for each in hand.heard(topic, 50)] == list(range(50))
 
 
+@case("advertise", "SPEC 1.2 advertise, queue_size")
+def test_advertise_queue_size_negative(client: Client, hand: Hand, topic: str) -> None:
+    """A queue_size below one is taken as left out: what is published arrives."""
+    ready(client, hand, topic, STRING, queue_size=-5)
+    client.send("publish", topic=topic, msg={"data": "here"})
+    assert hand.heard(topic, 1) == [{"data": "here"}]
+
+
+@case("advertise", "SPEC 1.2 advertise, the first one's latch and qos stay", suite=NO_STATUS)
+def test_advertise_other_latch(told: Client, server: Server, hand: Hand, topic: str) -> None:
+    """Who advertises a topic with another latch than the first one is warned, with the id."""
+    with server.connect() as first:
+        ready(first, hand, topic, STRING)
+        told.send("set_level", level="warning")
+        told.send("advertise", topic=topic, type=STRING, latch=True, id="other")
+        assert told.until("status", level="warning", id="other")["msg"]
+        assert hand.publishers(topic, 1)[0]["durability"] == "volatile"
+
+
+@case("advertise", "SPEC 1.2 advertise, told once with its id", suite=NO_STATUS)
+def test_advertise_failure_names_the_id(told: Client, topic: str) -> None:
+    """A type that is not to be had is an error with the id of its advertise."""
+    told.send("advertise", topic=topic, type="no_such_package/msg/Thing", id="which")
+    assert told.until("status", level="error", id="which")["msg"]
+
+
 # --- unadvertise ---
 
 
@@ -217,6 +243,14 @@ def test_unadvertise_unknown(client: Client, topic: str) -> None:
     client.lives()
 
 
+@case("unadvertise", UNADVERTISE, suite=NO_STATUS)
+def test_unadvertise_unknown_is_warned_of(told: Client, topic: str) -> None:
+    """Unadvertising what was never advertised is a warning in words."""
+    told.send("set_level", level="warning")
+    told.send("unadvertise", topic=topic, id="never")
+    assert told.until("status", level="warning", id="never")["msg"]
+
+
 # --- publish ---
 
 
@@ -245,6 +279,16 @@ def test_publish_with_type(client: Client, hand: Hand, topic: str) -> None:
     """Publishing without advertise takes the type from the message's own type field."""
     client.send("publish", topic=topic, type=STRING, msg={"data": "typed"})
     assert hand.publishers(topic, 1)[0]["type"] == STRING
+
+
+@case("publish", "SPEC 1.2 publish, latch and qos without advertise", suite=SPEC_ONLY)
+def test_publish_latch_without_advertise(client: Client, hand: Hand, topic: str) -> None:
+    """A first message with latch makes a latching publisher: who joins late gets it."""
+    client.send("publish", topic=topic, type=STRING, msg={"data": "kept"}, latch=True)
+    assert hand.publishers(topic, 1)[0]["durability"] == "transient_local"
+    client.lives()
+    hand.listen(topic, STRING, "latched")
+    assert hand.heard(topic, 1)[-1] == {"data": "kept"}
 
 
 @case("publish", PUBLISH)

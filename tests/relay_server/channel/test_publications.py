@@ -55,6 +55,63 @@ def test_what_is_asked_of_a_publisher_reaches_the_robot_within_reason(world: Wor
     assert asked.qos == QoS(depth=5)
 
 
+@pytest.mark.parametrize("size", [0, -1, -(10**30)])
+def test_a_queue_of_nothing_is_the_usual_one(world: World, size: int) -> None:
+    """Less than one message is no queue; it counts as left out."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING, queue_size=size)
+    assert world.link.all(link.Advertise)[0].queue_size == module.USUAL_QUEUE_SIZE
+
+
+def test_what_a_first_message_asks_of_its_publisher_reaches_the_robot(world: World) -> None:
+    """As an advertisement would; who has advertised is past that, and so is every later message."""
+    person = at_work(world)
+    person.says("set_level", level="warning")
+    wish = {"durability": "transient_local"}
+    person.says("publish", topic="/chatter", msg={}, latch=True, queue_size=7, qos=wish)
+    person.says("publish", topic="/chatter", msg={}, queue_size=9)
+    person.says("advertise", topic="/out", type=STRING, queue_size=3)
+    person.says("publish", topic="/out", msg={}, latch=True, queue_size=9)
+    first, second = world.link.all(link.Advertise)
+    assert (first.latch, first.queue_size, first.qos) == (True, 7, QoS(durability="transient_local"))
+    assert (second.latch, second.queue_size, second.qos) == (False, 3, None)
+    assert told(person) == []
+
+
+def test_what_the_first_one_asked_for_stays(world: World) -> None:
+    """Also when the robot is away meanwhile; who asks for something else is warned, with the id."""
+    first, second = at_work(world), world.person()
+    second.says("set_level", level="warning")
+    first.says("advertise", topic="/out", type=STRING, latch=True, queue_size=5, qos={"depth": 2})
+    second.says("advertise", topic="/out", type=STRING, latch=True, id="same")
+    assert told(second) == []
+    world.robot_goes()
+    second.says("advertise", topic="/out", type=STRING, id="no latch")
+    second.says("advertise", topic="/out", type=STRING, latch=True, qos={"depth": 3}, id="qos")
+    warnings = second.hears("status")
+    assert [(each["level"], each["id"]) for each in warnings] == [("warning", "no latch"), ("warning", "qos")]
+    assert warnings[0]["msg"] == "/out is advertised already; its first latch and qos stay"
+    world.robot_comes()
+    (asked,) = world.robot_joins().all(link.Advertise)
+    assert (asked.latch, asked.queue_size, asked.qos) == (True, 5, QoS(depth=2))
+
+
+def test_unadvertising_what_was_not_advertised_is_warned_of(world: World) -> None:
+    """An unknown topic, an unknown id, and the topic of somebody else, which stays."""
+    other, person = at_work(world), world.person()
+    person.says("set_level", level="warning")
+    other.says("advertise", topic="/theirs", type=STRING, id="a")
+    person.says("advertise", topic="/mine", type=STRING, id="a")
+    for topic, id in (("/none", "x"), ("/theirs", "a"), ("/theirs", None), ("/mine", "b")):
+        person.says("unadvertise", topic=topic, id=id)
+    warnings = person.hears("status")
+    assert [each["level"] for each in warnings] == ["warning"] * 4
+    assert [each.get("id") for each in warnings] == ["x", "a", None, "b"]
+    assert warnings[0]["msg"] == "unadvertise /none: you have not advertised it"
+    assert warnings[3]["msg"] == "unadvertise /mine: you have not advertised it with this id"
+    assert not world.link.all(link.Unadvertise)
+
+
 def test_json_becomes_cdr_when_the_type_is_known(world: World) -> None:
     """What comes before the definition waits for it, in order."""
     person = at_work(world)
@@ -172,6 +229,83 @@ def test_a_robot_that_can_not_advertise_is_told_to_all_who_wait(world: World) ->
     ]
     person.says("advertise", topic="/out", type=STRING, id="again")
     assert len(world.link.all(link.Advertise)) == 2
+
+
+def refuse(world: World, reason: str) -> None:
+    """The robot can't do what it was asked last."""
+    number = world.link.take(link.Advertise)[-1].number
+    world.channel.message(link.Failed(what="advertise", ref=str(number), reason=reason))
+
+
+def graph(world: World, **topics: link.Topic) -> None:
+    """These topics change in the robot's graph."""
+    changes = {"/" + name: topic for name, topic in topics.items()}
+    world.registry.graph(world.robot, link.Graph(topics=changes))
+
+
+def test_a_failure_is_told_once_for_each_advertisement_with_its_id(world: World) -> None:
+    """The robot is asked again when the topic has changed, and only another reason is told."""
+    person, other = at_work(world), world.person()
+    other.says("set_level", level="error")
+    person.says("advertise", topic="/out", type=STRING, id="a")
+    person.says("advertise", topic="/out", type=STRING, id="b")
+    other.says("advertise", topic="/out", type=STRING)
+    refuse(world, "no room")
+    assert [each["id"] for each in person.hears("status")] == ["a", "b"]
+    assert told(other) == ["advertise /out: no room"]
+    graph(world, elsewhere=link.Topic(types=[STRING], publishers=["/talker"]))
+    assert not world.link.all(link.Advertise)
+    graph(world, out=link.Topic(types=[STRING], subscribers=["/base"]))
+    refuse(world, "no room")
+    assert told(person) == told(other) == []
+    graph(world, out=link.Topic(types=[STRING], subscribers=["/base", "/logger"]))
+    refuse(world, "no memory")
+    assert told(person) == ["advertise /out: no memory"] * 2
+    assert told(other) == ["advertise /out: no memory"]
+
+
+def test_who_advertises_again_is_told_again_and_may_ask_otherwise(world: World) -> None:
+    """A wish the robot refused is not kept, and a new attempt is answered; nobody else hears the same twice."""
+    person, other = at_work(world), world.person()
+    other.says("set_level", level="error")
+    person.says("advertise", topic="/out", type=STRING, id="a", qos={"history": "keep_all"})
+    other.says("advertise", topic="/out", type=STRING)
+    refuse(world, "not keep_all")
+    assert told(other) == told(person)
+    person.says("advertise", topic="/out", type=STRING, id="a", qos={"depth": 4})
+    assert world.link.all(link.Advertise)[0].qos == QoS(depth=4)
+    refuse(world, "not keep_all")
+    assert told(person) == ["advertise /out: not keep_all"]
+    assert told(other) == []
+
+
+def test_what_failed_after_it_had_worked_is_told(world: World) -> None:
+    """Even for the reason it failed for before."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING)
+    refuse(world, "no room")
+    graph(world, out=link.Topic(types=[STRING], subscribers=["/base"]))
+    (asked,) = world.link.all(link.Advertise)
+    world.channel.message(link.Advertised(number=asked.number, topic="/out", type=STRING, encoding="cdr"))
+    world.robot_goes()
+    world.robot_comes()
+    world.robot_joins()
+    refuse(world, "no room")
+    assert told(person) == ["advertise /out: no room"] * 2
+
+
+def test_what_failed_without_its_type_is_tried_again_with_it(world: World) -> None:
+    """Whoever made the type known; two refusals of one attempt are told as one."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING)
+    world.link.take(link.GetType)
+    world.channel.message(link.Failed(what="get_type", ref=STRING, reason="not installed"))
+    refuse(world, "no such type")
+    assert told(person) == ["advertise /out: not installed"]
+    person.says("subscribe", topic="/chatter")
+    world.subscribed(world.link.all(link.Subscribe)[0].number)
+    world.define(STRING)
+    assert len(world.link.all(link.Advertise)) == 1
 
 
 def test_a_type_without_definition_fails_its_topics(world: World) -> None:
