@@ -73,6 +73,7 @@ class Listener:
     __slots__ = (
         "_asks",
         "_clock",
+        "_failed",
         "_plainly_at",
         "_queued_bytes",
         "_receiver",
@@ -98,6 +99,8 @@ class Listener:
         """The names the topic is subscribed by, latest compression and least size of fragments."""
         self._asks: dict[tuple[str, rosbridge.Id], Asked] = {}
         self._told: set[Flaw] = set()
+        self._failed: frozenset[rosbridge.Id] = frozenset()
+        """Ids of the subscriptions whose failure the client was told."""
         self._plainly_at = -PLAINLY_SECONDS
         self._sent_at = -THROTTLE_SECONDS
         # A deque takes 600 bytes when it is empty; most never have a throttle.
@@ -132,6 +135,7 @@ class Listener:
         self._asks.pop(key, None)
         self._asks[key] = Asked(ask, form)
         self._told.clear()
+        self._failed -= {ask.id}
         self._merge()
 
     def remove(self, name: str, id: rosbridge.Id) -> bool:
@@ -185,10 +189,30 @@ class Listener:
         self._receiver.deliver(self, sample)
 
     def complain(self, flaw: Flaw, words: str) -> None:
-        """Tell the client why it does not get what it asked for: once, until it asks again."""
+        """Tell the client why it does not get what it asked for: once for each id, until it asks again."""
         if flaw not in self._told:
             self._told.add(flaw)
-            self._receiver.tell(_LEVELS[flaw], f"{self.topic}: {words}")
+            for id in self._ids():
+                self._receiver.tell(_LEVELS[flaw], f"{self.topic}: {words}", id)
+
+    def fail(self, words: str) -> None:
+        """Tell the client that it gets nothing, and why: once for each id, until it asks again or that has passed."""
+        for id in self._ids():
+            if id not in self._failed:
+                self._failed |= {id}
+                self._receiver.tell("error", f"subscribe {self.topic}: {words}", id)
+
+    def mended(self) -> None:
+        """What made it fail has passed; what comes next is news."""
+        self._failed = frozenset()
+
+    @property
+    def latest(self) -> rosbridge.Id:
+        """The id of the latest subscription."""
+        return next(reversed(self._asks))[1]
+
+    def _ids(self) -> list[rosbridge.Id]:
+        return list(dict.fromkeys(id for _, id in self._asks))
 
     def plainly(self) -> None:
         """A sample comes as plain JSON for once: tell the client now and then."""

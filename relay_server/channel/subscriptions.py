@@ -63,11 +63,13 @@ class Subscriptions:
                 "warning",
                 f"subscribe {topic}: it does not exist yet, and another client says that its type is "
                 f"{uplink.type}; messages come if it turns out to be {type_name}",
+                listener.latest,
             )
         if uplink.phase in (Phase.WAITING, Phase.FAILED):
             self._ask(uplink)
             return
         self._follow_throttle(uplink)
+        self._tell_untypeable(uplink, member)
         if not served_before and uplink.serves(member):
             uplink.replay(listener)
 
@@ -173,9 +175,9 @@ class Subscriptions:
         if uplink is None:
             return
         uplink.phase = Phase.FAILED
-        if uplink.refusals == uplink.patience:
-            for member in list(uplink.listeners):
-                member.tell("error", f"subscribe {uplink.topic}: {reason}")
+        if uplink.refusals >= uplink.patience:
+            for listener in list(uplink.listeners.values()):
+                listener.fail(reason)
         if uplink.certain:
             self._try_again(uplink)
 
@@ -190,9 +192,15 @@ class Subscriptions:
         """A type is not to be had: its topics can't be shown, but to those who want them as they are."""
         for uplink in self._topics.values():
             if uplink.type == type_name:
-                for member, listener in list(uplink.listeners.items()):
-                    if uplink.serves(member) and not listener.raw:
-                        member.tell("error", f"subscribe {uplink.topic}: {reason}")
+                uplink.untypeable = reason
+                for member in list(uplink.listeners):
+                    self._tell_untypeable(uplink, member)
+
+    @staticmethod
+    def _tell_untypeable(uplink: TopicUplink, member: Member) -> None:
+        listener = uplink.listeners.get(member)
+        if uplink.untypeable and listener is not None and uplink.serves(member) and not listener.raw:
+            listener.fail(uplink.untypeable)
 
     def sample(self, number: int, body: bytes, stamp: int) -> None:
         """A sample from the robot; one of a subscription given back already is let go.
@@ -230,11 +238,9 @@ class Subscriptions:
             return
         uplink.certain = True
         for member, wanted in uplink.mistaken():
-            member.tell(
-                "error",
-                f"subscribe {uplink.topic}: it has the type {type_name}, not {wanted}; "
-                f"subscribe with {type_name} to get it",
-            )
+            listener = uplink.listeners[member]
+            listener.mended()
+            listener.fail(f"it has the type {type_name}, not {wanted}; subscribe with {type_name} to get it")
         if not uplink.served:
             self._unsubscribe(uplink)
 

@@ -64,6 +64,8 @@ class TopicUplink:
         self.patience = 0
         """Refusals that are nothing to tell yet."""
         self.retry: Timer | None = None
+        self.untypeable = ""
+        """Why the type's definition is not to be had."""
         self.failures = 0
         self.listeners: dict[Member, Listener] = {}
         self.wanted: dict[Member, str] = {}
@@ -130,9 +132,13 @@ class TopicUplink:
         self.latched = latched
         self.retype(type_name)
         self._recent = deque(self._recent, maxlen=min(max(publishers, 1), LATCHED_KEPT))
+        if not self.untypeable:
+            self._mended()
 
     def retype(self, type_name: str) -> None:
         """The topic has this type."""
+        if type_name != self.type:
+            self.untypeable = ""
         self.type = type_name
         self._converter = self._new_converter()
         self._serve()
@@ -141,8 +147,14 @@ class TopicUplink:
         """The robot's side is gone."""
         self.phase = Phase.WAITING
         self.refusals = self.patience = 0
+        self.untypeable = ""
         cancel(self.retry)
         self._forget()
+        self._mended()
+
+    def _mended(self) -> None:
+        for listener in self.listeners.values():
+            listener.mended()
 
     def _forget(self) -> None:
         self._recent.clear()
@@ -176,6 +188,9 @@ class TopicUplink:
     def typed(self) -> None:
         """The type's definition has come, or another one: hand on what waited for it."""
         self._converter = self._new_converter()
+        if self.untypeable:
+            self.untypeable = ""
+            self._mended()
         waiting = list(self._untyped)
         self._untyped.clear()
         for sample in waiting:

@@ -135,6 +135,21 @@ def test_raw_of_a_robot_that_speaks_json(world: World) -> None:
     assert (first["msg"], second["msg"]) == ({"data": "a"}, {"data": "b"})
 
 
+def test_a_form_that_can_not_be_had_is_told_with_the_ids(world: World) -> None:
+    """Of all subscriptions of the client to the topic, each once."""
+    world.robot_comes(encodings=["json"])
+    person = world.person()
+    world.robot_joins()
+    person.says("set_level", level="error")
+    for id in ("a", 2):
+        person.says("subscribe", topic="/chatter", compression="cbor-raw", id=id)
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number, encoding="json")
+    for _ in range(2):
+        world.channel.sample(number, b'{"data": "a"}')
+    assert [each["id"] for each in person.hears("status")] == ["a", 2]
+
+
 def test_cbor_of_a_robot_that_speaks_json(world: World) -> None:
     """What its JSON says, in a binary message."""
     world.robot_comes(encodings=["json"])

@@ -318,6 +318,45 @@ def test_a_type_the_robot_can_not_define_is_told(world: World) -> None:
     assert person.hears("status")[0]["msg"] == "subscribe /chatter: not installed"
 
 
+def test_a_failure_is_told_once_for_each_subscription(world: World) -> None:
+    """With its id: not again when the robot refuses the topic besides its type, but to who asks later or anew."""
+    number, (person,) = watching(world, {"topic": "/chatter", "id": "a"})
+    person.says("set_level", level="error")
+    person.says("subscribe", topic="/chatter", id="b")
+
+    def failing() -> list[tuple[str, str]]:
+        world.channel.message(link.Failed(what="get_type", ref=STRING, reason="not installed"))
+        world.channel.message(link.Failed(what="subscribe", ref=str(number), reason="no such type"))
+        return [(each["msg"], each["id"]) for each in person.hears("status")]
+
+    words = "subscribe /chatter: not installed"
+    assert failing() == [(words, "a"), (words, "b")]
+    world.registry.graph(world.robot, GRAPH)
+    assert failing() == []
+    person.says("subscribe", topic="/chatter", id="c")
+    person.says("subscribe", topic="/chatter", id="a")
+    assert sorted(failing()) == [(words, "a"), (words, "c")]
+    world.subscribed(number)
+    world.channel.message(link.Failed(what="get_type", ref=STRING, reason="not installed"))
+    assert not told(person)
+    person.says("subscribe", topic="/chatter", id=4)
+    assert [each["id"] for each in person.hears("status")] == [4]
+
+
+def test_a_failure_after_the_robot_was_away_is_news(world: World) -> None:
+    """It is told again, once."""
+    number, (person,) = watching(world, {"id": "a"})
+    person.says("set_level", level="error")
+    for _ in range(2):
+        for _ in range(2):
+            world.channel.message(link.Failed(what="subscribe", ref=str(number), reason="no"))
+        assert told(person) == ["subscribe /chatter: no"]
+        world.robot_goes()
+        person.hears("status")
+        world.robot_comes()
+        world.robot_joins()
+
+
 def test_answers_of_the_robot_to_nothing_are_let_go(world: World) -> None:
     """Unknown numbers, ids and types do no harm."""
     watching(world, {})
@@ -408,6 +447,20 @@ def test_a_wrong_guess_binds_nobody(world: World) -> None:
     world.channel.sample(guess.number, text("of the guess"))
     world.channel.sample(ask.number, text("hi"))
     assert [heard(person) for person in (wrong, right, careless)] == [[], ["hi"], ["hi"]]
+
+
+def test_who_was_wrong_is_told_with_the_ids(world: World) -> None:
+    """Each time the topic appears so; a warning about a guess has the id of who just asked."""
+    right, wrong = waiting(world, STRING, STRING)
+    for id in ("a", "b"):
+        wrong.says("set_level", level="warning")
+        wrong.says("subscribe", topic="/later", type=TWIST, id=id)
+    assert [each["id"] for each in wrong.hears("status")] == ["a", "b"]
+    for _ in range(2):
+        appears(world, STRING)
+        assert [each.get("id") for each in wrong.hears("status")] == [None, "a", "b"]
+        appears(world)
+    assert not told(right)
 
 
 def test_who_was_wrong_may_ask_again(world: World) -> None:
