@@ -188,10 +188,13 @@ class Publications:
 
     def graph_changed(self) -> None:
         """What the robot could not advertise may be possible now, where something has changed."""
-        topics = self._wire.robot.graph.topics
         for publication in list(self._topics.values()):
-            if publication.phase is Phase.FAILED and topics.get(publication.topic) != publication.seen:
-                self._ask(publication)
+            self._try_again(publication)
+
+    def _try_again(self, publication: Publication) -> None:
+        now = self._wire.robot.graph.topics.get(publication.topic)
+        if publication.phase is Phase.FAILED and now != publication.seen:
+            self._ask(publication)
 
     def opened(self) -> None:
         """The robot is there: advertise everything."""
@@ -240,10 +243,13 @@ class Publications:
                 ids[id] = reason
                 if told != reason:
                     member.tell("error", f"advertise {publication.topic}: {reason}", id)
+        if publication.holders:
+            # The topic may have changed while the answer was on its way.
+            self._try_again(publication)
 
     def type_refused(self, type_name: str, reason: str) -> None:
         """A type is not to be had."""
-        for publication in self._topics.values():
+        for publication in list(self._topics.values()):
             if publication.type == type_name and publication.phase is not Phase.WAITING:
                 self.refused(publication.number, reason)
 

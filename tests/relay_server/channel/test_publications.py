@@ -279,6 +279,18 @@ def test_who_advertises_again_is_told_again_and_may_ask_otherwise(world: World) 
     assert told(other) == []
 
 
+def test_a_change_that_comes_before_the_refusal_counts(world: World) -> None:
+    """The robot may have judged by what was before it; it is asked once more."""
+    person = at_work(world)
+    person.says("advertise", topic="/out", type=STRING)
+    asked = world.link.take(link.Advertise)[0]
+    graph(world, out=link.Topic(types=[STRING], subscribers=["/base"]))
+    world.channel.message(link.Failed(what="advertise", ref=str(asked.number), reason="another type"))
+    refuse(world, "another type")
+    assert told(person) == ["advertise /out: another type"]
+    assert not world.link.all(link.Advertise)
+
+
 def test_what_failed_after_it_had_worked_is_told(world: World) -> None:
     """Even for the reason it failed for before."""
     person = at_work(world)
