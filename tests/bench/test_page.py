@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from bench.page import BEGIN, END, PAGE, figures, rows_of
+from bench import RESULTS
+from bench.page import BEGIN, END, PAGE, WHY, figures, reasons, rows_of
 from bench.report import Row, save
 
 ROWS = [
@@ -36,6 +37,26 @@ def test_missed_bars_and_missing_measurements_are_told(tmp_path: Path) -> None:
     assert "2 of 3 bars are met" in text
     assert "Not measured: latency (no HAProxy)." in text
     assert "- hop: a remark" in text
+
+
+def test_missed_bars_are_explained_and_met_ones_are_not() -> None:
+    """A reason stands for as long as its row is missed; what has no bar is explained while it costs more."""
+    for (measurement, what), why in WHY.items():
+        missed = Row(measurement, what, "µs", 3.0, 2.0, "a proxy", 1.0)
+        assert (
+            reasons([missed, missed])
+            == f"\nWhy bars are missed, or ours costs more:\n\n- {measurement}, {what}: {why}\n"
+        )
+        assert reasons([Row(measurement, what, "µs", 3.0, 2.0, "a proxy")])
+        assert reasons([Row(measurement, what, "µs", 3.0, 2.0, "a proxy", 2.0)]) == ""
+        assert reasons([Row(measurement, what, "µs", 1.0, 2.0, "a proxy")]) == ""
+
+
+def test_reasons_are_of_rows_that_are_measured() -> None:
+    """No reason is left over from a row that is called otherwise now."""
+    rows = rows_of(json.loads((RESULTS / "latest.json").read_text()))
+    for measurement, what in WHY:
+        assert any(row.measurement == measurement and row.what.startswith(what) for row in rows)
 
 
 def test_the_page_has_its_place_for_figures() -> None:
