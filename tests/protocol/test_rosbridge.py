@@ -148,6 +148,15 @@ def test_who_waits_for_an_answer_is_seen_in_what_is_malformed(text: str, wanted:
     assert rosbridge.unreadable_request(text.encode()) == wanted
 
 
+@pytest.mark.parametrize("args", [b"[" * 200 + b"]" * 200, b'"\xff"'])
+def test_who_waits_is_seen_beside_a_body_that_is_refused(args: bytes) -> None:
+    """Too deep, or no UTF-8: what stands around it can be read all the same."""
+    text = b'{"op":"call_service","id":"1","service":"/s","args":' + args + b"}"
+    with pytest.raises(MalformedMessage):
+        rosbridge.decode(text)
+    assert rosbridge.unreadable_request(text) == rosbridge.CallService(service="/s", id="1")
+
+
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
 def test_nobody_waits_for_an_answer_to_junk(data: bytes) -> None:
     """No bytes make the look fail."""
