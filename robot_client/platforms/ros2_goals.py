@@ -17,6 +17,9 @@ from robot_client.platforms.ros2_executor import Hop, Spinner
 from robot_client.platforms.ros2_types import Types, parse
 from robot_client.reactors import Clock, Timer
 
+STRAGGLERS = 0.05
+"""Seconds the result of a goal waits for feedback that it has overtaken."""
+
 LOOK = 0.02
 """Seconds between looks for an action whose client was just made."""
 
@@ -63,7 +66,7 @@ class Goals:
             raise Unavailable(f"{MAX_GOALS} goals are under way on this robot; wait until some end")
         client = self._clients.get((action, type))
         if client is None:
-            ros = ActionClient(self.node, kind, action)
+            ros = _PatientClient(self.node, kind, action)
             client = self._clients[action, type] = _Client(ros, action)
         goal = RosGoal(self, client, message, on_feedback)
         client.goals.add(goal)
@@ -121,6 +124,24 @@ class Goals:
                     goal.check(servers)
         if any(client.goals for client in self._clients.values()):
             self._watching = self.clock.callLater(WATCH, self._watch)
+
+
+class _PatientClient(ActionClient):  # type: ignore[misc]
+    """A client of an action that goes on telling of feedback when the result has come.
+
+    The two come by different ways, and an executor takes one of each in a turn: rclpy would drop the feedback that the
+    result has overtaken. Who uses it ends the telling by :meth:`hush`.
+    """
+
+    def _remove_pending_result_request(self, future: Any) -> None:
+        told = dict(self._feedback_callbacks)
+        super()._remove_pending_result_request(future)
+        for goal_id, tell in told.items():
+            self._feedback_callbacks.setdefault(goal_id, tell)
+
+    def hush(self, goal_id: bytes) -> None:
+        """Tell nothing more of a goal."""
+        self._feedback_callbacks.pop(goal_id, None)
 
 
 class _Client:
@@ -246,6 +267,8 @@ class RosGoal:
         return run
 
     def _forget(self) -> None:
+        if self._handle is not None:
+            self._client.ros.hush(bytes(self._handle.goal_id.uuid))
         for future in self._pending:
             if not future.done():
                 future.cancel()  # rclpy would keep it for ever
@@ -254,6 +277,7 @@ class RosGoal:
 
     def _answered(self, handle: Any) -> None:
         if self._state is _State.ENDED:
+            self._goals.spinner.do(self._client.ros.hush, bytes(handle.goal_id.uuid))
             if handle.accepted:  # given up, and taken after all: nobody would ever end it
                 self._goals.spinner.do(handle.cancel_goal_async)
         elif not handle.accepted:
@@ -270,7 +294,9 @@ class RosGoal:
     def _arrived(self, found: tuple[int, bytes]) -> None:
         status, body = found
         if status in _ENDS:
-            self._end(status, "", body)
+            # Feedback that was said before the result may come after it.
+            wait = STRAGGLERS if self._on_feedback is not None else 0.0
+            self._goals.clock.callLater(wait, self._end, status, "", body)
         else:
             self._end(ABORTED, f"the action {self._client.action} does not know the goal any more")
 
