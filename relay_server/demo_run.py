@@ -17,7 +17,7 @@ from relay_server import logs
 from relay_server.clock import looping
 from relay_server.config import Endpoint, Settings
 from relay_server.demo import ROBOTS, Fleet, Login, prepare
-from relay_server.run import monotonic_reactor, run
+from relay_server.run import leave, monotonic_reactor, run
 from relay_server.service import Relay
 
 ONLINE_SECONDS = 90.0
@@ -40,7 +40,7 @@ def run_demo(folder: Path, http: Endpoint, robots: Endpoint) -> int:
 
     def broken(failure: Failure) -> None:
         failed.append(failure.getErrorMessage())
-        reactor.stop()
+        leave(reactor)
 
     def ready(relay: Relay, _: str | None) -> None:
         _say(f"the relay listens at {relay.url}")

@@ -7,10 +7,11 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from twisted.internet.defer import Deferred, TimeoutError
-from twisted.internet.error import CannotListenError
+from twisted.internet.error import CannotListenError, ReactorNotRunning
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
@@ -19,6 +20,7 @@ from relay_server.config import Settings
 from relay_server.service import Relay
 
 STOP_SECONDS = 8.0
+_ENDING = (signal.SIGTERM, signal.SIGINT)
 log = Logger()
 
 
@@ -42,25 +44,36 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None], *, hangu
         await relay.start()
         ready(relay, await relay.first_login())
 
+    def end() -> None:
+        leave(reactor)
+
     def wrong(failure: Failure) -> None:
         sys.stderr.write(f"switchboard: {_sentence(failure)}\n")
         failed.append(_code_of(failure.value))
-        reactor.stop()
+        end()
 
     def unfinished(failure: Failure) -> None:
         timed_out = failure.check(TimeoutError)
         stuck.append(f"no answer within {STOP_SECONDS:g} s" if timed_out else failure.getErrorMessage())
 
     def stopping() -> Deferred[Any]:
+        # Until the process is gone: at its very end Python would let them kill it.
+        for number in _ENDING:
+            signal.signal(number, signal.SIG_IGN)
         done = Deferred.fromCoroutine(relay.stop()).addTimeout(STOP_SECONDS, reactor)
         return done.addErrback(unfinished)
 
     def start() -> None:
+        # In place of Twisted's, which log a traceback when a second one comes. A job in the background may have been
+        # started to ignore Ctrl-C.
+        for number in _ENDING:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, lambda *_: reactor.callFromThread(end))
         Deferred.fromCoroutine(begin()).addErrback(wrong)
 
     reactor.callWhenRunning(start)
     reactor.addSystemEventTrigger("before", "shutdown", stopping)
-    on_hangup = reactor.stop if hangup_ends else relay.reload_tls
+    on_hangup = end if hangup_ends else relay.reload_tls
     signal.signal(signal.SIGHUP, lambda *_: reactor.callFromThread(on_hangup))
     reactor.run()
     code = failed[0] if failed else 0
@@ -70,6 +83,12 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None], *, hangu
         sys.stdout.flush()
         os._exit(code)
     return code
+
+
+def leave(reactor: Any) -> None:
+    """Stop the reactor; once it stops, nothing more comes of this."""
+    with suppress(ReactorNotRunning):
+        reactor.stop()
 
 
 def _code_of(error: BaseException | None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sqlite3
 import time
 import urllib.error
@@ -9,7 +10,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from switchboard_harness import Relay
+from switchboard_harness import Relay, wait_for
 
 
 def test_sigterm_ends_a_relay_whose_database_is_locked(tmp_path: Path) -> None:
@@ -32,3 +33,19 @@ def test_sigterm_ends_a_relay_whose_database_is_locked(tmp_path: Path) -> None:
         assert time.monotonic() - begun < 10
     finally:
         locker.close()
+
+
+def test_further_signals_do_not_disturb_a_relay_that_ends(tmp_path: Path) -> None:
+    """SIGTERM and Ctrl-C, again and again until it is gone: it ends as by one, with nothing to say about them."""
+    relay = Relay(tmp_path)
+    assert relay.process is not None
+    process = relay.process
+
+    def gone() -> bool:
+        process.signal(signal.SIGTERM)
+        process.signal(signal.SIGINT)
+        return process.popen.poll() is not None
+
+    wait_for("the relay has ended", gone)
+    assert process.popen.returncode == 0
+    assert "Traceback" not in relay.log
