@@ -5,28 +5,21 @@ from __future__ import annotations
 import math
 
 from twisted.internet.defer import CancelledError, Deferred
-from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import CALL_SECONDS
 from robot_client.platforms.base import Platform
-from robot_client.wire import NotNow, Wire, arguments, check_room, to_cdr
+from robot_client.wire import NotNow, Part, Wire, arguments, check_room
 
 
-class Calls:
-    """The calls under way.
-
-    :param frame_limit: largest frame the relay takes, bytes
-    """
+class Calls(Part):
+    """The calls under way."""
 
     def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
-        self._wire = wire
-        self._platform = platform
-        self._limit = frame_limit
+        super().__init__(wire, platform, frame_limit)
         self._calls: dict[str, Deferred[None]] = {}
-        self._log = Logger("channel")
 
     def call(self, message: link.CallService) -> None:
         """Begin one; it is always answered.
@@ -51,7 +44,7 @@ class Calls:
             call.cancel()
 
     def _answer(self, message: link.CallService, body: bytes) -> None:
-        cdr = to_cdr(body, self._limit, f"the answer of {message.service}")
+        cdr = self._to_cdr(body, f"the answer of {message.service}")
         self._wire.say(link.ServiceResponse(id=message.id, result=True, cdr=cdr))
 
     def _failed(self, message: link.CallService, failure: Failure) -> None:

@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from robot_client.platforms.base import ABORTED, NEVER_BEGAN, Goal, Outcome, Platform
-from robot_client.wire import Wire, arguments, check_room, to_cdr
+from robot_client.wire import Part, Wire, arguments, check_room
 
 
-class Goals:
+class Goals(Part):
     """The goals under way; each ends in exactly one ``action_result``.
 
     While the link takes nothing, only the newest feedback of each goal is kept: it is the one kind of JSON message
     that comes as often as somebody else likes.
-
-    :param frame_limit: largest frame the relay takes, bytes
     """
 
     def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
-        self._wire = wire
-        self._platform = platform
-        self._limit = frame_limit
+        super().__init__(wire, platform, frame_limit)
         self._goals: dict[str, Goal] = {}
         self._paused = False
         self._held: dict[str, link.ActionFeedback] = {}
         self._closed = False
-        self._log = Logger("channel")
 
     def begin(self, message: link.SendActionGoal) -> None:
         """Pursue one.
@@ -82,7 +76,7 @@ class Goals:
         if id not in self._goals:
             return
         try:
-            message = link.ActionFeedback(id=id, cdr=to_cdr(body, self._limit, f"feedback of {action}"))
+            message = link.ActionFeedback(id=id, cdr=self._to_cdr(body, f"feedback of {action}"))
         except SwitchboardError as error:
             self._log.warn("feedback is left out: {reason}", reason=str(error))
             return
@@ -96,7 +90,7 @@ class Goals:
             self._say_end(message.id, outcome.status, None, outcome.reason)
             return
         try:
-            cdr = to_cdr(outcome.body, self._limit, f"the result of {message.action}")
+            cdr = self._to_cdr(outcome.body, f"the result of {message.action}")
         except SwitchboardError as error:
             self._say_end(message.id, outcome.status, None, str(error))
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from typing import NamedTuple
 
@@ -12,10 +13,51 @@ from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import MIB
 from robot_client.platforms.base import ABORTED, SUCCEEDED, Offer, Platform, ServedGoal
-from robot_client.wire import MAX_OPEN, NotNow, Wire, arguments, check_room, to_cdr
+from robot_client.wire import MAX_OPEN, NotNow, Part, Wire, arguments, check_room
 
 PENDING_BYTES = 32 * MIB
 """Requests that wait for a client's answer, all together."""
+
+
+class _Offers:
+    """What a channel offers of one kind, by name.
+
+    :param kind: what one of them is called
+    """
+
+    def __init__(self, kind: str, log: Logger) -> None:
+        self._kind = kind
+        self._log = log
+        self._open: dict[str, Offer] = {}
+
+    def begin(self, name: str, source: str, make: Callable[[], Offer]) -> str:
+        """Offer one more; its full type.
+
+        :param source: who offers it, may be empty
+        :raises SwitchboardError: it can't be offered
+        """
+        if name in self._open:
+            raise NotNow(f"this channel offers the {self._kind} {name} already")
+        check_room(self._open, f"{self._kind}s")
+        offer = self._open[name] = make()
+        self._log.info("{who} offers the {kind} {name}", who=source or "a client", kind=self._kind, name=name)
+        return offer.type
+
+    def type(self, name: str) -> str:
+        """Full type of one that is offered."""
+        return self._open[name].type
+
+    def end(self, name: str) -> None:
+        """Offer it no more, if it was."""
+        offer = self._open.pop(name, None)
+        if offer is not None:
+            offer.close()
+
+    def close(self) -> None:
+        """Offer nothing more."""
+        for offer in self._open.values():
+            offer.close()
+        self._open.clear()
 
 
 class _Asked(NamedTuple):
@@ -24,21 +66,15 @@ class _Asked(NamedTuple):
     size: int
 
 
-class OfferedServices:
-    """Services of this channel; ROS has no answer for a call that fails, so that is told to the log alone.
-
-    :param frame_limit: largest frame the relay takes, bytes
-    """
+class OfferedServices(Part):
+    """Services of this channel; ROS has no answer for a call that fails, so that is told to the log alone."""
 
     def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
-        self._wire = wire
-        self._platform = platform
-        self._limit = frame_limit
-        self._offers: dict[str, Offer] = {}
+        super().__init__(wire, platform, frame_limit)
+        self._offers = _Offers("service", self._log)
         self._calls: dict[str, _Asked] = {}
         self._size = 0
         self._ids = count(1)
-        self._log = Logger("channel")
 
     def advertise(self, message: link.AdvertiseService) -> None:
         """Offer one.
@@ -46,25 +82,18 @@ class OfferedServices:
         :raises SwitchboardError: it can't be offered
         """
         service = message.service
-        if service in self._offers:
-            raise NotNow(f"this channel offers the service {service} already")
-        check_room(self._offers, "services")
-        offer = self._platform.serve(
-            service, message.type, lambda body, answer: self._called(service, body, answer)
+        called = partial(self._called, service)
+        type = self._offers.begin(
+            service, message.source, lambda: self._platform.serve(service, message.type, called)
         )
-        self._offers[service] = offer
-        self._log.info("{who} offers the service {name}", who=message.source or "a client", name=service)
-        self._wire.say(link.AdvertisedService(service=service, type=offer.type))
+        self._wire.say(link.AdvertisedService(service=service, type=type))
 
     def withdraw(self, message: link.UnadvertiseService) -> None:
         """Offer it no more; its callers get no answer."""
-        offer = self._offers.pop(message.service, None)
-        if offer is None:
-            return
-        offer.close()
         for id, call in list(self._calls.items()):
             if call.service == message.service:
                 self._forget(id)
+        self._offers.end(message.service)
 
     def answer(self, message: link.ServiceResponse) -> None:
         """Pass a client's answer on; one that is too late is passed over."""
@@ -81,9 +110,7 @@ class OfferedServices:
 
     def close(self) -> None:
         """Offer nothing more."""
-        for offer in self._offers.values():
-            offer.close()
-        self._offers.clear()
+        self._offers.close()
         self._calls.clear()
         self._size = 0
 
@@ -92,14 +119,14 @@ class OfferedServices:
             self._unanswered(service, f"{len(self._calls)} calls wait for their answers already")
             return
         try:
-            cdr = to_cdr(body, self._limit, f"a request to {service}")
+            cdr = self._to_cdr(body, f"a request to {service}")
         except SwitchboardError as error:
             self._unanswered(service, str(error))
             return
         id = f"s{next(self._ids)}"
         self._calls[id] = _Asked(service, answer, len(body))
         self._size += len(body)
-        self._wire.say(link.CallService(id=id, service=service, type=self._offers[service].type, cdr=cdr))
+        self._wire.say(link.CallService(id=id, service=service, type=self._offers.type(service), cdr=cdr))
 
     def _forget(self, id: str) -> _Asked | None:
         call = self._calls.pop(id, None)
@@ -116,21 +143,15 @@ class _Pursued(NamedTuple):
     goal: ServedGoal
 
 
-class OfferedActions:
-    """Actions of this channel, and the goals the graph gave them.
-
-    :param frame_limit: largest frame the relay takes, bytes
-    """
+class OfferedActions(Part):
+    """Actions of this channel, and the goals the graph gave them."""
 
     def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
-        self._wire = wire
-        self._platform = platform
-        self._limit = frame_limit
-        self._offers: dict[str, Offer] = {}
+        super().__init__(wire, platform, frame_limit)
+        self._offers = _Offers("action", self._log)
         self._goals: dict[str, _Pursued] = {}
         self._ids: dict[ServedGoal, str] = {}
         self._next = count(1)
-        self._log = Logger("channel")
 
     def advertise(self, message: link.AdvertiseAction) -> None:
         """Offer one.
@@ -138,25 +159,18 @@ class OfferedActions:
         :raises SwitchboardError: it can't be offered
         """
         action = message.action
-        if action in self._offers:
-            raise NotNow(f"this channel offers the action {action} already")
-        check_room(self._offers, "actions")
-        offer = self._platform.act(
-            action, message.type, lambda body, goal: self._asked(action, body, goal), self._unwanted
+        asked = partial(self._asked, action)
+        type = self._offers.begin(
+            action, message.source, lambda: self._platform.act(action, message.type, asked, self._unwanted)
         )
-        self._offers[action] = offer
-        self._log.info("{who} offers the action {name}", who=message.source or "a client", name=action)
-        self._wire.say(link.AdvertisedAction(action=action, type=offer.type))
+        self._wire.say(link.AdvertisedAction(action=action, type=type))
 
     def withdraw(self, message: link.UnadvertiseAction) -> None:
         """Offer it no more; its goals are aborted."""
-        offer = self._offers.pop(message.action, None)
-        if offer is None:
-            return
         for id, pursued in list(self._goals.items()):
             if pursued.action == message.action:
                 self._forget(id)
-        offer.close()
+        self._offers.end(message.action)
 
     def feedback(self, message: link.ActionFeedback) -> None:
         """Publish how far a goal has come."""
@@ -189,14 +203,12 @@ class OfferedActions:
         """Offer nothing more; all goals are aborted."""
         self._goals.clear()
         self._ids.clear()
-        for offer in self._offers.values():
-            offer.close()
-        self._offers.clear()
+        self._offers.close()
 
     def _asked(self, action: str, body: bytes, goal: ServedGoal) -> None:
         try:
             check_room(self._goals, "goals")
-            cdr = to_cdr(body, self._limit, f"a goal for {action}")
+            cdr = self._to_cdr(body, f"a goal for {action}")
         except SwitchboardError as error:
             self._log.warn("a goal of {action} is aborted: {reason}", action=action, reason=str(error))
             goal.finish(ABORTED, None)
@@ -204,7 +216,7 @@ class OfferedActions:
         id = f"g{next(self._next)}"
         self._goals[id] = _Pursued(action, goal)
         self._ids[goal] = id
-        type = self._offers[action].type
+        type = self._offers.type(action)
         self._wire.say(link.SendActionGoal(id=id, action=action, type=type, feedback=True, cdr=cdr))
 
     def _unwanted(self, goal: ServedGoal) -> None:

@@ -1,12 +1,15 @@
-"""What the parts of a channel need of its link, and the bounds they share."""
+"""What the parts of a channel need of its link, and what they share."""
 
 from __future__ import annotations
 
 from collections.abc import Sized
 from typing import Protocol
 
+from twisted.logger import Logger
+
 from relay_protocol import link
 from relay_protocol.errors import Invalid, SwitchboardError
+from robot_client.platforms.base import Platform
 
 MAX_OPEN = 1000
 """Subscriptions, publications, calls, goals and offers of each kind on one channel."""
@@ -50,13 +53,24 @@ def arguments(cdr: str | None, what: str) -> bytes:
     return link.from_base64(cdr, "cdr")
 
 
-def to_cdr(body: bytes, frame_limit: int, what: str) -> str:
-    """Bytes for the ``cdr`` of a message.
+class Part:
+    """A part of a channel that takes CDR from the relay's messages to the platform, and back.
 
     :param frame_limit: largest frame the relay takes, bytes
-    :param what: what they are, for the error
-    :raises Invalid: the message would be larger than the relay takes, which costs the whole link
     """
-    if (len(body) + 2) // 3 * 4 + _AROUND > frame_limit:
-        raise Invalid(f"{what} has {len(body)} bytes, more than fit into one message to the relay")
-    return link.to_base64(body)
+
+    def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
+        self._wire = wire
+        self._platform = platform
+        self._limit = frame_limit
+        self._log = Logger("channel")
+
+    def _to_cdr(self, body: bytes, what: str) -> str:
+        """Bytes for the ``cdr`` of a message.
+
+        :param what: what they are, for the error
+        :raises Invalid: the message would be larger than the relay takes, which costs the whole link
+        """
+        if (len(body) + 2) // 3 * 4 + _AROUND > self._limit:
+            raise Invalid(f"{what} has {len(body)} bytes, more than fit into one message to the relay")
+        return link.to_base64(body)
