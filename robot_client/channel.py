@@ -142,15 +142,14 @@ class Channel:
     # --- requests ------------------------------------------------------------------------------------------
 
     def _subscribe(self, message: link.Subscribe) -> None:
-        known = self._listening.get(message.number)
+        number = message.number
+        known = self._listening.get(number)
         if known is not None:
-            self.uplink.open(message.number, message.throttle_ms / 1000, known.source.latched)
-            self._listening[message.number] = _Listening(known.source, message)
-            self._confirm(message.number)
+            self._listening[number] = known._replace(request=message)
+            self._confirm(number)
             self._sending.arm()
             return
         check_room(self._listening, "subscriptions")
-        number = message.number
         source = self._platform.subscribe(
             message.topic,
             message.type,
@@ -159,7 +158,6 @@ class Channel:
             lambda: self._confirm(number),
         )
         self._listening[number] = _Listening(source, message)
-        self.uplink.open(number, message.throttle_ms / 1000, source.latched)
         self._confirm(number)
 
     def _confirm(self, number: int) -> None:
