@@ -8,8 +8,9 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid
-from relay_server.cli.app import App, examples, group_of, json_option, pass_app, sure, yes_option
+from relay_server.cli.app import App, examples, json_option, pass_app, yes_option
 from relay_server.cli.output import show, tell
+from relay_server.cli.removing import remove_named
 
 
 @click.group()
@@ -47,14 +48,7 @@ def list_(app: App, as_json: bool) -> None:
 @pass_app
 def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
     """Remove group NAME with its rights; its members stay users."""
-    with app.reading() as session:
-        found = group_of(session, name)
-    sure(f"Remove group {found.name} with its rights?", yes)
-    with app.change() as change:
-        found = change.group(name)
-        queries.remove_group(change.session, found.id)
-        change.audit("group.remove", found.name)
-    tell(as_json, {"group": found.name, "removed": True}, f"Removed group {found.name}.")
+    remove_named(app, "group", name, yes, as_json)
 
 
 @group.command(epilog=examples("switchboard group join lab ann"))

@@ -13,9 +13,10 @@ from relay_db import queries
 from relay_protocol.errors import Unavailable
 from relay_protocol.limits import ENROLMENT_SECONDS
 from relay_server import passwords
-from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, sure, yes_option
+from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, yes_option
 from relay_server.cli.output import show, tell
 from relay_server.cli.relaysocket import ask_status
+from relay_server.cli.removing import remove_named
 from relay_server.cli.text import duration, moment
 
 _ROBOTS_PORT = 9091
@@ -80,14 +81,7 @@ def list_(app: App, as_json: bool) -> None:
 @pass_app
 def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
     """Remove robot NAME with its keys and all rights on it; its link is cut at once."""
-    with app.reading() as session:
-        found = robot_of(session, name)
-    sure(f"Remove robot {found.name} with its keys and all rights on it?", yes)
-    with app.change() as change:
-        found = change.robot(name)
-        queries.remove_robot(change.session, found.id)
-        change.audit("robot.remove", found.name)
-    tell(as_json, {"robot": found.name, "removed": True}, f"Removed robot {found.name}.")
+    remove_named(app, "robot", name, yes, as_json)
 
 
 @robot.command(

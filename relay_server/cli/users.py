@@ -9,8 +9,9 @@ import click
 from relay_db import queries
 from relay_db.names import normal_name
 from relay_protocol.errors import Invalid
-from relay_server.cli.app import App, examples, json_option, pass_app, sure, user_of, yes_option
+from relay_server.cli.app import App, examples, json_option, pass_app, user_of, yes_option
 from relay_server.cli.output import show, tell
+from relay_server.cli.removing import remove_named
 from relay_server.cli.secrets_in import new_password_hash, stdin_option
 
 
@@ -101,14 +102,7 @@ def enable(app: App, name: str, as_json: bool) -> None:
 @pass_app
 def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
     """Remove user NAME with its rights and tokens."""
-    with app.reading() as session:
-        found = user_of(session, name)
-    sure(f"Remove user {found.name} with all rights and tokens?", yes)
-    with app.change() as change:
-        found = change.user(name)
-        queries.remove_user(change.session, found.id)
-        change.audit("user.remove", found.name)
-    tell(as_json, {"user": found.name, "removed": True}, f"Removed user {found.name}.")
+    remove_named(app, "user", name, yes, as_json)
 
 
 def _set_disabled(app: App, name: str, disabled: bool, as_json: bool) -> None:
