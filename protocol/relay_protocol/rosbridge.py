@@ -13,7 +13,7 @@ import msgspec
 
 from relay_protocol import jsontext
 from relay_protocol.limits import JSON_DEPTH
-from relay_protocol.link import Message
+from relay_protocol.message import Body, Message
 from relay_protocol.qos import QoS
 
 Id = str | int | None
@@ -22,33 +22,35 @@ Id = str | int | None
 Bodies = list[msgspec.Raw] | dict[str, msgspec.Raw]
 
 
-class Advertise(Message, frozen=True, kw_only=True):
+class Op(Message, frozen=True, kw_only=True):
+    """Base of what a client may ask; the ``id`` comes back with answers."""
+
+    id: Id = None
+
+
+class Advertise(Op, frozen=True, kw_only=True):
     topic: str
     type: str
-    id: Id = None
     latch: bool = False
     queue_size: int = 100
     qos: QoS | None = None
 
 
-class Unadvertise(Message, frozen=True, kw_only=True):
+class Unadvertise(Op, frozen=True, kw_only=True):
     topic: str
-    id: Id = None
 
 
-class Publish(Message, frozen=True, kw_only=True):
+class Publish(Op, frozen=True, kw_only=True):
     topic: str
     msg: msgspec.Raw = msgspec.Raw(b"{}")
-    id: Id = None
     latch: bool = False
     queue_size: int = 100
     qos: QoS | None = None
     type: str = ""
 
 
-class Subscribe(Message, frozen=True, kw_only=True):
+class Subscribe(Op, frozen=True, kw_only=True):
     topic: str
-    id: Id = None
     type: str | None = None
     throttle_rate: float = 0
     queue_length: int = 0
@@ -57,83 +59,72 @@ class Subscribe(Message, frozen=True, kw_only=True):
     qos: QoS | None = None
 
 
-class Unsubscribe(Message, frozen=True, kw_only=True):
+class Unsubscribe(Op, frozen=True, kw_only=True):
     topic: str
-    id: Id = None
 
 
-class CallService(Message, frozen=True, kw_only=True):
+class CallService(Op, frozen=True, kw_only=True):
     service: str
-    id: Id = None
-    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    args: Body = msgspec.UNSET
     type: str = ""
     fragment_size: int | None = None
     compression: str = "none"
     timeout: float | None = None
 
 
-class ServiceResponse(Message, frozen=True, kw_only=True):
+class ServiceResponse(Op, frozen=True, kw_only=True):
     service: str
     result: bool = True
-    id: Id = None
-    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    values: Body = msgspec.UNSET
 
 
-class AdvertiseService(Message, frozen=True, kw_only=True):
+class AdvertiseService(Op, frozen=True, kw_only=True):
     service: str
     type: str
-    id: Id = None
 
 
-class UnadvertiseService(Message, frozen=True, kw_only=True):
+class UnadvertiseService(Op, frozen=True, kw_only=True):
     service: str
-    id: Id = None
 
 
-class AdvertiseAction(Message, frozen=True, kw_only=True):
+class AdvertiseAction(Op, frozen=True, kw_only=True):
     action: str
     type: str
-    id: Id = None
 
 
-class UnadvertiseAction(Message, frozen=True, kw_only=True):
+class UnadvertiseAction(Op, frozen=True, kw_only=True):
     action: str
-    id: Id = None
 
 
-class SendActionGoal(Message, frozen=True, kw_only=True):
+class SendActionGoal(Op, frozen=True, kw_only=True):
     """:param feedback: whether ``action_feedback`` is wanted"""
 
     action: str
     action_type: str = ""
-    id: Id = None
-    args: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    args: Body = msgspec.UNSET
     feedback: bool = False
     fragment_size: int | None = None
     compression: str = "none"
 
 
-class CancelActionGoal(Message, frozen=True, kw_only=True):
+class CancelActionGoal(Op, frozen=True, kw_only=True):
     action: str
-    id: Id = None
 
 
-class ActionFeedback(Message, frozen=True, kw_only=True):
+class ActionFeedback(Op, frozen=True, kw_only=True):
     """From a client that offers the action."""
 
     action: str
-    id: Id = None
-    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    values: Body = msgspec.UNSET
 
 
-class ActionResult(Message, frozen=True, kw_only=True):
+class ActionResult(Op, frozen=True, kw_only=True):
     """From a client that offers the action; ``status`` is of ``action_msgs/msg/GoalStatus``."""
 
     action: str
-    id: Id = None
     status: int | None = None
     result: bool = True
-    values: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    values: Body = msgspec.UNSET
 
 
 class Fragment(Message, frozen=True, kw_only=True):
@@ -145,12 +136,11 @@ class Fragment(Message, frozen=True, kw_only=True):
     total: int
 
 
-class SetLevel(Message, frozen=True, kw_only=True, tag="set_level"):
+class SetLevel(Op, frozen=True, kw_only=True):
     level: str
-    id: Id = None
 
 
-class Auth(Message, frozen=True, kw_only=True):
+class Auth(Op, frozen=True, kw_only=True):
     """rosauth's message; ``mac`` carries the access token, the rest is taken and not used."""
 
     mac: str
@@ -160,7 +150,6 @@ class Auth(Message, frozen=True, kw_only=True):
     t: Any = None
     level: Any = None
     end: Any = None
-    id: Id = None
 
 
 ClientOp = (

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROBOT_NEEDS = "frames identity jsontext limits link rights rosbridge errors"
+ROBOT_NEEDS = "frames identity jsontext limits link message rights rosbridge errors"
 PROTOCOL = Path(__file__).parents[2] / "protocol"
 
 

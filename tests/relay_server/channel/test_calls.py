@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from relay_protocol import link
@@ -210,7 +211,7 @@ def test_a_robot_of_json_is_called_with_json(world: World) -> None:
     person.says("call_service", service="/reset", args={"hard": True})
     (call,) = world.link.all(link.CallService)
     assert (call.cdr, bytes(call.args)) == (None, b'{"hard":true}')  # type: ignore[arg-type]
-    answer(world, cdr=None, values=link.msgspec.Raw(b'{"done": 1}'))
+    answer(world, cdr=None, values=msgspec.Raw(b'{"done": 1}'))
     assert person.hears("service_response")[0]["values"] == {"done": 1}
 
 

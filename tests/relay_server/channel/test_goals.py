@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from relay_protocol import link
@@ -267,7 +268,7 @@ def test_a_robot_of_json_gets_and_gives_json(world: World) -> None:
     send(person, feedback=True)
     (goal,) = world.link.all(link.SendActionGoal)
     assert (goal.cdr, bytes(goal.args)) == (None, b'{"order":3}')  # type: ignore[arg-type]
-    values = link.msgspec.Raw(b'{ "sequence": [1] }')
+    values = msgspec.Raw(b'{ "sequence": [1] }')
     world.channel.message(link.ActionFeedback(id=goal.id, values=values))
     world.channel.message(link.ActionResult(id=goal.id, status=4, result=True, values=values))
     assert [each["values"] for each in person.client.take()] == [{"sequence": [1]}] * 2

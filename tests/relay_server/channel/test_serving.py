@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import msgspec
 import pytest
 
 from relay_protocol import link
@@ -274,7 +275,7 @@ def test_a_robot_of_json_calls_with_json(world: World) -> None:
     """Arguments and values are written anew, not passed on unread."""
     person = offering(world, ("json",))
     for raw, result in ((b'{ "a": 1 }', True), (b"{nonsense", False)):
-        world.channel.message(link.CallService(id="a", service="/add", type=ADD, args=link.msgspec.Raw(raw)))
+        world.channel.message(link.CallService(id="a", service="/add", type=ADD, args=msgspec.Raw(raw)))
         for call in person.hears("call_service"):
             assert call["args"] == {"a": 1}
             person.says("service_response", service="add", id=call["id"], values={"sum": 5})

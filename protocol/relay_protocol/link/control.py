@@ -1,0 +1,133 @@
+"""The control link: what a robot tells of itself, and the relay's orders to open channels."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from relay_protocol import limits
+from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
+from relay_protocol.link.both_ways import Bye, Ping, Pong
+from relay_protocol.link.fields import Ends, Few, Label, Name, cut
+from relay_protocol.message import Message
+
+
+class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What the robot's own safety counts as motion, and its times. The robot is the authority on it.
+
+    :param types: message types whose topics are motion topics
+    :param topics: further topics by name
+    :param deadline_ms: a command older than this is dropped
+    :param stop_within_ms: the robot stands still this long after the last valid command
+    """
+
+    types: Few = msgspec.field(default_factory=list)
+    topics: Few = msgspec.field(default_factory=list)
+    deadline_ms: int = COMMAND_DEADLINE_MS
+    stop_within_ms: int = STOP_WITHIN_MS
+
+
+class Describe(Message, frozen=True, kw_only=True):
+    """Robot: facts about myself, whole; sent after ``welcome`` and whenever they change.
+
+    :param platform: ``ros2``, ``mqtt``, …
+    :param distro: ROS distribution, e.g. ``jazzy``
+    :param started: Unix time the daemon started, seconds
+    :param sim_time: the robot's time is what ``/clock`` says (``use_sim_time``)
+    :param extra: anything else worth showing, text by text
+    """
+
+    host: Label = ""
+    platform: Label = ""
+    distro: Label = ""
+    os: Label = ""
+    agent: Label = ""
+    started: float = 0.0
+    sim_time: bool = False
+    motion: MotionPolicy = msgspec.field(default_factory=MotionPolicy)
+    extra: Annotated[dict[Label, Label], Meta(max_length=limits.FACTS)] = msgspec.field(default_factory=dict)
+
+
+class Topic(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One topic of the graph: its types (usually one) and the full names of the nodes at its ends."""
+
+    types: Ends
+    publishers: Ends = msgspec.field(default_factory=list)
+    subscribers: Ends = msgspec.field(default_factory=list)
+
+
+class Service(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One service (or action) of the graph and the nodes that provide it."""
+
+    types: Ends
+    providers: Ends = msgspec.field(default_factory=list)
+
+
+class Graph(Message, frozen=True, kw_only=True):
+    """Robot: the ROS graph, or what has changed in it.
+
+    With ``full`` the maps are all there is. Otherwise each map holds the names that changed, with ``null``
+    for a name that is gone. Nodes are keys with an empty object. The daemon's own node is left out.
+    """
+
+    full: bool = False
+    topics: dict[Name, Topic | None] = msgspec.field(default_factory=dict)
+    services: dict[Name, Service | None] = msgspec.field(default_factory=dict)
+    actions: dict[Name, Service | None] = msgspec.field(default_factory=dict)
+    nodes: dict[Name, dict[str, Any] | None] = msgspec.field(default_factory=dict)
+
+
+class Health(Message, frozen=True, kw_only=True):
+    """Robot: how I am, every few seconds.
+
+    :param battery: charge, 0 to 1; ``None`` when unknown
+    :param cpu: load of the whole machine, 0 to 1
+    :param memory: memory in use, 0 to 1
+    :param rtt_ms: round trip to the relay as the robot measures it, milliseconds
+    :param stale_commands: motion commands dropped because they were too old, since start
+    :param unguarded_commands: motion commands dropped because the guard could not have stopped them, since start
+    :param watchdog_stops: times the watchdog sent zero because commands ceased, since start
+    :param dropped_samples: samples dropped because the uplink was full, since start
+    """
+
+    battery: float | None = None
+    cpu: float | None = None
+    memory: float | None = None
+    rtt_ms: float | None = None
+    stale_commands: int = 0
+    unguarded_commands: int = 0
+    watchdog_stops: int = 0
+    dropped_samples: int = 0
+
+
+class Alert(Message, frozen=True, kw_only=True):
+    """Robot: something a person should know. ``level`` is ``info``, ``warning`` or ``error``."""
+
+    level: Label
+    text: str
+
+    def __post_init__(self) -> None:
+        cut(self, "text")
+
+
+class OpenChannel(Message, frozen=True, kw_only=True):
+    """Relay: dial and ``join`` with this ticket.
+
+    :param address: ``host:port`` to dial; empty for the address of the control link
+    """
+
+    channel: str
+    ticket: str
+    address: str = ""
+
+
+class CloseChannel(Message, frozen=True, kw_only=True):
+    """Relay: nobody is left on this channel."""
+
+    channel: str
+
+
+RobotControl = Describe | Graph | Health | Alert | Ping | Pong | Bye
+RelayControl = OpenChannel | CloseChannel | Ping | Pong | Bye
