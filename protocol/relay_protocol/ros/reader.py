@@ -156,14 +156,7 @@ class ReaderFactory:
         return self._array(one, kind.length) if kind.shape is Shape.ARRAY else self._sequence(one, least)
 
     def _array(self, one: Read, length: int) -> Read:
-        def read(data: bytes, position: int) -> tuple[Any, int]:
-            values = []
-            for _ in range(length):
-                value, position = one(data, position)
-                values.append(value)
-            return values, position
-
-        return read
+        return lambda data, position: _several(one, length, data, position)
 
     def _sequence(self, one: Read, least: int) -> Read:
         u32 = self._u32
@@ -177,11 +170,7 @@ class ReaderFactory:
             self._room -= count
             if self._room < 0:
                 raise Invalid(f"its sequences hold more than {MAX_ELEMENTS} messages and strings")
-            values = []
-            for _ in range(count):
-                value, position = one(data, position)
-                values.append(value)
-            return values, position
+            return _several(one, count, data, position)
 
         return read
 
@@ -270,6 +259,14 @@ def group_numbers(fields: tuple[Field, ...]) -> list[Run | Field]:
             groups.append(field)
             run = Run([], [])
     return groups
+
+
+def _several(one: Read, count: int, data: bytes, position: int) -> tuple[list[Any], int]:
+    values = []
+    for _ in range(count):
+        value, position = one(data, position)
+        values.append(value)
+    return values, position
 
 
 def _read_empty(data: bytes, position: int) -> tuple[Any, int]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -130,7 +131,7 @@ def quoted(name: str) -> str:
     return repr(name)
 
 
-class Cursor:
+class Cursor(ABC):
     """How far generated code has got in a message, and the numbers that are taken in one go.
 
     CDR aligns to multiples of 2, 4 and 8 from the start of the body. Of the place in the body this knows the
@@ -172,6 +173,6 @@ class Cursor:
         self.codes, self.slots = [], []
         return found
 
+    @abstractmethod
     def jump(self, alignment: int) -> None:
         """Emit what aligns at run time."""
-        raise NotImplementedError
