@@ -19,8 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from switchboard_harness import running, wait_for
 from switchboard_load import status_of
+from switchboard_processes import running
+from switchboard_waiting import wait_for
 
 from bench import ROOT
 from bench.cpu import resident, seconds_of

@@ -16,7 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_harness import running, wait_for
+from switchboard_processes import running
+from switchboard_waiting import wait_for
 
 from bench import ROOT
 from bench.cpu import seconds_of

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from switchboard_harness import running
+from switchboard_processes import running
 
 from bench.cpu import measured
 from bench.messages import STRING, text_of

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from switchboard_harness import running
+from switchboard_processes import running
 
 from bench.cpu import measured
 from bench.messages import STRING, TWIST, text_of

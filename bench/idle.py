@@ -7,7 +7,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_harness import running
+from switchboard_processes import running
 
 from bench.cpu import resident
 from bench.native import Receivers

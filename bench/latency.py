@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from switchboard_harness import running
+from switchboard_processes import running
 from websockets.frames import Frame, Opcode
 
 from bench.haproxy import HAProxy, executable

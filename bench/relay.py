@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import switchboard_harness
+import switchboard_relay
 from click.testing import CliRunner
 
 from relay_server.cli import main
 
 
-class Relay(switchboard_harness.Relay):
+class Relay(switchboard_relay.Relay):
     """``switchboard serve`` on a data folder; admin commands run in this process."""
 
     def cli(self, *arguments: str, stdin: str = "") -> Any:

@@ -11,7 +11,9 @@ import threading
 from typing import Any
 
 from switchboard_domains import free_domain
-from switchboard_harness import BIN, ChaosProxy, Process, ros_environment, wait_for
+from switchboard_processes import BIN, Process, ros_environment
+from switchboard_proxy import ChaosProxy
+from switchboard_waiting import wait_for
 
 from bench import ROOT
 from bench.relay import Relay

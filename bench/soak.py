@@ -10,8 +10,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from switchboard_harness import Robot, running, wait_for
 from switchboard_load import Counter, Publisher, meter_of, status_of
+from switchboard_processes import running
+from switchboard_robot import Robot
+from switchboard_waiting import wait_for
 
 from bench.relay import Relay
 from bench.report import Options, Row

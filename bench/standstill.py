@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from switchboard_drive import LIMIT_MS, SIM_STEP_MS, Drive
-from switchboard_harness import Driver
+from switchboard_threads import Driver
 
 from bench.report import Options, Row
 

@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from switchboard_harness import running, wait_for
+from switchboard_processes import running
+from switchboard_waiting import wait_for
 
 from bench.cpu import measured
 from bench.native import Receivers

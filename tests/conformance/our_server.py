@@ -7,7 +7,9 @@ from pathlib import Path
 
 from conformance_suite import Server
 from switchboard_domains import free_domain
-from switchboard_harness import BIN, Process, Relay, ros_environment, wait_for
+from switchboard_processes import BIN, Process, ros_environment
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
 
 ROBOT = "conformance"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from link_relay import ENROLMENT_CODE
 from switchboard_domains import free_domain
-from switchboard_harness import BIN, Process, ros_environment
+from switchboard_processes import BIN, Process, ros_environment
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[1] / "docs" / "examples"

@@ -16,7 +16,10 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from robots_under_test import EXAMPLE, SENSOR
-from switchboard_harness import Client, Process, Relay, wait_for
+from switchboard_client import Client
+from switchboard_processes import Process
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
 from websockets.sync.client import connect
 
 NAME = "tin-man"

@@ -6,7 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
-from switchboard_harness import Client, Relay, Robot, wait_for
+from switchboard_client import Client
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_waiting import wait_for
 
 
 @dataclass

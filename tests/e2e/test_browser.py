@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
-from switchboard_harness import Relay, Robot, wait_for
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_waiting import wait_for
 
 import relay_server
 from robot_client.safety import REPEATS

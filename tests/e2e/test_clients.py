@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_harness import ros_environment
+from switchboard_processes import ros_environment
 
 CLIENTS = Path(__file__).parent / "clients"
 ROOT = Path(__file__).parents[2]

@@ -14,7 +14,7 @@ from typing import Any
 import cbor2
 import pytest
 from PIL import Image
-from switchboard_harness import Client
+from switchboard_client import Client
 
 from relay_protocol.ros_types import TypeRegistry
 

@@ -13,7 +13,9 @@ from typing import Any
 
 import psutil
 import pytest
-from switchboard_harness import Client, FakeRobot, wait_for
+from switchboard_client import Client
+from switchboard_fake_robot import FakeRobot
+from switchboard_waiting import wait_for
 from switchboard_watchers import Watcher, bystanders, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect

@@ -12,7 +12,10 @@ from typing import Any
 
 import psutil
 import pytest
-from switchboard_harness import Answer, Client, Relay, ask, wait_for
+from switchboard_client import Client
+from switchboard_http import Answer, ask
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

@@ -6,14 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import switchboard_harness
-from switchboard_harness import wait_for
+import switchboard_processes
+from switchboard_waiting import wait_for
 
-HARNESS = Path(switchboard_harness.__file__).parent
+HARNESS = Path(switchboard_processes.__file__).parent
 STARTER = """
 import sys
 from pathlib import Path
-from switchboard_harness import Process
+from switchboard_processes import Process
 child = "import time; print('READY', flush=True); time.sleep(600)"
 started = Process([sys.executable, "-c", child], Path(sys.argv[1]), "child")
 started.wait_to_say("READY")

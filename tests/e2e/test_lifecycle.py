@@ -18,7 +18,13 @@ import pgserver
 import psutil
 import psycopg
 import pytest
-from switchboard_harness import BIN, Client, Driver, Process, Relay, Robot, ask, running, wait_for
+from switchboard_client import Client
+from switchboard_http import ask
+from switchboard_processes import BIN, Process, running
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_threads import Driver
+from switchboard_waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from switchboard_harness import Client, wait_for
+from switchboard_client import Client
 from switchboard_load import STRING, Counter, Publisher, Stalled, meter_of, status_of
+from switchboard_waiting import wait_for
 
 from relay_protocol.limits import MIB
 

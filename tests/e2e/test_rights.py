@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 import pytest
-from switchboard_harness import wait_for
+from switchboard_waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 

@@ -11,7 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_harness import Client, Process, Relay, Robot, ros_environment, running, wait_for
+from switchboard_client import Client
+from switchboard_processes import Process, ros_environment, running
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_waiting import wait_for
 
 from relay_server.local.catalogue import SERVICES
 

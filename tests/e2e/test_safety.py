@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from switchboard_drive import Drive
-from switchboard_harness import wait_for
+from switchboard_waiting import wait_for
 
 
 @pytest.fixture(scope="module")

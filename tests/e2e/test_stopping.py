@@ -10,7 +10,8 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from switchboard_harness import Relay, wait_for
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
 
 
 def test_sigterm_ends_a_relay_whose_database_is_locked(tmp_path: Path) -> None:

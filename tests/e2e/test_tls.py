@@ -18,7 +18,13 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from switchboard_harness import BIN, Client, Driver, Relay, Robot, ask, wait_for
+from switchboard_client import Client
+from switchboard_http import ask
+from switchboard_processes import BIN
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_threads import Driver
+from switchboard_waiting import wait_for
 from websockets.sync.client import connect
 
 DAY = datetime.timedelta(days=1)

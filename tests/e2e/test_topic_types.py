@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_harness import Client, Process, ros_environment, wait_for
+from switchboard_client import Client
+from switchboard_processes import Process, ros_environment
+from switchboard_waiting import wait_for
 
 TALKING = Path(__file__).parent / "clients" / "talking.py"
 STRING, BOOL = "std_msgs/msg/String", "std_msgs/msg/Bool"

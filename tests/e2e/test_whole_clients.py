@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_harness import Process, ros_environment, wait_for
+from switchboard_processes import Process, ros_environment
+from switchboard_waiting import wait_for
 
 TESTS = Path(__file__).parents[1]
 CLIENTS = Path(__file__).parent / "clients"

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from switchboard_harness import ChaosProxy, Driver, Relay, Robot, wait_for
+from switchboard_proxy import ChaosProxy
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_threads import Driver
+from switchboard_waiting import wait_for
 
 LIMIT_MS = 500
 SIM_STEP_MS = 20

@@ -12,7 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from switchboard_harness import Client, Process, Relay, Robot, readable, ros_environment, wait_for
+from switchboard_client import Client
+from switchboard_processes import Process, ros_environment
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_waiting import readable, wait_for
 from websockets.frames import Frame, Opcode
 
 PUBLISHER = Path(__file__).parents[1] / "e2e" / "clients" / "load.py"

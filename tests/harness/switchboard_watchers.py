@@ -7,7 +7,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from switchboard_harness import Client, Relay, wait_for
+from switchboard_client import Client
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
 
 STAMP_GAP = 1.0
 """Seconds between two odometry stamps that a busy machine can explain; the simulator sends 20 a second or more."""

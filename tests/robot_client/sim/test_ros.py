@@ -28,7 +28,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
 from std_srvs.srv import Trigger
 from switchboard_domains import free_domain
-from switchboard_harness import mortal
+from switchboard_processes import mortal
 
 PATIENCE = 30.0
 """Seconds; only a failure takes that long."""

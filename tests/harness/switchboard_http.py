@@ -1,0 +1,58 @@
+"""Single HTTP requests to a relay."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import ssl
+from typing import Any
+
+
+class Answer:
+    """What came back for an HTTP request."""
+
+    def __init__(self, response: http.client.HTTPResponse) -> None:
+        self.status = response.status
+        self.headers = response.headers
+        self.body = response.read()
+
+    @property
+    def json(self) -> Any:
+        """The body, decoded."""
+        return json.loads(self.body)
+
+    @property
+    def cookie(self) -> str:
+        """The cookie it sets, as the next request sends it."""
+        return str(self.headers["Set-Cookie"]).partition(";")[0]
+
+
+def ask(
+    port: int,
+    method: str,
+    path: str,
+    body: Any = None,
+    *,
+    headers: dict[str, str] | None = None,
+    token: str = "",
+    tls: ssl.SSLContext | None = None,
+) -> Answer:
+    """One HTTP request on a connection of its own.
+
+    :param body: sent as JSON
+    :param token: an access token, sent as Bearer
+    """
+    sent = dict(headers or {})
+    if body is not None:
+        sent.setdefault("Content-Type", "application/json")
+    if token:
+        sent["Authorization"] = f"Bearer {token}"
+    if tls is None:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    else:
+        connection = http.client.HTTPSConnection("127.0.0.1", port, timeout=30, context=tls)
+    try:
+        connection.request(method, path, None if body is None else json.dumps(body), sent)
+        return Answer(connection.getresponse())
+    finally:
+        connection.close()

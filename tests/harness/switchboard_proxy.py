@@ -1,0 +1,86 @@
+"""A network that can be broken, between any two ends."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+
+
+class ChaosProxy:
+    """A TCP proxy on loopback that can swallow bytes in either direction, or reset everything.
+
+    :param target: port it leads to
+    """
+
+    def __init__(self, target: int) -> None:
+        self._target = target
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._server.getsockname()[1])
+        self._open: set[socket.socket] = set()
+        self._lock = threading.Lock()
+        self.forward_up = threading.Event()
+        self.forward_down = threading.Event()
+        self.forward_up.set()
+        self.forward_down.set()
+        self._closing = False
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def black_hole(self) -> None:
+        """Nothing passes any more; nobody is told. What arrives is kept, as a network's queues keep it."""
+        self.forward_up.clear()
+        self.forward_down.clear()
+
+    def heal(self) -> None:
+        """Everything passes again, late as it is."""
+        self.forward_up.set()
+        self.forward_down.set()
+
+    def reset(self) -> None:
+        """Cut all connections at once."""
+        with self._lock:
+            for each in list(self._open):
+                with contextlib.suppress(OSError):
+                    each.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """End."""
+        self._closing = True
+        self._server.close()
+        self.heal()
+        self.reset()
+
+    def _accept(self) -> None:
+        while not self._closing:
+            try:
+                near, _ = self._server.accept()
+                far = socket.create_connection(("127.0.0.1", self._target), timeout=5)
+            except OSError:
+                if self._closing:
+                    return
+                with contextlib.suppress(OSError, UnboundLocalError):
+                    near.close()
+                continue
+            far.settimeout(None)
+            for each in (near, far):
+                each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with self._lock:
+                self._open |= {near, far}
+            threading.Thread(target=self._pump, args=(near, far, self.forward_up), daemon=True).start()
+            threading.Thread(target=self._pump, args=(far, near, self.forward_down), daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket, gate: threading.Event) -> None:
+        try:
+            while data := source.recv(65536):
+                gate.wait()
+                sink.sendall(data)
+        except OSError:
+            pass
+        finally:
+            gate.wait()
+            with self._lock:
+                self._open -= {source}
+            for each in (source, sink):
+                with contextlib.suppress(OSError):
+                    each.shutdown(socket.SHUT_RDWR)
+            source.close()

@@ -1,0 +1,120 @@
+"""A real relay on loopback, on ports from the OS, and the admin command line beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from switchboard_client import Client
+from switchboard_processes import BIN, Process
+from websockets.sync.client import connect
+
+
+class Relay:
+    """``switchboard serve`` on a data folder, and the admin command line beside it."""
+
+    def __init__(self, folder: Path, *options: str, database: str | None = None) -> None:
+        self.folder = folder
+        self.data = folder / "relay-data"
+        self._options = options
+        self._database = database
+        self.http_port = 0
+        self.robots_port = 0
+        self.process: Process | None = None
+        self.start()
+
+    @property
+    def _environment(self) -> dict[str, str]:
+        extra = {"SWITCHBOARD_DB": self._database} if self._database else {}
+        return {**os.environ, **extra}
+
+    def start(self) -> None:
+        """Start, on the ports it had before if it ran before."""
+        command = [str(BIN / "switchboard"), "serve", "--data", str(self.data), *self._options]
+        command += ["--http", f"127.0.0.1:{self.http_port}", "--robots", f"127.0.0.1:{self.robots_port}"]
+        self.process = Process(command, self.folder, "relay", self._environment)
+        ready = self.process.wait_to_say("READY")
+        words = dict(word.split("=") for word in ready.split()[1:])
+        self.http_port, self.robots_port = int(words["http"]), int(words["robots"])
+
+    def cli(self, *arguments: str, stdin: str = "") -> Any:
+        """Run an admin command with --json; returns what it prints, decoded."""
+        done = self.run_cli(*arguments, "--json", stdin=stdin)
+        assert done.returncode == 0, f"{arguments}: {done.stderr}"
+        return json.loads(done.stdout) if done.stdout.strip() else None
+
+    def run_cli(self, *arguments: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
+        """Run an admin command as it is."""
+        return subprocess.run(
+            [str(BIN / "switchboard"), "--data", str(self.data), *arguments],
+            input=stdin,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env=self._environment,
+            check=False,
+        )
+
+    def user(self, name: str, password: str = "correct horse", *, admin: bool = False) -> str:
+        """Add a user and return an access token."""
+        self.cli(
+            "user", "add", name, "--password-stdin", *(["--admin"] if admin else []), stdin=password + "\n"
+        )
+        return self.token(name)
+
+    def token(self, user: str, ttl: str = "1h") -> str:
+        """An access token of a user."""
+        return str(self.cli("token", "create", user, "--ttl", ttl)["token"])
+
+    def state_of(self, robot: str) -> str:
+        """``online``, ``in_use`` or ``offline``."""
+        for each in self.cli("status")["robots"]:
+            if each["name"] == robot:
+                return str(each["state"])
+        return "offline"
+
+    def url(self, robot: str) -> str:
+        """The websocket of a robot."""
+        return f"ws://127.0.0.1:{self.http_port}/robots/{robot}"
+
+    def connect(self, robot: str, token: str, **options: Any) -> Client:
+        """A websocket client with a Bearer token."""
+        headers = {"Authorization": f"Bearer {token}"}
+        # Who has stopped reading doesn't see the answer to its close behind what it has not read.
+        options.setdefault("close_timeout", 1)
+        return Client(connect(self.url(robot), additional_headers=headers, **options))
+
+    def connect_by(self, port: int, robot: str, token: str) -> Client:
+        """The same by way of a proxy."""
+        headers = {"Authorization": f"Bearer {token}"}
+        return Client(connect(f"ws://127.0.0.1:{port}/robots/{robot}", additional_headers=headers))
+
+    def freeze(self) -> None:
+        """SIGSTOP."""
+        assert self.process is not None
+        self.process.signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """SIGCONT."""
+        assert self.process is not None
+        self.process.signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        """kill -9."""
+        assert self.process is not None
+        self.process.kill()
+
+    def stop(self) -> int:
+        """SIGTERM; the exit code."""
+        assert self.process is not None
+        return self.process.stop()
+
+    @property
+    def log(self) -> str:
+        """All it has logged."""
+        assert self.process is not None
+        return self.process.log.read_text()

@@ -1,0 +1,92 @@
+"""A simulated robot with its daemon, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from typing import Any
+
+from switchboard_domains import free_domain
+from switchboard_processes import BIN, Process, ros_environment
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
+
+
+class Robot:
+    """A simulated robot in a ROS domain of its own, with its daemon, enrolled at a relay.
+
+    :param port: where the daemon dials; a proxy's port, or the relay's
+    """
+
+    def __init__(
+        self,
+        relay: Relay,
+        name: str,
+        *,
+        port: int | None = None,
+        camera: bool = False,
+        daemon_env: dict[str, str] | None = None,
+        enroll_options: tuple[str, ...] = (),
+    ) -> None:
+        self.relay = relay
+        self.name = name
+        self.domain = free_domain()
+        self.folder = relay.folder / name
+        self.record_file = self.folder / "record.jsonl"
+        self.state = self.folder / "state"
+        self._daemon_env = daemon_env or {}
+        self.folder.mkdir(parents=True)
+        command = [str(BIN / "switchboard-sim"), "--record", str(self.record_file), "--seed", "1"]
+        command += ["--camera" if camera else "--no-camera"]
+        self.sim = Process(command, self.folder, "sim", ros_environment(self.domain))
+        code = relay.cli("robot", "add", name)["enrolment_code"]
+        self.enroll(code, port or relay.robots_port, *enroll_options).check_returncode()
+        self.sim.wait_to_say("READY")
+        self.daemon = self._daemon()
+        self.wait_online()
+
+    def enroll(self, code: str, port: int, *options: str) -> subprocess.CompletedProcess[str]:
+        """``switchboard-robot enroll``; options such as ``--tls``, ``--ca`` FILE."""
+        command = [
+            str(BIN / "switchboard-robot"),
+            "enroll",
+            "--relay",
+            f"127.0.0.1:{port}",
+            "--robot",
+            self.name,
+        ]
+        command += ["--code", "-", "--state", str(self.state), *options]
+        return subprocess.run(command, input=code, capture_output=True, text=True, timeout=60, check=False)
+
+    def _daemon(self) -> Process:
+        command = [str(BIN / "switchboard-robot"), "run", "--state", str(self.state)]
+        return Process(command, self.folder, "daemon", {**ros_environment(self.domain), **self._daemon_env})
+
+    def start_daemon(self) -> None:
+        """Start the daemon again after it was killed."""
+        self.daemon = self._daemon()
+
+    def wait_online(self, seconds: float = 30.0) -> None:
+        """Until the relay sees it."""
+        wait_for(f"{self.name} is online", lambda: self.relay.state_of(self.name) != "offline", seconds)
+
+    def record(self) -> list[dict[str, Any]]:
+        """What the simulated body was told and did: dicts with ``t`` (monotonic ns) and ``event``."""
+        if not self.record_file.exists():
+            return []
+        lines = self.record_file.read_text().splitlines()
+        return [json.loads(line) for line in lines if line.endswith("}")]
+
+    def events(self, kind: str, since: int = 0) -> list[dict[str, Any]]:
+        """Events of one kind after a moment."""
+        return [each for each in self.record() if each["event"] == kind and each["t"] >= since]
+
+    def moving(self) -> bool:
+        """Whether it moves, by its own record."""
+        changes = [each["event"] for each in self.record() if each["event"] in ("moving", "standstill")]
+        return bool(changes) and changes[-1] == "moving"
+
+    def stop(self) -> None:
+        """End daemon and simulator."""
+        self.daemon.stop()
+        self.sim.stop()
