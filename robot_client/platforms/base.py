@@ -17,6 +17,7 @@ from relay_protocol import link
 from robot_client.topics import TypedTopic
 
 OnSample = Callable[[bytes], None]
+OnChange = Callable[[], None]
 OnCall = Callable[[bytes, Callable[[bytes], None]], None]
 """Takes a request and what its answer is to be given to, which raises :class:`Invalid` for bytes that are none."""
 
@@ -161,12 +162,7 @@ class Platform(Protocol):
         """What there is now."""
 
     def subscribe(
-        self,
-        topic: str,
-        type: str,
-        qos: link.QoS | None,
-        on_sample: OnSample,
-        on_change: Callable[[], None],
+        self, topic: str, type: str, qos: link.QoS | None, on_sample: OnSample, on_change: OnChange
     ) -> Source:
         """Listen to a topic, present or not yet.
 

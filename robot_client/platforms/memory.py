@@ -17,6 +17,7 @@ from robot_client.platforms.base import (
     Motion,
     OnCall,
     OnCancel,
+    OnChange,
     OnGoal,
     OnSample,
     Outcome,
@@ -44,7 +45,7 @@ class MemorySource:
         self.latched = False
         self.publishers = 1
         self.on_sample = on_sample
-        self.on_change: Callable[[], None] = lambda: None
+        self.on_change: OnChange = lambda: None
         self._platform = platform
 
     def close(self) -> None:
@@ -236,12 +237,7 @@ class MemoryPlatform(Platform):
         self._after.append(call)
 
     def subscribe(
-        self,
-        topic: str,
-        type: str,
-        qos: link.QoS | None,
-        on_sample: OnSample,
-        on_change: Callable[[], None],
+        self, topic: str, type: str, qos: link.QoS | None, on_sample: OnSample, on_change: OnChange
     ) -> MemorySource:
         """Listen to what is emitted."""
         if not type:

@@ -23,7 +23,7 @@ LINGER = 0.5
 """Seconds in which the aborts of an action's goals can reach those who wait, before the action goes."""
 
 
-class _Server(ActionServer):  # type: ignore[misc]
+class _Server(ActionServer):  # type: ignore[misc]  # rclpy is untyped
     """An action server whose goals are executed elsewhere.
 
     rclpy executes a goal by a callback that ends when the goal does; one that waits would hold the executor up. Here
@@ -69,15 +69,15 @@ class RosServedGoal:
 class RosAction:
     """One action.
 
-    :param kind: class of the action type
-    :param type: its full name
+    :param spinner: of the node it is on
+    :param type: full name of its type
+    :param kind: class of its type
     """
 
     def __init__(
         self,
-        node: Any,
-        hop: Hop,
         spinner: Spinner,
+        hop: Hop,
         clock: Clock,
         name: str,
         type: str,
@@ -100,7 +100,7 @@ class RosAction:
         self.closed = False
         self._server = _Server(
             self._accepted,
-            node,
+            spinner.node,
             kind,
             name,
             lambda handle: kind.Result(),

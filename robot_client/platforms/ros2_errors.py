@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from relay_protocol.errors import Invalid, SwitchboardError
 
 _PLACE = re.compile(r", at \.{0,2}/")
 
@@ -14,3 +18,18 @@ def in_words(error: BaseException) -> str:
     if place is not None:
         text = text[: place.start()]
     return text.strip() or type(error).__name__
+
+
+@contextmanager
+def refusals(what: str) -> Iterator[None]:
+    """Say what ROS 2 has against something.
+
+    :param what: what is tried
+    :raises Invalid: it was refused
+    """
+    try:
+        yield
+    except SwitchboardError:
+        raise
+    except Exception as error:
+        raise Invalid(f"ROS 2 refuses {what}: {in_words(error)}") from None

@@ -13,7 +13,7 @@ from typing import Any
 
 from twisted.internet.interfaces import IReadDescriptor
 from twisted.logger import Logger
-from zope.interface import implementer  # type: ignore[import-untyped]
+from zope.interface import implementer  # type: ignore[import-untyped]  # zope has no types
 
 from relay_protocol.limits import MIB
 
@@ -57,6 +57,7 @@ class Spinner:
     def __init__(
         self, executor: Any, node: Any, timer_clock: Any, clock: Callable[[], float] = time.monotonic
     ) -> None:
+        self.node = node
         self._executor = executor
         self._clock = clock
         self._stopping = False

@@ -44,13 +44,11 @@ _ENDS = frozenset((SUCCEEDED, CANCELED, ABORTED))
 class Goals:
     """All goals of one node.
 
-    :param place: gives the node and what turns its executor, when they are needed
+    :param place: gives the node, by what turns its executor, when it is needed
     :param clock: timers and seconds
     """
 
-    def __init__(
-        self, place: Callable[[], tuple[Any, Spinner]], hop: Hop, types: Types, clock: Clock
-    ) -> None:
+    def __init__(self, place: Callable[[], Spinner], hop: Hop, types: Types, clock: Clock) -> None:
         self.hop = hop
         self._place = place
         self.clock = clock
@@ -66,7 +64,7 @@ class Goals:
             raise Unavailable(f"{MAX_GOALS} goals are under way on this robot; wait until some end")
         client = self._clients.get((action, type))
         if client is None:
-            ros = _PatientClient(self.node, kind, action)
+            ros = _PatientClient(self.spinner.node, kind, action)
             client = self._clients[action, type] = _Client(ros, action)
         goal = RosGoal(self, client, message, on_feedback)
         client.goals.add(goal)
@@ -76,14 +74,9 @@ class Goals:
         return goal
 
     @property
-    def node(self) -> Any:
-        """The node they are on."""
-        return self._place()[0]
-
-    @property
     def spinner(self) -> Spinner:
-        """What turns its executor."""
-        return self._place()[1]
+        """The node they are on, and what turns its executor."""
+        return self._place()
 
     def sweep(self) -> None:
         """Destroy the clients nobody used for a while."""
@@ -112,7 +105,7 @@ class Goals:
         """Who serves an action, by identities that a server that was started anew does not share."""
         return frozenset(
             bytes(bytearray(each.endpoint_gid))
-            for each in self.node.get_publishers_info_by_topic(action + _STATUS)
+            for each in self.spinner.node.get_publishers_info_by_topic(action + _STATUS)
         )
 
     def _watch(self) -> None:
@@ -126,7 +119,7 @@ class Goals:
             self._watching = self.clock.callLater(WATCH, self._watch)
 
 
-class _PatientClient(ActionClient):  # type: ignore[misc]
+class _PatientClient(ActionClient):  # type: ignore[misc]  # rclpy is untyped
     """A client of an action that goes on telling of feedback when the result has come.
 
     The two come by different ways, and an executor takes one of each in a turn: rclpy would drop the feedback that the

@@ -30,7 +30,7 @@ def read(node: Any, own: tuple[str, ...]) -> GraphView:
     services: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     nodes = set()
     for name, namespace in node.get_node_names_and_namespaces():
-        full = f"{namespace.rstrip('/')}/{name}"
+        full = full_name(name, namespace)
         if full.startswith(own) or name == _UNKNOWN:
             continue
         if not hidden(full):
@@ -101,7 +101,7 @@ def provider(node: Any, service: str, own: tuple[str, ...]) -> str | None:
         if name in own:
             continue
         if service in _served(node, name, namespace):
-            return f"{namespace.rstrip('/')}/{name}"
+            return full_name(name, namespace)
     return None
 
 
@@ -110,6 +110,11 @@ def _served(node: Any, name: str, namespace: str) -> set[str]:
         return {each for each, _ in node.get_service_names_and_types_by_node(name, namespace)}
     except Exception:  # the node left between two questions
         return set()
+
+
+def full_name(name: str, namespace: str) -> str:
+    """Name of a node with its namespace."""
+    return f"{namespace.rstrip('/')}/{name}"
 
 
 def hidden(name: str) -> bool:

@@ -28,15 +28,15 @@ class RosService:
     turning at full speed. So ours returns at once, and ``send_response`` of this service keeps the header instead
     of sending; executors of all releases find both on the service itself.
 
-    :param kind: class of the service type
-    :param type: its full name
+    :param spinner: of the node it is on
+    :param type: full name of its type
+    :param kind: class of its type
     """
 
     def __init__(
         self,
-        node: Any,
-        hop: Hop,
         spinner: Spinner,
+        hop: Hop,
         name: str,
         type: str,
         kind: Any,
@@ -45,15 +45,14 @@ class RosService:
     ) -> None:
         self.name = name
         self.type = type
-        self._node = node
-        self._hop = hop
         self._spinner = spinner
+        self._hop = hop
         self._kind = kind
         self._on_call: OnCall | None = on_call
         self._on_close = on_close
         self._made = threading.Lock()
         with self._made:
-            self._service = node.create_service(kind, name, self._called)
+            self._service = spinner.node.create_service(kind, name, self._called)
             self._send = self._service.send_response
             self._service.send_response = self._responded
 
@@ -62,7 +61,7 @@ class RosService:
         if self._on_call is None:
             return
         self._on_call = None
-        self._spinner.do(self._node.destroy_service, self._service)
+        self._spinner.do(self._spinner.node.destroy_service, self._service)
         self._on_close(self)
 
     # --- in the executor's thread

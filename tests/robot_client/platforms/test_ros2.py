@@ -391,7 +391,7 @@ async def test_battery_is_found(ros: Ros2Platform, peer: Peer) -> None:
 
 def test_malformed_battery_sample_is_no_charge(ros: Ros2Platform, monkeypatch: pytest.MonkeyPatch) -> None:
     """A battery message that is none is passed over."""
-    monkeypatch.setattr(ros, "_battery_sample", b"\0\1\0\0\xff")
+    monkeypatch.setattr(ros._battery, "_sample", b"\0\1\0\0\xff")
     assert ros.battery() is None
 
 
@@ -449,7 +449,7 @@ async def test_stuck_executor_is_noticed(ros: Ros2Platform, monkeypatch: pytest.
     """An executor that serves no callbacks is told in words; one that does is no trouble."""
     await task.deferLater(reactor, 1.2)
     assert ros.trouble() is None
-    monkeypatch.setattr(ros._spinner, "_clock", lambda: time.monotonic() + 60)
+    monkeypatch.setattr(ros._nodes.main, "_clock", lambda: time.monotonic() + 60)
     assert "served nothing" in str(ros.trouble())
 
 

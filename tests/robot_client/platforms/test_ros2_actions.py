@@ -151,7 +151,7 @@ async def test_withdrawn_action_aborts_its_goals(ros: Ros2Platform, peer: Peer) 
     await until(lambda: peer.do("send", action, 2) or pursued())
     assert peer.told("result", action)[1]["status"] == SUCCEEDED
     again.offer.close()
-    node, _ = ros._for_actions()
+    node = ros._nodes.for_actions().node
     served = ros._node.get_service_names_and_types_by_node
     await until(lambda: not [name for name, _ in served(node.get_name(), "/") if name.startswith(action)])
 
@@ -163,7 +163,7 @@ async def test_open_goals_cost_nothing(ros: Ros2Platform, peer: Peer) -> None:
     peer.do("send", "/idle", 1)
     await until(lambda: client.goals)
     await task.deferLater(reactor, 0.2)
-    _, spinner = ros._for_actions()
+    spinner = ros._nodes.for_actions()
     assert not spinner._work
     assert not getattr(spinner._executor, "_tasks", [])
     client.offer.close()
@@ -179,7 +179,7 @@ async def test_an_events_executor_has_nothing_that_ends_the_process_when_it_goes
     goal = ros.pursue("/nobody", FIBONACCI, bytes(serialize_message(Fibonacci.Goal())), None)
     sink = ros.advertise("/said", "std_msgs/msg/String", False, None)
     source = ros.subscribe("/said", "std_msgs/msg/String", None, lambda body: None, lambda: None)
-    if ros._kind == "events":
+    if ros._nodes.kind == "events":
         assert set(ros._node.waitables) == before
         assert [name for name in ros.graph().nodes if "switchboard_test" in name] == []
         with pytest.raises(Invalid, match="somebody at the relay offers"):

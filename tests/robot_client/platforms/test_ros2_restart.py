@@ -54,7 +54,7 @@ def mortal(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 
 @pytest.fixture
 def node(mortal: dict[str, str], ros: Ros2Platform) -> Iterator[Node]:
-    made = Node(mortal, ros._kind)
+    made = Node(mortal, ros._nodes.kind)
     yield made
     made.peer.close()
 

@@ -79,7 +79,7 @@ async def test_waiting_for_an_answer_costs_nothing(ros: Ros2Platform, peer: Peer
     peer.do("call", "/idle_sum", 1, 1)
     await until(lambda: client.calls)
     turns = 0
-    once = ros._spinner._executor.spin_once
+    once = ros._nodes.main._executor.spin_once
 
     class Counted:
         """An executor whose turns are counted."""
@@ -92,9 +92,9 @@ async def test_waiting_for_an_answer_costs_nothing(ros: Ros2Platform, peer: Peer
         def __getattr__(self, name: str) -> Any:
             return getattr(executor, name)
 
-    executor, ros._spinner._executor = ros._spinner._executor, Counted()
+    executor, ros._nodes.main._executor = ros._nodes.main._executor, Counted()
     await task.deferLater(reactor, 0.5)
-    ros._spinner._executor = executor
+    ros._nodes.main._executor = executor
     assert turns < 200
     offer.close()
 

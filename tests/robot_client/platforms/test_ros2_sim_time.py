@@ -48,15 +48,15 @@ async def test_stamps_follow_the_simulation(ros: Ros2Platform, peer: Peer) -> No
 @pytest_twisted.ensureDeferred
 async def test_paused_simulation_is_no_stuck_executor(ros: Ros2Platform) -> None:
     """The executor's sign of life goes by the machine's clock: it comes while the simulation stands still."""
-    served = ros._spinner._served
-    await until(lambda: ros._spinner._served > served)
+    served = ros._nodes.main._served
+    await until(lambda: ros._nodes.main._served > served)
     assert ros.trouble() is None
 
 
 @pytest_twisted.ensureDeferred
 async def test_paused_simulation_keeps_no_robot_moving(ros: Ros2Platform, peer: Peer) -> None:
     """While the simulation stands still commands still grow old, and a robot whose driver fell silent is stopped."""
-    topic = f"/cmd_{ros._kind}"
+    topic = f"/cmd_{ros._nodes.kind}"
     peer.do("clock", 5.0)
     peer.do("listen", topic, "twist")
     desk = MotionDesk(MotionPolicy(types=[TWIST]), ros, reactor, now_ns, NoGuard())
