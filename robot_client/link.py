@@ -8,6 +8,7 @@ What may be said when is a table in each class; everything else breaks the contr
 from __future__ import annotations
 
 import enum
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, get_args
 
@@ -115,7 +116,7 @@ Handler = Callable[[Any, Any], "list[Event]"]
 Table = dict[tuple[State, type], Handler]
 
 
-class Link:
+class Link(ABC):
     """What all links share: frames, pings, silence.
 
     :param clock: own monotonic clock, nanoseconds
@@ -135,9 +136,9 @@ class Link:
         """What :meth:`take` gives."""
         self._heard = clock()
 
+    @abstractmethod
     def begin(self) -> None:
         """The connection stands; say the first word."""
-        raise NotImplementedError
 
     def say(self, message: link.Message) -> None:
         """Queue one message."""

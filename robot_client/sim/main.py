@@ -47,7 +47,7 @@ def main(namespace: str, record: Path | None, seed: int | None, world: str, came
     Prints READY when its topics are there. SIGINT and SIGTERM end it.
     """
     try:
-        import rclpy  # noqa: F401
+        import rclpy  # noqa: F401  # only to see that it is there
     except ImportError as error:
         raise click.ClickException(
             f"there is no ROS 2 for this Python ({error}): "
