@@ -66,14 +66,14 @@ async def _ask(session: Session, node: str, service: str, request: Any, seconds:
     :raises NotFound: the node is not there, or has no such service
     """
     name = f"{node}/{service}"
-    with session.counted():
+    with session.share.counted():
         session.judge(Operation.CALL, name)
         found = view(session).services.get(name)
         if found is None or not found.types:
             raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
-    session.asks_robot()
+    session.share.asks_robot()
     answer = await session.channel.call(name, found.types[0], jsontext.encode(request), seconds)
-    with session.counted():
+    with session.share.counted():
         return jsontext.decode_any(answer)
 
 

@@ -60,8 +60,8 @@ async def message_details(session: Session, args: Any) -> Any:
     type_name = _type(args, "msg")
     try:
         types = await _known(session, type_name)
-        await session.own_turn()
-        with session.counted():
+        await session.share.own_turn()
+        with session.share.counted():
             return {"typedefs": types.typedefs(type_name)}
     except NotFound:
         return {"typedefs": []}
@@ -70,8 +70,8 @@ async def message_details(session: Session, args: Any) -> Any:
 async def _part_details(session: Session, args: Any, kind: str, part: str) -> Any:
     type_name = _type(args, kind)
     types = await _known(session, type_name)
-    await session.own_turn()
-    with session.counted():
+    await session.share.own_turn()
+    with session.share.counted():
         return {"typedefs": types.typedefs(f"{type_name}_{part}")}
 
 
@@ -106,8 +106,8 @@ async def topics_and_raw_types(session: Session, args: Any) -> Any:
     types = [next(iter(topic.types), "") for topic in found.values()]
     with _surveys.take(session.allowance):
         texts = await _texts(session, types)
-    await session.own_turn()
-    with session.counted():
+    await session.share.own_turn()
+    with session.share.counted():
         return {"topics": list(found), "types": types, "typedefs_full_text": _given(types, texts)}
 
 
@@ -150,10 +150,10 @@ async def interfaces(session: Session, args: Any) -> Any:
     """``/rosapi/interfaces``: all types the robot has; of a robot that does not tell them, those in its graph."""
     if "cdr" in session.robot.encodings:
         told: Iterable[str] = await session.channel.interfaces()
-        await session.own_turn()
+        await session.share.own_turn()
     else:
         told = _in_graph(view(session))
-    with session.counted():
+    with session.share.counted():
         return {"interfaces": sorted({*told, *catalogue.TYPE_NAMES})}
 
 

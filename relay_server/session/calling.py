@@ -16,7 +16,8 @@ from relay_server.forms import asked
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
-    from relay_server.session.core import LocalNode, Session
+    from relay_server.session.core import Session
+    from relay_server.session.ends import LocalNode
 
 CALLS = 256
 CALL_BYTES = 2 * MIB
@@ -64,7 +65,7 @@ class Calling:
         local = self._local.service(service)
         if local is None:
             self._session.judge(Operation.CALL, service)
-            self._session.asks_robot()
+            self._session.share.asks_robot()
             answer: Awaitable[bytes] = self._session.channel.call(
                 service, normal_type(ask.type, "srv"), raw, ask.timeout
             )
@@ -90,7 +91,7 @@ class Calling:
 
     async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
         answer = await local(self._session, args)
-        with self._session.counted():
+        with self._session.share.counted():
             return jsontext.encode(answer)
 
     async def _finish(self, ask: rosbridge.CallService, answer: Awaitable[bytes]) -> None:

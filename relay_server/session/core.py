@@ -6,23 +6,19 @@ Bytes come in as whole websocket messages and go out as frames; every message is
 from __future__ import annotations
 
 import itertools
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable
 
 from twisted.logger import Logger
 
-from relay_protocol import jsontext, rosbridge
+from relay_protocol import rosbridge
 from relay_protocol.errors import MalformedMessage, PeerError, Refused, SwitchboardError
 from relay_protocol.limits import KIB
-from relay_protocol.rights import Level, Operation
+from relay_protocol.rights import Operation
 from relay_server import closing
 from relay_server.access import Permit
 from relay_server.bucket import TokenBucket
-from relay_server.budget import DEBT, Allowance
+from relay_server.budget import Allowance
 from relay_server.channel import Channel
-from relay_server.channel.goal import Status
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Sample
 from relay_server.clock import Clock
@@ -30,19 +26,19 @@ from relay_server.forms import PLAIN, TOO_COSTLY, Form, frames
 from relay_server.freshness import Freshness
 from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
-from relay_server.rounds import Round, Rounds
+from relay_server.rounds import Rounds
 from relay_server.session.calling import Calling
+from relay_server.session.ends import ClientTransport, LocalNode, Timing
 from relay_server.session.incoming import Incoming
 from relay_server.session.listening import Listening
+from relay_server.session.operations import CHANGES_A_SECOND, CHANGES_AT_ONCE, answer_failed, perform
+from relay_server.session.pinging import Pinging
 from relay_server.session.providing import Providing
 from relay_server.session.publishing import Publishing
 from relay_server.session.pursuing import Pursuing
+from relay_server.session.share import Share
 
 LEVELS = {"info": 0, "warning": 1, "error": 2, "none": 3}
-CHANGES_A_SECOND = 50.0
-CHANGES_AT_ONCE = 1000.0
-"""Subscriptions, advertisements, offers and their ends one client may ask for; messages and calls are not counted."""
-
 LINES_A_SECOND = 1.0
 LINES_AT_ONCE = 20.0
 """Lines of the log one client's refusals may cause."""
@@ -50,48 +46,10 @@ LINES_AT_ONCE = 20.0
 SMALL = 4 * KIB
 """Shorter messages take little time to read. That of publishing them is not counted."""
 
-REFUSAL = 5e-6
-"""Seconds it takes to refuse something."""
-
-ROUND_TRIP = 150e-6
-"""Seconds it takes to send a question to a robot and to hand on the answer, beside what is timed."""
-
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
 
 _numbers = itertools.count(1)
-
-
-class ClientTransport(Protocol):
-    """The websocket under a session."""
-
-    def send(self, frames: bytes) -> None:
-        """One or more whole websocket frames, see :mod:`relay_server.wsframe`."""
-
-    def ping(self, payload: bytes) -> None:
-        """A websocket ping."""
-
-    def close(self, code: int, reason: str) -> None:
-        """Close with a code of :mod:`relay_server.closing`."""
-
-
-class LocalNode(Protocol):
-    """The relay's own services and topics in every robot's graph (``/relay/…``, ``/rosapi/…``)."""
-
-    def service(self, name: str) -> Callable[[Session, Any], Awaitable[Any]] | None:
-        """The handler of a service the relay itself offers."""
-
-    def topic(self, name: str) -> Callable[[Session], dict[str, Any]] | None:
-        """What makes the messages of a topic the relay itself publishes."""
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Times of a session, seconds; see :class:`relay_server.config.Settings`."""
-
-    client_ping: float
-    driving_ping: float
-    stall_limit: float
 
 
 class Session:
@@ -103,6 +61,12 @@ class Session:
     """
 
     log = Logger()
+    incoming: Incoming
+    listening: Listening
+    publishing: Publishing
+    calling: Calling
+    pursuing: Pursuing
+    providing: Providing
 
     def __init__(
         self,
@@ -131,20 +95,18 @@ class Session:
         self.refusals = 0
         self.plain_instead = 0
         self.queued_bytes = 0
-        self._counting = False
-        self._clock = clock
+        self.share = Share(self)
         self._transport = transport
         self._freshness = freshness
-        self._timing = timing
         self._ended = ended
         self._level = LEVELS["none"]
-        self._changes = TokenBucket(CHANGES_A_SECOND, CHANGES_AT_ONCE, clock.seconds)
+        self.changes = TokenBucket(CHANGES_A_SECOND, CHANGES_AT_ONCE, clock.seconds)
         self._noise = TokenBucket(LINES_A_SECOND, LINES_AT_ONCE, clock.seconds)
         self._malformed = 0
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
         self._rounds = rounds
-        self._pinging: Round | None = None
+        self._pinging = Pinging(self, clock, transport, freshness, timing)
         self.incoming = Incoming(clock, lambda: freshness.not_before, self._joined, self._given_up)
         self.listening = Listening(self, clock, local, rounds)
         self.publishing = Publishing(self, freshness)
@@ -177,8 +139,7 @@ class Session:
     def start(self) -> None:
         """Begin: take a place on the channel, start pinging."""
         self.channel.attach(self)
-        self._pinging = Round(self._ping, self._ping_interval())
-        self._rounds.start(self._pinging)
+        self._pinging.start(self._rounds)
         self.log.info(
             "client {number}: {user} from {address} works with {robot}",
             number=self.number,
@@ -193,8 +154,7 @@ class Session:
             return
         self._closed = True
         self.outbox.close()
-        if self._pinging is not None:
-            self._pinging.stop()
+        self._pinging.end()
         self.incoming.end()
         self.listening.end()
         self.calling.end()
@@ -231,9 +191,10 @@ class Session:
             with self._freshness.as_of(since):
                 self.message(data, joined=joined)
             return
-        if len(data) > SMALL and not self._counting:
+        if len(data) > SMALL and not self.share.counting:
             # Even to read it takes time.
-            self._count(self.message, data, joined=joined)
+            with self.share.timed():
+                self.message(data, joined=joined)
             return
         try:
             operation = rosbridge.decode(data)
@@ -246,28 +207,22 @@ class Session:
             if type(operation) is rosbridge.Publish:
                 # Nearly all that clients send: not counted, not a change, no table to look into.
                 self._malformed = 0
-                if self._counting:
-                    self._check_budget()
+                if self.share.counting:
+                    self.share.check()
                 self.publishing.publish(operation)
                 return
             if not isinstance(operation, rosbridge.Fragment):
                 # What it is a part of has yet to show.
                 self._malformed = 0
-            handler = _HANDLERS.get(type(operation))
-            if handler is None:
-                raise Refused(f"'{operation.__struct_config__.tag}' is not carried to robots by this relay")
-            if type(operation) in _CHANGES and not self._changes.take():
-                raise Refused(f"too many changes at once; at most {CHANGES_A_SECOND:g} a second are followed")
-            if type(operation) in _REFUSED_WHEN_BUSY:
-                self._check_budget()
-            self._count(handler, self, operation)
+            perform(self, operation)
         except SwitchboardError as error:
             self.refuse(operation, error)
-            self._spent(REFUSAL)
+            self.share.refused()
 
     def _no_rosbridge(self, error: PeerError, data: bytes) -> None:
         self._malformed += 1
-        self._spent(0.0 if self._counting else REFUSAL)
+        if not self.share.counting:
+            self.share.refused()
         if self._malformed == 1 and self._noise.take():
             self.log.info(
                 "client {number} sent what is not rosbridge: {reason}", number=self.number, reason=str(error)
@@ -275,68 +230,11 @@ class Session:
         request = rosbridge.unreadable_request(data)
         self.tell("error", str(error), None if request is None else request.id)
         if request is not None:
-            self._fail(request, error)
+            answer_failed(self, request, error)
         if self._malformed >= MALFORMED:
             self.close(
                 closing.TOO_MANY_ERRORS,
                 f"{MALFORMED} messages in a row were not rosbridge: {error}"[:120],
-            )
-
-    # --- its share of the processor -----------------------------------------------------------------------
-
-    def _check_budget(self) -> None:
-        """:raises Refused: the user has used up his share of the processor"""
-        if self.allowance.requests.left <= 0:
-            raise Refused(
-                "too much at once: your share of the relay's processor is used up; try again in a moment"
-            )
-
-    def _count(self, work: Callable[..., None], *args: Any, **more: Any) -> None:
-        """Do some work on the user's account. What is done within it is counted along."""
-        with self._counted():
-            work(*args, **more)
-
-    @contextmanager
-    def counted(self) -> Iterator[None]:
-        """Around work for the client that is done later than its message is handled.
-
-        :raises Refused: the user has used up his share of the processor
-        """
-        self._check_budget()
-        with self._counted():
-            yield
-
-    async def own_turn(self) -> None:
-        """Wait for a turn of the reactor in which nobody else's answer is made, unless the message is still handled.
-
-        Many may wait for the same word of a robot; it must not take all of their work at once.
-        """
-        if not self._counting:
-            await self.channel.line.turn()
-
-    def asks_robot(self) -> None:
-        """A question goes to the robot: what its way there and back takes is counted."""
-        self._spent(ROUND_TRIP)
-
-    @contextmanager
-    def _counted(self) -> Iterator[None]:
-        if self._counting:
-            yield
-            return
-        self._counting = True
-        began = self.allowance.worked()
-        try:
-            yield
-        finally:
-            self._counting = False
-            self._spent(self.allowance.worked() - began)
-
-    def _spent(self, work: float) -> None:
-        requests = self.allowance.requests
-        requests.spend(work)
-        if requests.left < -DEBT:
-            self.close(
-                closing.TOO_MANY_ERRORS, "far too much at once: more than the relay can do beside its work"
             )
 
     def pong(self, payload: bytes) -> None:
@@ -404,14 +302,7 @@ class Session:
                 "client {number}: {what} refused: {reason}", number=self.number, what=what, reason=str(error)
             )
         self.tell("error", str(error), operation.id)
-        self._fail(operation, error)
-
-    def _fail(self, operation: rosbridge.ClientOp, error: Exception) -> None:
-        """Answer what has to be answered; nobody may wait in vain."""
-        if isinstance(operation, rosbridge.CallService):
-            self.calling.answer(operation, False, jsontext.encode(str(error)))
-        elif isinstance(operation, rosbridge.SendActionGoal):
-            self.pursuing.answer(operation, Status.NEVER_BEGAN, False, jsontext.encode(str(error)))
+        answer_failed(self, operation, error)
 
     def judge(self, operation: Operation, resource: str) -> None:
         """:raises Refused: the client may not do this to that resource of the robot, with the reason"""
@@ -421,33 +312,17 @@ class Session:
 
     # --- the rest -----------------------------------------------------------------------------------------
 
-    def _set_level(self, ask: rosbridge.SetLevel) -> None:
+    def set_level(self, ask: rosbridge.SetLevel) -> None:
+        """From now on the client is told of this and what is worse.
+
+        :raises Refused: there is no such level
+        """
         if ask.level not in LEVELS:
             raise Refused(f"level '{ask.level[:20]}' is none of {', '.join(LEVELS)}")
         self._level = LEVELS[ask.level]
 
-    def _auth(self, ask: rosbridge.Auth) -> None:
-        """Authenticated already; rosauth clients send it on every connection."""
-
     def _given_up(self, reason: str, id: rosbridge.Id) -> None:
         self.tell("error", reason, id)
-
-    def _ping_interval(self) -> float:
-        only_watches = all(
-            grant.level is Level.VIEWER and not grant.allow for grant in self.permit.rules.grants
-        )
-        return self._timing.client_ping if only_watches else self._timing.driving_ping
-
-    def _ping(self) -> None:
-        silent = self._freshness.silence() / 1e9
-        if silent > max(self._timing.client_ping * 3, self._timing.stall_limit):
-            self.close(closing.TOO_SLOW, f"no answer to pings for {silent:.0f} s")
-            return
-        paused = self.outbox.paused_since
-        if paused is not None and self._clock.seconds() - paused > self._timing.stall_limit:
-            self.close(closing.TOO_SLOW, f"nothing was taken for {self._timing.stall_limit:g} s")
-            return
-        self._transport.ping(self._freshness.ping())
 
     def _overflow(self) -> None:
         self.close(closing.TOO_SLOW, "replies pile up; read faster")
@@ -457,52 +332,8 @@ class Session:
         self.calling.rights_changed()
         self.pursuing.rights_changed()
         self.channel.forget_denied(self, self.permit)
-        if self._pinging is not None:
-            self._pinging.interval = self._ping_interval()
+        self._pinging.rights_changed()
 
     def _revoked(self, reason: str) -> None:
         code = closing.FORBIDDEN if "right" in reason else closing.UNAUTHENTICATED
         self.close(code, reason)
-
-
-_REFUSED_WHEN_BUSY = {
-    rosbridge.Subscribe,
-    rosbridge.Advertise,
-    rosbridge.AdvertiseService,
-    rosbridge.AdvertiseAction,
-    rosbridge.CallService,
-    rosbridge.SendActionGoal,
-}
-"""What asks for work. What takes back, cancels or answers is always done."""
-
-_CHANGES = {
-    rosbridge.Subscribe,
-    rosbridge.Unsubscribe,
-    rosbridge.Advertise,
-    rosbridge.Unadvertise,
-    rosbridge.AdvertiseService,
-    rosbridge.UnadvertiseService,
-    rosbridge.AdvertiseAction,
-    rosbridge.UnadvertiseAction,
-    rosbridge.SetLevel,
-}
-
-_HANDLERS: dict[type, Callable[[Session, Any], None]] = {
-    rosbridge.Subscribe: lambda session, ask: session.listening.subscribe(ask),
-    rosbridge.Unsubscribe: lambda session, ask: session.listening.unsubscribe(ask),
-    rosbridge.Advertise: lambda session, ask: session.publishing.advertise(ask),
-    rosbridge.Unadvertise: lambda session, ask: session.publishing.unadvertise(ask),
-    rosbridge.CallService: lambda session, ask: session.calling.call(ask),
-    rosbridge.AdvertiseService: lambda session, ask: session.providing.advertise_service(ask),
-    rosbridge.UnadvertiseService: lambda session, ask: session.providing.unadvertise_service(ask),
-    rosbridge.ServiceResponse: lambda session, ask: session.providing.service_response(ask),
-    rosbridge.AdvertiseAction: lambda session, ask: session.providing.advertise_action(ask),
-    rosbridge.UnadvertiseAction: lambda session, ask: session.providing.unadvertise_action(ask),
-    rosbridge.ActionFeedback: lambda session, ask: session.providing.action_feedback(ask),
-    rosbridge.ActionResult: lambda session, ask: session.providing.action_result(ask),
-    rosbridge.SendActionGoal: lambda session, ask: session.pursuing.send_goal(ask),
-    rosbridge.CancelActionGoal: lambda session, ask: session.pursuing.cancel(ask),
-    rosbridge.Fragment: lambda session, part: session.incoming.take(part),
-    rosbridge.SetLevel: Session._set_level,
-    rosbridge.Auth: Session._auth,
-}

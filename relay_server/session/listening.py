@@ -18,7 +18,8 @@ from relay_server.rounds import Round, Rounds
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
-    from relay_server.session.core import LocalNode, Session
+    from relay_server.session.core import Session
+    from relay_server.session.ends import LocalNode
 
 SUBSCRIPTIONS = 1024
 """Topics one connection may have subscribed."""

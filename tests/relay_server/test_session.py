@@ -12,7 +12,7 @@ from relay_protocol.errors import Invalid
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server import closing
 from relay_server.channel import subscriptions
-from relay_server.session import calling, listening, normal_type
+from relay_server.session import calling, listening, normal_type, operations
 from relay_server.session import core as module
 from tests.relay_server.memory import STRING, TEXTS, TWIST, Person, World, text
 
@@ -70,6 +70,24 @@ def test_a_call_that_makes_no_sense_is_answered(world: World, wrong: dict[str, A
     assert (reply["op"], reply["id"], reply["result"]) == ("service_response", "x", False)
     assert reply["service"] == ("" if "service" in wrong else "/reset")
     assert f"$.{next(iter(wrong))}" in reply["values"]
+
+
+@pytest.mark.parametrize(
+    ("op", "name", "answer"),
+    [("call_service", "service", "service_response"), ("send_action_goal", "action", "action_result")],
+)
+def test_what_a_request_lacks_is_told(world: World, op: str, name: str, answer: str) -> None:
+    """By a status; with an id, which somebody waits for, by an answer too."""
+    person = world.person()
+    person.says("set_level", level="error")
+    person.says(op)
+    (status,) = person.client.take()
+    assert (status["op"], status["level"]) == ("status", "error")
+    assert f"missing required field `{name}`" in status["msg"]
+    person.says(op, id="x")
+    told, reply = person.client.take()
+    assert (told["op"], told["id"], told["msg"]) == ("status", "x", status["msg"])
+    assert (reply["op"], reply["id"], reply["result"], reply["values"]) == (answer, "x", False, told["msg"])
 
 
 def test_calls_that_make_no_sense_are_counted(world: World) -> None:
@@ -403,7 +421,7 @@ def test_changes_faster_than_any_program_needs_are_refused(world: World) -> None
     """A loop of subscribe and unsubscribe does not reach the robot; a second later changes are followed again."""
     person = world.person()
     person.says("set_level", level="error")
-    for _ in range(int(module.CHANGES_AT_ONCE)):
+    for _ in range(int(operations.CHANGES_AT_ONCE)):
         person.says("subscribe", topic="/chatter", type=STRING)
         person.says("unsubscribe", topic="/chatter")
     assert "too many changes at once" in told(person)[0]

@@ -30,7 +30,7 @@ def driving(world: World) -> Person:
 
 def drive(person: Person, **more: Any) -> None:
     """A fresh command."""
-    person.session._ping()
+    person.session._pinging.ping()
     person.answers_pings()
     person.says("publish", topic="/cmd_vel", msg=STOP, **more)
 

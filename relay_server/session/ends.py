@@ -1,0 +1,42 @@
+"""What a session works with: the websocket under it, the relay's own node, and its times."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from relay_server.session.core import Session
+
+
+class ClientTransport(Protocol):
+    """The websocket under a session."""
+
+    def send(self, frames: bytes) -> None:
+        """One or more whole websocket frames, see :mod:`relay_server.wsframe`."""
+
+    def ping(self, payload: bytes) -> None:
+        """A websocket ping."""
+
+    def close(self, code: int, reason: str) -> None:
+        """Close with a code of :mod:`relay_server.closing`."""
+
+
+class LocalNode(Protocol):
+    """The relay's own services and topics in every robot's graph (``/relay/…``, ``/rosapi/…``)."""
+
+    def service(self, name: str) -> Callable[[Session, Any], Awaitable[Any]] | None:
+        """The handler of a service the relay itself offers."""
+
+    def topic(self, name: str) -> Callable[[Session], dict[str, Any]] | None:
+        """What makes the messages of a topic the relay itself publishes."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of a session, seconds; see :class:`relay_server.config.Settings`."""
+
+    client_ping: float
+    driving_ping: float
+    stall_limit: float
