@@ -114,6 +114,15 @@ def test_bad_message(told: Client, what: str) -> None:
     told.lives()
 
 
+@case("any op", ERRORS, suite=NO_STATUS)
+@pytest.mark.parametrize(("op", "missing"), [("call_service", "service"), ("send_action_goal", "action")])
+def test_request_without_name(told: Client, op: str, missing: str) -> None:
+    """A call or goal with neither name nor id, which no answer could be known by, is told of what it lacks."""
+    told.send(op, args={})
+    assert missing in told.until("status", level="error")["msg"]
+    told.lives()
+
+
 @case("any op", ERRORS)
 def test_bad_messages_live(client: Client) -> None:
     """What is no rosbridge harms nobody, also without set_level."""
