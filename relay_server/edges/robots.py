@@ -25,6 +25,7 @@ from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, e
 from relay_server.clock import Clock, Timer, cancel, looping
 from relay_server.edges.caps import AddressCap, Place
 from relay_server.edges.fastpath import Turns, Writer, writer_for
+from relay_server.edges.flow import Flow
 from relay_server.outbox import Outbox
 
 PINGS = 256
@@ -104,7 +105,7 @@ class RobotConnection(TwistedProtocol):
         harden(self.transport)
         self._writer = writer_for(self.transport, Turns(self._clock))
         self._outbox.write = self._writer.write
-        self.transport.registerProducer(_Flow(self._outbox), True)
+        self.transport.registerProducer(Flow(self._outbox), True)
         if not self._cap.enter(self.address):
             self.refuse(link.Refused(reason="too many connections from your address", retry_after=10.0))
             return
@@ -317,22 +318,6 @@ class RobotConnection(TwistedProtocol):
         self.log.warn("the robot at {address} takes nothing; it is cut", address=self.address)
         self._end("the robot takes nothing")
         self.transport.abortConnection()
-
-
-class _Flow:
-    """Twisted's push producer interface in front of an outbox."""
-
-    def __init__(self, outbox: Outbox) -> None:
-        self._outbox = outbox
-
-    def pauseProducing(self) -> None:
-        self._outbox.pause()
-
-    def resumeProducing(self) -> None:
-        self._outbox.resume()
-
-    def stopProducing(self) -> None:
-        self._outbox.close()
 
 
 def _nowhere(data: bytes) -> None:

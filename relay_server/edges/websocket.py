@@ -1,14 +1,14 @@
 """The edge towards clients: one websocket is one client on one robot (``/robots/<robot>``).
 
-Autobahn speaks RFC 6455; this module proves who is there and hands whole messages to a session. A client proves
-itself in the handshake (Bearer header, ``bearer.`` subprotocol, ticket, or cookie with a listed Origin) or by a
-rosbridge ``auth`` as its first message.
+This module finds out who is there and hands whole messages to a session. A client proves itself in the handshake
+(Bearer header, ``bearer.`` subprotocol, ticket, or cookie with a listed Origin) or by a rosbridge ``auth`` as its first
+message.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 from urllib.parse import unquote
 
 from autobahn.twisted.websocket import WebSocketServerFactory
@@ -19,82 +19,27 @@ from twisted.internet.protocol import connectionDone
 from twisted.logger import Logger
 
 from relay_protocol import limits, rosbridge
-from relay_protocol.errors import NotFound, PeerError, SwitchboardError, Unavailable
+from relay_protocol.errors import PeerError, SwitchboardError, Unavailable
 from relay_server import closing, wsframe
-from relay_server.access import Principal
-from relay_server.auth import BadCredentials
 from relay_server.clock import Clock, Timer, cancel
+from relay_server.edges.bounded import BoundedProtocol
 from relay_server.edges.caps import AddressCap, Place
-from relay_server.edges.fastpath import FastProtocol, Turns, Writer, writer_for
+from relay_server.edges.fastpath import Turns
+from relay_server.edges.gate import HANDSHAKE_STATUS, Gate, code_of, identify
 from relay_server.frontdesk import Admission
-from relay_server.session import ClientTransport, Session
+from relay_server.session import Session
 
 T = TypeVar("T")
-
-HANDSHAKE_STATUS = {
-    closing.UNAUTHENTICATED: 401,
-    closing.NOT_FOUND: 403,
-    closing.UNAVAILABLE: 503,
-    closing.GOING_AWAY: 503,
-}
-HANDSHAKE_ATTRIBUTES = (
-    "http_headers",
-    "http_request_data",
-    "http_request_host",
-    "http_request_params",
-    "http_request_path",
-    "http_request_uri",
-    "http_response_data",
-    "http_status_line",
-)
-"""What Autobahn has read and answered; a websocket that is open needs none of it."""
 
 EARLY_OVERHEAD = 64
 """What a message before the proof counts for beside its bytes; empty ones take memory too."""
 
-PIECES = 16_384
-"""Frames of one message, and chunks they came in: also the empty ones take memory."""
 
-LEAVING_SECONDS = 2.0
-"""What was sent before the end has so long to go out; a client that takes nothing would stay for ever."""
-
-REASON_BYTES = 123
-"""Room for words in a close frame (RFC 6455 section 5.5.1)."""
-
-
-class Gate(Protocol):
-    """Who may come in; the composition root's."""
-
-    accepting: bool
-
-    async def bearer(self, token: str) -> Principal:
-        """The principal of an access token."""
-
-    async def ticket(self, ticket: str, robot: str) -> Principal:
-        """The principal of a single-use ticket."""
-
-    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
-        """The principal of a session cookie, ``None`` when there is no such cookie."""
-
-    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
-        """Find out whether the principal has any right on the robot.
-
-        :raises NotFound: it has none, or there is no such robot
-        """
-
-    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> Session:
-        """Begin a session that was admitted."""
-
-    def turn_away(self, admission: Admission) -> None:
-        """Somebody who was admitted left before a session began."""
-
-
-class ClientProtocol(FastProtocol):
+class ClientProtocol(BoundedProtocol):
     """One client's websocket."""
 
     log = Logger()
     factory: ClientFactory
-    _writer: Writer
 
     def __init__(self) -> None:
         super().__init__()
@@ -106,28 +51,21 @@ class ClientProtocol(FastProtocol):
         self._early: list[bytes] = []
         self._early_bytes = 0
         self._deadline: Timer | None = None
-        self._leaving: Timer | None = None
         self._place: Place | None = None
         self._asking = False
         self._open = False
         self._opened_ns = 0
         self._begun_ns = 0
-        self._full = False
-        self._unanswered: bytes | None = None
 
     # --- handshake ----------------------------------------------------------------------------------------
 
     def connectionMade(self) -> None:
         """The site has handed over a connection that asked to become a websocket."""
-        self._writer = writer_for(self.transport, self.factory.turns)
         super().connectionMade()
-        self._take_at_most(limits.UNPROVEN_BYTES)
+        self.take_at_most(limits.UNPROVEN_BYTES)
         self._place = self.factory.cap.stranger()
         # One for handshake and auth together; a session ends it.
         self._deadline = self.factory.clock.callLater(limits.UNPROVEN_SECONDS, self._nobody)
-
-    def _take_at_most(self, size: int) -> None:
-        self.maxFramePayloadSize = self.maxMessagePayloadSize = size
 
     def dataReceived(self, data: bytes) -> None:
         """Bytes. Who asked to come in says nothing more before the answer (RFC 6455 section 4.1)."""
@@ -161,11 +99,11 @@ class ClientProtocol(FastProtocol):
                 raise Unavailable("the relay is going down; connect again in a moment")
             if self._place is None:
                 raise Unavailable("too many clients connect at the same time; try again in a moment")
-            principal, chosen = await self._identify(request)
+            principal, chosen = await identify(self.factory.gate, request, self._robot)
             if principal is not None:
                 self._admission = await self.factory.gate.admit(principal, self._robot, self._address())
         except SwitchboardError as error:
-            self._failure = (_code_of(error), str(error))
+            self._failure = (code_of(error), str(error))
         if self.state == self.STATE_CLOSED:
             self._turn_away()
             raise ConnectionDeny(HANDSHAKE_STATUS[closing.UNAVAILABLE], "the client has left")
@@ -178,23 +116,6 @@ class ClientProtocol(FastProtocol):
             raise ConnectionDeny(HANDSHAKE_STATUS.get(code, 403), reason)
         return chosen
 
-    async def _identify(self, request: ConnectionRequest) -> tuple[Principal | None, str | None]:
-        """The principal, if the handshake names one, and the subprotocol to answer with."""
-        gate = self.factory.gate
-        scheme, _, token = request.headers.get("authorization", "").partition(" ")
-        bearer = next((each for each in request.protocols if each.startswith("bearer.")), None)
-        ticket = request.params.get("ticket")
-        chosen = bearer or next((each for each in request.protocols if each.startswith("rosbridge")), None)
-        if scheme.lower() == "bearer" and token:
-            return await gate.bearer(token.strip()), chosen
-        if bearer is not None:
-            return await gate.bearer(bearer.removeprefix("bearer.")), chosen
-        if ticket:
-            return await gate.ticket(ticket[0], self._robot), chosen
-        headers = request.headers
-        origin = request.origin or None
-        return await gate.cookie(headers.get("cookie", ""), origin, headers.get("host", "")), chosen
-
     def onOpen(self) -> None:
         """The handshake is done."""
         self._asking = False
@@ -203,23 +124,11 @@ class ClientProtocol(FastProtocol):
             return
         self._open = True
         self._opened_ns = self.factory.clock_ns()
-        self._forget_handshake()
-        # Twisted's HTTP channel was the producer of this transport until now.
-        self.transport.unregisterProducer()
-        self.transport.registerProducer(_Flow(self), True)
+        self.begun()
         if self._failure is not None:
             self.close(*self._failure)
         elif self._admission is not None:
             self._begin()
-
-    def _forget_handshake(self) -> None:
-        """Let go of what Autobahn keeps for each connection and nobody reads any more: kilobytes for every client."""
-        for name in HANDSHAKE_ATTRIBUTES:
-            self.__dict__.pop(name, None)
-        # Of these every connection has its own: figures nobody asks for, a queue for writes that are held back (they
-        # go through the writer) and a validator for text that is checked elsewhere.
-        self.trafficStats = self.factory.traffic
-        self.send_queue = self.utf8validator = None
 
     def _nobody(self) -> None:
         self._deadline = None
@@ -236,10 +145,9 @@ class ClientProtocol(FastProtocol):
         admission, self._admission = self._admission, None
         self._stop_deadline()
         self._known()
-        self._take_at_most(limits.CLIENT_MESSAGE)
+        self.take_at_most(limits.CLIENT_MESSAGE)
         session = self._session = self.factory.gate.open(admission, self, self._opened_ns)
-        # What the session sends goes to the socket without a look at the state; what follows a close is held off by
-        # closing the outbox, see _nothing_more.
+        # What the session sends goes to the socket without a look at the state; see nothing_more.
         session.outbox.write = self._writer.write
         session.start()
         self.takes_text = session.message
@@ -250,7 +158,7 @@ class ClientProtocol(FastProtocol):
     def _failed(self, failure: Any) -> None:
         error = failure.value
         if isinstance(error, SwitchboardError):
-            self.close(_code_of(error), str(error))
+            self.close(code_of(error), str(error))
         else:
             self.log.failure("a client's session could not be opened", failure)
             self.close(closing.INTERNAL, "the relay failed; its log tells more")
@@ -264,22 +172,6 @@ class ClientProtocol(FastProtocol):
         """The first frame of a message. Pongs may come before the last one, and say nothing of when this was sent."""
         super().onMessageBegin(isBinary)
         self._begun_ns = self._opened_ns if self._session is None else self._session.not_before
-
-    def onMessageFrameBegin(self, length: int) -> None:
-        """One more frame of a message."""
-        super().onMessageFrameBegin(length)
-        self._check_pieces()
-
-    def onMessageFrameData(self, payload: bytes) -> None:
-        """One more piece of it."""
-        super().onMessageFrameData(payload)
-        self._check_pieces()
-
-    def _check_pieces(self) -> None:
-        pieces = len(self.message_data) + len(self.frame_data)
-        if pieces > PIECES and not self.failedByMe:
-            self.wasMaxMessagePayloadSizeExceeded = True
-            self._max_message_size_exceeded(pieces, PIECES, f"a message came in more than {PIECES} pieces")
 
     def onMessage(self, payload: bytes, isBinary: bool) -> None:
         """One whole message."""
@@ -326,16 +218,6 @@ class ClientProtocol(FastProtocol):
         if admission is not None:
             self.factory.gate.turn_away(admission)
 
-    def onPing(self, payload: bytes) -> None:
-        """A ping of the client. One that takes nothing gets the latest answered when it does again.
-
-        RFC 6455 section 5.5.3 allows that; the answers to a flood of pings must not pile up here.
-        """
-        if self._full:
-            self._unanswered = payload
-        else:
-            super().onPing(payload)
-
     def onPong(self, payload: bytes) -> None:
         """The answer to a ping."""
         if self._session is not None:
@@ -346,7 +228,6 @@ class ClientProtocol(FastProtocol):
         self.factory.cap.leave(self._address())
         self._known()
         self._stop_deadline()
-        cancel(self._leaving)
         super().connectionLost(reason)
 
     def onClose(self, wasClean: bool, code: int | None, reason: str | None) -> None:
@@ -360,29 +241,10 @@ class ClientProtocol(FastProtocol):
         if session is not None:
             session.end()
 
-    def sendData(self, data: bytes, sync: bool = False, chopsize: int | None = None) -> None:
-        """What Autobahn itself sends, in order with what does not go through it."""
-        self._writer.write(data)
-
-    def sendCloseFrame(
-        self, code: int | None = None, reasonUtf8: bytes | None = None, isReply: bool = False
-    ) -> None:
-        """Our close, or the answer to the client's. Nothing may follow it (RFC 6455 section 5.5.1)."""
-        super().sendCloseFrame(code, reasonUtf8, isReply)
-        self._nothing_more()
-
-    def _nothing_more(self) -> None:
+    def nothing_more(self) -> None:
+        """Hold off what the session sends, which goes to the writer without a look at the state."""
         if self._session is not None:
             self._session.outbox.close()
-
-    def _closeConnection(self, abort: bool = False) -> None:
-        self._nothing_more()
-        self._writer.flush()
-        # TLS would not shut down while a producer is registered.
-        self.transport.unregisterProducer()
-        if not abort and self._leaving is None:
-            self._leaving = self.factory.clock.callLater(LEAVING_SECONDS, self.transport.abortConnection)
-        super()._closeConnection(abort)
 
     # --- ClientTransport ----------------------------------------------------------------------------------
 
@@ -404,22 +266,17 @@ class ClientProtocol(FastProtocol):
                 self.log.info(
                     "a client at {address} is refused: {reason}", address=self._address(), reason=reason
                 )
-            text = reason.encode()[:REASON_BYTES].decode(errors="ignore")
-            # Autobahn's sendClose takes no code that RFC 6455 itself defines, such as 1001 and 1009.
-            self.sendCloseFrame(code=code, reasonUtf8=text.encode(), isReply=False)
+            self.say_close(code, reason)
 
     def pause(self) -> None:
         """The transport's buffer is full."""
-        self._full = True
+        super().pause()
         if self._session is not None:
             self._session.pause()
 
     def resume(self) -> None:
         """The transport takes bytes again."""
-        self._full = False
-        unanswered, self._unanswered = self._unanswered, None
-        if unanswered is not None:
-            self.onPing(unanswered)
+        super().resume()
         if self._session is not None:
             self._session.resume()
 
@@ -430,32 +287,6 @@ class ClientProtocol(FastProtocol):
     def _stop_deadline(self) -> None:
         cancel(self._deadline)
         self._deadline = None
-
-
-class _Flow:
-    """Twisted's push producer interface in front of a client."""
-
-    def __init__(self, client: ClientProtocol) -> None:
-        self._client = client
-
-    def pauseProducing(self) -> None:
-        self._client.pause()
-
-    def resumeProducing(self) -> None:
-        self._client.resume()
-
-    def stopProducing(self) -> None:
-        """The connection is gone; ``onClose`` follows."""
-
-
-def _code_of(error: SwitchboardError) -> int:
-    if isinstance(error, BadCredentials):
-        return closing.UNAUTHENTICATED
-    if isinstance(error, NotFound):
-        return closing.NOT_FOUND
-    if isinstance(error, Unavailable):
-        return closing.UNAVAILABLE
-    return closing.FORBIDDEN
 
 
 class ClientFactory(WebSocketServerFactory):

@@ -12,7 +12,7 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits
 from relay_server import closing, wsframe
-from relay_server.edges import websocket as module
+from relay_server.edges import bounded
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.websocket import ClientProtocol
 from tests.relay_server.edges.websocket_client import AUTH, Client, MemoryGate, Transport
@@ -338,7 +338,7 @@ def test_an_open_websocket_keeps_little(gate: MemoryGate) -> None:
     assert options == {"maxFramePayloadSize", "maxMessagePayloadSize"}
     assert client.end.requireMaskedClientFrames is True
     assert client.end.perMessageCompressionAccept([]) is None
-    assert not set(module.HANDSHAKE_ATTRIBUTES) & set(vars(client.end))
+    assert not set(bounded.HANDSHAKE_ATTRIBUTES) & set(vars(client.end))
     assert "good" not in str(vars(client.end).values())
 
 
@@ -349,7 +349,7 @@ def test_names_of_what_is_forgotten_are_autobahns(gate: MemoryGate) -> None:
     before = set(vars(client.end))
     gate.wait.callback(None)
     client.run()
-    assert set(module.HANDSHAKE_ATTRIBUTES) - {"http_response_data"} <= before
+    assert set(bounded.HANDSHAKE_ATTRIBUTES) - {"http_response_data"} <= before
 
 
 def test_pings_of_a_client_that_takes_nothing_are_answered_by_one_pong(gate: MemoryGate) -> None:
@@ -409,7 +409,7 @@ def test_the_frames_of_a_message_are_bounded(
     gate: MemoryGate, payload: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also those with nothing in them: they come for nothing and take memory."""
-    monkeypatch.setattr(module, "PIECES", 10)
+    monkeypatch.setattr(bounded, "PIECES", 10)
     client = Client(gate, Authorization="Bearer good")
     client.core.send_text(b"", fin=False)
     for _ in range(9):
@@ -436,7 +436,7 @@ def test_a_client_that_leaves_and_takes_nothing_is_cut(
         client.core.send_close(1000)
         client.run()
     assert client.transport.connected
-    client.clock.advance(module.LEAVING_SECONDS)
+    client.clock.advance(bounded.LEAVING_SECONDS)
     assert not client.transport.connected
     assert how == "refused" or gate.sessions[0].got[-1] == "end"
     assert not client.clock.getDelayedCalls()

@@ -1,0 +1,79 @@
+"""Who may come in by websocket: by what credentials of the handshake, and what is said to whom may not."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from autobahn.websocket.types import ConnectionRequest
+
+from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
+from relay_server import closing
+from relay_server.access import BadCredentials, Principal
+from relay_server.frontdesk import Admission
+from relay_server.session import ClientTransport, Session
+
+HANDSHAKE_STATUS = {
+    closing.UNAUTHENTICATED: 401,
+    closing.NOT_FOUND: 403,
+    closing.UNAVAILABLE: 503,
+    closing.GOING_AWAY: 503,
+}
+"""The HTTP status of a handshake that would close with this code."""
+
+
+class Gate(Protocol):
+    """Who may come in; the composition root's."""
+
+    accepting: bool
+
+    async def bearer(self, token: str) -> Principal:
+        """The principal of an access token."""
+
+    async def ticket(self, ticket: str, robot: str) -> Principal:
+        """The principal of a single-use ticket."""
+
+    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
+        """The principal of a session cookie, ``None`` when there is no such cookie."""
+
+    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
+        """Find out whether the principal has any right on the robot.
+
+        :raises NotFound: it has none, or there is no such robot
+        """
+
+    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> Session:
+        """Begin a session that was admitted."""
+
+    def turn_away(self, admission: Admission) -> None:
+        """Somebody who was admitted left before a session began."""
+
+
+async def identify(gate: Gate, request: ConnectionRequest, robot: str) -> tuple[Principal | None, str | None]:
+    """The principal, if the handshake names one, and the subprotocol to answer with.
+
+    :raises SwitchboardError: what it names proves nobody, or can't be checked
+    """
+    scheme, _, token = request.headers.get("authorization", "").partition(" ")
+    bearer = next((each for each in request.protocols if each.startswith("bearer.")), None)
+    ticket = request.params.get("ticket")
+    chosen = bearer or next((each for each in request.protocols if each.startswith("rosbridge")), None)
+    if scheme.lower() == "bearer" and token:
+        return await gate.bearer(token.strip()), chosen
+    if bearer is not None:
+        return await gate.bearer(bearer.removeprefix("bearer.")), chosen
+    if ticket:
+        return await gate.ticket(ticket[0], robot), chosen
+    headers = request.headers
+    origin = request.origin or None
+    return await gate.cookie(headers.get("cookie", ""), origin, headers.get("host", "")), chosen
+
+
+def code_of(error: SwitchboardError) -> int:
+    """The code a websocket closes with for this reason."""
+    if isinstance(error, BadCredentials):
+        return closing.UNAUTHENTICATED
+    if isinstance(error, NotFound):
+        return closing.NOT_FOUND
+    if isinstance(error, Unavailable):
+        return closing.UNAVAILABLE
+    return closing.FORBIDDEN
