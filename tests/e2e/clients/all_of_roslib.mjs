@@ -1,30 +1,18 @@
 // Everything roslib.js can do with ROS 2, once each, against the conformance suite's fixture node.
 // Arguments: path of roslib's module, websocket URL, access token. Prints what came of it as JSON.
 
+import { connect, deadline } from "./connecting.mjs";
+
 const [module, url, token] = process.argv.slice(2);
 const ROSLIB = await import(module);
 const seen = {};
-
-const late = setTimeout(() => {
-  console.error(`not done within 90 s; so far: ${JSON.stringify(seen)}`);
-  process.exit(1);
-}, 90000);
+const inTime = deadline(90, seen);
 
 /** A call with callbacks as a promise. */
 const ask = (start) => new Promise((resolve, reject) => start(resolve, (error) => reject(new Error(error))));
-const connect = async () => {
-  const ros = new ROSLIB.Ros();
-  await new Promise((resolve, reject) => {
-    ros.on("connection", resolve);
-    ros.on("error", reject);
-    ros.connect(url);
-  });
-  ros.authenticate(token, "test", "relay", "random", 0, "any", 0);
-  return ros;
-};
 
-const ros = await connect();
-const other = await connect();
+const ros = await connect(ROSLIB, url, token);
+const other = await connect(ROSLIB, url, token);
 
 // --- rosapi ---
 seen.topics = (await ask((ok, no) => ros.getTopics(ok, no))).topics;
@@ -171,6 +159,6 @@ await closed;
 seen.closed = true;
 other.close();
 
-clearTimeout(late);
+inTime();
 console.log(JSON.stringify(seen));
 process.exit(0);

@@ -1,14 +1,12 @@
 // An unmodified roslib.js user in Node who subscribes to one topic in one form and prints what it got as JSON.
 // Arguments: path of roslib's module (2.x or 1.x), websocket URL, access token, topic, type, compression, fragment size.
 
+import { connect, deadline } from "./connecting.mjs";
+
 const [module, url, token, name, messageType, compression, fragmentSize] = process.argv.slice(2);
 const loaded = await import(module);
 const ROSLIB = loaded.Ros ? loaded : loaded.default;
-
-const late = setTimeout(() => {
-  console.error("not done within 60 s");
-  process.exit(1);
-}, 60000);
+const inTime = deadline(60, {});
 
 // JSON has no typed arrays, no NaN and no large integers.
 function shown(value) {
@@ -27,13 +25,7 @@ function shown(value) {
   return value;
 }
 
-const ros = new ROSLIB.Ros();
-await new Promise((resolve, reject) => {
-  ros.on("connection", resolve);
-  ros.on("error", reject);
-  ros.connect(url);
-});
-ros.authenticate(token, "test", "relay", "random", 0, "any", 0);
+const ros = await connect(ROSLIB, url, token);
 const topic = new ROSLIB.Topic({ ros, name, messageType, compression });
 if (fragmentSize !== "0") {
   // roslib.js takes fragments but has no option to ask for them.
@@ -41,6 +33,6 @@ if (fragmentSize !== "0") {
 }
 const message = await new Promise((resolve) => topic.subscribe(resolve));
 ros.close();
-clearTimeout(late);
+inTime();
 console.log(JSON.stringify(shown(message)));
 process.exit(0);

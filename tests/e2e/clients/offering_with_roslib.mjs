@@ -3,23 +3,15 @@
 // Arguments: path of roslib's module, websocket URL, access token, the service and the action it offers, an action, and
 // one whose goals are to be cancelled.
 
+import { connect, deadline } from "./connecting.mjs";
+
 const [module, url, token, serviceName, offeredName, actionName, endlessName] = process.argv.slice(2);
 const ROSLIB = await import(module);
-
-const late = setTimeout(() => {
-  console.error("not done within 90 s");
-  process.exit(1);
-}, 90000);
-
-const ros = new ROSLIB.Ros();
-await new Promise((resolve, reject) => {
-  ros.on("connection", resolve);
-  ros.on("error", reject);
-  ros.connect(url);
-});
-ros.authenticate(token, "test", "relay", "random", 0, "any", 0);
-
 const seen = { feedback: [] };
+const inTime = deadline(90, seen);
+
+const ros = await connect(ROSLIB, url, token);
+
 const actionType = "example_interfaces/action/Fibonacci";
 const service = new ROSLIB.Service({ ros, name: serviceName, serviceType: "example_interfaces/srv/AddTwoInts" });
 const called = new Promise((resolve) => {
@@ -62,5 +54,5 @@ seen.failure = await new Promise((resolve) => {
 offered.unadvertise();
 service.unadvertise();
 ros.close();
-clearTimeout(late);
+inTime();
 console.log(JSON.stringify(seen));

@@ -1,27 +1,19 @@
 // An unmodified roslib.js asks all of rosapi it has helpers for. Prints what it saw as JSON.
 // Arguments: path of roslib's module, websocket URL, access token, parameters as JSON (name, new value).
 
+import { connect, deadline } from "./connecting.mjs";
+
 const [module, url, token, parameters] = process.argv.slice(2);
 const ROSLIB = await import(module);
+const seen = {};
+const inTime = deadline(60, seen);
 
-const late = setTimeout(() => {
-  console.error("not done within 60 s");
-  process.exit(1);
-}, 60000);
-
-const ros = new ROSLIB.Ros();
-await new Promise((resolve, reject) => {
-  ros.on("connection", resolve);
-  ros.on("error", reject);
-  ros.connect(url);
-});
-ros.authenticate(token, "test", "relay", "random", 0, "any", 0);
+const ros = await connect(ROSLIB, url, token);
 
 const ask = (helper, ...args) => new Promise((resolve, reject) => ros[helper](...args, resolve, reject));
 const NESTED = "switchboard_test_interfaces/msg/Nested";
 const EVERYTHING = "switchboard_test_interfaces/srv/Everything";
 
-const seen = {};
 seen.topics = await ask("getTopics");
 seen.topicsForType = await ask("getTopicsForType", NESTED);
 seen.topicType = await ask("getTopicType", "/lab/nested");
@@ -61,6 +53,6 @@ const absent = new ROSLIB.Param({ ros, name: "/nobody:x" });
 seen.absent = await new Promise((resolve) => absent.get(() => resolve(""), resolve));
 
 ros.close();
-clearTimeout(late);
+inTime();
 console.log(JSON.stringify(seen));
 process.exit(0);

@@ -1,25 +1,15 @@
 // An unmodified roslib.js user in Node: lists, subscribes, drives, calls. Prints what it saw as JSON.
 // Arguments: path of roslib's module, websocket URL, access token ("" when the URL carries a ticket).
 
+import { connect, deadline } from "./connecting.mjs";
+
 const [module, url, token] = process.argv.slice(2);
 const ROSLIB = await import(module);
-
-const late = setTimeout(() => {
-  console.error("not done within 60 s");
-  process.exit(1);
-}, 60000);
-
-const ros = new ROSLIB.Ros();
-await new Promise((resolve, reject) => {
-  ros.on("connection", resolve);
-  ros.on("error", reject);
-  ros.connect(url);
-});
-if (token) {
-  ros.authenticate(token, "test", "relay", "random", 0, "any", 0);
-}
-
 const seen = {};
+const inTime = deadline(60, seen);
+
+const ros = await connect(ROSLIB, url, token);
+
 const topics = await new Promise((resolve, reject) => ros.getTopics(resolve, reject));
 seen.topics = topics.topics;
 seen.services = await new Promise((resolve, reject) => ros.getServices(resolve, reject));
@@ -56,6 +46,6 @@ seen.reset = await new Promise((resolve, reject) => reset.callService({}, resolv
 scan.unsubscribe();
 odom.unsubscribe();
 ros.close();
-clearTimeout(late);
+inTime();
 console.log(JSON.stringify(seen));
 process.exit(0);
