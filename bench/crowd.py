@@ -12,23 +12,20 @@ import json
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from switchboard_load import status_of
 from switchboard_processes import running
 from switchboard_waiting import wait_for
 
-from bench import ROOT
+from bench.child import Child
 from bench.cpu import resident, seconds_of
 from bench.native import Receivers
-from bench.relay import Relay
 from bench.report import Options, Row
-from bench.robot import SETTLE_SECONDS, RealRobot
+from bench.robot import RealRobot, real_robot, settle
 from bench.viewers import subscribe
 from bench.wire import handshake
 
@@ -90,11 +87,10 @@ class Spell:
 class Ground:
     """Relay, robot, and who watches."""
 
-    def __init__(self, folder: Path, relay: Relay, robot: RealRobot) -> None:
-        self.folder = folder
-        self.relay = relay
+    def __init__(self, robot: RealRobot) -> None:
+        self.relay = robot.relay
         self.robot = robot
-        self.pids = {"daemon": robot.pid, "relay": relay.pid}
+        self.pids = {"daemon": robot.pid, "relay": robot.relay.pid}
         self.watching: dict[str, Receivers] = {}
 
     def come(self, group: Group, count: int) -> None:
@@ -102,7 +98,7 @@ class Ground:
         request = handshake(f"/robots/{self.robot.name}", self.robot.viewer(group.name))
         frames = subscribe(*((topic, TYPES[topic], group.throttle) for topic in group.topics))
         self.watching[group.name] = Receivers(
-            self.folder,
+            self.relay.folder,
             self.relay.http_port,
             count,
             request,
@@ -120,7 +116,7 @@ class Ground:
         cpu = {name: seconds_of(pid, children=True) for name, pid in self.pids.items()}
         while (left := begun + seconds - time.monotonic()) > 0:
             seen.memory.append(resident(self.pids["relay"]))
-            time.sleep(min(1.0, left))
+            time.sleep(min(1.0, left))  # memory is looked at once a second
         seen.seconds = time.monotonic() - begun
         for name, pid in self.pids.items():
             seen.cpu[name] = (seconds_of(pid, children=True) - cpu[name]) * 1000 / seen.seconds
@@ -132,56 +128,38 @@ class Ground:
 
 
 @contextlib.contextmanager
-def breaking(relay: Relay, robot: RealRobot) -> Iterator[dict[str, int]]:
+def breaking(robot: RealRobot) -> Iterator[dict[str, int]]:
     """A client that breaks every rule, meanwhile; what it has done is there at the end."""
     token = robot.viewer("breaker")
-    popen = subprocess.Popen(
-        [sys.executable, "-m", "bench.breaker", str(relay.http_port), robot.name, token],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert popen.stdin is not None and popen.stdout is not None
-    assert popen.stdout.readline().strip() == "READY"
-    done: dict[str, int] = {}
-    try:
+    command = [sys.executable, "-m", "bench.breaker", str(robot.relay.http_port), robot.name, token]
+    breaker = Child(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    breaker.ready(AssertionError("the one that breaks every rule does not start; see above"))
+    with running(breaker):
+        done: dict[str, int] = {}
         yield done
-        popen.stdin.close()
-        done.update(json.loads(popen.stdout.readline()))
-    finally:
-        popen.stdin.close()
-        try:
-            popen.wait(10)
-        except subprocess.TimeoutExpired:
-            popen.kill()
-            popen.wait()
-        popen.stdout.close()
+        assert breaker.popen.stdin is not None
+        breaker.popen.stdin.close()
+        done.update(json.loads(breaker.line()))
 
 
 def run(options: Options) -> list[Row]:
     """One alone, then all."""
     seconds = options.seconds or options.pick(3, CROWD_SECONDS)
     part = 0.2 if options.quick else 1.0
-    with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
-        folder = Path(name)
-        relay = Relay(folder)
-        stack.enter_context(running(relay))
-        robot = RealRobot(relay, "rover", STREAMS)
-        stack.enter_context(running(robot))
-        ground = Ground(folder, relay, robot)
+    with real_robot(STREAMS) as robot, contextlib.ExitStack() as stack:
+        ground = Ground(robot)
         stack.callback(lambda: [each.stop() for each in ground.watching.values()])
         ground.come(Group("alone", 1, ALL), 1)
         wait_for("the first client has something of all", lambda: _topics(ground, "alone") == set(ALL), 30)
-        time.sleep(options.pick(0, SETTLE_SECONDS))
+        settle(options)
         alone = ground.spell(options.pick(1, ALONE_SECONDS))
         for group in GROUPS:
             ground.come(group, max(1, round(group.count * part)))
-        time.sleep(options.pick(1, WARM_SECONDS))
+        time.sleep(options.pick(1, WARM_SECONDS))  # the crowd's coming is not to be measured
         peaceful = ground.spell(options.pick(1, ALONE_SECONDS))
-        with breaking(relay, robot) as broken:
+        with breaking(robot) as broken:
             crowd = ground.spell(seconds)
-        dropped = status_of(relay, robot.name)["health"]["dropped_samples"]
+        dropped = status_of(robot.relay, robot.name)["health"]["dropped_samples"]
     tell({"one client": alone, "all": peaceful, "all and a rule breaker": crowd}, broken, dropped)
     return rows(alone, peaceful, crowd, dropped)
 

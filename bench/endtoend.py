@@ -8,23 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import socket
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
-from pathlib import Path
 
 from switchboard_processes import running
 from switchboard_waiting import wait_for
 
-from bench import ROOT
+from bench.child import Child, free_port
 from bench.cpu import seconds_of
 from bench.native import Receivers
-from bench.relay import Relay
 from bench.report import Options, Row
-from bench.robot import SETTLE_SECONDS, RealRobot
+from bench.robot import RealRobot, real_robot, settle
 from bench.viewers import SCAN, STREAM, TOPIC, subscribe
 from bench.wire import handshake
 
@@ -36,46 +32,21 @@ def stand_in() -> bool:
     return all(importlib.util.find_spec(module) for module in ("tornado", "ujson"))
 
 
-class RosbridgeLike:
+class RosbridgeLike(Child):
     """The stand-in, running."""
 
     def __init__(self, environment: dict[str, str], topic: str) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as probe:
-            self.port = probe.getsockname()[1]
-        self._popen = subprocess.Popen(
-            [sys.executable, "-m", "bench.rosbridge_like", str(self.port), topic],
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-            cwd=ROOT,
-        )
-        assert self._popen.stdout is not None
-        if self._popen.stdout.readline().strip() != "READY":
-            self.stop()
-            raise AssertionError("the stand-in for rosbridge does not start; see above")
-
-    @property
-    def pid(self) -> int:
-        """Its process."""
-        return self._popen.pid
-
-    def stop(self) -> None:
-        """End and reap it."""
-        assert self._popen.stdout is not None
-        self._popen.terminate()
-        try:
-            self._popen.wait(5)
-        except subprocess.TimeoutExpired:
-            self._popen.kill()
-            self._popen.wait()
-        self._popen.stdout.close()
+        self.port = free_port()
+        command = [sys.executable, "-m", "bench.rosbridge_like", str(self.port), topic]
+        super().__init__(command, stdout=subprocess.PIPE, env=environment)
+        self.ready(AssertionError("the stand-in for rosbridge does not start; see above"))
 
 
 def spent_by(pids: dict[str, int], seconds: float) -> dict[str, float]:
     """Processor milliseconds a second over a while."""
     begun = time.monotonic()
     before = {name: seconds_of(pid, children=True) for name, pid in pids.items()}
-    time.sleep(seconds)
+    time.sleep(seconds)  # what is measured: the time others need while this one does nothing
     used = {name: seconds_of(pid, children=True) - before[name] for name, pid in pids.items()}
     return {name: each * 1000 / (time.monotonic() - begun) for name, each in used.items()}
 
@@ -97,27 +68,23 @@ def watched(
 def run(options: Options) -> list[Row]:
     """Some windows of time; medians of processor milliseconds a second."""
     seconds, rounds = options.pick(1, 8), int(options.pick(1, 3))
-    with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
-        folder = Path(name)
-        relay = Relay(folder)
-        stack.enter_context(running(relay))
-        robot = RealRobot(relay, "rover", [STREAM])
-        stack.enter_context(running(robot))
-        time.sleep(options.pick(0, SETTLE_SECONDS))
+    with real_robot([STREAM]) as robot, contextlib.ExitStack() as stack:
+        relay = robot.relay
+        settle(options)
         rest = spent_by({"daemon": robot.pid, "relay": relay.pid}, seconds / 2)
         ask = subscribe((TOPIC, SCAN, 0))
         request = handshake("/robots/rover", robot.viewer("watcher"))
-        watching = [Receivers(folder, relay.http_port, VIEWERS, request, ask)]
+        watching = [Receivers(relay.folder, relay.http_port, VIEWERS, request, ask)]
         pids = {"daemon": robot.pid, "relay": relay.pid}
         if stand_in():
             bridge = RosbridgeLike(robot.environment, TOPIC)
             stack.enter_context(running(bridge))
-            watching.append(Receivers(folder, bridge.port, VIEWERS, handshake("/"), ask))
+            watching.append(Receivers(relay.folder, bridge.port, VIEWERS, handshake("/"), ask))
             pids["stand-in"] = bridge.pid
         stack.enter_context(running(*watching))
         for each in watching:
             wait_for("all viewers have something", lambda each=each: each.report()["least"] > 0, 20)
-        time.sleep(seconds / 4)
+        time.sleep(seconds / 4)  # the viewers' coming is not to be measured
         spells = [watched(robot, pids, watching, seconds) for _ in range(rounds)]
     spent = {name: statistics.median(each[name] for each in spells) for name in pids}
     row = Row(

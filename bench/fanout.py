@@ -91,7 +91,7 @@ def loop_side(folder: Path, clients: int, stack: contextlib.ExitStack) -> Side:
     """The loop in C."""
     spreader = Native("fanout")
     stack.callback(spreader.stop)
-    source_port, receiver_port = (int(each) for each in spreader.ready[1:])
+    source_port, receiver_port = (int(each) for each in spreader.words[1:])
     source = stack.enter_context(socket.create_connection(("127.0.0.1", source_port)))
     source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     receivers = Receivers(folder, receiver_port, clients, handshake("/"), every_ms=EVERY_MS)

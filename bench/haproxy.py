@@ -8,6 +8,7 @@ import subprocess
 import time
 from pathlib import Path
 
+from bench.child import Child, free_port
 from bench.report import Unavailable
 from bench.wire import End, Loop, TcpEnd, WebEnd
 
@@ -45,7 +46,7 @@ def executable() -> str:
     return found
 
 
-class HAProxy:
+class HAProxy(Child):
     """HAProxy with a websocket client of ours in front and a TCP end that answered the handshake behind.
 
     :param size: bytes of one message, frame and all, as the server sees it
@@ -53,16 +54,12 @@ class HAProxy:
 
     def __init__(self, loop: Loop, folder: Path, size: int) -> None:
         command = executable()
-        with socket.create_server(("127.0.0.1", 0)) as probe:
-            port = probe.getsockname()[1]
+        port = free_port()
         with socket.create_server(("127.0.0.1", 0)) as target:
             configuration = folder / "haproxy.cfg"
             configuration.write_text(CONFIGURATION.format(port=port, target=target.getsockname()[1]))
-            self.popen = subprocess.Popen(
-                [command, "-db", "-f", str(configuration)],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
+            quiet = subprocess.DEVNULL
+            super().__init__([command, "-db", "-f", str(configuration)], stdout=quiet, stderr=quiet)
             try:
                 self.client, self.server = self._open(loop, port, target, size)
             except BaseException:
@@ -78,7 +75,7 @@ class HAProxy:
                 break
             except ConnectionRefusedError:
                 assert time.monotonic() < end, "HAProxy does not listen"
-                time.sleep(0.05)
+                time.sleep(0.05)  # it does not say when it listens
         client = WebEnd.begin(opening, "/")
         server, _ = target.accept()
         request = b""
@@ -86,17 +83,3 @@ class HAProxy:
             request += server.recv(4096)
         server.sendall(_ANSWER)
         return WebEnd.opened(loop, client), TcpEnd(loop, server, size)
-
-    @property
-    def pid(self) -> int:
-        """Its process."""
-        return self.popen.pid
-
-    def stop(self) -> None:
-        """End and reap it."""
-        self.popen.terminate()
-        try:
-            self.popen.wait(5)
-        except subprocess.TimeoutExpired:
-            self.popen.kill()
-            self.popen.wait()

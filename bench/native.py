@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import BUILD, ROOT
+from bench.child import Child
 from bench.report import Unavailable
 
 SOURCES = ROOT / "bench" / "native"
@@ -34,38 +34,13 @@ def program(name: str) -> Path:
     return built
 
 
-class Native:
+class Native(Child):
     """One of these programs, running. It ends with its standard input."""
 
     def __init__(self, name: str, *arguments: str) -> None:
-        self.popen = subprocess.Popen(
-            [str(program(name)), *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        self.ready = self.line().split()
-        if self.ready[:1] != ["READY"]:
-            self.stop()
-            raise AssertionError(f"{name} did not start; see above")
-
-    @property
-    def pid(self) -> int:
-        """Its process."""
-        return self.popen.pid
-
-    def line(self) -> str:
-        """The next line it prints."""
-        assert self.popen.stdout is not None
-        return self.popen.stdout.readline()
-
-    def stop(self) -> None:
-        """End and reap it."""
-        assert self.popen.stdin is not None and self.popen.stdout is not None
-        self.popen.stdin.close()
-        try:
-            self.popen.wait(5)
-        except subprocess.TimeoutExpired:
-            self.popen.kill()
-            self.popen.wait(5)
-        self.popen.stdout.close()
+        command = [str(program(name)), *arguments]
+        super().__init__(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.words = self.ready(AssertionError(f"{name} did not start; see above"))
 
 
 class Receivers(Native):
@@ -102,10 +77,7 @@ class Receivers(Native):
 
     def report(self) -> dict[str, Any]:
         """What has come since the report before."""
-        assert self.popen.stdin is not None
-        self.popen.stdin.write("\n")
-        self.popen.stdin.flush()
-        return dict(json.loads(self.line()))
+        return self.ask()
 
     def until_each_has(self, count: float, seconds: float = 20.0) -> None:
         """Wait until every client has had so many messages since the report before.
@@ -115,5 +87,5 @@ class Receivers(Native):
         least, end = 0, time.monotonic() + seconds
         while least < count:
             assert time.monotonic() < end, f"a client got {least} messages of {count:.0f}"
-            time.sleep(0.05)
+            time.sleep(0.05)  # they tell only what they are asked for
             least += self.report()["least"]

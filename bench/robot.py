@@ -7,17 +7,21 @@ import json
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from switchboard_domains import free_domain
-from switchboard_processes import BIN, Process, ros_environment
+from switchboard_processes import BIN, Process, ros_environment, running
 from switchboard_proxy import ChaosProxy
 from switchboard_waiting import wait_for
 
-from bench import ROOT
+from bench.child import Child
 from bench.relay import Relay
-from bench.report import Unavailable
+from bench.report import Options, Unavailable
 
 SETTLE_SECONDS = 8.0
 """A daemon that has just come up is busy for some seconds with what it finds."""
@@ -48,43 +52,20 @@ class CountingProxy(ChaosProxy):
             source.close()
 
 
-class Publisher:
+class Publisher(Child):
     """``bench/ros_publisher.py``, running.
 
     :param streams: as it takes them
     """
 
     def __init__(self, environment: dict[str, str], streams: list[dict[str, Any]]) -> None:
-        self._popen = subprocess.Popen(
-            [sys.executable, "-m", "bench.ros_publisher", json.dumps(streams)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-            cwd=ROOT,
-        )
-        assert self._popen.stdout is not None
-        if self._popen.stdout.readline().strip() != "READY":
-            self.stop()
-            raise Unavailable("the ROS 2 publisher does not start; see above")
+        command = [sys.executable, "-m", "bench.ros_publisher", json.dumps(streams)]
+        super().__init__(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+        self.ready(Unavailable("the ROS 2 publisher does not start; see above"))
 
     def sent(self) -> dict[str, int]:
         """Messages published so far, by topic."""
-        assert self._popen.stdin is not None and self._popen.stdout is not None
-        self._popen.stdin.write("\n")
-        self._popen.stdin.flush()
-        return dict(json.loads(self._popen.stdout.readline()))
-
-    def stop(self) -> None:
-        """End and reap it."""
-        assert self._popen.stdin is not None and self._popen.stdout is not None
-        self._popen.stdin.close()
-        try:
-            self._popen.wait(10)
-        except subprocess.TimeoutExpired:
-            self._popen.kill()
-            self._popen.wait()
-        self._popen.stdout.close()
+        return self.ask()
 
 
 class RealRobot:
@@ -123,3 +104,19 @@ class RealRobot:
         self.daemon.stop()
         self.publisher.stop()
         self.proxy.close()
+
+
+@contextlib.contextmanager
+def real_robot(streams: list[dict[str, Any]]) -> Iterator[RealRobot]:
+    """A relay and a robot that publishes these, in a folder that goes with them."""
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+        relay = Relay(Path(folder))
+        with running(relay):
+            robot = RealRobot(relay, "rover", streams)
+            with running(robot):
+                yield robot
+
+
+def settle(options: Options) -> None:
+    """Wait until a daemon that has just come up costs what it costs from then on. Nothing tells when."""
+    time.sleep(options.pick(0, SETTLE_SECONDS))

@@ -7,19 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import statistics
-import tempfile
 import time
-from pathlib import Path
 from typing import NamedTuple
 
-from switchboard_processes import running
 from switchboard_waiting import wait_for
 
 from bench.cpu import measured
 from bench.native import Receivers
-from bench.relay import Relay
 from bench.report import Options, Row
-from bench.robot import SETTLE_SECONDS, RealRobot
+from bench.robot import RealRobot, real_robot, settle
 from bench.wire import handshake, text_frame
 from relay_protocol import jsontext
 
@@ -51,7 +47,7 @@ def watched(robot: RealRobot, receivers: Receivers, seconds: float) -> Cost:
     wait_for("all viewers have something", lambda: receivers.report()["least"] > 0, 20)
     begun, sent = robot.proxy.up, robot.publisher.sent()[TOPIC]
     with measured(robot.pid, children=True) as watch:
-        time.sleep(seconds)
+        time.sleep(seconds)  # what is measured: the time the robot needs while this one does nothing
         samples = robot.publisher.sent()[TOPIC] - sent
     passed = robot.proxy.up - begun
     receivers.until_each_has(0.95 * samples)
@@ -63,20 +59,16 @@ def run(options: Options) -> list[Row]:
     many = int(options.pick(5, 50))
     seconds, rounds = options.pick(1, 7), int(options.pick(1, 4))
     costs: dict[int, list[Cost]] = {1: [], many: []}
-    with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
-        folder = Path(name)
-        relay = Relay(folder)
-        stack.enter_context(running(relay))
-        robot = RealRobot(relay, "rover", [STREAM])
-        stack.enter_context(running(robot))
+    with real_robot([STREAM]) as robot, contextlib.ExitStack() as stack:
+        relay = robot.relay
         request, ask = handshake("/robots/rover", robot.viewer("watcher")), subscribe((TOPIC, SCAN, 0))
         # The first viewer stays, so that nothing is opened and closed on the robot between the rounds.
-        first = Receivers(folder, relay.http_port, 1, request, ask)
+        first = Receivers(relay.folder, relay.http_port, 1, request, ask)
         stack.callback(first.stop)
-        time.sleep(options.pick(0, SETTLE_SECONDS))
+        settle(options)
         for _ in range(rounds):
             costs[1].append(watched(robot, first, seconds))
-            others = Receivers(folder, relay.http_port, many - 1, request, ask)
+            others = Receivers(relay.folder, relay.http_port, many - 1, request, ask)
             try:
                 costs[many].append(watched(robot, others, seconds))
             finally:
