@@ -2,37 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import Any
 
-from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
-from twisted.python.failure import Failure
 
-from relay_protocol import limits, link
-from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_protocol import link
+from relay_protocol.errors import Unavailable
 from relay_server.access import Permit
+from relay_server.channel.asking import Asking
 from relay_server.channel.bodies import Bodies
-from relay_server.channel.calls import GRACE, Calls
+from relay_server.channel.calls import Calls
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.errands import Errands
-from relay_server.channel.goal import Asker, ClientGoal
 from relay_server.channel.goals import Goals
 from relay_server.channel.interfaces import Interfaces
 from relay_server.channel.line import Line
 from relay_server.channel.offers import ACTIONS, SERVICES, Offers
 from relay_server.channel.publications import Publications
 from relay_server.channel.robot_clock import RobotClock
-from relay_server.channel.round_trips import RoundTrips
-from relay_server.channel.serving import ServedCalls, call_seconds
+from relay_server.channel.serving import ServedCalls
 from relay_server.channel.states import NEXT, Event, State
 from relay_server.channel.subscriptions import Subscriptions
 from relay_server.channel.wire import ChannelLink, Member, Wire
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.graph import Ends
 from relay_server.registry import Presence
-
-T = TypeVar("T")
 
 JOIN_SECONDS = 10.0
 """A robot that has not joined by then is asked again."""
@@ -75,11 +70,9 @@ class Channel:
         self.members: set[Member] = set()
         self._timer: Timer | None = None
         self._idle: Timer | None = None
-        self._opened: list[Deferred[None]] = []
         self.wire = Wire(clock, robot)
         self.line = Line(clock)
         """For what is made for clients when the robot has answered."""
-        self._round_trips = RoundTrips(self.wire)
         definitions = Definitions(self.wire, self._typed, self._untypeable)
         self._definitions = definitions
         self._interfaces = Interfaces(self.wire)
@@ -95,6 +88,24 @@ class Channel:
         self.served = ServedCalls(clock, self.wire, bodies, self.services, errands)
         self.goals = Goals(self.wire, bodies, self.actions, errands)
         self._calls = Calls(clock, self.wire, bodies, self.services, self.served)
+        self.asking = Asking(
+            clock, self.wire, lambda: self.state, self._calls, self.goals, definitions, self._interfaces
+        )
+        self._takers: dict[type, Callable[[Any], None]] = {
+            link.Subscribed: self.subscriptions.subscribed,
+            link.Advertised: self.publications.advertised,
+            link.ServiceResponse: self._calls.answered,
+            link.Interfaces: self._interfaces.told,
+            link.CallService: self.served.called,
+            link.SendActionGoal: self.goals.graph_asks,
+            link.CancelActionGoal: self.goals.graph_cancels,
+            link.ActionFeedback: self.goals.robot_feedback,
+            link.ActionResult: self.goals.robot_result,
+            link.AdvertisedService: lambda message: self.services.advertised(message.service),
+            link.AdvertisedAction: lambda message: self.actions.advertised(message.action),
+            link.TypeDefinition: definitions.add,
+            link.Failed: self._failed,
+        }
         robot.watchers.append(self)
 
     # --- members ------------------------------------------------------------------------------------------
@@ -136,105 +147,6 @@ class Channel:
             self._idle.cancel()
             self._idle = None
         self._happen(Event.SHUT)
-
-    async def call(self, service: str, type_name: str, args: bytes, timeout: float | None) -> bytes:
-        """Call a service on the robot; see :meth:`Calls.call`. Waits for the channel while it opens.
-
-        :raises Unavailable: besides the cases there, the robot is offline
-        """
-        seconds = call_seconds(timeout)
-
-        async def work() -> bytes:
-            await self._open()
-            return await self._calls.call(service, type_name, args, seconds)
-
-        # One second more than the call itself has: its own words are the better ones.
-        return await self.within(seconds + 2 * GRACE, work())
-
-    def pursue(
-        self,
-        member: Member,
-        asker: Asker,
-        action: str,
-        type_name: str,
-        args: bytes,
-        *,
-        feedback: bool,
-    ) -> ClientGoal:
-        """Have a goal pursued; see :meth:`Goals.begin`. All that comes of it is told to ``asker``, failures too.
-
-        :param feedback: whether that is wanted
-        """
-        goal = self.goals.want(member, asker, action, feedback)
-
-        async def work() -> None:
-            await self._open()
-            await self.goals.begin(goal, type_name, args)
-
-        goal.beginning = Deferred.fromCoroutine(self.within(limits.CALL_SECONDS, work()))
-        goal.beginning.addErrback(self.goals.not_begun, goal)
-        return goal
-
-    async def round_trip(self) -> float:
-        """Seconds for a ping to the robot over this channel's own link.
-
-        :raises Unavailable: the robot is offline or lost before it answers
-        """
-
-        async def work() -> float:
-            await self._open()
-            return await self._round_trips.ask()
-
-        return await self.within(limits.CALL_SECONDS, work())
-
-    async def definition(self, type_name: str, text: bool = False) -> None:
-        """Wait until the robot's definition of a type is known.
-
-        :param text: wait for the robot's text of just this type; else one that contains it will do
-        :raises NotFound: the robot does not have it
-        :raises Invalid: the robot's definition is unusable
-        :raises Unavailable: the robot is offline
-        """
-
-        async def work() -> None:
-            await self._open()
-            await self._definitions.ready(type_name, text)
-
-        await self.within(limits.CALL_SECONDS, work())
-
-    async def interfaces(self) -> list[str]:
-        """The full names of all types the robot can tell the definition of.
-
-        :raises Unavailable: the robot is offline, or does not tell them
-        """
-
-        async def work() -> list[str]:
-            await self._open()
-            return await self._interfaces.names()
-
-        return await self.within(limits.CALL_SECONDS, work())
-
-    async def within(self, seconds: float, work: Coroutine[Deferred[Any], Any, T]) -> T:
-        """Whatever the robot leaves out, nobody waits longer than this for it."""
-        running = Deferred.fromCoroutine(work)
-        late = Unavailable(f"robot {self.robot.name} did not answer within {seconds:g} s")
-
-        def too_late(result: Any, timeout: float) -> Any:
-            if isinstance(result, Failure):
-                result.trap(CancelledError)
-                raise late
-            return result
-
-        running.addTimeout(seconds, self._clock, too_late)  # type: ignore[arg-type]
-        return await running
-
-    async def _open(self) -> None:
-        if self.state is State.WAITING:
-            raise Unavailable(f"robot {self.robot.name} is offline")
-        if self.state is State.OPENING:
-            waiting: Deferred[None] = Deferred()
-            self._opened.append(waiting)
-            await waiting
 
     # --- the robot ----------------------------------------------------------------------------------------
 
@@ -291,9 +203,9 @@ class Channel:
 
     def message(self, message: link.RobotChannel) -> None:
         """A message came over the channel's link."""
-        handler = _HANDLERS.get(type(message))
-        if handler is not None:
-            handler(self, message)
+        take = self._takers.get(type(message))
+        if take is not None:
+            take(message)
 
     def _failed(self, message: link.Failed) -> None:
         reason = message.reason
@@ -337,7 +249,7 @@ class Channel:
         elif following is State.WAITING:
             # Also when the link had not opened yet: what was held must not be done when the robot is back.
             self.publications.lost()
-            self._tell_waiting(Unavailable(f"robot {self.robot.name} is offline"))
+            self.asking.not_opened(Unavailable(f"robot {self.robot.name} is offline"))
         elif following is State.OPEN:
             self._enter_open()
         elif following is State.CLOSED:
@@ -355,7 +267,7 @@ class Channel:
         self.publications.opened()
         self.services.opened()
         self.actions.opened()
-        self._tell_waiting(None)
+        self.asking.opened()
 
     def _leave_open(self, event: Event) -> None:
         broken, self.wire.link = self.wire.link, None
@@ -376,33 +288,8 @@ class Channel:
     def _end(self) -> None:
         if self.robot.control is not None:
             self.robot.control.send(link.CloseChannel(channel=self.name))
-        self._tell_waiting(Unavailable("the channel was closed"))
+        self.asking.not_opened(Unavailable("the channel was closed"))
         self.services.shut()
         self.actions.shut()
         self.robot.watchers.remove(self)
         self._closed(self)
-
-    def _tell_waiting(self, error: SwitchboardError | None) -> None:
-        waiting, self._opened = self._opened, []
-        for each in waiting:
-            if error is None:
-                each.callback(None)
-            else:
-                each.errback(error)
-
-
-_HANDLERS: dict[type, Callable[[Channel, Any], None]] = {
-    link.Subscribed: lambda channel, message: channel.subscriptions.subscribed(message),
-    link.Advertised: lambda channel, message: channel.publications.advertised(message),
-    link.ServiceResponse: lambda channel, message: channel._calls.answered(message),
-    link.Interfaces: lambda channel, message: channel._interfaces.told(message),
-    link.CallService: lambda channel, message: channel.served.called(message),
-    link.SendActionGoal: lambda channel, message: channel.goals.graph_asks(message),
-    link.CancelActionGoal: lambda channel, message: channel.goals.graph_cancels(message),
-    link.ActionFeedback: lambda channel, message: channel.goals.robot_feedback(message),
-    link.ActionResult: lambda channel, message: channel.goals.robot_result(message),
-    link.AdvertisedService: lambda channel, message: channel.services.advertised(message.service),
-    link.AdvertisedAction: lambda channel, message: channel.actions.advertised(message.action),
-    link.TypeDefinition: lambda channel, message: channel._definitions.add(message),
-    link.Failed: lambda channel, message: channel._failed(message),
-}

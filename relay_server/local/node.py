@@ -16,7 +16,7 @@ async def ping(session: Session, args: Any) -> dict[str, Any]:
     """``/relay/ping``: answered at once, or with ``{"robot": true}`` after a round trip to the robot."""
     robot_rtt = session.robot.rtt
     if isinstance(args, dict) and args.get("robot"):
-        robot_rtt = await session.channel.round_trip()
+        robot_rtt = await session.channel.asking.round_trip()
     return {"relay_time_ns": time.time_ns(), "robot_rtt_ms": milliseconds(robot_rtt)}
 
 

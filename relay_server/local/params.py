@@ -72,7 +72,7 @@ async def _ask(session: Session, node: str, service: str, request: Any, seconds:
         if found is None or not found.types:
             raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
     session.share.asks_robot()
-    answer = await session.channel.call(name, found.types[0], jsontext.encode(request), seconds)
+    answer = await session.channel.asking.call(name, found.types[0], jsontext.encode(request), seconds)
     with session.share.counted():
         return jsontext.decode_any(answer)
 
@@ -207,5 +207,5 @@ async def get_param_names(session: Session, args: Any) -> Any:
 
     mine, places = _surveys_of_user.take(session.allowance), _surveys.take(session.channel)
     with mine, places, contextlib.suppress(Unavailable):
-        await session.channel.within(ALL_SECONDS, side_by_side(waiting, ask))
+        await session.channel.asking.within(ALL_SECONDS, side_by_side(waiting, ask))
     return {"names": [name for node in nodes for name in found.get(node, [])][:NAMES]}

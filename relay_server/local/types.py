@@ -40,7 +40,7 @@ async def _known(session: Session, type_name: str, own_text: bool = False) -> Ty
     """
     if type_name.startswith(catalogue.PACKAGES) and catalogue.TYPES.knows(type_name):
         return catalogue.TYPES
-    await session.channel.definition(type_name, own_text)
+    await session.channel.asking.definition(type_name, own_text)
     return session.robot.types
 
 
@@ -149,7 +149,7 @@ async def _full_text(session: Session, type_name: str) -> str:
 async def interfaces(session: Session, args: Any) -> Any:
     """``/rosapi/interfaces``: all types the robot has; of a robot that does not tell them, those in its graph."""
     if "cdr" in session.robot.encodings:
-        told: Iterable[str] = await session.channel.interfaces()
+        told: Iterable[str] = await session.channel.asking.interfaces()
         await session.share.own_turn()
     else:
         told = _in_graph(view(session))

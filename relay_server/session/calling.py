@@ -66,7 +66,7 @@ class Calling:
         if local is None:
             self._session.judge(Operation.CALL, service)
             self._session.share.asks_robot()
-            answer: Awaitable[bytes] = self._session.channel.call(
+            answer: Awaitable[bytes] = self._session.channel.asking.call(
                 service, normal_type(ask.type, "srv"), raw, ask.timeout
             )
         else:

@@ -58,7 +58,7 @@ class Pursuing:
         self._check_room(ask)
         goal = _Goal(self, ask, asked(ask, session.tell))
         self._goals.append(goal)
-        pursued = session.channel.pursue(
+        pursued = session.channel.asking.pursue(
             session,
             goal,
             action,

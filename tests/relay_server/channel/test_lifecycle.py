@@ -178,12 +178,12 @@ def test_callers_wait_for_the_channel_and_are_told_when_the_robot_goes(world: Wo
     world.robot_comes()
     world.channel.attach(Member())
     told: list[Any] = []
-    asking = Deferred.fromCoroutine(world.channel.definition("std_msgs/msg/String"))
+    asking = Deferred.fromCoroutine(world.channel.asking.definition("std_msgs/msg/String"))
     asking.addErrback(lambda failure: told.append(str(failure.value)))
     assert not told
     world.robot_goes()
     assert told == ["robot rover is offline"]
-    assert fails(world.channel.definition("std_msgs/msg/String")) == "robot rover is offline"
+    assert fails(world.channel.asking.definition("std_msgs/msg/String")) == "robot rover is offline"
 
 
 def test_a_robot_that_never_joins_keeps_nobody_waiting_for_ever(world: World) -> None:
@@ -192,9 +192,9 @@ def test_a_robot_that_never_joins_keeps_nobody_waiting_for_ever(world: World) ->
     world.channel.attach(Member())
     told: list[str] = []
     for work in (
-        world.channel.round_trip(),
-        world.channel.definition("std_msgs/msg/String"),
-        world.channel.call("/reset", "", b"", 2.0),
+        world.channel.asking.round_trip(),
+        world.channel.asking.definition("std_msgs/msg/String"),
+        world.channel.asking.call("/reset", "", b"", 2.0),
     ):
         Deferred.fromCoroutine(work).addErrback(lambda failure: told.append(str(failure.value)))
     world.clock.pump([1.0] * 4)
@@ -209,7 +209,7 @@ def test_a_round_trip_is_what_the_link_measures(world: World) -> None:
     world.channel.attach(Member())
     world.robot_joins()
     results: list[Any] = []
-    Deferred.fromCoroutine(world.channel.round_trip()).addBoth(results.append)
+    Deferred.fromCoroutine(world.channel.asking.round_trip()).addBoth(results.append)
     world.link.pings[0].callback(0.25)
     assert results == [0.25]
 
@@ -244,9 +244,9 @@ def test_one_ping_serves_all_who_ask_meanwhile(world: World) -> None:
     world.robot_joins()
     results: list[object] = []
     for _ in range(3):
-        Deferred.fromCoroutine(world.channel.round_trip()).addBoth(results.append)
+        Deferred.fromCoroutine(world.channel.asking.round_trip()).addBoth(results.append)
     assert len(world.link.pings) == 1
     world.link.pings[0].callback(0.25)
     assert results == [0.25, 0.25, 0.25]
-    Deferred.fromCoroutine(world.channel.round_trip())
+    Deferred.fromCoroutine(world.channel.asking.round_trip())
     assert len(world.link.pings) == 2
