@@ -62,7 +62,10 @@ class Peer:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            self.record.append(json.loads(line))
+            if line.startswith("{"):
+                self.record.append(json.loads(line))
+            else:  # the middleware's, which warns here of what other processes left
+                sys.stderr.write(line)
 
     def do(self, *what: Any) -> None:
         """Have something done, and wait until it is."""
@@ -91,7 +94,7 @@ class Peer:
         while not true():
             assert self._process.poll() is None, "the peer ended"
             assert time.monotonic() < deadline, f"waited {timeout} s in vain"
-            time.sleep(0.01)
+            time.sleep(0.01)  # what is waited for comes from another process
 
     def close(self) -> None:
         assert self._process.stdin is not None

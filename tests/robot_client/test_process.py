@@ -20,7 +20,7 @@ from rclpy.serialization import serialize_message
 
 from relay_protocol import link
 from tests.robot_client.fake_relay import FakeRelay, Peer
-from tests.robot_client.ros import PATIENCE, domain
+from tests.robot_client.ros import PATIENCE
 from tests.robot_client.ros import Peer as Node
 
 TWIST = "geometry_msgs/msg/Twist"
@@ -40,13 +40,7 @@ def until(true: Callable[[], object], timeout: float = PATIENCE) -> None:
     deadline = time.monotonic() + timeout
     while not true():
         assert time.monotonic() < deadline, f"waited {timeout} s in vain"
-        time.sleep(0.02)
-
-
-@pytest.fixture(scope="module")
-def environment() -> Iterator[dict[str, str]]:
-    with domain() as found:
-        yield found
+        time.sleep(0.02)  # what is waited for comes from other processes
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +153,7 @@ class Drive:
         """Drive for half a second; when the last command was heard, nanoseconds."""
         for _ in range(10):
             self.channel.sample(5, GO)
-            time.sleep(0.05)
+            time.sleep(0.05)  # the pace of a driver
         return int(self.node.heard("/cmd_vel")[-1]["at"])
 
     def zero_after(self, since: int) -> float:
@@ -249,7 +243,7 @@ def test_relay_that_restarts_has_its_robot_back(enrolled: Robot) -> None:
     enrolled.run()
     enrolled.relay.register()
     enrolled.relay.close()
-    time.sleep(1.0)
+    time.sleep(1.0)  # the robot dials in vain meanwhile
     enrolled.relay.open()
     back = time.monotonic()
     enrolled.relay.register()
@@ -312,11 +306,11 @@ def test_frozen_daemon_stops(drive: Drive) -> None:
     for _ in range(5):
         drive.channel.sample(5, GO)
     assert drive.zero_after(last) < STOP_MS
-    time.sleep(1.0)
+    time.sleep(1.0)  # the commands grow old
     thawed = time.monotonic_ns()
     drive.process.send_signal(signal.SIGCONT)
     drive.control.expect(link.Health)
-    time.sleep(0.5)
+    time.sleep(0.5)  # proves absence
     assert [each for each in drive.node.heard("/cmd_vel") if each["at"] > thawed and each["x"] != 0.0] == []
 
 
@@ -355,7 +349,7 @@ def test_dead_guard_is_replaced_and_told(drive: Drive) -> None:
 def test_idle_guard_costs_nothing(drive: Drive) -> None:
     """A guard with nothing to guard uses no measurable processor time of its own code."""
     before = sum(drive.guard.cpu_times()[:2])
-    time.sleep(2.0)
+    time.sleep(2.0)  # the time it is measured over
     assert sum(drive.guard.cpu_times()[:2]) - before < 0.2
     assert os.getsid(drive.guard.pid) != os.getsid(drive.process.pid)
 
@@ -368,11 +362,11 @@ def test_frozen_guard_lets_nothing_move(drive: Drive) -> None:
         held_back = time.monotonic() + PATIENCE
         while not drive.channel.sample(5, GO) and drive.node.heard("/cmd_vel")[-1]["x"] != 0.0:
             assert time.monotonic() < held_back
-            time.sleep(0.05)
+            time.sleep(0.05)  # the pace of a driver
         stood = len(drive.node.heard("/cmd_vel"))
         for _ in range(10):
             drive.channel.sample(5, GO)
-            time.sleep(0.05)
+            time.sleep(0.05)  # the pace of a driver
         assert {each["x"] for each in drive.node.heard("/cmd_vel")[stood:]} <= {0.0}
     finally:
         drive.guard.resume()

@@ -1,4 +1,4 @@
-"""A ROS domain of its own for each module, with a node in another process."""
+"""The platform in a domain of its own for each module, with a node in another process."""
 
 from __future__ import annotations
 
@@ -8,13 +8,7 @@ import pytest
 from twisted.internet import reactor
 
 from robot_client.platforms.ros2 import Ros2Platform
-from tests.robot_client.ros import Peer, domain
-
-
-@pytest.fixture(scope="module")
-def environment() -> Iterator[dict[str, str]]:
-    with domain() as found:
-        yield found
+from tests.robot_client.ros import Peer
 
 
 @pytest.fixture(scope="module")

@@ -38,14 +38,21 @@ class Client:
         self.goals.append(goal)
 
 
+async def given_a_goal(ros: Ros2Platform, peer: Peer, action: str, order: int = 1) -> Client:
+    """A client that offers an action, once a node's goal has come to it."""
+    client = Client(ros, action)
+    peer.record.clear()
+    peer.do("send", action, order)
+    await until(lambda: client.goals)
+    return client
+
+
 @pytest_twisted.ensureDeferred
 async def test_goal_is_pursued(ros: Ros2Platform, peer: Peer) -> None:
     """A node's goal comes as CDR; feedback reaches the node in order, and the result with its status."""
-    client, action = Client(ros, "/pursued"), "/pursued"
+    action = "/pursued"
+    client = await given_a_goal(ros, peer, action, 5)
     assert client.offer.type == FIBONACCI
-    peer.record.clear()
-    peer.do("send", action, 5)
-    await until(lambda: client.goals)
     assert client.orders == [5]
     for number in range(5):
         client.goals[0].feedback(feedback(*range(number)))
@@ -83,10 +90,9 @@ async def test_goals_are_pursued_side_by_side(ros: Ros2Platform, peer: Peer) -> 
 @pytest_twisted.ensureDeferred
 async def test_cancel_comes_to_the_client(ros: Ros2Platform, peer: Peer) -> None:
     """A node's wish to cancel is told to the client, whose canceled result reaches the node."""
-    client, action = Client(ros, "/cancelled"), "/cancelled"
-    peer.record.clear()
-    peer.do("send", action, 1)
-    await until(lambda: client.goals and peer.told("taken", action))
+    action = "/cancelled"
+    client = await given_a_goal(ros, peer, action)
+    await until(lambda: peer.told("taken", action))
     peer.do("cancel", action)
     await until(lambda: client.unwanted)
     assert client.unwanted == client.goals
@@ -114,10 +120,8 @@ async def test_canceled_without_being_asked_is_an_abort(ros: Ros2Platform, peer:
 @pytest_twisted.ensureDeferred
 async def test_bytes_that_are_no_result_end_nothing(ros: Ros2Platform, peer: Peer) -> None:
     """Bytes that are no feedback or result are refused in words, and the goal goes on."""
-    client, action = Client(ros, "/odd"), "/odd"
-    peer.record.clear()
-    peer.do("send", action, 1)
-    await until(lambda: client.goals)
+    action = "/odd"
+    client = await given_a_goal(ros, peer, action)
     with pytest.raises(Invalid, match="no feedback"):
         client.goals[0].feedback(b"\0")
     with pytest.raises(Invalid, match="no result"):
@@ -133,10 +137,8 @@ async def test_bytes_that_are_no_result_end_nothing(ros: Ros2Platform, peer: Pee
 @pytest_twisted.ensureDeferred
 async def test_withdrawn_action_aborts_its_goals(ros: Ros2Platform, peer: Peer) -> None:
     """Who waits for a goal of an action that is withdrawn hears that it was aborted; it can be offered again."""
-    client, action = Client(ros, "/withdrawn"), "/withdrawn"
-    peer.record.clear()
-    peer.do("send", action, 1)
-    await until(lambda: client.goals)
+    action = "/withdrawn"
+    client = await given_a_goal(ros, peer, action)
     client.offer.close()
     await until(lambda: peer.told("result", action))
     assert peer.told("result", action)[0]["status"] == ABORTED
@@ -159,9 +161,7 @@ async def test_withdrawn_action_aborts_its_goals(ros: Ros2Platform, peer: Peer) 
 @pytest_twisted.ensureDeferred
 async def test_open_goals_cost_nothing(ros: Ros2Platform, peer: Peer) -> None:
     """The executor's thread sleeps while a goal is pursued elsewhere."""
-    client = Client(ros, "/idle")
-    peer.do("send", "/idle", 1)
-    await until(lambda: client.goals)
+    client = await given_a_goal(ros, peer, "/idle")
     await task.deferLater(reactor, 0.2)
     spinner = ros._nodes.for_actions()
     assert not spinner._work

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from robot_client.platforms.ros2_errors import in_words
+from relay_protocol.errors import Invalid, NotFound
+from robot_client.platforms.ros2_errors import in_words, refusals
 
 
 @pytest.mark.parametrize(
@@ -21,3 +22,20 @@ from robot_client.platforms.ros2_errors import in_words
 def test_places_in_sources_are_left_out(said: str, left: str) -> None:
     """From the first path on it is of no use to who reads it."""
     assert in_words(RuntimeError(said)) == left
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (
+            RuntimeError("wrong type, at /project/src/a.c:1"),
+            Invalid("ROS 2 refuses the service /a: wrong type"),
+        ),
+        (NotFound("there is no /a"), NotFound("there is no /a")),
+    ],
+)
+def test_refusals_are_told_in_words(error: Exception, told: Exception) -> None:
+    """What ROS 2 throws becomes a sentence about what was tried; what is one already stays."""
+    with pytest.raises(type(told)) as caught, refusals("the service /a"):
+        raise error
+    assert str(caught.value) == str(told)

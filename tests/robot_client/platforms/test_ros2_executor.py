@@ -114,7 +114,7 @@ async def test_bell_wakes_the_reactor_and_loses_nothing() -> None:
 async def test_what_is_put_while_the_bell_goes_arrives() -> None:
     """Calls put before, while and after the bell is taken away arrive, then by the reactor's own way."""
     got = list[int]()
-    hop = Hop(real_reactor.callFromThread)  # type: ignore[attr-defined]
+    hop = Hop(real_reactor.callFromThread)  # type: ignore[attr-defined]  # to mypy a module
     hop.open(real_reactor)
     hop.put(got.append, -1)
     hop.close()
@@ -134,7 +134,7 @@ async def test_bell_the_reactor_gave_up_is_replaced() -> None:
     assert bell is not None
     hop.put(got.append, 1)
     bell.connectionLost(None)
-    assert bell not in real_reactor.getReaders()  # type: ignore[attr-defined]
+    assert bell not in real_reactor.getReaders()  # type: ignore[attr-defined]  # to mypy a module
     hop.put(got.append, 2)
     reactor.turn()
     assert got == [1, 2]
@@ -259,7 +259,7 @@ def test_executor_at_rest_serves_and_ends(kind: str, environment: dict[str, str]
         served = spinner._served
         end = time.monotonic() + 10
         while spinner._served == served and time.monotonic() < end:
-            time.sleep(0.01)
+            time.sleep(0.01)  # the beat comes from another thread
         assert spinner._served > served
         assert spinner.trouble() is None
         assert set(turns) == {TURN}

@@ -179,12 +179,13 @@ async def test_idle_clients_are_swept(ros: Ros2Platform, peer: Peer, monkeypatch
     assert (await running.end()).status == CANCELED
 
 
+@pytest.mark.parametrize("executor", ["events", "single"])
 @pytest_twisted.ensureDeferred
 async def test_leaving_cancels_what_is_under_way(
-    executor_kind: str, environment: dict[str, str], peer: Peer
+    executor: str, environment: dict[str, str], peer: Peer
 ) -> None:
     """A daemon that leaves cancels the goals it asked for, and each has an outcome."""
-    ros = Ros2Platform(reactor, "switchboard_brief", executor=executor_kind)
+    ros = Ros2Platform(reactor, "switchboard_brief", executor=executor)
     ros.start()
     try:
         await serve(ros, peer, "/forever", "forever")
@@ -196,20 +197,3 @@ async def test_leaving_cancels_what_is_under_way(
     assert wanted.outcomes[0].status == ABORTED
     peer.until(lambda: peer.told("ended", "/forever"))
     assert peer.told("ended", "/forever")[0]["canceled"] is True
-
-
-def test_interfaces_of_the_robot_are_known(ros: Ros2Platform) -> None:
-    """All installed types are named, each with a definition: actions in three parts, with a hash."""
-    names = ros.interfaces()
-    assert names == sorted(set(names))
-    assert {FIBONACCI, "std_msgs/msg/String", "switchboard_test_interfaces/srv/Everything"} <= set(names)
-    for name in names:
-        assert ros.definition(name).type == name
-    found = ros.definition(FIBONACCI)
-    assert found.text == "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"
-    assert found.hash.startswith("RIHS01_")
-
-
-@pytest.fixture(params=["events", "single"])
-def executor_kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)

@@ -7,13 +7,14 @@ from typing import Any
 
 import pytest
 import pytest_twisted
-import rclpy
 from example_interfaces.srv import AddTwoInts
 from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor, task
 
 from relay_protocol.errors import Invalid, NotFound
+from robot_client.platforms.base import Offer
 from robot_client.platforms.ros2 import Ros2Platform
+from tests.robot_client.platforms.ends import node
 from tests.robot_client.ros import Peer, until
 
 ADD = "example_interfaces/srv/AddTwoInts"
@@ -22,10 +23,11 @@ ADD = "example_interfaces/srv/AddTwoInts"
 class Client:
     """Somebody at the relay who answers, or doesn't yet."""
 
-    def __init__(self) -> None:
+    def __init__(self, ros: Ros2Platform, service: str, type: str = ADD) -> None:
         self.calls: list[tuple[AddTwoInts.Request, Callable[[bytes], None]]] = []
+        self.offer: Offer = ros.serve(service, type, self.take)
 
-    def __call__(self, body: bytes, answer: Callable[[bytes], None]) -> None:
+    def take(self, body: bytes, answer: Callable[[bytes], None]) -> None:
         self.calls.append((deserialize_message(body, AddTwoInts.Request), answer))
 
     def answer(self, number: int) -> None:
@@ -33,26 +35,36 @@ class Client:
         answer(bytes(serialize_message(AddTwoInts.Response(sum=request.a + request.b))))
 
 
+async def called(ros: Ros2Platform, peer: Peer, service: str, a: int, b: int) -> Client:
+    """A client that offers a service, once a node's call has come to it."""
+    client = Client(ros, service)
+    peer.record.clear()
+    peer.do("call", service, a, b)
+    await until(lambda: client.calls)
+    return client
+
+
 @pytest_twisted.ensureDeferred
 async def test_call_is_answered_by_the_client(ros: Ros2Platform, peer: Peer) -> None:
     """A node's call comes as CDR, and the CDR given for it reaches the node as the answer."""
-    client = Client()
-    offer = ros.serve("/sum", "example_interfaces/AddTwoInts", client)
-    before = len(peer.told("answer", "/sum"))
-    assert offer.type == ADD
-    peer.do("call", "/sum", 2, 3)
-    await until(lambda: client.calls)
+    client = await called(ros, peer, "/sum", 2, 3)
     client.answer(0)
-    await until(lambda: len(peer.told("answer", "/sum")) > before)
-    assert peer.told("answer", "/sum")[-1]["sum"] == 5
-    offer.close()
+    await until(lambda: peer.told("answer", "/sum"))
+    assert peer.told("answer", "/sum")[0]["sum"] == 5
+    client.offer.close()
+
+
+def test_type_of_a_service_is_told_in_full(ros: Ros2Platform) -> None:
+    """However it was spelled."""
+    client = Client(ros, "/spelled", "example_interfaces/AddTwoInts")
+    assert client.offer.type == ADD
+    client.offer.close()
 
 
 @pytest_twisted.ensureDeferred
 async def test_unanswered_call_holds_nothing_up(ros: Ros2Platform, peer: Peer) -> None:
     """While calls wait for their answers others are answered, in any order, and the executor serves."""
-    slow, quick = Client(), Client()
-    offers = [ros.serve("/slow_sum", ADD, slow), ros.serve("/quick_sum", ADD, quick)]
+    slow, quick = Client(ros, "/slow_sum"), Client(ros, "/quick_sum")
     peer.record.clear()
     for a in range(5):
         peer.do("call", "/slow_sum", a, 0)
@@ -67,17 +79,14 @@ async def test_unanswered_call_holds_nothing_up(ros: Ros2Platform, peer: Peer) -
         await until(lambda a=a: [each for each in peer.told("answer", "/slow_sum") if each["a"] == a])
     assert [each["sum"] for each in peer.told("answer", "/slow_sum")] == [4, 0, 2, 1, 3]
     assert ros.trouble() is None
-    for offer in offers:
-        offer.close()
+    for client in (slow, quick):
+        client.offer.close()
 
 
 @pytest_twisted.ensureDeferred
 async def test_waiting_for_an_answer_costs_nothing(ros: Ros2Platform, peer: Peer) -> None:
     """The executor's thread sleeps while a call waits for its answer."""
-    client = Client()
-    offer = ros.serve("/idle_sum", ADD, client)
-    peer.do("call", "/idle_sum", 1, 1)
-    await until(lambda: client.calls)
+    client = await called(ros, peer, "/idle_sum", 1, 1)
     turns = 0
     once = ros._nodes.main._executor.spin_once
 
@@ -96,34 +105,27 @@ async def test_waiting_for_an_answer_costs_nothing(ros: Ros2Platform, peer: Peer
     await task.deferLater(reactor, 0.5)
     ros._nodes.main._executor = executor
     assert turns < 200
-    offer.close()
+    client.offer.close()
 
 
 @pytest_twisted.ensureDeferred
 async def test_bytes_that_are_no_answer_are_refused(ros: Ros2Platform, peer: Peer) -> None:
     """Bytes that are no response are refused in words, and the service goes on."""
-    client = Client()
-    offer = ros.serve("/odd_sum", ADD, client)
-    peer.do("call", "/odd_sum", 1, 2)
-    await until(lambda: client.calls)
+    client = await called(ros, peer, "/odd_sum", 1, 2)
     with pytest.raises(Invalid, match="no response of type example_interfaces/srv/AddTwoInts"):
         client.calls[0][1](b"\0\1")
     client.answer(0)
     await until(lambda: peer.told("answer", "/odd_sum"))
-    offer.close()
+    client.offer.close()
 
 
 @pytest_twisted.ensureDeferred
 async def test_withdrawn_service_is_gone_and_can_come_again(ros: Ros2Platform, peer: Peer) -> None:
     """What is withdrawn leaves the graph, late answers go nowhere, and it can be offered again at once."""
-    client, again = Client(), Client()
-    offer = ros.serve("/brief_sum", ADD, client)
-    peer.record.clear()
-    peer.do("call", "/brief_sum", 1, 1)
-    await until(lambda: client.calls)
-    offer.close()
+    client = await called(ros, peer, "/brief_sum", 1, 1)
+    client.offer.close()
     client.answer(0)
-    second = ros.serve("/brief_sum", ADD, again)
+    again = Client(ros, "/brief_sum")
 
     def answered() -> bool:
         for number in range(len(again.calls)):
@@ -133,7 +135,7 @@ async def test_withdrawn_service_is_gone_and_can_come_again(ros: Ros2Platform, p
     peer.do("call", "/brief_sum", 7, 1)
     await until(answered)
     assert [each["a"] for each in peer.told("answer", "/brief_sum")] == [7]
-    second.close()
+    again.offer.close()
     served = ros._node.get_service_names_and_types_by_node
     await until(lambda: "/brief_sum" not in dict(served("switchboard_test", "/")))
 
@@ -144,30 +146,24 @@ async def test_what_can_not_be_offered_is_said(ros: Ros2Platform, peer: Peer) ->
     peer.do("serve", "/taken", "invert")
     await until(lambda: "/taken" in ros.graph().services)
     with pytest.raises(Invalid, match="/robot/peer offers it"):
-        ros.serve("/taken", ADD, Client())
-    offer = ros.serve("/ours", ADD, Client())
+        Client(ros, "/taken")
+    client = Client(ros, "/ours")
     with pytest.raises(Invalid, match="already"):
-        ros.serve("ours", ADD, Client())
-    offer.close()
+        Client(ros, "ours")
+    client.offer.close()
     with pytest.raises(Invalid, match="no service name"):
-        ros.serve("/not a name", ADD, Client())
+        Client(ros, "/not a name")
     with pytest.raises(NotFound, match="no_such/srv/Thing"):
-        ros.serve("/free", "no_such/srv/Thing", Client())
+        Client(ros, "/free", "no_such/srv/Thing")
     with pytest.raises(Invalid, match="no type of services"):
-        ros.serve("/free", "std_msgs/msg/String", Client())
+        Client(ros, "/free", "std_msgs/msg/String")
 
 
 @pytest_twisted.ensureDeferred
 async def test_service_that_is_only_waited_for_is_free(ros: Ros2Platform, peer: Peer) -> None:
     """A node that waits for a service does not keep it from being offered."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("waiting", context=context)
-    try:
-        node.create_client(AddTwoInts, "/awaited_sum")
+    with node("waiting") as waiting:
+        waiting.create_client(AddTwoInts, "/awaited_sum")
         known = ros._node.get_service_names_and_types
         await until(lambda: "/awaited_sum" in dict(known()))
-        ros.serve("/awaited_sum", ADD, Client()).close()
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
+        Client(ros, "/awaited_sum").offer.close()

@@ -1,0 +1,65 @@
+"""Calls of services by the ROS 2 platform in a real graph."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import pytest_twisted
+from rclpy.serialization import deserialize_message, serialize_message
+from std_srvs.srv import SetBool, Trigger
+from twisted.internet import reactor, task
+
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from robot_client.platforms.ros2 import Ros2Platform
+from tests.robot_client.platforms.ends import seen
+from tests.robot_client.ros import Peer
+
+TRIGGER = "std_srvs/srv/Trigger"
+
+pytestmark = pytest.mark.parametrize("ros", ["events"], indirect=True, scope="module")
+
+
+async def failure(call: Any) -> SwitchboardError:
+    try:
+        await call
+    except SwitchboardError as error:
+        return error
+    raise AssertionError("the call was answered")
+
+
+@pytest_twisted.ensureDeferred
+async def test_service_is_called(ros: Ros2Platform, peer: Peer) -> None:
+    """A call carries its request there and its answer back."""
+    peer.do("serve", "/invert", "invert")
+    await seen(ros, lambda graph: "/invert" in graph.services)
+    request = bytes(serialize_message(SetBool.Request(data=True)))
+    answer = deserialize_message(await ros.call("/invert", "std_srvs/SetBool", request, 10), SetBool.Response)
+    assert (answer.success, answer.message) == (False, "inverted")
+
+
+@pytest_twisted.ensureDeferred
+async def test_calls_that_can_not_be_answered_end_in_words(ros: Ros2Platform, peer: Peer) -> None:
+    """No such service, another type, senseless arguments, no answer in time: each is told in words, soon."""
+    peer.do("serve", "/slow", "slow")
+    peer.do("serve", "/invert2", "invert")
+    await seen(ros, lambda graph: "/slow" in graph.services and "/invert2" in graph.services)
+    empty = bytes(serialize_message(Trigger.Request()))
+    assert isinstance(await failure(ros.call("/nowhere", TRIGGER, empty, 30)), NotFound)
+    assert "std_srvs/srv/SetBool" in str(await failure(ros.call("/invert2", TRIGGER, empty, 30)))
+    assert isinstance(await failure(ros.call("/invert2", "std_srvs/srv/SetBool", b"", 30)), Invalid)
+    assert isinstance(await failure(ros.call("bad name", TRIGGER, empty, 30)), Invalid)
+    late = await failure(ros.call("/slow", TRIGGER, empty, 0.3))
+    assert isinstance(late, Unavailable)
+    assert "0.3 s" in str(late)
+
+
+@pytest_twisted.ensureDeferred
+async def test_service_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: Peer) -> None:
+    """A call under way to a service that is taken away ends long before its timeout."""
+    peer.do("serve", "/doomed", "slow")
+    await seen(ros, lambda graph: "/doomed" in graph.services)
+    call = ros.call("/doomed", TRIGGER, bytes(serialize_message(Trigger.Request())), 600)
+    await task.deferLater(reactor, 0.3)
+    peer.do("unserve", "/doomed")
+    assert isinstance(await failure(call), SwitchboardError)
