@@ -16,7 +16,7 @@ import msgspec
 from relay_protocol import frames, identity, link
 from relay_protocol.errors import PeerError
 
-T = TypeVar("T", bound=link.Message)
+T = TypeVar("T", bound=link.Message | frames.SampleFrame)
 PATIENCE = 20.0
 
 
@@ -75,7 +75,7 @@ class Peer:
             self.skipped.append(message)
 
     def expect_sample(self, timeout: float = PATIENCE) -> frames.SampleFrame:
-        return self.expect(frames.SampleFrame, timeout)  # type: ignore[type-var]
+        return self.expect(frames.SampleFrame, timeout)
 
     def expect_end(self, timeout: float = PATIENCE) -> list[Any]:
         """Wait until the robot hangs up; what it still said."""

@@ -43,7 +43,7 @@ def invert(request: SetBool.Request, response: SetBool.Response) -> SetBool.Resp
 
 
 def slow(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-    time.sleep(4.0)
+    time.sleep(4.0)  # longer than its caller waits
     return response
 
 
@@ -109,7 +109,7 @@ def act(action: str, kind: str) -> None:
             goal.abort()
         elif kind == "forever":
             while not goal.is_cancel_requested:
-                time.sleep(0.02)
+                time.sleep(0.02)  # the pace of its feedback
                 goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
             goal.canceled()
         else:
@@ -119,7 +119,7 @@ def act(action: str, kind: str) -> None:
 
     def judge(goal: object) -> GoalResponse:
         if kind == "late":
-            time.sleep(1.0)
+            time.sleep(1.0)  # a server that thinks before it takes a goal
         return GoalResponse.REJECT if kind == "reject" else GoalResponse.ACCEPT
 
     ends[action] = ActionServer(

@@ -219,13 +219,13 @@ def test_call_that_can_not_be_made_is_answered_in_words(
     assert words in answer.reason
 
 
-def test_middleware_that_throws_costs_one_answer(scene: Scene) -> None:
+def test_middleware_that_throws_costs_one_answer(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """An unforeseen fault of the platform is answered without its internals, and the channel lives."""
 
     def broken(*args: object) -> None:
         raise RuntimeError("secret internals")
 
-    scene.platform.subscribe = broken  # type: ignore[method-assign,assignment]
+    monkeypatch.setattr(scene.platform, "subscribe", broken)
     answer = scene.ask(link.Subscribe(number=1, topic="/chat"))
     assert isinstance(answer, link.Failed)
     assert "secret" not in answer.reason

@@ -311,12 +311,12 @@ def test_stop_says_goodbye(scene: Scene) -> None:
     assert len(scene.dialled) == 1
 
 
-def test_stuck_middleware_is_told_once(scene: Scene) -> None:
+def test_stuck_middleware_is_told_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A middleware that is stuck is an alert, once, and its recovery another."""
     control = scene.register()
     control.heard()
     trouble: list[str | None] = ["the executor is stuck"]
-    scene.platform.trouble = lambda: trouble[0]  # type: ignore[method-assign]
+    monkeypatch.setattr(scene.platform, "trouble", lambda: trouble[0])
     scene.run(1)
     trouble[0] = None
     scene.run(1)
@@ -324,33 +324,34 @@ def test_stuck_middleware_is_told_once(scene: Scene) -> None:
     assert alerts == ["error", "info"]
 
 
-def test_battery_that_can_not_be_read_ends_nothing(scene: Scene) -> None:
+def test_battery_that_can_not_be_read_ends_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A platform that throws over its battery costs the charge, not the registration and not the health to come."""
 
     def broken() -> float | None:
         raise RuntimeError("malformed sample")
 
-    scene.platform.battery = broken  # type: ignore[method-assign]
-    heard = scene.register().heard()
-    assert "health" in [each["op"] for each in heard]
-    del scene.platform.battery
+    with monkeypatch.context() as broken_for_now:
+        broken_for_now.setattr(scene.platform, "battery", broken)
+        heard = scene.register().heard()
+        assert "health" in [each["op"] for each in heard]
     scene.platform.charge = 0.5
     scene.run(4)
     told = [each for each in scene.lines[-1].heard() if each["op"] == "health"]
     assert told[-1]["battery"] == 0.5
 
 
-def test_graph_that_can_not_be_read_at_first_is_told_later(scene: Scene) -> None:
+def test_graph_that_can_not_be_read_at_first_is_told_later(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A robot whose graph throws is registered all the same, and tells it when it can be read."""
-    view = scene.platform.graph
 
     def broken() -> GraphView:
         raise RuntimeError("no graph")
 
-    scene.platform.graph = broken  # type: ignore[method-assign]
-    control = scene.register()
-    assert "health" in control.ops()
-    scene.platform.graph = view  # type: ignore[method-assign]
+    with monkeypatch.context() as broken_for_now:
+        broken_for_now.setattr(scene.platform, "graph", broken)
+        control = scene.register()
+        assert "health" in control.ops()
     scene.run(1)
     assert any("/talker" in each["nodes"] for each in control.heard() if each["op"] == "graph")
 

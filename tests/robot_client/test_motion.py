@@ -137,7 +137,7 @@ def test_driver_leaving_stops_at_once(scene: Scene) -> None:
     assert scene.sent == [GO, ZERO]
 
 
-def test_stop_all_stops_every_topic_though_one_fails(scene: Scene) -> None:
+def test_stop_all_stops_every_topic_though_one_fails(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A topic that can't be published on does not keep the next from its stop."""
     scene.open("b", "/second")
     scene.command(GO)
@@ -146,7 +146,7 @@ def test_stop_all_stops_every_topic_though_one_fails(scene: Scene) -> None:
     def broken(body: bytes) -> None:
         raise RuntimeError("middleware is gone")
 
-    scene.platform.sinks[0].publish = broken  # type: ignore[method-assign]
+    monkeypatch.setattr(scene.platform.sinks[0], "publish", broken)
     scene.desk.stop_all("test")
     assert scene.platform.published[-1] == ("/second", ZERO)
 
@@ -238,11 +238,16 @@ def test_finish_waits_for_the_last_zero(scene: Scene) -> None:
     assert len(said) == 2
 
 
-def test_zero_has_the_type_of_the_command(scene: Scene) -> None:
+def test_zero_has_the_type_of_the_command(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A topic advertised as TwistStamped first and driven as Twist is stopped as Twist."""
     asked: list[str] = []
     honest = scene.platform.zero
-    scene.platform.zero = lambda type: asked.append(type) or honest(type)  # type: ignore[method-assign,func-returns-value]
+
+    def noted(type: str) -> bytes:
+        asked.append(type)
+        return honest(type)
+
+    monkeypatch.setattr(scene.platform, "zero", noted)
     scene.open("stamped", "/base", STAMPED)
     scene.open("plain", "/base", TWIST)
     scene.command(GO, "plain")
