@@ -18,6 +18,7 @@ from rosidl_parser import definition as idl
 
 from relay_protocol.errors import Invalid
 from relay_protocol.ros_types import TypeRegistry
+from tests.protocol.ros_texts import registry
 
 ROOT = Path(__file__).resolve().parents[2]
 ROSLIB = ROOT / "web_client" / "node_modules" / "roslib" / "dist" / "RosLib.js"
@@ -109,13 +110,6 @@ def test_roslib_reads_every_kind_of_field() -> None:
         assert message_numbered(type(message), value) == message_as_roslib_says(message)
 
 
-def registry(text: str) -> TypeRegistry:
-    """A registry of one type, ``a/msg/B``."""
-    types = TypeRegistry()
-    types.add("a/msg/B", text)
-    return types
-
-
 @pytest.mark.parametrize(
     ("text", "cdr", "cbor"),
     [
@@ -136,12 +130,12 @@ def registry(text: str) -> TypeRegistry:
 )
 def test_bytes_of_cbor(text: str, cdr: str, cbor: str) -> None:
     """Maps, keys, numbers and typed arrays are written so."""
-    assert registry(text).to_cbor("a/msg/B", bytes.fromhex("00010000" + cdr)).hex() == cbor
+    assert registry(B=text).to_cbor("a/msg/B", bytes.fromhex("00010000" + cdr)).hex() == cbor
 
 
 def test_big_endian_numbers_are_turned() -> None:
     """Typed arrays are little endian, whatever the robot's byte order is."""
-    types = registry("int16[] a\nfloat64[2] b\nuint8[] c")
+    types = registry(B="int16[] a\nfloat64[2] b\nuint8[] c")
     cdr = bytes.fromhex("00000000 00000002 0001 fffe 3ff0000000000000 c000000000000000 00000001 07")
     value = cbor2.loads(types.to_cbor("a/msg/B", cdr))
     assert [(each.tag, each.value.hex()) for each in value.values()] == [
@@ -153,7 +147,7 @@ def test_big_endian_numbers_are_turned() -> None:
 
 def test_nan_and_infinity_stay() -> None:
     """CBOR has them, so nothing is lost."""
-    types = registry("float64 a\nfloat32 b\nfloat64[1] c")
+    types = registry(B="float64 a\nfloat32 b\nfloat64[1] c")
     cdr = b"\0\1\0\0" + bytes.fromhex("000000000000f87f 000080ff 00000000 000000000000f07f")
     value = cbor2.loads(types.to_cbor("a/msg/B", cdr))
     assert math.isnan(value["a"])
@@ -166,7 +160,7 @@ def test_nan_and_infinity_stay() -> None:
 )
 def test_bad_messages_are_told_as_for_json(cdr: bytes) -> None:
     """The same bytes are refused, with the same words."""
-    types = registry("string x")
+    types = registry(B="string x")
     with pytest.raises(Invalid) as cbor:
         types.to_cbor("a/msg/B", cdr)
     with pytest.raises(Invalid) as text:

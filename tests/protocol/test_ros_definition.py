@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import TYPE_DEFINITION
 from relay_protocol.ros.definition import Constant, FieldType, Shape, normalise, parse
-
-LINE = "=" * 80
+from tests.protocol.ros_texts import LINE
 
 
 def contained(name: str, text: str) -> str:

@@ -21,8 +21,8 @@ from relay_protocol.ros import fast_reader, fast_writer
 from relay_protocol.ros.compiled import Compiled
 from relay_protocol.ros.source import MAX_STEPS, Source, TooLarge, quoted
 from relay_protocol.ros_types import TypeRegistry
+from tests.protocol.ros_texts import LINE
 
-LINE = "=" * 80
 EVERYTHING = f"""std_msgs/Header header
 bool flag
 int8 i8
