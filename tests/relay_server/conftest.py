@@ -11,13 +11,19 @@ from twisted.internet import reactor
 
 from relay_db.engine import Database
 from relay_server.store import Store
-from tests.relay_server.memory import World
+from tests.relay_server.memory import Time, World
 
 
 @pytest.fixture
 def world() -> World:
     """One robot, offline, and nobody there."""
     return World()
+
+
+@pytest.fixture
+def time() -> Time:
+    """A thousand seconds after the beginning."""
+    return Time()
 
 
 @pytest.fixture(scope="session")

@@ -81,6 +81,15 @@ def messages_in(frames: bytes) -> list[tuple[int, bytes]]:
     return found
 
 
+class Time:
+    """A clock the test moves, seconds."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 class MemoryLink:
     """A robot's link as the relay writes to it."""
 
@@ -166,6 +175,10 @@ class Person:
     def hears(self, op: str) -> list[dict[str, Any]]:
         """What came of one op; the rest is forgotten."""
         return [message for message in self.client.take() if message["op"] == op]
+
+    def told(self) -> list[str]:
+        """The words of the statuses that came; the rest is forgotten."""
+        return [message["msg"] for message in self.hears("status")]
 
     def answers_pings(self) -> None:
         """Send a pong to every ping."""
@@ -285,6 +298,14 @@ class World:
             for person in people:
                 person.answers_pings()
 
+    def at_work(self) -> Person:
+        """An operator who wants to hear of errors, with a robot that is there and joined."""
+        self.robot_comes()
+        person = self.person()
+        self.robot_joins()
+        person.says("set_level", level="error")
+        return person
+
     def working(self) -> None:
         """The robot is there, joined, and has told of all types it was asked for."""
         self.robot_comes()
@@ -302,5 +323,5 @@ def fails(work: Any) -> str:
 
 __all__ = [
     "ADD", "FIBONACCI", "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink",
-    "Person", "Presence", "Unavailable", "World", "fails", "text", "words",
+    "Person", "Presence", "Time", "Unavailable", "World", "fails", "text", "words",
 ]  # fmt: skip

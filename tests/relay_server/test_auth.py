@@ -19,25 +19,11 @@ from relay_server import limiter, passwords
 from relay_server.access import Principal
 from relay_server.auth import Authenticator, BadCredentials, TooManyTries
 from relay_server.store import Store
+from tests.relay_server.memory import Time
 
 PASSWORD = "correct horse"
 HASHED = passwords.hash_password(PASSWORD)
 HERE = "192.0.2.1"
-
-
-class Time:
-    """A clock the test moves, monotonic and wall alike."""
-
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def time() -> Time:
-    """A thousand seconds after the beginning."""
-    return Time()
 
 
 @pytest.fixture

@@ -109,7 +109,7 @@ def test_what_is_small_to_publish_and_what_takes_back_is_always_done(world: Worl
     person.says("unsubscribe", topic="/chatter")
     assert not world.channel.ends().subscribes
     person.says("cancel_action_goal", action="/dock", id="g")
-    told = [each["msg"] for each in person.hears("status")]
+    told = person.told()
     assert told[0].startswith("too much at once")
     assert told[1] == "no goal of yours with the id 'g' is under way"
 

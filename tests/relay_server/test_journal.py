@@ -12,21 +12,7 @@ from relay_server import journal as module
 from relay_server.journal import BURST, WAITING, Journal
 from relay_server.store import Store
 from tests.relay_server.edges.robot_ends import until
-
-
-class Time:
-    """A clock the test moves."""
-
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def time() -> Time:
-    """Some time."""
-    return Time()
+from tests.relay_server.memory import Time
 
 
 @pytest.fixture

@@ -433,10 +433,7 @@ def test_changes_faster_than_any_program_needs_are_refused(world: World) -> None
 def test_arguments_of_calls_that_wait_are_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """What calls keep in memory is given back when they end."""
     monkeypatch.setattr(calling, "CALL_BYTES", 100)
-    world.robot_comes()
-    person = world.person()
-    world.robot_joins()
-    person.says("set_level", level="error")
+    person = world.at_work()
     for _ in range(2):
         person.says("call_service", service="/reset", args={"x": "y" * 60})
     assert "too large together" in told(person)[0]

@@ -18,23 +18,9 @@ ASKED: dict[str, Any] = {"service": link.AdvertiseService, "action": link.Advert
 ENDED: dict[str, Any] = {"service": link.UnadvertiseService, "action": link.UnadvertiseAction}
 
 
-def at_work(world: World) -> Person:
-    """A robot that is there, and an operator who wants to hear errors."""
-    world.robot_comes()
-    person = world.person()
-    world.robot_joins()
-    person.says("set_level", level="error")
-    return person
-
-
 def offer(person: Person, kind: str, name: str = "/mine", type_name: str = "") -> None:
     """A client offers something."""
     person.says(f"advertise_{kind}", **{kind: name}, type=type_name or TYPES[kind])
-
-
-def errors(person: Person) -> list[str]:
-    """The statuses that came."""
-    return [each["msg"] for each in person.hears("status")]
 
 
 def confirm(world: World, kind: str, name: str = "/mine") -> None:
@@ -46,7 +32,7 @@ def confirm(world: World, kind: str, name: str = "/mine") -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_robot_is_asked_to_offer_it(world: World, kind: str) -> None:
     """With the full name and type, and who offers it; the same again asks nothing; the end is told."""
-    person = at_work(world)
+    person = world.at_work()
     short = TYPES[kind].replace(f"/{'srv' if kind == 'service' else 'action'}/", "/")
     offer(person, kind, "mine", short)
     offer(person, kind, "/mine")
@@ -56,27 +42,27 @@ def test_the_robot_is_asked_to_offer_it(world: World, kind: str) -> None:
     confirm(world, kind)
     person.says(f"unadvertise_{kind}", **{kind: "mine"})
     assert [getattr(each, kind) for each in world.link.all(ENDED[kind])] == ["/mine"]
-    assert not errors(person)
+    assert not person.told()
     assert world.channel.wire.names == 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_name_is_offered_once(world: World, kind: str) -> None:
     """Neither another client, nor the same one with another type, nor what the robot offers itself."""
-    person = at_work(world)
+    person = world.at_work()
     other = world.person()
     other.says("set_level", level="error")
     offer(person, kind)
     offer(other, kind)
-    assert errors(other) == [f"another client offers the {kind} /mine already"]
+    assert other.told() == [f"another client offers the {kind} /mine already"]
     offer(person, kind, type_name={"service": "std_srvs/srv/Empty", "action": "a_msgs/action/Other"}[kind])
-    assert errors(person) == [f"you offer the {kind} /mine already"]
+    assert person.told() == [f"you offer the {kind} /mine already"]
     world.robot.graph.actions["/walk"] = link.Service(types=[FIBONACCI], providers=["/legs"])
     taken = {"service": "/reset", "action": "/walk"}[kind]
     offer(person, kind, taken)
-    assert errors(person) == [f"the robot offers the {kind} {taken} itself"]
+    assert person.told() == [f"the robot offers the {kind} {taken} itself"]
     other.says(f"unadvertise_{kind}", **{kind: "/mine"})
-    assert errors(other) == [f"you do not offer the {kind} /mine"]
+    assert other.told() == [f"you do not offer the {kind} /mine"]
     assert len(world.link.all(ASKED[kind])) == 1
 
 
@@ -84,25 +70,25 @@ def test_a_name_is_offered_once(world: World, kind: str) -> None:
 @pytest.mark.parametrize("name", ["/relay/ping", "relay", "/rosapi/topics", "/rosapi"])
 def test_the_relays_own_names_are_refused(world: World, kind: str, name: str) -> None:
     """Nobody speaks for the relay."""
-    person = at_work(world)
+    person = world.at_work()
     offer(person, kind, name)
-    assert "are the relay's own" in errors(person)[0]
+    assert "are the relay's own" in person.told()[0]
     assert not world.link.all(ASKED[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_hidden_parts_of_actions_are_refused(world: World, kind: str) -> None:
     """Whoever offers them would speak for the action."""
-    person = at_work(world)
+    person = world.at_work()
     offer(person, kind, "/walk/_action/send_goal")
-    assert "for the parts of actions" in errors(person)[0]
+    assert "for the parts of actions" in person.told()[0]
     assert not world.link.all(ASKED[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_offering_is_judged(world: World, kind: str) -> None:
     """By the right to provide, by name."""
-    at_work(world)
+    world.at_work()
     for rights, reason in (
         ({"level": Level.VIEWER}, "provide on /mine needs the level operator"),
         ({"level": Level.OWNER, "deny": ("provide:/mine",)}, "denied"),
@@ -110,7 +96,7 @@ def test_offering_is_judged(world: World, kind: str) -> None:
         person = world.person(**rights)  # type: ignore[arg-type]
         person.says("set_level", level="error")
         offer(person, kind)
-        assert reason in errors(person)[0]
+        assert reason in person.told()[0]
     assert not world.link.all(ASKED[kind])
 
 
@@ -118,16 +104,16 @@ def test_offering_is_judged(world: World, kind: str) -> None:
 @pytest.mark.parametrize("type_name", ["", "no type", "a/b/c/d"])
 def test_an_offer_needs_a_type(world: World, kind: str, type_name: str) -> None:
     """One that is a name of a type."""
-    person = at_work(world)
+    person = world.at_work()
     person.says(f"advertise_{kind}", **{kind: "/mine"}, type=type_name)
-    assert "type" in errors(person)[0]
+    assert "type" in person.told()[0]
     assert not world.link.all(ASKED[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_offers_are_made_again_when_the_robot_is_back(world: World, kind: str) -> None:
     """Also those made while it was away; those withdrawn meanwhile are not."""
-    person = at_work(world)
+    person = world.at_work()
     offer(person, kind)
     offer(person, kind, "/second")
     confirm(world, kind)
@@ -142,7 +128,7 @@ def test_offers_are_made_again_when_the_robot_is_back(world: World, kind: str) -
 @pytest.mark.parametrize("kind", KINDS)
 def test_offers_of_a_client_that_leaves_end(world: World, kind: str) -> None:
     """Others' stay, and the name is free again."""
-    person, other = at_work(world), world.person()
+    person, other = world.at_work(), world.person()
     offer(person, kind)
     offer(other, kind, "/other")
     confirm(world, kind)
@@ -156,7 +142,7 @@ def test_offers_of_a_client_that_leaves_end(world: World, kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_lost_right_ends_offers_at_once(world: World, kind: str) -> None:
     """By name; the client is told."""
-    person = at_work(world)
+    person = world.at_work()
     offer(person, kind)
     offer(person, kind, "/second")
     confirm(world, kind)
@@ -164,20 +150,20 @@ def test_a_lost_right_ends_offers_at_once(world: World, kind: str) -> None:
     person.session.permit.rules = Rules([Grant(Level.OPERATOR, (), ("provide:/mine",))])
     person.session.permit.on_change()
     assert [getattr(each, kind) for each in world.link.all(ENDED[kind])] == ["/mine"]
-    assert errors(person)[0].startswith("unadvertised /mine: ")
+    assert person.told()[0].startswith("unadvertised /mine: ")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_the_robot_can_not_offer_is_told_and_tried_again(world: World, kind: str) -> None:
     """When its graph changes; the same reason is told once."""
-    person = at_work(world)
+    person = world.at_work()
     offer(person, kind)
     failed = link.Failed(what=f"advertise_{kind}", ref="/mine", reason="another node offers it")
     world.channel.message(failed)
-    assert errors(person) == [f"advertise_{kind} /mine: another node offers it"]
+    assert person.told() == [f"advertise_{kind} /mine: another node offers it"]
     world.registry.graph(world.robot, GRAPH)
     world.channel.message(failed)
-    assert not errors(person)
+    assert not person.told()
     world.registry.graph(world.robot, GRAPH)
     assert len(world.link.take(ASKED[kind])) == 3
     confirm(world, kind)
@@ -194,7 +180,7 @@ def appear(world: World, kind: str, name: str = "/mine") -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_offer_gives_way_to_the_robots_own(world: World, kind: str) -> None:
     """Nobody is answered by a client that was there first; when the robot's is gone it is offered again."""
-    person = at_work(world)
+    person = world.at_work()
     offer(person, kind)
     world.define()
     confirm(world, kind)
@@ -226,7 +212,7 @@ def test_what_the_robot_has_when_it_comes_is_not_offered(world: World, kind: str
     appear(world, kind)
     world.robot_joins()
     assert not world.link.all(ASKED[kind])
-    assert errors(person) == [f"advertise_{kind} /mine: the robot offers the {kind} /mine itself"]
+    assert person.told() == [f"advertise_{kind} /mine: the robot offers the {kind} /mine itself"]
 
 
 REQUESTS = ("call_service", "send_action_goal")
@@ -244,14 +230,14 @@ def ask(person: Person, kind: str, id: int = 1) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_answer_to_a_former_offer_is_not_taken_for_the_new_one(world: World, kind: str) -> None:
     """The robot answers in order: what is asked of a name waits for the answer to what was asked before."""
-    person, other = at_work(world), world.person()
+    person, other = world.at_work(), world.person()
     other.says("set_level", level="error")
     offer(person, kind)
     person.says(f"unadvertise_{kind}", **{kind: "/mine"})
     offer(other, kind)
     assert len(world.link.all(ASKED[kind])) == 1
     world.channel.message(link.Failed(what=f"advertise_{kind}", ref="/mine", reason="no such type"))
-    assert not errors(other)
+    assert not other.told()
     assert len(world.link.all(ASKED[kind])) == 2
 
 
@@ -262,20 +248,20 @@ def test_offers_of_one_client_and_of_one_user_are_bounded(
     """Over all connections of a user; and so are all names in use on a robot."""
     monkeypatch.setattr(module, "OFFERS", 2)
     monkeypatch.setattr(module, "USER_OFFERS", 3)
-    person = at_work(world)
+    person = world.at_work()
     again, stranger = world.person(), world.person(user=8)
     for each in (again, stranger):
         each.says("set_level", level="error")
     for number in range(3):
         offer(person, kind, f"/a{number}")
-    assert errors(person) == [f"at most 2 {kind}s can be offered on one connection"]
+    assert person.told() == [f"at most 2 {kind}s can be offered on one connection"]
     for number in range(2):
         offer(again, kind, f"/b{number}")
-    assert errors(again) == [f"you offer 3 {kind}s on this robot, the most one user may"]
+    assert again.told() == [f"you offer 3 {kind}s on this robot, the most one user may"]
     monkeypatch.setattr(wire, "NAMES", 4)
     for number in range(2):
         offer(stranger, kind, f"/c{number}")
-    assert errors(stranger) == ["more than 4 names are in use on this robot"]
+    assert stranger.told() == ["more than 4 names are in use on this robot"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -284,7 +270,7 @@ def test_no_client_floods_the_robot_with_offers(
 ) -> None:
     """A bounded number of requests goes out at a time; the next when one is answered."""
     monkeypatch.setattr(wire, "ASKS", 4)
-    person = at_work(world)
+    person = world.at_work()
     for number in range(20):
         offer(person, kind, f"/a{number}")
     assert len(world.link.all(ASKED[kind])) == 4
@@ -294,17 +280,17 @@ def test_no_client_floods_the_robot_with_offers(
 
 def test_changing_offers_in_a_hurry_is_refused(world: World) -> None:
     """As for topics."""
-    person = at_work(world)
+    person = world.at_work()
     for _ in range(600):
         offer(person, "service")
         person.says("unadvertise_service", service="/mine")
-    assert any("too many changes at once" in each for each in errors(person))
+    assert any("too many changes at once" in each for each in person.told())
     assert len(world.link.all(link.AdvertiseService)) == 1
 
 
 def test_a_channel_that_is_closed_offers_nothing(world: World) -> None:
     """Whoever is still there."""
-    person = at_work(world)
+    person = world.at_work()
     offer(person, "service")
     world.channel.shut()
     assert world.channels.find(world.robot) is None

@@ -9,21 +9,7 @@ import pytest
 from relay_protocol import link
 from relay_protocol.qos import QoS
 from relay_server.channel import publications as module
-from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World, words
-
-
-def at_work(world: World) -> Person:
-    """A robot and somebody who wants to be told of errors."""
-    world.robot_comes()
-    person = world.person()
-    world.robot_joins()
-    person.says("set_level", level="error")
-    return person
-
-
-def told(person: Person) -> list[str]:
-    """The errors the person was told."""
-    return [each["msg"] for each in person.hears("status")]
+from tests.relay_server.memory import STRING, TRIGGER, TWIST, World, words
 
 
 def said(world: World) -> list[str]:
@@ -33,7 +19,7 @@ def said(world: World) -> list[str]:
 
 def test_a_topic_is_advertised_once_and_counted_by_id(world: World) -> None:
     """The publisher goes with the last advertisement."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type="std_msgs/String", id="a", latch=True, queue_size=3)
     person.says("advertise", topic="out", type=STRING, id="b")
     (asked,) = world.link.all(link.Advertise)
@@ -48,7 +34,7 @@ def test_a_topic_is_advertised_once_and_counted_by_id(world: World) -> None:
 
 def test_what_is_asked_of_a_publisher_reaches_the_robot_within_reason(world: World) -> None:
     """Quality of service as the client wrote it; a queue of any number is not."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING, queue_size=10**30, qos={"depth": 5})
     (asked,) = world.link.all(link.Advertise)
     assert asked.queue_size == module.QUEUE_SIZE
@@ -58,14 +44,14 @@ def test_what_is_asked_of_a_publisher_reaches_the_robot_within_reason(world: Wor
 @pytest.mark.parametrize("size", [0, -1, -(10**30)])
 def test_a_queue_of_nothing_is_the_usual_one(world: World, size: int) -> None:
     """Less than one message is no queue; it counts as left out."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING, queue_size=size)
     assert world.link.all(link.Advertise)[0].queue_size == module.USUAL_QUEUE_SIZE
 
 
 def test_what_a_first_message_asks_of_its_publisher_reaches_the_robot(world: World) -> None:
     """As an advertisement would; who has advertised is past that, and so is every later message."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("set_level", level="warning")
     wish = {"durability": "transient_local"}
     person.says("publish", topic="/chatter", msg={}, latch=True, queue_size=7, qos=wish)
@@ -75,16 +61,16 @@ def test_what_a_first_message_asks_of_its_publisher_reaches_the_robot(world: Wor
     first, second = world.link.all(link.Advertise)
     assert (first.latch, first.queue_size, first.qos) == (True, 7, QoS(durability="transient_local"))
     assert (second.latch, second.queue_size, second.qos) == (False, 3, None)
-    assert told(person) == []
+    assert person.told() == []
 
 
 def test_what_the_first_one_asked_for_stays(world: World) -> None:
     """Also when the robot is away meanwhile; who asks for something else is warned, with the id."""
-    first, second = at_work(world), world.person()
+    first, second = world.at_work(), world.person()
     second.says("set_level", level="warning")
     first.says("advertise", topic="/out", type=STRING, latch=True, queue_size=5, qos={"depth": 2})
     second.says("advertise", topic="/out", type=STRING, latch=True, id="same")
-    assert told(second) == []
+    assert second.told() == []
     world.robot_goes()
     second.says("advertise", topic="/out", type=STRING, id="no latch")
     second.says("advertise", topic="/out", type=STRING, latch=True, qos={"depth": 3}, id="qos")
@@ -98,7 +84,7 @@ def test_what_the_first_one_asked_for_stays(world: World) -> None:
 
 def test_unadvertising_what_was_not_advertised_is_warned_of(world: World) -> None:
     """An unknown topic, an unknown id, and the topic of somebody else, which stays."""
-    other, person = at_work(world), world.person()
+    other, person = world.at_work(), world.person()
     person.says("set_level", level="warning")
     other.says("advertise", topic="/theirs", type=STRING, id="a")
     person.says("advertise", topic="/mine", type=STRING, id="a")
@@ -114,7 +100,7 @@ def test_unadvertising_what_was_not_advertised_is_warned_of(world: World) -> Non
 
 def test_json_becomes_cdr_when_the_type_is_known(world: World) -> None:
     """What comes before the definition waits for it, in order."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING)
     person.says("publish", topic="/out", msg={"data": "a"})
     person.says("publish", topic="/out", msg={"data": "b"})
@@ -127,7 +113,7 @@ def test_json_becomes_cdr_when_the_type_is_known(world: World) -> None:
 
 def test_the_stamp_is_the_moment_before_which_it_was_not_sent(world: World) -> None:
     """The sending time of the latest ping answered goes with the command."""
-    person = at_work(world)
+    person = world.at_work()
     person.answers_pings()
     pinged = world.now_ns()
     world.clock.advance(0.05)
@@ -138,22 +124,22 @@ def test_the_stamp_is_the_moment_before_which_it_was_not_sent(world: World) -> N
 
 def test_publishing_without_advertising_takes_the_graphs_type(world: World) -> None:
     """Or the one that came along; nobody knows it otherwise."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("publish", topic="/chatter", msg={"data": "x"})
     person.says("publish", topic="/new", type="std_msgs/String", msg={"data": "y"})
     person.says("publish", topic="/nobody/knows", msg={})
     assert [ask.topic for ask in world.link.all(link.Advertise)] == ["/chatter", "/new"]
-    assert told(person) == ["topic /nobody/knows does not exist and no type was given; advertise it first"]
+    assert person.told() == ["topic /nobody/knows does not exist and no type was given; advertise it first"]
 
 
 def test_types_that_can_not_be_are_refused(world: World) -> None:
     """Conflicts, none, and what is no type name."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/chatter", type="std_msgs/Bool")
     person.says("advertise", topic="/new", type="")
     person.says("advertise", topic="/new", type="x" * 10_000)
     person.says("advertise", topic="/new", type="std_msgs/msg/../../String")
-    first, second, *others = told(person)
+    first, second, *others = person.told()
     assert first == f"topic /chatter has the type {STRING}, not std_msgs/msg/Bool"
     assert second == "topic /new does not exist; advertise it with its type"
     assert all("is no type name" in each for each in others) and len(others) == 2
@@ -163,12 +149,12 @@ def test_types_that_can_not_be_are_refused(world: World) -> None:
 
 def test_messages_that_do_not_fit_are_told_and_not_sent(world: World) -> None:
     """The sentence names topic and field."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING)
     world.define()
     for body in ({"data": 7}, {"dat": "x"}, [1], "text", None):
         person.says("publish", topic="/out", msg=body)
-    errors = told(person)
+    errors = person.told()
     assert len(errors) == 5
     assert all(each.startswith("publish /out: ") for each in errors)
     assert "data must be a string" in errors[0]
@@ -177,7 +163,7 @@ def test_messages_that_do_not_fit_are_told_and_not_sent(world: World) -> None:
 
 def test_what_was_held_is_not_done_when_the_robot_comes_back(world: World) -> None:
     """Neither when its link had been open, nor when it had not opened yet."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("publish", topic="/chatter", msg={"data": "before the type"})
     world.robot_goes()
     world.robot_comes()
@@ -211,19 +197,19 @@ def test_nothing_is_queued_for_a_robot_that_is_away(world: World) -> None:
     person.says("set_level", level="error")
     person.says("advertise", topic="/cmd_vel", type="geometry_msgs/Twist")
     person.says("publish", topic="/cmd_vel", msg={})
-    assert told(person) == ["robot rover is offline; the message was dropped"]
+    assert person.told() == ["robot rover is offline; the message was dropped"]
     world.working()
     assert not world.link.samples
 
 
 def test_a_robot_that_can_not_advertise_is_told_to_all_who_wait(world: World) -> None:
     """Later messages are refused, and advertising again tries again."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING)
     number = world.link.all(link.Advertise)[0].number
     world.channel.message(link.Failed(what="advertise", ref=str(number), reason="no such type"))
     person.says("publish", topic="/out", msg={})
-    assert told(person) == [
+    assert person.told() == [
         "advertise /out: no such type",
         "the robot could not advertise /out; the message was dropped",
     ]
@@ -245,55 +231,55 @@ def graph(world: World, **topics: link.Topic) -> None:
 
 def test_a_failure_is_told_once_for_each_advertisement_with_its_id(world: World) -> None:
     """The robot is asked again when the topic has changed, and only another reason is told."""
-    person, other = at_work(world), world.person()
+    person, other = world.at_work(), world.person()
     other.says("set_level", level="error")
     person.says("advertise", topic="/out", type=STRING, id="a")
     person.says("advertise", topic="/out", type=STRING, id="b")
     other.says("advertise", topic="/out", type=STRING)
     refuse(world, "no room")
     assert [each["id"] for each in person.hears("status")] == ["a", "b"]
-    assert told(other) == ["advertise /out: no room"]
+    assert other.told() == ["advertise /out: no room"]
     graph(world, elsewhere=link.Topic(types=[STRING], publishers=["/talker"]))
     assert not world.link.all(link.Advertise)
     graph(world, out=link.Topic(types=[STRING], subscribers=["/base"]))
     refuse(world, "no room")
-    assert told(person) == told(other) == []
+    assert person.told() == other.told() == []
     graph(world, out=link.Topic(types=[STRING], subscribers=["/base", "/logger"]))
     refuse(world, "no memory")
-    assert told(person) == ["advertise /out: no memory"] * 2
-    assert told(other) == ["advertise /out: no memory"]
+    assert person.told() == ["advertise /out: no memory"] * 2
+    assert other.told() == ["advertise /out: no memory"]
 
 
 def test_who_advertises_again_is_told_again_and_may_ask_otherwise(world: World) -> None:
     """A wish the robot refused is not kept, and a new attempt is answered; nobody else hears the same twice."""
-    person, other = at_work(world), world.person()
+    person, other = world.at_work(), world.person()
     other.says("set_level", level="error")
     person.says("advertise", topic="/out", type=STRING, id="a", qos={"history": "keep_all"})
     other.says("advertise", topic="/out", type=STRING)
     refuse(world, "not keep_all")
-    assert told(other) == told(person)
+    assert other.told() == person.told()
     person.says("advertise", topic="/out", type=STRING, id="a", qos={"depth": 4})
     assert world.link.all(link.Advertise)[0].qos == QoS(depth=4)
     refuse(world, "not keep_all")
-    assert told(person) == ["advertise /out: not keep_all"]
-    assert told(other) == []
+    assert person.told() == ["advertise /out: not keep_all"]
+    assert other.told() == []
 
 
 def test_a_change_that_comes_before_the_refusal_counts(world: World) -> None:
     """The robot may have judged by what was before it; it is asked once more."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING)
     asked = world.link.take(link.Advertise)[0]
     graph(world, out=link.Topic(types=[STRING], subscribers=["/base"]))
     world.channel.message(link.Failed(what="advertise", ref=str(asked.number), reason="another type"))
     refuse(world, "another type")
-    assert told(person) == ["advertise /out: another type"]
+    assert person.told() == ["advertise /out: another type"]
     assert not world.link.all(link.Advertise)
 
 
 def test_what_failed_after_it_had_worked_is_told(world: World) -> None:
     """Even for the reason it failed for before."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING)
     refuse(world, "no room")
     graph(world, out=link.Topic(types=[STRING], subscribers=["/base"]))
@@ -303,17 +289,17 @@ def test_what_failed_after_it_had_worked_is_told(world: World) -> None:
     world.robot_comes()
     world.robot_joins()
     refuse(world, "no room")
-    assert told(person) == ["advertise /out: no room"] * 2
+    assert person.told() == ["advertise /out: no room"] * 2
 
 
 def test_what_failed_without_its_type_is_tried_again_with_it(world: World) -> None:
     """Whoever made the type known; two refusals of one attempt are told as one."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("advertise", topic="/out", type=STRING)
     world.link.take(link.GetType)
     world.channel.message(link.Failed(what="get_type", ref=STRING, reason="not installed"))
     refuse(world, "no such type")
-    assert told(person) == ["advertise /out: not installed"]
+    assert person.told() == ["advertise /out: not installed"]
     person.says("subscribe", topic="/chatter")
     world.subscribed(world.link.all(link.Subscribe)[0].number)
     world.define(STRING)
@@ -322,10 +308,10 @@ def test_what_failed_without_its_type_is_tried_again_with_it(world: World) -> No
 
 def test_a_type_without_definition_fails_its_topics(world: World) -> None:
     """What waited for it is let go."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("publish", topic="/cmd_vel", msg={})
     world.channel.message(link.Failed(what="get_type", ref=TWIST, reason="not installed"))
-    assert told(person) == ["publish /cmd_vel: not installed", "advertise /cmd_vel: not installed"]
+    assert person.told() == ["publish /cmd_vel: not installed", "advertise /cmd_vel: not installed"]
     assert not world.channel.publications._topics["/cmd_vel"].held
 
 
@@ -351,7 +337,7 @@ def test_a_robot_of_json_gets_objects_with_numbers_that_are_finite(world: World,
     world.robot_joins()
     person.session.message(b'{"op":"publish","topic":"/chatter","msg":%s}' % body)
     assert not world.link.samples
-    (error,) = told(person)
+    (error,) = person.told()
     assert error.startswith("publish /chatter: ")
     person.session.message(b'{"op":"publish","topic":"/chatter","msg":  {"a" : 1e308}  }')
     assert [sent for _, _, sent in world.link.samples] == [b'{"a" : 1e308}']
@@ -359,7 +345,7 @@ def test_a_robot_of_json_gets_objects_with_numbers_that_are_finite(world: World,
 
 def test_a_robot_that_comes_back_with_another_definition_is_sent_that(world: World) -> None:
     """What was made for the former one is not used again."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("publish", topic="/chatter", msg={"data": "a"})
     world.define()
     assert said(world) == ["a"]
@@ -375,7 +361,7 @@ def test_a_robot_that_comes_back_with_another_definition_is_sent_that(world: Wor
 
 def test_a_robot_that_comes_back_speaking_otherwise_is_sent_that(world: World) -> None:
     """CDR before, JSON after."""
-    person = at_work(world)
+    person = world.at_work()
     person.says("publish", topic="/chatter", msg={"data": "a"})
     world.define()
     assert said(world) == ["a"]
@@ -389,12 +375,12 @@ def test_a_robot_that_comes_back_speaking_otherwise_is_sent_that(world: World) -
 def test_advertisements_of_one_client_are_bounded(world: World, monkeypatch: Any) -> None:
     """By topic and by id: nobody takes the names of all others."""
     monkeypatch.setattr(module, "ADVERTISEMENTS", 5)
-    person, other = at_work(world), world.person()
+    person, other = world.at_work(), world.person()
     for number in range(4):
         person.says("advertise", topic=f"/t{number}", type=STRING)
     for number in range(4):
         person.says("advertise", topic="/t0", type=STRING, id=number)
-    assert told(person) == ["at most 5 advertisements can be held on one connection"] * 3
+    assert person.told() == ["at most 5 advertisements can be held on one connection"] * 3
     assert world.channel.wire.names == 4
     other.says("advertise", topic="/mine", type=STRING)
     assert world.channel.wire.names == 5
@@ -402,24 +388,24 @@ def test_advertisements_of_one_client_are_bounded(world: World, monkeypatch: Any
 
 def test_a_command_is_not_held_longer_than_it_is_good(world: World) -> None:
     """What waits for a type's definition grows old like anything else; too old a command is dropped and told."""
-    person = at_work(world)
+    person = world.at_work()
     world.robot.description = link.Describe(motion=link.MotionPolicy(types=[TWIST], deadline_ms=500))
     person.says("publish", topic="/cmd_vel", msg={})
     world.clock.advance(0.6)
     world.define(TWIST)
     assert world.link.samples == []
-    assert "in time" in told(person)[0]
+    assert "in time" in person.told()[0]
 
 
 def test_what_one_client_makes_the_relay_hold_is_bounded(world: World) -> None:
     """However many topics it uses; further messages are dropped and told."""
-    person = at_work(world)
+    person = world.at_work()
     for number in range(5):
         person.says("advertise", topic=f"/t{number}", type=STRING)
         person.says("publish", topic=f"/t{number}", msg={"data": "x" * 300_000})
     held = [len(each.held) for each in world.channel.publications._topics.values()]
     assert sum(held) == 3
-    assert len([words for words in told(person) if "too much waits" in words]) == 2
+    assert len([words for words in person.told() if "too much waits" in words]) == 2
     person.session.end()
     assert world.channel.publications._topics == {}
 

@@ -16,11 +16,7 @@ from tests.relay_server.memory import TWIST, Person, World
 @pytest.fixture
 def person(world: World) -> Person:
     """A client of a robot at work that wants to hear of errors."""
-    world.robot_comes()
-    person = world.person()
-    world.robot_joins()
-    person.says("set_level", level="error")
-    return person
+    return world.at_work()
 
 
 def send(
@@ -29,11 +25,6 @@ def send(
     """Some or all fragments of a message."""
     for number in order if order is not None else range(len(parts)):
         person.says("fragment", id=id, num=number, total=total or len(parts), data=parts[number])
-
-
-def errors(person: Person) -> list[str]:
-    """What the client was told."""
-    return [each["msg"] for each in person.hears("status")]
 
 
 def unfinished(person: Person) -> tuple[int, int, int]:
@@ -49,7 +40,7 @@ def test_fragments_are_joined_in_any_order(person: Person, world: World, order: 
     send(person, "m", words[:20], words[20:21], words[21:], order=order)
     assert [ask.topic for ask in world.link.all(link.Subscribe)] == ["/chatter"]
     assert unfinished(person) == (0, 0, 0)
-    assert not errors(person)
+    assert not person.told()
 
 
 def test_a_joined_message_is_obeyed(person: Person, world: World) -> None:
@@ -96,7 +87,7 @@ def test_fragments_that_make_no_sense(person: Person, parts: list[dict[str, Any]
     """An error in words, and all of the message is let go."""
     for part in parts:
         person.says("fragment", **{"id": "m", "data": "x", **part})
-    assert errors(person) == [words]
+    assert person.told() == [words]
     assert unfinished(person) == (0, 0, 0)
 
 
@@ -105,7 +96,7 @@ def test_the_rest_of_a_refused_message_is_passed_over(person: Person, world: Wor
     words = json.dumps({"op": "subscribe", "topic": "/chatter"})
     parts = [words[:5], words[5:9], words[9:20], words[20:]]
     send(person, "m", *parts, order=[0, 1, 1, 2, 3])
-    assert errors(person) == ["fragment 1 came twice"]
+    assert person.told() == ["fragment 1 came twice"]
     assert unfinished(person) == (0, 0, 0)
     send(person, "m", *parts)
     assert [ask.topic for ask in world.link.all(link.Subscribe)] == ["/chatter"]
@@ -115,7 +106,7 @@ def test_messages_at_a_time_are_bounded(person: Person) -> None:
     """One more than the limit is refused; those that were there stay."""
     for number in range(limits.FRAGMENTS + 1):
         send(person, number, "x", "y", order=[0])
-    assert errors(person) == ["16 messages in fragments are unfinished already"]
+    assert person.told() == ["16 messages in fragments are unfinished already"]
     assert unfinished(person) == (16, 16, 16)
 
 
@@ -126,7 +117,7 @@ def test_bytes_are_bounded(person: Person) -> None:
     third = "é" * (limits.CLIENT_MESSAGE // 6)
     for number in range(3):
         person.says("fragment", id="large", num=number, total=4, data=third)
-    assert errors(person) == ["messages in fragments have more than 1048576 bytes together"]
+    assert person.told() == ["messages in fragments have more than 1048576 bytes together"]
     assert unfinished(person) == (1, 1, 100)
 
 
@@ -135,7 +126,7 @@ def test_fragments_are_bounded(person: Person, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(module, "PARTS", 5)
     send(person, "a", "x", "x", "x", "x", order=[0, 1, 2])
     send(person, "b", "x", "x", "x", "x", order=[0, 1, 2])
-    assert errors(person) == ["messages in fragments have more than 5 fragments together"]
+    assert person.told() == ["messages in fragments have more than 5 fragments together"]
     assert unfinished(person) == (1, 3, 3)
 
 
@@ -153,7 +144,7 @@ def test_a_message_that_does_not_go_on_is_given_up(person: Person, world: World)
     assert status["msg"] == "a message in fragments is given up: 1 of 3 came, and then nothing for 10 s"
     assert unfinished(person) == (1, 2, 2)
     world.clock.advance(5)
-    assert len(errors(person)) == 1
+    assert len(person.told()) == 1
     assert unfinished(person) == (0, 0, 0)
 
 
@@ -171,7 +162,7 @@ def test_fragments_in_fragments_are_refused(person: Person) -> None:
     """Nobody needs them."""
     inner = json.dumps({"op": "fragment", "id": "n", "num": 0, "total": 1, "data": "{}"})
     send(person, "m", inner[:9], inner[9:])
-    assert errors(person) == ["a message in fragments can't be a fragment itself"]
+    assert person.told() == ["a message in fragments can't be a fragment itself"]
     assert unfinished(person) == (0, 0, 0)
 
 

@@ -45,11 +45,6 @@ def found(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return looked
 
 
-def told(person: Person) -> list[str]:
-    """What was said to the person in words."""
-    return [each["msg"] for each in person.hears("status")]
-
-
 def test_a_route_is_found_once(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """As long as nothing changes, names are not resolved nor rights looked up again."""
     person = driving(world)
@@ -69,7 +64,7 @@ def test_a_right_that_is_gone_counts_for_the_very_next_message(world: World) -> 
     person.session.permit.rules = Rules([Grant(Level.OPERATOR, deny=("publish:/cmd_vel",))])
     drive(person)
     assert not world.link.samples
-    assert "is denied to you" in told(person)[0]
+    assert "is denied to you" in person.told()[0]
     assert person.session.refusals == 1
     person.session.permit.rules = former
     drive(person)
@@ -81,7 +76,7 @@ def test_a_robot_that_goes_ends_it(world: World) -> None:
     person = driving(world)
     world.robot_goes()
     drive(person)
-    assert told(person) == ["robot rover is offline; the message was dropped"]
+    assert person.told() == ["robot rover is offline; the message was dropped"]
     world.robot_comes(encodings=["json"])
     world.robot_joins()
     assert len(world.link.all(link.Advertise)) == 1
@@ -144,7 +139,7 @@ def test_a_robot_that_can_not_advertise_any_more_ends_it(world: World) -> None:
     person.client.take()
     drive(person)
     assert not world.link.samples
-    assert told(person) == ["the robot could not advertise /cmd_vel; the message was dropped"]
+    assert person.told() == ["the robot could not advertise /cmd_vel; the message was dropped"]
 
 
 def test_a_type_that_comes_along_is_looked_at_each_time_it_differs(world: World) -> None:
@@ -152,7 +147,7 @@ def test_a_type_that_comes_along_is_looked_at_each_time_it_differs(world: World)
     person = driving(world)
     drive(person, type="nonsense")
     assert not world.link.samples
-    assert "is no type name" in told(person)[0]
+    assert "is no type name" in person.told()[0]
     drive(person, type="geometry_msgs/Twist")
     assert len(world.link.samples) == 1
 

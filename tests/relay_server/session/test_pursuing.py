@@ -130,7 +130,7 @@ def test_goals_need_no_id_but_cancelling_does(world: World) -> None:
     send(person, None)
     person.says("cancel_action_goal", action="/count")
     person.says("cancel_action_goal", action="/count", id="unknown")
-    assert [each["msg"] for each in person.hears("status")] == [
+    assert person.told() == [
         "'cancel_action_goal' needs the 'id' of the goal",
         "no goal of yours with the id 'unknown' is under way",
     ]
