@@ -17,7 +17,7 @@ from relay_protocol import link
 from relay_server import budget
 from relay_server.channel import sample as module
 from relay_server.forms import cbor, png
-from tests.relay_server.channel.test_subscriptions import counting, heard, watching
+from tests.relay_server.channel.watching import counting, heard, watching
 from tests.relay_server.memory import STRING, Person, World, text
 
 STAMP = 1_700_000_000_000_000_007
