@@ -77,10 +77,21 @@ class Hall:
         """A robot's new connection."""
         return Robot(self)
 
+    async def registered(self) -> Robot:
+        """A robot that has proved its key."""
+        robot = self.dial()
+        assert (await robot.registers())["op"] == "welcome"
+        return robot
+
     @property
     def presence(self) -> Presence | None:
         """The robot as the registry sees it."""
         return next((robot for robot in self.registry if robot.name == "r2-d2"), None)
+
+    @property
+    def online(self) -> bool:
+        """Whether the registry has a control link of the robot."""
+        return self.presence is not None and self.presence.control is not None
 
 
 class Robot:

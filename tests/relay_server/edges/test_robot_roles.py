@@ -140,8 +140,7 @@ class Member:
 
 async def asked_to_join(hall: Hall) -> tuple[Robot, str]:
     """A registered robot in use, and the ticket it was given."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     assert hall.presence is not None
     hall.world.channels.of(hall.presence).attach(Member())
     hall.world.clock.advance(0)
@@ -256,8 +255,7 @@ async def test_a_slow_robot_gets_the_newest_samples_and_every_message(hall: Hall
 @pytest_twisted.ensureDeferred
 async def test_a_link_closed_by_the_relay_is_dropped_if_the_robot_does_not_close_it(hall: Hall) -> None:
     """A moment for the farewell, then the connection is aborted; a closed one leaves no timer."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     robot.transport.loseConnection = lambda: None  # type: ignore[method-assign]
     robot.connection.close("going down")
     robot.connection.close("again")

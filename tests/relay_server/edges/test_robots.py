@@ -104,15 +104,13 @@ async def test_a_key_revoked_while_its_proof_is_judged_does_not_stay(
     await robot.answered()
     assert robot.hears()[-1] == {"op": "bye", "reason": "the robot's key is not accepted any more"}
     assert not robot.transport.connected
-    assert hall.presence is not None
-    assert hall.presence.control is None
+    assert not hall.online
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_robots_flood_of_alerts_does_not_reach_the_database(hall: Hall) -> None:
     """Some are kept, the rest is counted; another robot's events are kept meanwhile."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     for number in range(5000):
         robot.says(link.Alert(level="error", text=str(number)))
     assert robot.transport.connected
@@ -134,7 +132,7 @@ async def test_a_recorded_signature_is_worthless(hall: Hall) -> None:
     first.prove(nonce)
     first.prove(nonce)
     await first.answered()
-    assert hall.presence is None or hall.presence.control is None
+    assert not hall.online
 
 
 @pytest.mark.parametrize(
@@ -232,7 +230,7 @@ async def test_a_robot_that_leaves_while_the_database_is_asked_leaves_no_ghost(h
     robot.prove(robot.hello())
     robot.breaks()
     await robot.answered()
-    assert hall.presence is None or hall.presence.control is None
+    assert not hall.online
     assert not [call for call in hall.world.clock.getDelayedCalls() if call.active()]
     assert (await hall.dial().registers())["op"] == "welcome"
 
@@ -270,8 +268,7 @@ async def test_strangers_are_capped_whatever_their_addresses(hall: Hall) -> None
 @pytest_twisted.ensureDeferred
 async def test_what_a_robot_tells_of_itself_is_kept(hall: Hall) -> None:
     """Facts, graph and health."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     robot.says(link.Describe(host="shed"))
     robot.says(link.Graph(full=True, nodes={"/n": {}}))
     robot.says(link.Health(battery=0.5))
@@ -285,19 +282,16 @@ async def test_what_a_robot_tells_of_itself_is_kept(hall: Hall) -> None:
 @pytest_twisted.ensureDeferred
 async def test_a_control_link_takes_no_large_frame(hall: Hall, op: str) -> None:
     """What could stall the relay is refused by its length, before it is there."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     robot.sends((limits.CONTROL_FRAME + 1).to_bytes(4, "big") + b'\x00{"op":"' + op.encode())
     assert robot.refusal()["code"] == "frame_too_large"
-    assert hall.presence is not None
-    assert hall.presence.control is None
+    assert not hall.online
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_graph_without_end_is_refused_in_words(hall: Hall) -> None:
     """The robot is cut and what it told is forgotten."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     ends = ["/" + "n" * 200 + str(number) for number in range(limits.GRAPH_ENDS)]
     for number in range(40):
         robot.says(link.Graph(topics={f"/t{number}": link.Topic(types=["a/msg/B"], publishers=ends)}))
@@ -309,8 +303,7 @@ async def test_a_graph_without_end_is_refused_in_words(hall: Hall) -> None:
 @pytest_twisted.ensureDeferred
 async def test_a_silent_robot_is_cut_after_three_heartbeats(hall: Hall) -> None:
     """It is pinged meanwhile; one that answers stays, and its round trip is known."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     for _ in range(4):
         hall.world.clock.advance(2)
         for each in robot.hears():
@@ -329,8 +322,7 @@ async def test_a_silent_robot_is_cut_after_three_heartbeats(hall: Hall) -> None:
 @pytest_twisted.ensureDeferred
 async def test_a_robot_that_never_pongs_fills_no_memory(hall: Hall) -> None:
     """It sends other things, so it is not cut; what it owes is bounded."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     trips: list[Any] = []
     robot.connection.round_trip().addErrback(lambda failure: trips.append(str(failure.value)))
     for _ in range(PINGS + 50):
@@ -343,8 +335,7 @@ async def test_a_robot_that_never_pongs_fills_no_memory(hall: Hall) -> None:
 @pytest_twisted.ensureDeferred
 async def test_a_newer_link_replaces_the_older_but_not_at_once(hall: Hall) -> None:
     """Two daemons with one key do not replace each other for ever."""
-    first = hall.dial()
-    await first.registers()
+    first = await hall.registered()
     second = hall.dial()
     second.prove(second.hello())
     await second.answered()
@@ -353,8 +344,7 @@ async def test_a_newer_link_replaces_the_older_but_not_at_once(hall: Hall) -> No
     assert refusal["retry_after"] == REPLACE_SECONDS
     assert first.transport.connected
     hall.world.clock.advance(REPLACE_SECONDS)
-    third = hall.dial()
-    assert (await third.registers())["op"] == "welcome"
+    third = await hall.registered()
     assert first.hears()[-1] == {"op": "bye", "reason": "the robot has connected anew"}
     assert not first.transport.connected
     assert hall.presence is not None
@@ -364,8 +354,7 @@ async def test_a_newer_link_replaces_the_older_but_not_at_once(hall: Hall) -> No
 @pytest_twisted.ensureDeferred
 async def test_two_daemons_with_one_key_flap_ever_more_slowly(hall: Hall) -> None:
     """Each replacement doubles the wait up to a minute, and is told; a quiet time makes it short again."""
-    current = hall.dial()
-    await current.registers()
+    current = await hall.registered()
     waits: list[int] = []
     for _ in range(7):
         waits.append(round((await hall.dial().registers())["retry_after"]))
@@ -391,32 +380,27 @@ async def test_two_daemons_with_one_key_flap_ever_more_slowly(hall: Hall) -> Non
 @pytest_twisted.ensureDeferred
 async def test_what_has_no_place_on_a_control_link_ends_it(hall: Hall, data: bytes) -> None:
     """The robot is offline then."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     robot.sends(data)
     assert robot.refusal()["code"] == "malformed"
-    assert hall.presence is not None
-    assert hall.presence.control is None
+    assert not hall.online
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_robot_that_takes_no_commands_is_cut(hall: Hall) -> None:
     """What may not be lost piles up only so far."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     robot.connection._outbox.pause()
     for _ in range(1100):
         robot.connection.send(link.Ping(t=1))
     assert robot.transport.aborted
-    assert hall.presence is not None
-    assert hall.presence.control is None
+    assert not hall.online
 
 
 @pytest_twisted.ensureDeferred
 async def test_of_feedback_a_slow_robot_gets_the_newest(hall: Hall) -> None:
     """A client that tells more than the link takes does not have it cut."""
-    robot = hall.dial()
-    await robot.registers()
+    robot = await hall.registered()
     robot.connection._outbox.pause()
     for number in range(5000):
         for goal in ("a", "b"):
