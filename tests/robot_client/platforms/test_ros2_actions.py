@@ -8,7 +8,7 @@ from example_interfaces.action import Fibonacci
 from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor, task
 
-from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.errors import Invalid
 from robot_client.platforms.base import ABORTED, CANCELED, SUCCEEDED, Offer, ServedGoal
 from robot_client.platforms.ros2 import Ros2Platform
 from tests.robot_client.ros import Peer, until
@@ -195,23 +195,3 @@ async def test_an_action_can_be_offered_again_at_once(ros: Ros2Platform, peer: P
     for _ in range(3):
         client = Client(ros, "/again")
         client.offer.close()
-
-
-@pytest_twisted.ensureDeferred
-async def test_what_can_not_be_offered_is_said(ros: Ros2Platform, peer: Peer) -> None:
-    """An action another node has, one offered already, a bad name and an unknown type are refused in words."""
-    if "/robots_own" not in ros.graph().actions:
-        peer.do("act", "/robots_own", "count")
-    await until(lambda: "/robots_own" in ros.graph().actions)
-    with pytest.raises(Invalid, match="/robot/peer offers it"):
-        Client(ros, "/robots_own")
-    client = Client(ros, "/ours")
-    with pytest.raises(Invalid, match="already"):
-        Client(ros, "ours")
-    client.offer.close()
-    with pytest.raises(Invalid, match="no action name"):
-        Client(ros, "/not a name")
-    with pytest.raises(NotFound, match="no_such/action/Thing"):
-        ros.act("/free", "no_such/action/Thing", client.take, client.unwanted.append)
-    with pytest.raises(Invalid, match="no type of actions"):
-        ros.act("/free", "std_msgs/msg/String", client.take, client.unwanted.append)

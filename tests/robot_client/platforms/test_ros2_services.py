@@ -11,7 +11,7 @@ from example_interfaces.srv import AddTwoInts
 from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor, task
 
-from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.errors import Invalid
 from robot_client.platforms.base import Offer
 from robot_client.platforms.ros2 import Ros2Platform
 from tests.robot_client.platforms.ends import node
@@ -138,25 +138,6 @@ async def test_withdrawn_service_is_gone_and_can_come_again(ros: Ros2Platform, p
     again.offer.close()
     served = ros._node.get_service_names_and_types_by_node
     await until(lambda: "/brief_sum" not in dict(served("switchboard_test", "/")))
-
-
-@pytest_twisted.ensureDeferred
-async def test_what_can_not_be_offered_is_said(ros: Ros2Platform, peer: Peer) -> None:
-    """A service another node has, one offered already, a bad name and an unknown type are refused in words."""
-    peer.do("serve", "/taken", "invert")
-    await until(lambda: "/taken" in ros.graph().services)
-    with pytest.raises(Invalid, match="/robot/peer offers it"):
-        Client(ros, "/taken")
-    client = Client(ros, "/ours")
-    with pytest.raises(Invalid, match="already"):
-        Client(ros, "ours")
-    client.offer.close()
-    with pytest.raises(Invalid, match="no service name"):
-        Client(ros, "/not a name")
-    with pytest.raises(NotFound, match="no_such/srv/Thing"):
-        Client(ros, "/free", "no_such/srv/Thing")
-    with pytest.raises(Invalid, match="no type of services"):
-        Client(ros, "/free", "std_msgs/msg/String")
 
 
 @pytest_twisted.ensureDeferred

@@ -15,6 +15,7 @@ from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
 from robot_client.motion import MOTION_QOS
 from robot_client.platforms.ros2 import LOOK_EVERY, Ros2Platform
+from robot_client.platforms.ros2_topics import RosSink
 from robot_client.topics import TypedTopic
 from tests.robot_client.platforms.ends import STAMPED, STRING, TWIST, Listener, node, seen
 from tests.robot_client.ros import Peer, until
@@ -99,14 +100,20 @@ async def test_closed_subscription_is_silent(ros: Ros2Platform, peer: Peer) -> N
     assert len(listener.bodies) == count
 
 
+async def driving(ros: Ros2Platform, peer: Peer, topic: str, speed: float) -> RosSink:
+    """A publisher whose command a node has heard."""
+    peer.do("listen", topic, "twist")
+    sink = ros.advertise(topic, TWIST, False, None)
+    command = Twist()
+    command.linear.x = speed
+    await until(lambda: sink.publish(bytes(serialize_message(command))) or peer.heard(topic))
+    return sink
+
+
 @pytest_twisted.ensureDeferred
 async def test_published_bytes_arrive(ros: Ros2Platform, peer: Peer) -> None:
     """CDR bytes published as they are reach another node as the message they are."""
-    peer.do("listen", "/cmd_vel", "twist")
-    sink = ros.advertise("/cmd_vel", TWIST, False, None)
-    command = Twist()
-    command.linear.x = 0.25
-    await until(lambda: sink.publish(bytes(serialize_message(command))) or peer.heard("/cmd_vel"))
+    sink = await driving(ros, peer, "/cmd_vel", 0.25)
     assert peer.heard("/cmd_vel")[0]["x"] == 0.25
     sink.close()
 
@@ -114,11 +121,7 @@ async def test_published_bytes_arrive(ros: Ros2Platform, peer: Peer) -> None:
 @pytest_twisted.ensureDeferred
 async def test_last_message_survives_its_publisher(ros: Ros2Platform, peer: Peer) -> None:
     """What was published just before the publisher was taken away still arrives: it may be a stop."""
-    peer.do("listen", "/farewell", "twist")
-    sink = ros.advertise("/farewell", TWIST, False, None)
-    command = Twist()
-    command.linear.x = 1.0
-    await until(lambda: sink.publish(bytes(serialize_message(command))) or peer.heard("/farewell"))
+    sink = await driving(ros, peer, "/farewell", 1.0)
     sink.publish(ros.zero(TWIST))
     sink.close()
     await until(lambda: peer.heard("/farewell")[-1]["x"] == 0.0)

@@ -1,6 +1,8 @@
 """The body's physics: limits, exact arcs, quick stops, and walls that hold."""
 
 import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import pytest
 from hypothesis import example, given, settings
@@ -33,6 +35,23 @@ def drive(each: Body, speed: float, turn: float, steps: int) -> None:
         each.step(STEP)
 
 
+class Step(NamedTuple):
+    """What was asked, and how the body was just before."""
+
+    asked: Twist
+    velocity: Twist
+    pose: Pose
+
+
+def steps(robot: Body, commands: list[tuple[float, float, int]]) -> Iterator[Step]:
+    for speed, turn, count in commands:
+        robot.target = Twist(speed, turn)
+        for _ in range(count):
+            step = Step(robot.target, robot.velocity, robot.pose)
+            robot.step(STEP)
+            yield step
+
+
 @settings(max_examples=60, deadline=None)
 @given(COMMANDS)
 @example([(HIGHEST_SPEED, 0.0, 400)])
@@ -40,12 +59,9 @@ def drive(each: Body, speed: float, turn: float, steps: int) -> None:
 def test_never_inside_a_wall(commands: list[tuple[float, float, int]]) -> None:
     """Whatever is asked at the highest speed, the hull overlaps no obstacle and stays in the hall."""
     robot = body(HALL, HALL.start, HIGHEST_SPEED)
-    for speed, turn, steps in commands:
-        robot.target = Twist(speed, turn)
-        for _ in range(steps):
-            robot.step(STEP)
-            assert HALL.nearest(robot.pose.x, robot.pose.y).distance >= RADIUS
-            assert abs(robot.pose.x) < 6 and abs(robot.pose.y) < 4.5
+    for _ in steps(robot, commands):
+        assert HALL.nearest(robot.pose.x, robot.pose.y).distance >= RADIUS
+        assert abs(robot.pose.x) < 6 and abs(robot.pose.y) < 4.5
 
 
 @settings(max_examples=60, deadline=None)
@@ -53,15 +69,11 @@ def test_never_inside_a_wall(commands: list[tuple[float, float, int]]) -> None:
 def test_no_energy_from_nowhere(commands: list[tuple[float, float, int]]) -> None:
     """Speed never exceeds what was asked or what was there, and never grows faster than the motors can."""
     robot = body(HALL, HALL.start, HIGHEST_SPEED)
-    for speed, turn, steps in commands:
-        robot.target = Twist(speed, turn)
-        for _ in range(steps):
-            before = robot.velocity
-            robot.step(STEP)
-            now = robot.velocity
-            assert abs(now.speed) <= max(abs(before.speed), abs(speed)) + 1e-9
-            assert abs(now.speed) - abs(before.speed) <= robot.limits.speeding_up * STEP + 1e-9
-            assert abs(now.turn) <= max(abs(before.turn), abs(turn)) + 1e-9
+    for asked, before, _ in steps(robot, commands):
+        now = robot.velocity
+        assert abs(now.speed) <= max(abs(before.speed), abs(asked.speed)) + 1e-9
+        assert abs(now.speed) - abs(before.speed) <= robot.limits.speeding_up * STEP + 1e-9
+        assert abs(now.turn) <= max(abs(before.turn), abs(asked.turn)) + 1e-9
 
 
 @settings(max_examples=60, deadline=None)
@@ -69,13 +81,9 @@ def test_no_energy_from_nowhere(commands: list[tuple[float, float, int]]) -> Non
 def test_says_it_stands_only_when_it_stands(commands: list[tuple[float, float, int]]) -> None:
     """`moving` is the truth about the pose: no step changes it while the body claims to stand."""
     robot = body(HALL, HALL.start, HIGHEST_SPEED)
-    for speed, turn, steps in commands:
-        robot.target = Twist(speed, turn)
-        for _ in range(steps):
-            before = robot.pose
-            robot.step(STEP)
-            if not robot.moving:
-                assert robot.pose == pytest.approx(before, abs=1e-8)
+    for _, _, before in steps(robot, commands):
+        if not robot.moving:
+            assert robot.pose == pytest.approx(before, abs=1e-8)
 
 
 @given(speed=st.floats(-0.5, 0.5), turn=st.floats(-2, 2), heading=st.floats(-3, 3), cuts=st.integers(2, 20))
