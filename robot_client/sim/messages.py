@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Quaternion, TransformStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
+from std_msgs.msg import Header
 
 from robot_client.sim import robot as scanner
 from robot_client.sim.battery import CAPACITY_AH, Battery
@@ -41,9 +42,7 @@ class Frames:
 
 def odometry(stamp: Time, frames: Frames, pose: Pose, velocity: Twist) -> Odometry:
     """Pose relative to where the world's origin is, velocity in the body's frame."""
-    message = Odometry()
-    message.header.stamp = stamp
-    message.header.frame_id = frames.odom
+    message = Odometry(header=Header(stamp=stamp, frame_id=frames.odom))
     message.child_frame_id = frames.base
     message.pose.pose.position.x = pose.x
     message.pose.pose.position.y = pose.y
@@ -74,9 +73,7 @@ def static_transforms(stamp: Time, frames: Frames, camera_height: float) -> list
 
 def scan(stamp: Time, frames: Frames, ranges: npt.NDArray[np.float32], period: float) -> LaserScan:
     """:param ranges: metres per ray; :param period: seconds from one scan to the next"""
-    message = LaserScan()
-    message.header.stamp = stamp
-    message.header.frame_id = frames.laser
+    message = LaserScan(header=Header(stamp=stamp, frame_id=frames.laser))
     message.angle_min = scanner.SCAN_BEGIN
     message.angle_max = scanner.SCAN_BEGIN + scanner.SCAN_STEP * (len(ranges) - 1)
     message.angle_increment = scanner.SCAN_STEP
@@ -90,9 +87,7 @@ def scan(stamp: Time, frames: Frames, ranges: npt.NDArray[np.float32], period: f
 
 def image(stamp: Time, frames: Frames, pixels: bytes) -> Image:
     """:param pixels: rows of R, G, B"""
-    message = Image()
-    message.header.stamp = stamp
-    message.header.frame_id = frames.camera
+    message = Image(header=Header(stamp=stamp, frame_id=frames.camera))
     message.height, message.width, message.step = HEIGHT, WIDTH, WIDTH * 3
     message.encoding = "rgb8"
     message.data = array.array("B", pixels)
@@ -101,9 +96,7 @@ def image(stamp: Time, frames: Frames, pixels: bytes) -> Image:
 
 def compressed(stamp: Time, frames: Frames, jpeg: bytes) -> CompressedImage:
     """:param jpeg: a JPEG file"""
-    message = CompressedImage()
-    message.header.stamp = stamp
-    message.header.frame_id = frames.camera
+    message = CompressedImage(header=Header(stamp=stamp, frame_id=frames.camera))
     message.format = "rgb8; jpeg compressed bgr8"
     message.data = array.array("B", jpeg)
     return message
@@ -111,9 +104,7 @@ def compressed(stamp: Time, frames: Frames, jpeg: bytes) -> CompressedImage:
 
 def battery(stamp: Time, frames: Frames, pack: Battery) -> BatteryState:
     """What isn't measured is NaN, as the message's definition wants it."""
-    message = BatteryState()
-    message.header.stamp = stamp
-    message.header.frame_id = frames.base
+    message = BatteryState(header=Header(stamp=stamp, frame_id=frames.base))
     message.voltage = pack.voltage
     message.current = -pack.current
     message.charge = pack.charge * CAPACITY_AH
@@ -129,8 +120,7 @@ def battery(stamp: Time, frames: Frames, pack: Battery) -> BatteryState:
 
 def diagnostics(stamp: Time, robot: str, findings: list[Finding]) -> DiagnosticArray:
     """:param robot: the name that stands before each part"""
-    message = DiagnosticArray()
-    message.header.stamp = stamp
+    message = DiagnosticArray(header=Header(stamp=stamp))
     message.status = [
         DiagnosticStatus(
             level=bytes((finding.severity,)),
@@ -145,9 +135,7 @@ def diagnostics(stamp: Time, robot: str, findings: list[Finding]) -> DiagnosticA
 
 
 def _transform(stamp: Time, parent: str, child: str, pose: Pose, height: float) -> TransformStamped:
-    message = TransformStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = parent
+    message = TransformStamped(header=Header(stamp=stamp, frame_id=parent))
     message.child_frame_id = child
     message.transform.translation.x = pose.x
     message.transform.translation.y = pose.y
