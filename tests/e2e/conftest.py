@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import pytest
@@ -10,6 +11,7 @@ from switchboard_client import Client
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_waiting import wait_for
+from switchboard_watchers import Watcher, bystanders
 
 
 @dataclass
@@ -21,6 +23,13 @@ class World:
     operator: str
     viewer: str
     stranger: str
+
+    @contextmanager
+    def operating(self) -> Iterator[Client]:
+        """An operator's connection, who wants to hear errors."""
+        with self.relay.connect("rover", self.operator) as client:
+            client.send(op="set_level", level="error")
+            yield client
 
 
 def topics_of(client: Client) -> set[str]:
@@ -46,3 +55,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             robot.stop()
     finally:
         relay.stop()
+
+
+@pytest.fixture(scope="module")
+def watchers(world: World) -> Iterator[list[Watcher]]:
+    """Two bystanders for all tests of a module: the same connections from the first attack to the last."""
+    with bystanders(world.relay, "rover", world.viewer, world.operator) as found:
+        yield found

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +28,11 @@ def peer(world: Any) -> Iterator[Peer]:
     peer = Peer(ros_environment(world.robot.domain))
     for name, kind in ACTIONS.items():
         peer.do("act", name, kind)
-    with operator(world) as client:
+    with world.operating() as client:
         # The first goal needs no type when the relay knows the graph.
         wait_for("the relay knows the actions", lambda: known(client) >= set(ACTIONS))
     yield peer
     peer.close()
-
-
-@contextmanager
-def operator(world: Any) -> Iterator[Client]:
-    """An operator who wants to hear errors."""
-    with world.relay.connect("rover", world.operator) as client:
-        client.send(op="set_level", level="error")
-        yield client
 
 
 def known(client: Client) -> set[str]:
@@ -70,7 +61,7 @@ def until_the_end(client: Client) -> list[dict[str, Any]]:
 
 def test_a_node_pursues_a_clients_goal(world: Any, peer: Peer) -> None:
     """Feedback as it goes on, then one result; the type may be left to the graph."""
-    with operator(world) as client:
+    with world.operating() as client:
         *feedback, end = pursue(client, "/counts", feedback=True)
         assert [each["values"]["sequence"] for each in feedback] == [
             [0, 1, 1], [0, 1, 1, 2], [0, 1, 1, 2, 3]
@@ -84,7 +75,7 @@ def test_a_node_pursues_a_clients_goal(world: Any, peer: Peer) -> None:
 
 def test_a_client_cancels_its_goal(world: Any, peer: Peer) -> None:
     """The node ends it, and its result still comes."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="send_action_goal", action="/endless", id="g", args=[3], feedback=True)
         client.until(op="action_feedback", id="g")
         client.send(op="cancel_action_goal", action="/endless", id="g")
@@ -94,7 +85,7 @@ def test_a_client_cancels_its_goal(world: Any, peer: Peer) -> None:
 
 def test_goals_that_come_to_nothing_are_told_so(world: Any, peer: Peer) -> None:
     """Aborted, rejected, unknown, wrong, not allowed: one result each."""
-    with operator(world) as client, world.relay.connect("rover", world.viewer) as viewer:
+    with world.operating() as client, world.relay.connect("rover", world.viewer) as viewer:
         (aborted,) = pursue(client, "/aborts")
         assert aborted["status"] == 6
         (rejected,) = pursue(client, "/rejects")
@@ -112,7 +103,7 @@ def test_goals_that_come_to_nothing_are_told_so(world: Any, peer: Peer) -> None:
 def test_a_client_that_vanishes_leaves_no_goal_behind(world: Any, peer: Peer) -> None:
     """The node is told to cancel."""
     ended = len(peer.told("ended", "/endless"))
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="send_action_goal", action="/endless", id="g", args=[3], feedback=True)
         client.until(op="action_feedback", id="g")
     peer.until(lambda: len(peer.told("ended", "/endless")) > ended)
@@ -137,7 +128,7 @@ def test_every_kind_of_field_passes_in_goals(world: Any, tmp_path: Path) -> None
     """Goal, feedback and result, with a node on the other side."""
     command = [sys.executable, str(CLIENTS / "everything_peer.py"), "serve", "/everything"]
     node = Process(command, tmp_path, "node", ros_environment(world.robot.domain))
-    with running(node), operator(world) as client:
+    with running(node), world.operating() as client:
         node.wait_to_say('{"ready"')
         wait_for("the relay knows the action", lambda: "/everything" in known(client))
         goal = {"primitives": {"wide": "weit 🛰", "vast": 2**64 - 1}, "last": 3}
@@ -156,7 +147,7 @@ def test_every_kind_of_field_passes_in_goals(world: Any, tmp_path: Path) -> None
 
 def test_a_client_pursues_a_nodes_goal(world: Any, peer: Peer) -> None:
     """With feedback and a result, as a node would."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="advertise_action", action="/clients", type=FIBONACCI)
         peer.do("send", "/clients", 7)
         goal = client.until(20, op="send_action_goal", action="/clients")
@@ -173,7 +164,7 @@ def test_a_client_pursues_a_nodes_goal(world: Any, peer: Peer) -> None:
 
 def test_a_node_cancels_a_goal_at_a_client(world: Any, peer: Peer) -> None:
     """The client is asked to end it, and says how it ended."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="advertise_action", action="/stoppable", type=FIBONACCI)
         peer.do("send", "/stoppable", 7)
         goal = client.until(20, op="send_action_goal")
@@ -189,7 +180,7 @@ def test_a_node_cancels_a_goal_at_a_client(world: Any, peer: Peer) -> None:
 
 def test_a_client_fails_or_vanishes_and_the_node_is_told(world: Any, peer: Peer) -> None:
     """Its goals are aborted; so are those it answers with nonsense."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="advertise_action", action="/mortal", type=FIBONACCI)
         for order, said in ((1, {"result": False, "values": "no"}), (2, {"values": {"sum": 1}}), (3, None)):
             peer.do("send", "/mortal", order)
@@ -207,7 +198,7 @@ def test_a_client_fails_or_vanishes_and_the_node_is_told(world: Any, peer: Peer)
 
 def test_a_node_sends_every_kind_of_field_to_a_client(world: Any) -> None:
     """And gets it back, unchanged."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="advertise_action", action="/reflect", type=EVERYTHING)
         node = subprocess.Popen(
             [sys.executable, str(CLIENTS / "everything_peer.py"), "send", "/reflect"],
@@ -232,7 +223,7 @@ def test_a_node_sends_every_kind_of_field_to_a_client(world: Any) -> None:
 
 def test_a_client_pursues_a_clients_goal(world: Any) -> None:
     """With feedback, cancelling and a result; and when it vanishes, an end in words."""
-    with operator(world) as server, operator(world) as asker:
+    with world.operating() as server, world.operating() as asker:
         server.send(op="advertise_action", action="/shared", type=FIBONACCI)
         server.send(op="send_action_goal", action="/shared", id="own")
         server.until(op="send_action_goal")

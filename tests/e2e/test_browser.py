@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import re
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
+from switchboard_browser import chromium, portal, sound_pages
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_waiting import wait_for
 
-import relay_server
 from robot_client.safety import REPEATS
 
 PASSWORD = "correct horse"
-ARGUMENTS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--disable-background-networking"]
-WAIT_MS = 30_000
+WAIT_SECONDS = 30.0
 
 OpenPage = Callable[..., Page]
 
@@ -55,8 +53,7 @@ class House:
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     """One house for all; the tests that restart its relay leave it whole."""
-    if not (relay_server.PORTAL / "index.html").is_file():
-        pytest.fail("The portal is not built. Run 'make web', then the tests again.")
+    portal()
     house = House(tmp_path_factory.mktemp("browser"))
     try:
         yield house
@@ -67,45 +64,26 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """One Chromium for all."""
-    expect.set_options(timeout=WAIT_MS)
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.fail("There is no Chromium. Install the package 'chromium', then run the tests again.")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+    expect.set_options(timeout=WAIT_SECONDS * 1000)
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture
 def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
     """Opens pages of the portal; an uncaught error or a breach of the CSP in any of them fails the test."""
-    faults: list[str] = []
-    contexts = []
+    with sound_pages(browser, house.url, WAIT_SECONDS) as new_page:
 
-    def open_page(path: str = "/", user: str = "", width: int = 1280, height: int = 800) -> Page:
-        context = browser.new_context(viewport={"width": width, "height": height}, base_url=house.url)
-        context.set_default_timeout(WAIT_MS)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: faults.append(f"uncaught: {error}"))
-        page.on(
-            "console",
-            lambda message: (
-                faults.append(message.text) if "Content Security Policy" in message.text else None
-            ),
-        )
-        page.goto("/login" if user else path)
-        if user:
-            log_in(page, user)
-            expect(seen(page, "robot-card")).to_have_count(1)
-            page.goto(path)
-        return page
+        def open_page(path: str = "/", user: str = "", width: int = 1280, height: int = 800) -> Page:
+            page = new_page(width, height)
+            page.goto("/login" if user else path)
+            if user:
+                log_in(page, user)
+                expect(seen(page, "robot-card")).to_have_count(1)
+                page.goto(path)
+            return page
 
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert faults == []
+        yield open_page
 
 
 def seen(page: Page, testid: str) -> Any:
@@ -171,6 +149,15 @@ def stands_after_zero(house: House, page: Page, since: int) -> None:
     told = commands()
     last = max(index for index, each in enumerate(told) if each != (0, 0))
     assert 1 <= len(told[last + 1 :]) <= REPEATS
+
+
+def turn_by_key(house: House, page: Page) -> None:
+    """Holding A turns the robot on the spot; lifting it brings zero and standstill."""
+    since = time.monotonic_ns()
+    page.keyboard.down("a")
+    wait_for("the robot moves", house.robot.moving)
+    page.keyboard.up("a")
+    stands_after_zero(house, page, since)
 
 
 # --- coming in --------------------------------------------------------------------------------------------
@@ -251,11 +238,7 @@ def test_the_keyboard_drives_and_lifting_the_key_stops(house: House, open_page: 
     """A turns on the spot; lifting it brings zero and standstill."""
     page = open_page("/cockpit/rover", "pilot")
     ready_to_drive(page)
-    since = time.monotonic_ns()
-    page.keyboard.down("a")
-    wait_for("the robot moves", house.robot.moving)
-    page.keyboard.up("a")
-    stands_after_zero(house, page, since)
+    turn_by_key(house, page)
 
 
 def test_a_page_that_loses_the_focus_stops(house: House, open_page: OpenPage) -> None:
@@ -336,11 +319,7 @@ def test_the_page_recovers_from_a_restart_of_the_relay(house: House, open_page: 
         ready_to_drive(page)
         first = picture(page, "camera-canvas")
         wait_for("the picture changes", lambda first=first: picture(page, "camera-canvas") != first)
-    since = time.monotonic_ns()
-    page.keyboard.down("a")
-    wait_for("the robot moves", house.robot.moving)
-    page.keyboard.up("a")
-    stands_after_zero(house, page, since)
+    turn_by_key(house, page)
 
 
 def test_a_robot_that_goes_away_is_shown_so_and_comes_back(house: House, open_page: OpenPage) -> None:

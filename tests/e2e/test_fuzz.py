@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from switchboard_watchers import Watcher, bystanders, undisturbed
+from switchboard_watchers import Watcher, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -47,13 +47,7 @@ ODD = (
 )  # fmt: skip
 """Values that are right for some field, and wrong for most."""
 MESSAGES = 4000
-
-
-@pytest.fixture(scope="module")
-def watchers(world: Any) -> Iterator[list[Watcher]]:
-    """Two bystanders from the first message to the last."""
-    with bystanders(world.relay, "rover", world.viewer, world.operator) as found:
-        yield found
+TELL = '{"op":"set_level","level":"error"}'
 
 
 @pytest.fixture(autouse=True)
@@ -114,9 +108,11 @@ def test_random_operations_are_told_or_cut(world: Any, seed: int) -> None:
     while left:
         with connected(world, world.operator) as client:
             try:
-                client.send('{"op":"set_level","level":"error"}')
+                client.send(TELL)
                 while left:
                     left -= 1
+                    if left % 100 == 0:
+                        client.send(TELL)  # one of the messages may have asked for silence
                     client.send(message(chance))
                     with contextlib.suppress(TimeoutError):
                         while True:

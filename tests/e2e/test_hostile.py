@@ -16,7 +16,7 @@ import pytest
 from switchboard_client import Client
 from switchboard_fake_robot import FakeRobot
 from switchboard_waiting import wait_for
-from switchboard_watchers import Watcher, bystanders, undisturbed
+from switchboard_watchers import Watcher, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -25,13 +25,6 @@ from relay_db.engine import Database
 from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json
 from relay_server import passwords
-
-
-@pytest.fixture(scope="module")
-def watchers(world: Any) -> Iterator[list[Watcher]]:
-    """Two bystanders for all tests: the same connections from the first attack to the last."""
-    with bystanders(world.relay, "rover", world.viewer, world.operator) as found:
-        yield found
 
 
 @pytest.fixture(autouse=True)

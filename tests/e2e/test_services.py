@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +29,6 @@ def peer(world: Any) -> Iterator[Peer]:
     peer = Peer(ros_environment(world.robot.domain))
     yield peer
     peer.close()
-
-
-@contextmanager
-def operator(world: Any) -> Iterator[Client]:
-    """An operator who wants to hear errors."""
-    with world.relay.connect("rover", world.operator) as client:
-        client.send(op="set_level", level="error")
-        yield client
 
 
 def adds(client: Client, service: str, seconds: float = 20.0) -> dict[str, Any]:
@@ -64,7 +55,7 @@ def everything(world: Any, what: str, name: str) -> list[str]:
 
 def test_a_node_calls_a_service_of_a_client(world: Any, peer: Peer) -> None:
     """As often as it likes, also several calls at a time, answered in any order."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="advertise_service", service="/sum", type="example_interfaces/AddTwoInts")
         peer.do("call", "/sum", 2, 3)
         call = adds(client, "/sum")
@@ -83,7 +74,7 @@ def test_a_node_calls_a_service_of_a_client(world: Any, peer: Peer) -> None:
 
 def test_every_kind_of_field_passes(world: Any) -> None:
     """Out of the graph into JSON and back into the graph, unchanged."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="advertise_service", service="/mirror", type=EVERYTHING)
         node = subprocess.Popen(
             everything(world, "call", "/mirror"),
@@ -113,7 +104,7 @@ def test_a_client_calls_a_service_with_every_kind_of_field(world: Any, tmp_path:
     node = Process(
         everything(world, "serve", "/nodes_mirror"), tmp_path, "node", ros_environment(world.robot.domain)
     )
-    with running(node), operator(world) as client:
+    with running(node), world.operating() as client:
         node.wait_to_say('{"ready"')
         asked = {"words": ["w"], "request": {"primitives": {"wide": "weit 🛰", "tiny": -128}, "last": 3}}
         answer = wait_for(
@@ -129,11 +120,11 @@ def test_a_client_calls_a_service_with_every_kind_of_field(world: Any, tmp_path:
 
 def test_a_client_that_leaves_takes_its_service_along(world: Any, peer: Peer) -> None:
     """The one call is lost, as with any node that dies; the next client's service is found and answers."""
-    with operator(world) as client:
+    with world.operating() as client:
         client.send(op="advertise_service", service="/brief", type=ADD)
         peer.do("call", "/brief", 1, 1)
         client.until(op="call_service", service="/brief")
-    with operator(world) as client:
+    with world.operating() as client:
         # The name is free at once.
         client.send(op="advertise_service", service="/brief", type=ADD)
         peer.do("call", "/brief", 2, 2)
@@ -144,7 +135,7 @@ def test_a_client_that_leaves_takes_its_service_along(world: Any, peer: Peer) ->
 
 def test_names_that_are_taken_are_refused(world: Any) -> None:
     """By another client, by the robot, by the relay; and a type the robot does not have."""
-    with operator(world) as first, operator(world) as second:
+    with world.operating() as first, world.operating() as second:
         first.send(op="advertise_service", service="/taken", type=ADD)
         # A call of its own shows that the relay has done what was asked before.
         first.send(op="call_service", service="/taken", args={"a": 1})
@@ -161,7 +152,7 @@ def test_names_that_are_taken_are_refused(world: Any) -> None:
 
 def test_a_client_calls_a_client(world: Any) -> None:
     """Answers, failures in words, wrong arguments and a server that vanishes: nobody waits in vain."""
-    with operator(world) as server, operator(world) as caller:
+    with world.operating() as server, world.operating() as caller:
         server.send(op="advertise_service", service="/between", type=ADD)
         server.send(op="call_service", service="/between", id="ready", args=[1])
         adds(server, "/between")
@@ -190,7 +181,7 @@ def test_a_client_calls_a_client(world: Any) -> None:
 
 def test_rights_decide_who_offers_and_who_calls(world: Any) -> None:
     """A viewer does neither."""
-    with operator(world) as server, world.relay.connect("rover", world.viewer) as viewer:
+    with world.operating() as server, world.relay.connect("rover", world.viewer) as viewer:
         server.send(op="advertise_service", service="/judged", type=ADD)
         viewer.send(op="set_level", level="error")
         viewer.send(op="advertise_service", service="/viewers", type=ADD)

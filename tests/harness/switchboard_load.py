@@ -6,7 +6,6 @@ import itertools
 import json
 import socket
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from switchboard_client import Client
 from switchboard_processes import Process, ros_environment
 from switchboard_relay import Relay
 from switchboard_robot import Robot
+from switchboard_threads import Listener
 from switchboard_waiting import readable, wait_for
 from websockets.frames import Frame, Opcode
 
@@ -51,38 +51,27 @@ class Publisher:
         self.process.stop()
 
 
-class Counter(threading.Thread):
+class Counter(Listener):
     """A client that takes everything of some topics and keeps the numbers.
 
     :param topics: short name (``small`` for ``/load/small``) and ``throttle_rate`` in milliseconds
     """
 
     def __init__(self, client: Client, topics: dict[str, int]) -> None:
-        super().__init__(daemon=True)
-        self.client = client
+        super().__init__(client)
         self.numbers: dict[str, list[int]] = {name: [] for name in topics}
-        self.broken = ""
-        self._end = threading.Event()
         client.send(op="set_level", level="error")
         for name, throttle in topics.items():
             client.send(op="subscribe", topic=f"/load/{name}", type=STRING, throttle_rate=throttle)
         self.start()
 
-    def run(self) -> None:
-        """Count until told to stop or until the connection breaks."""
-        while not self._end.is_set():
-            try:
-                message = self.client.receive(0.5)
-            except TimeoutError:
-                continue
-            except Exception as error:
-                self.broken = repr(error)
-                return
-            if message["op"] == "publish":
-                name = message["topic"].removeprefix("/load/")
-                self.numbers[name].append(int(message["msg"]["data"].split()[0]))
-            else:
-                self.broken = message["msg"]
+    def take(self, message: dict[str, Any]) -> None:
+        """Keep its number."""
+        if message["op"] == "publish":
+            name = message["topic"].removeprefix("/load/")
+            self.numbers[name].append(int(message["msg"]["data"].split()[0]))
+        else:
+            self.broken = message["msg"]
 
     def lost(self, name: str) -> list[int]:
         """Numbers missing between the first and the last that came."""
@@ -97,12 +86,6 @@ class Counter(threading.Thread):
         """Whether each number is greater than the one before."""
         numbers = self.numbers[name]
         return all(earlier < later for earlier, later in itertools.pairwise(numbers))
-
-    def stop(self) -> None:
-        """Leave."""
-        self._end.set()
-        self.join(10)
-        self.client.close()
 
 
 class Stalled:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from abc import ABC, abstractmethod
+from typing import Any
 
 from switchboard_client import Client
 
@@ -34,3 +36,35 @@ class Driver(threading.Thread):
         """Let go, without a zero."""
         self._end.set()
         self.join(10)
+
+
+class Listener(threading.Thread, ABC):
+    """Takes whatever comes until told to stop, or until the connection breaks."""
+
+    def __init__(self, client: Client) -> None:
+        super().__init__(daemon=True)
+        self.client = client
+        self.broken = ""
+        self._end = threading.Event()
+
+    @abstractmethod
+    def take(self, message: dict[str, Any]) -> None:
+        """One message."""
+
+    def run(self) -> None:
+        """Receive."""
+        while not self._end.is_set():
+            try:
+                message = self.client.receive(0.5)
+            except TimeoutError:
+                continue
+            except Exception as error:
+                self.broken = repr(error)
+                return
+            self.take(message)
+
+    def stop(self) -> None:
+        """Leave."""
+        self._end.set()
+        self.join(10)
+        self.client.close()

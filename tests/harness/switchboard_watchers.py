@@ -3,47 +3,31 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from switchboard_client import Client
 from switchboard_relay import Relay
+from switchboard_threads import Listener
 from switchboard_waiting import wait_for
 
 STAMP_GAP = 1.0
 """Seconds between two odometry stamps that a busy machine can explain; the simulator sends 20 a second or more."""
 
 
-class Watcher(threading.Thread):
+class Watcher(Listener):
     """Somebody who watches odometry all the time and keeps the stamps."""
 
     def __init__(self, client: Client) -> None:
-        super().__init__(daemon=True)
-        self.client = client
+        super().__init__(client)
         self.stamps: list[float] = []
-        self.broken = ""
-        self._end = threading.Event()
         client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
 
-    def run(self) -> None:
-        """Until told to stop, or until the connection breaks."""
-        while not self._end.is_set():
-            try:
-                message = self.client.receive(0.5)
-            except TimeoutError:
-                continue
-            except Exception as error:
-                self.broken = repr(error)
-                return
-            stamp = message["msg"]["header"]["stamp"]
-            self.stamps.append(stamp["sec"] + stamp["nanosec"] / 1e9)
-
-    def stop(self) -> None:
-        """Leave."""
-        self._end.set()
-        self.join(10)
-        self.client.close()
+    def take(self, message: dict[str, Any]) -> None:
+        """Keep its stamp."""
+        stamp = message["msg"]["header"]["stamp"]
+        self.stamps.append(stamp["sec"] + stamp["nanosec"] / 1e9)
 
 
 @contextmanager

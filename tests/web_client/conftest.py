@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 import time
@@ -13,17 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
+from switchboard_browser import chromium, portal, sound_pages
 
 HERE = Path(__file__).parent
-PORTAL = HERE.parents[1] / "relay_server" / "portal"
 PASSWORD = "correct horse"
-CHROMIUM_ARGS = [
-    "--no-sandbox",
-    "--disable-dev-shm-usage",
-    "--disable-gpu",
-    "--disable-background-networking",
-]
 WAIT_SECONDS = 20.0
 
 expect.set_options(timeout=WAIT_SECONDS * 1000)
@@ -67,10 +60,8 @@ class FakeRelay:
 
 @pytest.fixture
 def relay() -> Iterator[FakeRelay]:
-    if not (PORTAL / "index.html").is_file():
-        pytest.fail("The portal is not built. Run 'make web', then the tests again.")
     process = subprocess.Popen(
-        [sys.executable, str(HERE / "fake_relay.py"), "--portal", str(PORTAL)],
+        [sys.executable, str(HERE / "fake_relay.py"), "--portal", str(portal())],
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -88,13 +79,8 @@ def relay() -> Iterator[FakeRelay]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.fail("There is no Chromium. Install the package 'chromium', then run the tests again.")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=CHROMIUM_ARGS)
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 OpenPage = Callable[..., Page]
@@ -103,36 +89,20 @@ OpenPage = Callable[..., Page]
 @pytest.fixture
 def open_page(browser: Browser, relay: FakeRelay) -> Iterator[OpenPage]:
     """Opens pages of the portal; fails the test if any of them had an uncaught error or broke the CSP."""
-    faults: list[str] = []
-    contexts = []
+    with sound_pages(browser, relay.url, WAIT_SECONDS) as new_page:
 
-    def open_page(
-        path: str = "/", width: int = 1280, height: int = 800, user: str | None = None, **options: Any
-    ) -> Page:
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, base_url=relay.url, **options
-        )
-        context.set_default_timeout(WAIT_SECONDS * 1000)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: faults.append(f"uncaught: {error}"))
-        page.on(
-            "console",
-            lambda message: (
-                faults.append(message.text) if "Content Security Policy" in message.text else None
-            ),
-        )
-        if user is not None:
-            answer = context.request.post(
-                "/api/v1/session",
-                data={"user": user, "password": PASSWORD},
-                headers={"X-Requested-With": "switchboard"},
-            )
-            assert answer.ok, answer.text()
-        page.goto(path)
-        return page
+        def open_page(
+            path: str = "/", width: int = 1280, height: int = 800, user: str | None = None, **options: Any
+        ) -> Page:
+            page = new_page(width, height, **options)
+            if user is not None:
+                answer = page.request.post(
+                    "/api/v1/session",
+                    data={"user": user, "password": PASSWORD},
+                    headers={"X-Requested-With": "switchboard"},
+                )
+                assert answer.ok, answer.text()
+            page.goto(path)
+            return page
 
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert faults == []
+        yield open_page
