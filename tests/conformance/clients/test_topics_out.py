@@ -311,12 +311,17 @@ def test_subscribe_relay_status(client: Client) -> None:
 # --- unsubscribe ---
 
 
-@case("unsubscribe", UNSUBSCRIBE)
-def test_unsubscribe_by_id(client: Client) -> None:
-    """With an id only that subscription ends."""
+def subscribe_twice(client: Client) -> None:
+    """Two subscriptions to the counter, with the ids ``one`` and ``two``."""
     for name in ("one", "two"):
         client.send("subscribe", topic=COUNTER, type=INT, id=name)
     client.until("publish")
+
+
+@case("unsubscribe", UNSUBSCRIBE)
+def test_unsubscribe_by_id(client: Client) -> None:
+    """With an id only that subscription ends."""
+    subscribe_twice(client)
     client.send("unsubscribe", topic=COUNTER, id="one")
     client.lives()
     client.all_within("publish", 0.05)
@@ -326,9 +331,7 @@ def test_unsubscribe_by_id(client: Client) -> None:
 @case("unsubscribe", UNSUBSCRIBE)
 def test_unsubscribe_last_id(client: Client) -> None:
     """With the last id samples end."""
-    for name in ("one", "two"):
-        client.send("subscribe", topic=COUNTER, type=INT, id=name)
-    client.until("publish")
+    subscribe_twice(client)
     for name in ("one", "two"):
         client.send("unsubscribe", topic=COUNTER, id=name)
     client.lives()
@@ -339,9 +342,7 @@ def test_unsubscribe_last_id(client: Client) -> None:
 @case("unsubscribe", UNSUBSCRIBE)
 def test_unsubscribe_all(client: Client) -> None:
     """Without an id all of the client's subscriptions to the topic end."""
-    for name in ("one", "two"):
-        client.send("subscribe", topic=COUNTER, type=INT, id=name)
-    client.until("publish")
+    subscribe_twice(client)
     client.send("unsubscribe", topic=COUNTER)
     client.lives()
     client.all_within("publish", 0.05)
