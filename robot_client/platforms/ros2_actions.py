@@ -10,7 +10,7 @@ from rclpy.serialization import serialize_message
 
 from robot_client.platforms.base import ABORTED, CANCELED, SUCCEEDED, OnCancel, OnGoal
 from robot_client.platforms.ros2_executor import Hop, Spinner
-from robot_client.platforms.ros2_types import parse
+from robot_client.platforms.ros2_types import Interface, parse
 from robot_client.reactors import Clock, Timer
 
 MAX_GOALS = 1000
@@ -70,8 +70,6 @@ class RosAction:
     """One action.
 
     :param spinner: of the node it is on
-    :param type: full name of its type
-    :param kind: class of its type
     """
 
     def __init__(
@@ -79,16 +77,12 @@ class RosAction:
         spinner: Spinner,
         hop: Hop,
         clock: Clock,
-        name: str,
-        type: str,
-        kind: Any,
+        interface: Interface,
         on_goal: OnGoal,
         on_cancel: OnCancel,
         on_gone: Callable[[RosAction], None],
     ) -> None:
-        self.name = name
-        self.type = type
-        self.kind = kind
+        self.name, self.type, self.kind = interface
         self.spinner = spinner
         self._hop = hop
         self._clock = clock
@@ -101,9 +95,9 @@ class RosAction:
         self._server = _Server(
             self._accepted,
             spinner.node,
-            kind,
-            name,
-            lambda handle: kind.Result(),
+            self.kind,
+            self.name,
+            lambda handle: self.kind.Result(),
             goal_callback=self._judge,
             cancel_callback=self._cancelled,
             result_timeout=KEPT,

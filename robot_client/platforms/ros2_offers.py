@@ -12,7 +12,7 @@ from robot_client.platforms.ros2_executor import Hop
 from robot_client.platforms.ros2_names import check_name
 from robot_client.platforms.ros2_nodes import Nodes
 from robot_client.platforms.ros2_services import RosService
-from robot_client.platforms.ros2_types import Types
+from robot_client.platforms.ros2_types import Interface, Types
 from robot_client.reactors import Clock
 
 
@@ -36,9 +36,9 @@ class Offers:
         full = check_name(self._node.resolve_service_name, service, "service")
         self._check_free(f"service {service}", full, full in self._services)
         name = normalise(type, "srv")
-        kind = self._types.service(name)
+        interface = Interface(full, name, self._types.service(name))
         with refusals(f"the service {service} as {name}"):
-            offer = RosService(self._nodes.main, self._hop, full, name, kind, on_call, self._withdrawn)
+            offer = RosService(self._nodes.main, self._hop, interface, on_call, self._withdrawn)
         self._services[full] = offer
         return offer
 
@@ -48,14 +48,12 @@ class Offers:
         former = self._actions.get(full)
         self._check_free(f"action {action}", full + ros2_graph.GOAL, former is not None and not former.closed)
         name = normalise(type, "action")
-        kind = self._types.action(name)
+        interface = Interface(full, name, self._types.action(name))
         if former is not None:
             former.go()
         spinner = self._nodes.for_actions()
         with refusals(f"the action {action} as {name}"):
-            offer = RosAction(
-                spinner, self._hop, self._clock, full, name, kind, on_goal, on_cancel, self._gone
-            )
+            offer = RosAction(spinner, self._hop, self._clock, interface, on_goal, on_cancel, self._gone)
         self._actions[full] = offer
         return offer
 

@@ -11,7 +11,7 @@ from rclpy.serialization import serialize_message
 
 from robot_client.platforms.base import OnCall
 from robot_client.platforms.ros2_executor import Hop, Spinner
-from robot_client.platforms.ros2_types import parse
+from robot_client.platforms.ros2_types import Interface, parse
 
 
 class _Asked(NamedTuple):
@@ -29,30 +29,24 @@ class RosService:
     of sending; executors of all releases find both on the service itself.
 
     :param spinner: of the node it is on
-    :param type: full name of its type
-    :param kind: class of its type
     """
 
     def __init__(
         self,
         spinner: Spinner,
         hop: Hop,
-        name: str,
-        type: str,
-        kind: Any,
+        interface: Interface,
         on_call: OnCall,
         on_close: Callable[[RosService], None],
     ) -> None:
-        self.name = name
-        self.type = type
+        self.name, self.type, self._kind = interface
         self._spinner = spinner
         self._hop = hop
-        self._kind = kind
         self._on_call: OnCall | None = on_call
         self._on_close = on_close
         self._made = threading.Lock()
         with self._made:
-            self._service = spinner.node.create_service(kind, name, self._called)
+            self._service = spinner.node.create_service(self._kind, self.name, self._called)
             self._send = self._service.send_response
             self._service.send_response = self._responded
 

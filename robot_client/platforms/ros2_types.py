@@ -6,7 +6,7 @@ import importlib.util
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -17,6 +17,14 @@ from robot_client.platforms.base import Motion
 
 HEADER = "std_msgs/Header"
 _OF = {"msg": "messages", "srv": "services", "action": "actions"}
+
+
+class Interface(NamedTuple):
+    """A service or an action: its name in the graph, the full name of its type, and that type's class."""
+
+    name: str
+    type: str
+    kind: Any
 
 
 class Types:
