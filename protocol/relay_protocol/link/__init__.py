@@ -3,6 +3,10 @@ itself.
 
 Every message is an object with ``op``. Unknown fields are passed over, an unknown ``op`` is an error.
 A sender leaves out fields at their default.
+
+``opening`` is said before a robot is known, ``control`` on its control link, ``requests`` (relay) and ``answers``
+(robot) on a channel link, ``both_ways`` by either end; ``wire`` reads and writes them all. Whoever uses them says
+``link.Subscribe``, because client operations have the same names: so all of them are here.
 """
 
 from relay_protocol.link.answers import (
