@@ -188,11 +188,13 @@ class RosOutlets:
         from builtin_interfaces.msg import Time
         from rclpy.signals import SignalHandlerOptions
 
+        from robot_client.platforms.ros2_transport import without_shared_memory
         from robot_client.platforms.ros2_types import Types
 
         ensure_log_folder()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        self._node: Any = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
+        with without_shared_memory(rclpy.get_rmw_implementation_identifier()):
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            self._node: Any = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
         self._unknown = Time() if sim_time else None
         self._types = Types()
         self._publishers: dict[TypedTopic, Any] = {}

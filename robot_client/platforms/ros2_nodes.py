@@ -11,6 +11,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from relay_protocol.errors import Unavailable
 from robot_client.platforms.ros2_executor import Spinner, make_executor
+from robot_client.platforms.ros2_transport import without_shared_memory
 
 _ACTIONS = "_actions"
 """What the name of the node for actions adds to ours."""
@@ -40,8 +41,11 @@ class Nodes:
         """
         self._context = rclpy.Context()
         try:
-            rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-            self.main = self._spun(self.names[0], self.kind)
+            with without_shared_memory(rclpy.get_rmw_implementation_identifier()):
+                rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+                self.main = self._spun(self.names[0], self.kind)
+        except Unavailable:
+            raise
         except Exception as error:
             raise Unavailable(f"ROS 2 does not start: {error}") from error
 

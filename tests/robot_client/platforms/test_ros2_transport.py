@@ -1,0 +1,132 @@
+"""The daemon shares no memory with other nodes, whatever range of discovery the robot has."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from switchboard_domains import free_domain
+
+from relay_protocol.errors import Unavailable
+from robot_client.platforms.ros2_transport import profile, without_shared_memory
+
+FASTRTPS = "rmw_fastrtps_cpp"
+CHOICES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
+RANGES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS")
+
+LISTENER = """
+import sys
+import rclpy
+from rclpy.qos import QoSProfile, DurabilityPolicy
+from std_msgs.msg import String
+from robot_client.platforms.ros2_transport import without_shared_memory
+
+with without_shared_memory(rclpy.get_rmw_implementation_identifier()):
+    rclpy.init()
+    node = rclpy.create_node("listener")
+heard = []
+latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+node.create_subscription(String, "/said", heard.append, latched)
+while not heard:
+    rclpy.spin_once(node, timeout_sec=1)
+with open("/proc/self/maps") as maps:
+    print(heard[0].data, sum("/dev/shm/fast" in line for line in maps))
+"""
+SPEAKER = """
+import sys
+import rclpy
+from rclpy.qos import QoSProfile, DurabilityPolicy
+from std_msgs.msg import String
+
+rclpy.init()
+node = rclpy.create_node("speaker")
+latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+speaker = node.create_publisher(String, "/said", latched)
+speaker.publish(String(data="hello"))
+sys.stdin.read()
+"""
+
+
+@pytest.fixture(autouse=True)
+def _bare(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Nobody has chosen anything."""
+    for name in CHOICES + RANGES:
+        monkeypatch.delenv(name, raising=False)
+    yield
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+        {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "localhost;127.0.0.2"},
+        {"ROS_LOCALHOST_ONLY": "1"},
+    ],
+    ids=["localhost", "with peers", "former name"],
+)
+def test_a_node_hears_others_and_shares_no_memory(settings: dict[str, str]) -> None:
+    """A node as the daemon makes it finds one with the usual transports, and maps nothing of Fast DDS."""
+    environment = {**os.environ, **settings, "ROS_DOMAIN_ID": str(free_domain())}
+    with subprocess.Popen([sys.executable, "-c", SPEAKER], env=environment, stdin=subprocess.PIPE) as speaker:
+        try:
+            listener = subprocess.run(
+                [sys.executable, "-c", LISTENER],
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=60,
+                check=False,
+            )
+        finally:
+            assert speaker.stdin is not None
+            speaker.stdin.close()
+    assert listener.stdout.split() == ["hello", "0"], listener.stderr
+
+
+def test_the_environment_is_as_before() -> None:
+    """What children inherit is what the robot's owner set."""
+    os.environ["ROS_LOCALHOST_ONLY"] = "1"
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    before = dict(os.environ)
+    with without_shared_memory(FASTRTPS):
+        during = dict(os.environ)
+    assert os.environ == before
+    assert during["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SYSTEM_DEFAULT"
+    assert "ROS_LOCALHOST_ONLY" not in during
+    assert not Path(during["FASTRTPS_DEFAULT_PROFILES_FILE"]).exists()
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_a_choice_of_the_owner_stands(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has chosen profiles or transports keeps them."""
+    monkeypatch.setenv(name, "chosen")
+    before = dict(os.environ)
+    with without_shared_memory(FASTRTPS):
+        assert os.environ == before
+
+
+def test_other_middleware_is_left_alone() -> None:
+    """What Fast DDS would read says nothing to others, and they need the range as it is."""
+    before = dict(os.environ)
+    with without_shared_memory("rmw_cyclonedds_cpp"):
+        assert os.environ == before
+
+
+def test_peers_are_looked_for_beside_this_machine() -> None:
+    """A robot that stays on its machine but for some peers asks those too, and listens to more than the loopback."""
+    settings = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "127.0.0.3; localhost"}
+    told = ElementTree.fromstring(profile(settings))
+    addresses = [each.text for each in told.iter() if each.tag.endswith("}address")]
+    assert addresses == ["127.0.0.1", "127.0.0.3", "127.0.0.1"]
+
+
+def test_a_peer_nobody_knows_is_named() -> None:
+    """ROS 2 itself would not start either."""
+    settings = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "nobody.invalid"}
+    with pytest.raises(Unavailable, match=r"nobody\.invalid"):
+        profile(settings)
