@@ -20,7 +20,6 @@ CHOICES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "F
 RANGES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS")
 
 LISTENER = """
-import sys
 import rclpy
 from rclpy.qos import QoSProfile, DurabilityPolicy
 from std_msgs.msg import String
@@ -66,8 +65,9 @@ def _bare(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
         {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "localhost;127.0.0.2"},
         {"ROS_LOCALHOST_ONLY": "1"},
+        {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": "127.0.0.1"},
     ],
-    ids=["localhost", "with peers", "former name"],
+    ids=["localhost", "with peers", "former name", "subnet"],
 )
 def test_a_node_hears_others_and_shares_no_memory(settings: dict[str, str]) -> None:
     """A node as the daemon makes it finds one with the usual transports, and maps nothing of Fast DDS."""
@@ -88,10 +88,10 @@ def test_a_node_hears_others_and_shares_no_memory(settings: dict[str, str]) -> N
     assert listener.stdout.split() == ["hello", "0"], listener.stderr
 
 
-def test_the_environment_is_as_before() -> None:
+def test_the_environment_is_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """What children inherit is what the robot's owner set."""
-    os.environ["ROS_LOCALHOST_ONLY"] = "1"
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     before = dict(os.environ)
     with without_shared_memory(FASTRTPS):
         during = dict(os.environ)
