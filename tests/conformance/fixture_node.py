@@ -14,6 +14,7 @@ import array
 import contextlib
 import importlib
 import json
+import queue
 import signal
 import threading
 import time
@@ -95,6 +96,8 @@ class Fixture(Node):
         self._group = ReentrantCallbackGroup()
         self._ends: dict[tuple[str, str], Any] = {}
         self._heard: dict[str, list[Any]] = {}
+        self.leaving: queue.SimpleQueue[ActionClient] = queue.SimpleQueue()
+        """Action clients to be destroyed by the thread that spins."""
         self._began = time.monotonic()
         self.cancelled = 0
         for name, value in (("text", "hello"), ("number", 7), ("ratio", 0.5), ("truths", [True, False])):
@@ -308,7 +311,7 @@ class Fixture(Node):
             told = {"accepted": True, "status": answer.status, "result": to_plain(answer.result)}
             return [json.dumps({**told, "feedback": to_plain(feedback)})]
         finally:
-            client.destroy()
+            self.leaving.put(client)
 
     def do_cancelled(self, count: str) -> list[str]:
         """Wait until so many goals of ours were cancelled; how many."""
@@ -329,7 +332,7 @@ def main() -> None:
     node = Fixture()
     executor = MultiThreadedExecutor(num_threads=12)
     executor.add_node(node)
-    spinning = threading.Thread(target=_spin, args=(executor,), daemon=True)
+    spinning = threading.Thread(target=_spin, args=(executor, node.leaving), daemon=True)
     spinning.start()
     print("READY", flush=True)
     signal.sigwait({signal.SIGINT, signal.SIGTERM})
@@ -338,9 +341,13 @@ def main() -> None:
     spinning.join(2)
 
 
-def _spin(executor: MultiThreadedExecutor) -> None:
+def _spin(executor: MultiThreadedExecutor, leaving: queue.SimpleQueue[ActionClient]) -> None:
     with contextlib.suppress(ExternalShutdownException):
-        executor.spin()
+        while rclpy.ok():
+            executor.spin_once()
+            # By no other thread: this one looks at all action clients when it begins to wait (rclpy 7.1).
+            with contextlib.suppress(queue.Empty):
+                leaving.get_nowait().destroy()
 
 
 if __name__ == "__main__":
