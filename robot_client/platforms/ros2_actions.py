@@ -19,6 +19,11 @@ MAX_GOALS = 1000
 KEPT = 60
 """Seconds the result of a goal can still be asked for."""
 
+LISTENED = 0.3
+LOOK = 0.02
+"""Seconds a goal waits to be told of until somebody listens to the action's feedback, and between two looks: the first
+feedback would be lost before DDS has matched the asker, whose request came by another way."""
+
 LINGER = 0.5
 """Seconds in which the aborts of an action's goals can reach those who wait, before the action goes."""
 
@@ -48,6 +53,8 @@ class RosServedGoal:
 
     def __init__(self, action: RosAction, handle: Any) -> None:
         self.handle = handle
+        self.told = False
+        self.to_be_cancelled = False
         self.ended = False
         self._action = action
 
@@ -83,6 +90,7 @@ class RosAction:
         on_gone: Callable[[RosAction], None],
     ) -> None:
         self.name, self.type, self.kind = interface
+        self._feedback = f"{self.name}/_action/feedback"
         self.spinner = spinner
         self._hop = hop
         self._clock = clock
@@ -156,16 +164,23 @@ class RosAction:
 
     # --- in the reactor's thread
 
-    def _told(self, goal: RosServedGoal) -> None:
+    def _told(self, goal: RosServedGoal, patience: float = LISTENED) -> None:
         if goal.ended:
             return
         if self.closed:
             goal.finish(ABORTED, None)
+        elif patience > 0 and not self.spinner.node.count_subscribers(self._feedback):
+            self._clock.callLater(LOOK, self._told, goal, patience - LOOK)
         else:
+            goal.told = True
             self._on_goal(bytes(serialize_message(goal.handle.request)), goal)
+            if goal.to_be_cancelled:
+                self._on_cancel_there(goal)
 
     def _on_cancel_there(self, goal: RosServedGoal) -> None:
-        if not goal.ended:
+        if not goal.told:
+            goal.to_be_cancelled = True
+        elif not goal.ended:
             self._on_cancel(goal)
 
 

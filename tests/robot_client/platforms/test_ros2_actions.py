@@ -11,6 +11,7 @@ from twisted.internet import reactor, task
 from relay_protocol.errors import Invalid
 from robot_client.platforms.base import ABORTED, CANCELED, SUCCEEDED, Offer, ServedGoal
 from robot_client.platforms.ros2 import Ros2Platform
+from tests.robot_client.platforms.ends import node
 from tests.robot_client.ros import Peer, until
 
 FIBONACCI = "example_interfaces/action/Fibonacci"
@@ -101,6 +102,30 @@ async def test_cancel_comes_to_the_client(ros: Ros2Platform, peer: Peer) -> None
     done = peer.told("result", action)[0]
     assert (done["status"], done["sequence"]) == (CANCELED, [7])
     client.offer.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_goal_without_ears_is_told_of_before_its_end_is_wished_for(ros: Ros2Platform) -> None:
+    """A goal waits a moment for somebody to listen to feedback; it comes all the same, and before its cancel."""
+    action = "/deaf"
+    told: list[str] = []
+    offer = ros.act(
+        action, FIBONACCI, lambda _, goal: told.append("goal"), lambda goal: told.append("cancel")
+    )
+    kinds = Fibonacci.Impl
+    with node("deaf") as deaf:
+        send = deaf.create_client(kinds.SendGoalService, f"{action}/_action/send_goal")
+        cancel = deaf.create_client(kinds.CancelGoalService, f"{action}/_action/cancel_goal")
+        await until(lambda: send.service_is_ready() and cancel.service_is_ready())
+        send.call_async(kinds.SendGoalService.Request())
+
+        def wished() -> bool:
+            cancel.call_async(kinds.CancelGoalService.Request())
+            return "cancel" in told
+
+        await until(wished)
+    assert told[:2] == ["goal", "cancel"]
+    offer.close()
 
 
 @pytest_twisted.ensureDeferred
