@@ -11,7 +11,7 @@ import traceback
 from pathlib import Path
 
 from bench import RESULTS, ROOT
-from bench.report import Options, Row, Unavailable, load, save, show
+from bench.report import Options, Row, Unavailable, load, machine, save, show
 
 MEASUREMENTS = {
     "hop": "relay, one hop, against websockify",
@@ -79,6 +79,9 @@ def main() -> int:
     options, measured = Options(asked.quick, asked.seconds), commit()
     rows: list[Row] = []
     missing: dict[str, str] = {}
+    print(
+        f"on this machine work after a rest of 50 ms costs {machine()['rest_costs']:g} times as much as in a loop"
+    )
     for name in asked.names or MEASUREMENTS:
         before = round(load(), 1)
         print(f"--- {name}: {MEASUREMENTS[name]} (load {before})", flush=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import platform
@@ -13,6 +14,8 @@ from typing import Any
 import psutil
 from rich.console import Console
 from rich.table import Table
+
+from bench.machine import rest_costs
 
 
 class Unavailable(Exception):
@@ -131,7 +134,13 @@ def machine() -> dict[str, Any]:
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
         "kernel": platform.release().partition("-")[0],
         "python": platform.python_version(),
+        "rest_costs": _rest_costs(),
     }
+
+
+@functools.cache
+def _rest_costs() -> float:
+    return round(rest_costs(), 1)
 
 
 def load() -> float:

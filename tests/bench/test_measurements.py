@@ -70,7 +70,7 @@ def test_what_is_kept_names_no_machine(tmp_path: Path) -> None:
     save(path, "hop", [Row("hop", "x", "µs", 1.0, 4.0, "y", 0.25)], "", 0.5, "abc")
     save(path, "latency", [], "no HAProxy", 0.5, "abc")
     content = json.loads(path.read_text())
-    assert set(content["machine"]) == {"cores", "processor", "memory_gib", "kernel", "python"}
+    assert set(content["machine"]) == {"cores", "processor", "memory_gib", "kernel", "python", "rest_costs"}
     assert content["measurements"]["hop"]["rows"][0]["met"] is True
     assert content["measurements"]["latency"]["missing"] == "no HAProxy"
     assert str(Path.home()) not in path.read_text()
