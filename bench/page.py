@@ -47,8 +47,8 @@ WHY = {
     (
         "fanout",
         "fan-out",
-    ): "100 samples a second, each after a rest, are framed once and then written to 500 sockets in a loop of Python; a "
-    "loop in C stays in the cache. Where work after a rest costs little more than in a loop this was 1.8 to 2.0×.",
+    ): "100 samples a second, each after a rest, are framed once and then written to 500 sockets in a loop of Python; "
+    "a loop in C stays in the cache. Where work after a rest costs little more than in a loop this was 1.8 to 2.0×.",
 }
 """Reasons, by measurement and the beginning of what a row is called."""
 
