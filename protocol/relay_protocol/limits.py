@@ -30,6 +30,15 @@ TYPE_TEXTS = 16 * MIB
 INTERFACES = 8192
 """Most names of types a robot tells of at once."""
 
+PICTURE_FRAME = 4 * MIB
+"""Largest frame a robot may send on a video link: one picture as JPEG or PNG, or one of H.264."""
+
+PICTURE_SIDE = 8192
+"""Most pixels of a picture in a row or a column."""
+
+CAMERAS = 256
+"""Most cameras of a robot."""
+
 PARTS_BYTES = 2 * ROBOT_FRAME
 """Most bytes of samples that have come in part only, over one link."""
 

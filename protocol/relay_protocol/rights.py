@@ -30,6 +30,8 @@ class Operation(str, enum.Enum):
     """What one may do to a resource of a robot."""
 
     SUBSCRIBE = "subscribe"
+    VIEW = "view"
+    """See the pictures of a camera."""
     PUBLISH = "publish"
     CALL = "call"
     PROVIDE = "provide"
@@ -45,6 +47,7 @@ _RANK = {Level.VIEWER: 0, Level.OPERATOR: 1, Level.OWNER: 2}
 
 _NEEDED = {
     Operation.SUBSCRIBE: Level.VIEWER,
+    Operation.VIEW: Level.VIEWER,
     Operation.PUBLISH: Level.OPERATOR,
     Operation.CALL: Level.OPERATOR,
     Operation.PROVIDE: Level.OPERATOR,
@@ -145,6 +148,8 @@ class Rules:
         for pattern in self._allow:
             if pattern.matches(operation, resource):
                 return Verdict(True, f"allowed by '{pattern.text}'")
+        if operation is Operation.VIEW:
+            return self._decide(Operation.SUBSCRIBE, resource)
         needed = _NEEDED[operation]
         if _RANK[self.level] >= _RANK[needed]:
             return Verdict(True, f"allowed to {self.level}")

@@ -27,7 +27,14 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
     """Values of one annotation."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Annotated:
-        return values(arguments[0])
+        (meta,) = arguments[1:]
+        if meta.ge is None:
+            return values(arguments[0])
+        return (st.integers if arguments[0] is int else st.floats)(meta.ge, meta.le)
+    if origin is typing.Literal:
+        return st.sampled_from(arguments)
+    if origin is tuple:
+        return st.tuples(*map(values, arguments))
     if origin in (typing.Union, types.UnionType):
         return st.one_of(*map(values, arguments))
     if origin is list:
@@ -105,9 +112,8 @@ def test_an_unknown_op_is_told_with_those_known() -> None:
     """The error says what would have been right here."""
     with pytest.raises(MalformedMessage) as caught:
         jsontext.decode(link.relay_control_decoder, b'{"op":"subscribe","number":1,"topic":"/a"}')
-    assert (
-        str(caught.value) == "unknown op 'subscribe'; known are bye, close_channel, open_channel, ping, pong"
-    )
+    known = "bye, close_channel, close_video, open_channel, open_video, ping, pong"
+    assert str(caught.value) == f"unknown op 'subscribe'; known are {known}"
 
 
 def test_a_long_unknown_op_is_cut_short() -> None:

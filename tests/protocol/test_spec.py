@@ -65,6 +65,9 @@ def test_the_version_and_the_words_of_rights_are_the_codes() -> None:
         (f"`encodings` | {limits.FACTS}", 64),
         (f"`text` of an alert), `ref` | {limits.WORDS} characters", 4096),
         (f"names of types in `interfaces` | {limits.INTERFACES}", 8192),
+        (f"a video link | {limits.PICTURE_FRAME // limits.MIB} MiB", 4),
+        (f"height of a picture | {limits.PICTURE_SIDE}", 8192),
+        (f"cameras of a robot | {limits.CAMERAS}", 256),
         (f"one link, unfinished | {limits.PARTS_BYTES // limits.MIB} MiB", 32),
         (
             f"one client, unfinished | {limits.FRAGMENTS}, {limits.CLIENT_MESSAGE // limits.MIB} MiB together, "

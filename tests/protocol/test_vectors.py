@@ -115,6 +115,8 @@ def test_every_link_message_has_a_case() -> None:
         "relay_control",
         "robot_channel",
         "relay_channel",
+        "robot_video",
+        "relay_video",
     ):
         decoder = getattr(link, f"{name}_decoder")
         tags = {each.__struct_config__.tag for each in decoder.type.__args__} - {"ping", "pong", "bye"}

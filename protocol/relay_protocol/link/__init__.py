@@ -5,8 +5,8 @@ Every message is an object with ``op``. Unknown fields are passed over, an unkno
 A sender leaves out fields at their default.
 
 ``opening`` is said before a robot is known, ``control`` on its control link, ``requests`` (relay) and ``answers``
-(robot) on a channel link, ``both_ways`` by either end; ``wire`` reads and writes them all. Whoever uses them says
-``link.Subscribe``, because client operations have the same names: so all of them are here.
+(robot) on a channel link, ``both_ways`` by either end; ``video`` is all about pictures; ``wire`` reads and writes them
+all. Whoever uses them says ``link.Subscribe``, because client operations have the same names: so all of them are here.
 """
 
 from relay_protocol.link.answers import (
@@ -75,14 +75,30 @@ from relay_protocol.link.requests import (
     UnadvertiseService,
     Unsubscribe,
 )
+from relay_protocol.link.video import (
+    Camera,
+    Cameras,
+    CloseVideo,
+    Codec,
+    KeyFrame,
+    NotPlaying,
+    OpenVideo,
+    Playing,
+    RelayVideo,
+    RobotVideo,
+    Took,
+    VideoSettings,
+)
 from relay_protocol.link.wire import (
     frame,
     opening_decoder,
     opening_reply_decoder,
     relay_channel_decoder,
     relay_control_decoder,
+    relay_video_decoder,
     robot_channel_decoder,
     robot_control_decoder,
+    robot_video_decoder,
 )
 from relay_protocol.message import (
     Message,
@@ -102,9 +118,13 @@ __all__ = [
     "BothChannel",
     "Bye",
     "CallService",
+    "Camera",
+    "Cameras",
     "CancelActionGoal",
     "Challenge",
     "CloseChannel",
+    "CloseVideo",
+    "Codec",
     "Describe",
     "Enroll",
     "Enrolled",
@@ -117,31 +137,39 @@ __all__ = [
     "Interfaces",
     "Join",
     "Joined",
+    "KeyFrame",
     "Message",
     "MotionPolicy",
+    "NotPlaying",
     "OpenChannel",
+    "OpenVideo",
     "Opening",
     "OpeningReply",
     "Ping",
+    "Playing",
     "Pong",
     "Prove",
     "QoS",
     "Refused",
     "RelayChannel",
     "RelayControl",
+    "RelayVideo",
     "RobotChannel",
     "RobotControl",
+    "RobotVideo",
     "SendActionGoal",
     "Service",
     "ServiceResponse",
     "Subscribe",
     "Subscribed",
+    "Took",
     "Topic",
     "TypeDefinition",
     "Unadvertise",
     "UnadvertiseAction",
     "UnadvertiseService",
     "Unsubscribe",
+    "VideoSettings",
     "Welcome",
     "frame",
     "from_base64",
@@ -150,7 +178,9 @@ __all__ = [
     "opening_reply_decoder",
     "relay_channel_decoder",
     "relay_control_decoder",
+    "relay_video_decoder",
     "robot_channel_decoder",
     "robot_control_decoder",
+    "robot_video_decoder",
     "to_base64",
 ]

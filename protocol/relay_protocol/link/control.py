@@ -11,6 +11,7 @@ from relay_protocol import limits
 from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
 from relay_protocol.link.both_ways import Bye, Ping, Pong
 from relay_protocol.link.fields import Ends, Few, Label, Name, cut
+from relay_protocol.link.video import Cameras, CloseVideo, OpenVideo
 from relay_protocol.message import Message
 
 
@@ -129,5 +130,5 @@ class CloseChannel(Message, frozen=True, kw_only=True):
     channel: str
 
 
-RobotControl = Describe | Graph | Health | Alert | Ping | Pong | Bye
-RelayControl = OpenChannel | CloseChannel | Ping | Pong | Bye
+RobotControl = Describe | Graph | Cameras | Health | Alert | Ping | Pong | Bye
+RelayControl = OpenChannel | CloseChannel | OpenVideo | CloseVideo | Ping | Pong | Bye

@@ -9,6 +9,7 @@ from relay_protocol.link.answers import RobotChannel
 from relay_protocol.link.control import RelayControl, RobotControl
 from relay_protocol.link.opening import Opening, OpeningReply
 from relay_protocol.link.requests import RelayChannel
+from relay_protocol.link.video import RelayVideo, RobotVideo
 from relay_protocol.message import Message
 
 opening_decoder: msgspec.json.Decoder[Opening] = msgspec.json.Decoder(Opening)
@@ -17,6 +18,8 @@ robot_control_decoder: msgspec.json.Decoder[RobotControl] = msgspec.json.Decoder
 relay_control_decoder: msgspec.json.Decoder[RelayControl] = msgspec.json.Decoder(RelayControl)
 robot_channel_decoder: msgspec.json.Decoder[RobotChannel] = msgspec.json.Decoder(RobotChannel)
 relay_channel_decoder: msgspec.json.Decoder[RelayChannel] = msgspec.json.Decoder(RelayChannel)
+robot_video_decoder: msgspec.json.Decoder[RobotVideo] = msgspec.json.Decoder(RobotVideo)
+relay_video_decoder: msgspec.json.Decoder[RelayVideo] = msgspec.json.Decoder(RelayVideo)
 
 
 def frame(message: Message) -> bytes:
