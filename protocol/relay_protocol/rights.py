@@ -32,6 +32,8 @@ class Operation(str, enum.Enum):
     SUBSCRIBE = "subscribe"
     VIEW = "view"
     """See the pictures of a camera."""
+    RECORD = "record"
+    """Have the relay keep what a topic or camera says, and get at what was kept."""
     PUBLISH = "publish"
     CALL = "call"
     PROVIDE = "provide"
@@ -48,6 +50,7 @@ _RANK = {Level.VIEWER: 0, Level.OPERATOR: 1, Level.OWNER: 2}
 _NEEDED = {
     Operation.SUBSCRIBE: Level.VIEWER,
     Operation.VIEW: Level.VIEWER,
+    Operation.RECORD: Level.OPERATOR,
     Operation.PUBLISH: Level.OPERATOR,
     Operation.CALL: Level.OPERATOR,
     Operation.PROVIDE: Level.OPERATOR,
