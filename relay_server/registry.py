@@ -34,7 +34,7 @@ class State(str, enum.Enum):
 
 
 class Watcher(Protocol):
-    """Something that follows one robot: its channel."""
+    """Something that follows one robot: its channel, a stream of a camera."""
 
     def robot_online(self) -> None:
         """The robot has registered (again)."""
@@ -46,7 +46,7 @@ class Watcher(Protocol):
         """The mirror of its graph has changed."""
 
     def described(self) -> None:
-        """It has told facts about itself."""
+        """It has told facts about itself, or which cameras it has."""
 
 
 @dataclass
@@ -71,6 +71,7 @@ class Presence:
     encodings: tuple[str, ...] = ()
     description: link.Describe = field(default_factory=link.Describe)
     health: link.Health = field(default_factory=link.Health)
+    cameras: tuple[link.Camera, ...] = ()
     graph: GraphMirror = field(default_factory=GraphMirror)
     types: TypeRegistry = field(default_factory=TypeRegistry)
     rtt: float | None = None
@@ -121,6 +122,7 @@ class Registry:
         older = robot.control
         robot.control = control
         robot.types = TypeRegistry()
+        robot.cameras = ()
         robot.graph.clear()
         robot.health = link.Health()
         robot.rtt = None
@@ -157,6 +159,13 @@ class Registry:
     def described(self, robot: Presence, description: link.Describe) -> None:
         """The robot told facts about itself."""
         robot.description = description
+        for watcher in list(robot.watchers):
+            watcher.described()
+        self.changed()
+
+    def cameras(self, robot: Presence, cameras: link.Cameras) -> None:
+        """The robot told which cameras it has."""
+        robot.cameras = tuple(cameras.cameras)
         for watcher in list(robot.watchers):
             watcher.described()
         self.changed()

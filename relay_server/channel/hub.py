@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Callable, Iterator
 
 from relay_protocol.errors import Refused
-from relay_protocol.limits import CHANNEL_TICKET_SECONDS
 from relay_server.channel.lifecycle import Channel
 from relay_server.clock import Clock
 from relay_server.registry import Presence
+from relay_server.tickets import Tickets
 
 
 class Channels:
@@ -32,7 +32,7 @@ class Channels:
         self._new_ticket = new_ticket
         self._wall_ns = wall_ns
         self._channels: dict[int, Channel] = {}
-        self._tickets: dict[str, tuple[Channel, float]] = {}
+        self._tickets: Tickets[Channel] = Tickets(clock, new_ticket)
         self._counter = itertools.count(1)
 
     def __iter__(self) -> Iterator[Channel]:
@@ -47,7 +47,7 @@ class Channels:
                 robot,
                 f"{robot.name}#{next(self._counter)}",
                 linger=self._linger,
-                issue_ticket=self._issue,
+                issue_ticket=self._tickets.issue,
                 closed=self._forget,
                 new_id=self._new_ticket,
                 wall_ns=self._wall_ns,
@@ -63,20 +63,12 @@ class Channels:
 
         :raises Refused: unknown, used or too old
         """
-        found = self._tickets.pop(ticket, None)
-        if found is None or found[1] < self._clock.seconds():
+        channel = self._tickets.redeem(ticket)
+        if channel is None:
             raise Refused("the channel ticket is unknown, used or too old")
-        return found[0]
-
-    def _issue(self, channel: Channel) -> str:
-        now = self._clock.seconds()
-        for old in [key for key, (held, until) in self._tickets.items() if held is channel or until < now]:
-            del self._tickets[old]
-        ticket = self._new_ticket()
-        self._tickets[ticket] = (channel, now + CHANNEL_TICKET_SECONDS)
-        return ticket
+        return channel
 
     def _forget(self, channel: Channel) -> None:
         if self._channels.get(channel.robot.robot_id) is channel:
             del self._channels[channel.robot.robot_id]
-        self._tickets = {key: held for key, held in self._tickets.items() if held[0] is not channel}
+        self._tickets.withdraw(channel)

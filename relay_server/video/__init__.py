@@ -1,0 +1,13 @@
+"""Video: one stream for each camera and form of it that is watched, made once by the robot, shown to all.
+
+``stream`` is a table of states like a channel, with a link of its own to the robot; ``hub`` has all streams;
+``pictures`` looks at what robots send before anybody gets it; ``ends`` says what links and viewers are.
+"""
+
+from relay_server.video.ends import VideoLink, Viewer
+from relay_server.video.hub import Videos
+from relay_server.video.pictures import STALE_SECONDS, Picture
+from relay_server.video.states import State
+from relay_server.video.stream import Stream
+
+__all__ = ["STALE_SECONDS", "Picture", "State", "Stream", "VideoLink", "Videos", "Viewer"]

@@ -1,0 +1,45 @@
+"""The two ends of a stream, as the stream uses them: the robot's link, and those who watch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError
+from relay_server.video.pictures import Picture
+
+if TYPE_CHECKING:
+    from relay_server.video.stream import Stream
+
+
+class VideoLink(Protocol):
+    """The robot's end of a stream."""
+
+    def send(self, message: link.Message) -> None:
+        """Queue a message that must not be lost."""
+
+    def close(self, reason: str) -> None:
+        """Say ``bye`` and end the connection."""
+
+
+class Viewer(Protocol):
+    """Somebody who watches. Nothing is told before :meth:`Videos.watch` has returned."""
+
+    @property
+    def user(self) -> int:
+        """Whose it is: what one person may watch is bounded over all of his connections."""
+
+    def picture(self, picture: Picture) -> None:
+        """There is a new picture; the viewer keeps the newest until it can take it.
+
+        One that leaves out a picture of H.264 says so by :meth:`Stream.start_anew`.
+        """
+
+    def playing(self, playing: link.Playing) -> None:
+        """What the robot sends from now on."""
+
+    def moved(self, stream: Stream) -> None:
+        """The robot is at its limit: from now on it is this stream that is watched, and left by ``detach``."""
+
+    def ended(self, error: SwitchboardError) -> None:
+        """The stream can't be had, or no more. Called once; the viewer is detached already."""
