@@ -5,11 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 from relay_protocol import link
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.video.pictures import Picture
 
 if TYPE_CHECKING:
     from relay_server.video.stream import Stream
+
+
+class NothingCame(Unavailable):
+    """All that is needed is there, but no picture came in time."""
+
+    code = "nothing_came"
 
 
 class VideoLink(Protocol):
