@@ -13,7 +13,7 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
 from relay_protocol.limits import KIB, MIB, TYPE_TEXTS
 from relay_protocol.ros.compiled import Compiled, Reader, Writer
-from relay_protocol.ros.definition import normalise, parts_of
+from relay_protocol.ros.definition import normalise, parts_of, text_of
 from relay_protocol.ros.typedefs import typedef
 
 __all__ = ["Body", "Reader", "TypeRegistry", "Writer"]
@@ -109,6 +109,14 @@ class TypeRegistry:
         if text is None:
             raise NotFound(f"the definition of {type_name} is not known")
         return text
+
+    def full_text(self, type_name: str) -> str:
+        """The definition of a message with all it contains, also if it came as a part of another's.
+
+        :raises NotFound: the type is not registered
+        """
+        name, compiled = self._find(type_name)
+        return text_of(name, compiled.type_name, compiled.text, compiled.definitions)
 
     def reader(self, type_name: str, form: str) -> Reader:
         """What turns messages of this type from a robot into ``form``: the fast way for many of them.

@@ -77,8 +77,8 @@ class Converter:
     def __init__(
         self, types: TypeRegistry, type_name: str, encoding: str, failed: Callable[[str], None]
     ) -> None:
-        self._types = types
-        self._type = type_name
+        self.types = types
+        self.type = type_name
         self.cdr = encoding == "cdr"
         self.failed = failed
         self.known = False
@@ -89,7 +89,7 @@ class Converter:
     def knows(self) -> bool:
         """Whether all that this takes is known."""
         if not self.known:
-            self.known = not self.cdr or self._types.knows(self._type)
+            self.known = not self.cdr or self.types.knows(self.type)
         return self.known
 
     def convert(self, language: str, body: bytes) -> bytes:
@@ -99,7 +99,7 @@ class Converter:
         """
         reader = self._readers.get(language)
         if reader is None:
-            found = self._types.reader(self._type, language) if self.cdr else _ANEW[language]
+            found = self.types.reader(self.type, language) if self.cdr else _ANEW[language]
             reader = self._readers[language] = found
         return reader(body)
 
@@ -112,7 +112,6 @@ class Sample:
     """
 
     __slots__ = (
-        "_converter",
         "_json",
         "_others",
         "_pictures",
@@ -120,15 +119,16 @@ class Sample:
         "_plain_wish",
         "_ready",
         "_ready_bytes",
-        "_stamp",
         "body",
+        "converter",
         "size",
+        "stamp",
     )
 
     def __init__(self, body: bytes, stamp: int, converter: Converter) -> None:
         self.body = body
-        self._stamp = stamp
-        self._converter = converter
+        self.stamp = stamp
+        self.converter = converter
         self.size = len(body)
         # The first plain form, which is most often the only one, needs no table. The others are made when it is not.
         self._json: bytes | SwitchboardError | None = None
@@ -185,7 +185,7 @@ class Sample:
 
     def _costly(self, form: Form) -> bool:
         if form.compression in ("cbor", "cbor-raw"):
-            return form.compression == "cbor" and not self._converter.cdr
+            return form.compression == "cbor" and not self.converter.cdr
         if form == PLAIN:
             return False
         body = self._in("json")
@@ -196,11 +196,11 @@ class Sample:
         language = "cbor" if compression == "cbor" else "json"
         flaw, words = None, ""
         if compression == "cbor-raw":
-            if self._converter.cdr:
+            if self.converter.cdr:
                 language = compression
             else:
                 flaw, words = Flaw.NOT_CDR, "its messages are JSON, not CDR, so cbor-raw is plain JSON here"
-        if language == "cbor" and not self._converter.cdr and self.size > cbor.MOST:
+        if language == "cbor" and not self.converter.cdr and self.size > cbor.MOST:
             language, flaw = "json", Flaw.TOO_LARGE
             words = f"messages that are JSON and longer than {cbor.MOST} bytes are sent not as CBOR but as they are"
         body = self._in(language)
@@ -233,11 +233,11 @@ class Sample:
 
     def _converted(self, language: str) -> bytes | SwitchboardError:
         if language == "cbor-raw":
-            return cbor.raw(self._stamp, self.body)
+            return cbor.raw(self.stamp, self.body)
         try:
-            return self._converter.convert(language, self.body)
+            return self.converter.convert(language, self.body)
         except SwitchboardError as error:
-            self._converter.failed(str(error))
+            self.converter.failed(str(error))
             return error
 
     def _picture(self, name: str, text: bytes) -> bytes:

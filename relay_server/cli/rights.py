@@ -54,7 +54,8 @@ def grant(
     """Give USER or GROUP a right on ROBOT; it replaces the one they have there.
 
     A viewer may subscribe, an operator also publish and call, an owner do everything. Patterns are
-    operation:resource with subscribe, publish, call, provide, manage or *, and wildcards in the resource.
+    operation:resource with subscribe, view, record, publish, call, provide, manage or *, and wildcards in the
+    resource.
     """
     with app.change() as change:
         found, whose = change.robot(robot), _holder(change, holder)

@@ -123,3 +123,21 @@ def test_typedefs_list_every_type_once() -> None:
         "constvalues": ["1"],
     }
     assert second["type"] == "geometry_msgs/Vector3"
+
+
+def test_a_whole_text_holds_what_the_type_contains_and_nothing_else() -> None:
+    """Also if it came as a part of another's, and with the built-in types that a robot may leave out."""
+    types = TypeRegistry()
+    text = f"# a comment\nTwist twist\nbuiltin_interfaces/Time at\n{LINE}\nMSG: geometry_msgs/msg/Twist\n{TWIST}\n"
+    types.add("geometry_msgs/msg/Timed", text)
+    assert types.full_text("geometry_msgs/Twist") == TWIST + "\n"
+    whole = types.full_text("geometry_msgs/msg/Timed")
+    assert whole.startswith("# a comment\nTwist twist\n")
+    assert whole.count(LINE) == 3
+    assert f"{LINE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n" in whole
+    types.add(
+        "geometry_msgs/srv/Move", f"Vector3 by\n---\nbool done\n{LINE}\nMSG: geometry_msgs/Vector3\n{VECTOR}"
+    )
+    assert types.full_text("geometry_msgs/srv/Move_Response") == "bool done\n"
+    with pytest.raises(NotFound):
+        types.full_text("geometry_msgs/msg/Wrench")

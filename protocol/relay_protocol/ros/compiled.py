@@ -45,6 +45,8 @@ class Compiled:
     """
 
     def __init__(self, type_name: str, text: str) -> None:
+        self.type_name = type_name
+        self.text = text
         self.definitions: dict[str, Definition] = parse(type_name, text)
         self._slow_writers = WriterFactory(self.definitions)
         self._slow_readers: dict[tuple[str, str], ReaderFactory] = {}

@@ -166,6 +166,31 @@ def parse(type_name: str, text: str) -> dict[str, Definition]:
     return definitions
 
 
+def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) -> str:
+    """The text of one message with all it contains and nothing else, in rosbag2's ``ros2msg`` layout.
+
+    :param name: a part of ``top``, or a message its text contains
+    :param top: the type whose text it is
+    :param definitions: what :func:`parse` made of it
+    """
+    main, *contained = _sections(text.split("\n"))
+    bodies = {each: body.split("\n") for each, body in _BUILT_IN.items()}
+    for lines in reversed(contained):
+        bodies[normalise(lines[0].strip()[4:].strip())] = lines[1:]
+    names = parts_of(top)
+    bodies.update(zip(names, _split_parts(main, len(names)), strict=True))
+    waiting, found = [name], dict[str, str]()
+    while waiting:
+        each = waiting.pop()
+        if each not in found:
+            package, _, short = each.split("/")
+            title = "" if each == name else f"{'=' * 80}\nMSG: {package}/{short}\n"
+            found[each] = title + "\n".join(bodies[each]).rstrip("\n") + "\n"
+            kinds = (field.type for field in definitions[each].fields)
+            waiting += reversed([kind.base for kind in kinds if kind.primitive is None])
+    return "".join(found.values())
+
+
 def _parse_all(type_name: str, text: str) -> dict[str, Definition]:
     main, *contained = _sections(text.split("\n"))
     names = parts_of(type_name)
