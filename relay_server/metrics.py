@@ -10,16 +10,22 @@ from prometheus_client.registry import Collector, CollectorRegistry
 from relay_server.channel import Channels
 from relay_server.registry import Registry, State
 from relay_server.session import Session
+from relay_server.video import Videos
 
 
 class RelayCollector(Collector):
-    """Counts robots, clients and channels."""
+    """Counts robots, clients, channels, streams and their viewers."""
 
     def __init__(
-        self, registry: Registry, channels: Channels, sessions: Callable[[], Iterable[Session]]
+        self,
+        registry: Registry,
+        channels: Channels,
+        videos: Videos,
+        sessions: Callable[[], Iterable[Session]],
     ) -> None:
         self._registry = registry
         self._channels = channels
+        self._videos = videos
         self._sessions = sessions
 
     def collect(self) -> Iterator[Metric]:
@@ -32,6 +38,13 @@ class RelayCollector(Collector):
         sessions = list(self._sessions())
         yield GaugeMetricFamily("switchboard_clients", "Clients connected", len(sessions))
         yield GaugeMetricFamily("switchboard_channels", "Channels in use", len(list(self._channels)))
+        streams = list(self._videos)
+        yield GaugeMetricFamily("switchboard_video_streams", "Streams of cameras", len(streams))
+        yield GaugeMetricFamily(
+            "switchboard_video_viewers",
+            "Viewers of streams",
+            sum(len(stream.viewers) for stream in streams),
+        )
         yield GaugeMetricFamily(
             "switchboard_client_waiting_bytes",
             "Bytes that wait for slow clients",

@@ -22,7 +22,7 @@ from twisted.web.server import Site
 import relay_server
 from relay_db import queries
 from relay_db.engine import Database
-from relay_protocol.errors import Invalid, SwitchboardError
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_server import passwords
 from relay_server.access import Access
 from relay_server.auth import Authenticator
@@ -44,6 +44,7 @@ from relay_server.registry import Registry
 from relay_server.session import Timing
 from relay_server.store import Store
 from relay_server.tls import ServerTls
+from relay_server.video import Videos
 
 FIRST_LINK_SECONDS = 3600.0
 PURGE_SECONDS = 3600.0
@@ -74,6 +75,7 @@ class Relay:
         self._channels = Channels(
             reactor, linger=settings.linger, new_ticket=passwords.new_token, wall_ns=time.time_ns
         )
+        self._videos = Videos(reactor, new_ticket=passwords.new_token)
         self._journal = Journal(self._store, time.time)
         self._ports: list[Any] = []
         self._revision = -1
@@ -101,7 +103,14 @@ class Relay:
         http = await self._listen(self.settings.http, self._site(name))
         self.http_port = http.getHost().port
         hall = RobotHall(
-            name, self._store, self._registry, self._channels, self._journal, time.monotonic, time.time
+            name,
+            self._store,
+            self._registry,
+            self._channels,
+            self._videos,
+            self._journal,
+            time.monotonic,
+            time.time,
         )
         robots = await self._listen(self.settings.robots, self._robot_factory(hall))
         self.robots_port = robots.getHost().port
@@ -133,7 +142,7 @@ class Relay:
             wall=time.time,
         )
         desk = self._desk
-        metrics = registry_of(RelayCollector(self._registry, self._channels, lambda: desk))
+        metrics = registry_of(RelayCollector(self._registry, self._channels, self._videos, lambda: desk))
         api = Api(self._reactor, desk, origins, metrics, cookie=cookie, secure=settings.tls)
         cap = AddressCap(settings.connections_per_address)
         websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk, cap))
@@ -230,9 +239,11 @@ class Relay:
         for robot, control in links:
             if robot.robot_id not in there:
                 self._registry.forget(robot.robot_id)
+                self._videos.end(robot, NotFound("this robot was removed from the relay"))
             elif control is not None and robot.control is control and (robot.robot_id, robot.key) not in live:
                 self.log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
                 control.close("the robot's key is not accepted any more")
+                self._videos.end(robot, Unavailable("the robot's key is not accepted any more"))
 
     async def _poll_once(self) -> None:
         self._access.expire()
@@ -320,6 +331,7 @@ class Relay:
                 loop.stop()
         for channel in self._channels:
             channel.shut()
+        self._videos.shut()
         await DeferredList(
             [Deferred.fromCoroutine(_stopped(port)) for port in self._ports], consumeErrors=True
         )

@@ -22,6 +22,10 @@ class Tickets(Generic[T]):
         self._new_ticket = new_ticket
         self._issued: dict[str, tuple[T, float]] = {}
 
+    def __len__(self) -> int:
+        """How many are kept."""
+        return len(self._issued)
+
     def issue(self, owner: T) -> str:
         """A new ticket, good for :data:`~relay_protocol.limits.CHANNEL_TICKET_SECONDS`."""
         now = self._clock.seconds()

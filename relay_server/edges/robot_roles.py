@@ -1,4 +1,7 @@
-"""What a robot's connection is for: opening, then control link or channel link (SPEC sections 2.2 to 2.4)."""
+"""What a robot's connection is for: opening, then control link or channel link (SPEC sections 2.2 to 2.4).
+
+The link of a stream of pictures has its role in :mod:`~relay_server.edges.robot_video`.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,13 @@ from relay_protocol.errors import Invalid, MalformedMessage, Refused, Unavailabl
 from relay_protocol.frames import SampleFrame
 from relay_server import passwords
 from relay_server.channel import Channel, Channels
-from relay_server.edges.robots import RobotConnection
+from relay_server.edges.robot_video import VideoEnd
+from relay_server.edges.robots import RobotConnection, Role
 from relay_server.journal import Journal
 from relay_server.limiter import LoginLimiter
 from relay_server.registry import REPLACE_SECONDS, Presence, Registry
 from relay_server.store import Store
+from relay_server.video import Videos
 
 MOST_PATIENCE = 60.0
 FLAPPING_SECONDS = 2 * MOST_PATIENCE
@@ -47,6 +52,7 @@ class RobotHall:
     store: Store
     registry: Registry
     channels: Channels
+    videos: Videos
     journal: Journal
     seconds: Callable[[], float]
     wall: Callable[[], float]
@@ -56,7 +62,7 @@ class RobotHall:
         object.__setattr__(self, "failures", LoginLimiter(self.seconds, FAILURES_OF_NETWORK))
 
 
-class Opening:
+class Opening(Role):
     """A connection that has not said yet, or not proved, what it is."""
 
     def __init__(self, hall: RobotHall, connection: RobotConnection) -> None:
@@ -173,15 +179,23 @@ class Opening:
         hall.failures.succeeded(claimed, address)
 
     def _join(self, message: link.Join) -> None:
+        connection = self._connection
+        stream = self._hall.videos.redeem(message.ticket)
+        if stream is not None:
+            self._joined(stream.name, VideoEnd(stream, connection), limits.PICTURE_FRAME)
+            stream.joined(connection)
+            return
         try:
             channel = self._hall.channels.redeem(message.ticket)
         except Refused as error:
-            self._connection.refuse(link.Refused(reason=str(error), code=error.code))
+            connection.refuse(link.Refused(reason=str(error), code=error.code))
             return
-        self._connection.send(link.Joined(channel=channel.name, at=self._connection.clock_ns()))
-        end = ChannelEnd(channel, self._connection)
-        self._connection.proven(end, limits.ROBOT_FRAME)
-        channel.joined(self._connection)
+        self._joined(channel.name, ChannelEnd(channel, connection), limits.ROBOT_FRAME)
+        channel.joined(connection)
+
+    def _joined(self, name: str, end: Role, frame_limit: int) -> None:
+        self._connection.send(link.Joined(channel=name, at=self._connection.clock_ns()))
+        self._connection.proven(end, frame_limit)
 
 
 def _redeem(s: Session, message: link.Enroll, public_key: bytes, origin: str, now: float) -> RobotRecord:
@@ -210,7 +224,7 @@ def _wrong_version(version: int) -> MalformedMessage:
     )
 
 
-class Control:
+class Control(Role):
     """The control link of a registered robot."""
 
     log = Logger()
@@ -287,6 +301,8 @@ class Control:
             self._hall.registry.changed()
         elif isinstance(message, link.Describe):
             self._hall.registry.described(self._robot, message)
+        elif isinstance(message, link.Cameras):
+            self._hall.registry.cameras(self._robot, message)
         elif isinstance(message, link.Alert):
             self._alert(message.level[:20], message.text[:500])
         elif isinstance(message, (link.Ping, link.Pong)):
@@ -318,7 +334,7 @@ class Control:
         self._hall.registry.seen(self._robot)
 
 
-class ChannelEnd:
+class ChannelEnd(Role):
     """The robot's end of a channel."""
 
     def __init__(self, channel: Channel, connection: RobotConnection) -> None:

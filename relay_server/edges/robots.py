@@ -21,7 +21,7 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
-from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, encode_sample
+from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, VideoFrame, encode_sample
 from relay_server.clock import Clock, Timer, cancel, looping
 from relay_server.edges.caps import AddressCap, Place
 from relay_server.edges.fastpath import Turns, Writer, writer_for
@@ -46,6 +46,13 @@ class Role(Protocol):
 
         :raises PeerError: it has no place here
         """
+
+    def picture(self, frame: VideoFrame) -> None:
+        """A picture; few roles take any.
+
+        :raises PeerError: it is none, or has no place here
+        """
+        raise MalformedMessage("pictures have a link of their own")
 
     def lost(self, reason: str) -> None:
         """The connection has ended."""
@@ -208,12 +215,12 @@ class RobotConnection(TwistedProtocol):
         waiting = self._waiting
         while waiting and not self._busy and self._role is not None:
             frame = waiting.popleft()
-            if type(frame) is SampleFrame:
+            if isinstance(frame, SampleFrame):
                 self._role.sample(frame)
             elif isinstance(frame, JsonFrame):
                 self._role.message(frame.body)
             else:
-                raise MalformedMessage("pictures have a link of their own")
+                self._role.picture(frame)
 
     def heartbeat(self, message: link.Ping | link.Pong) -> None:
         """Ping and pong are the same in every role."""

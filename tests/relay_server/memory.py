@@ -22,6 +22,7 @@ from relay_server.local import RelayNode
 from relay_server.registry import Presence, Registry
 from relay_server.rounds import Rounds
 from relay_server.session import Session, Timing
+from relay_server.video import Videos
 
 M = TypeVar("M", bound=link.Message)
 
@@ -204,6 +205,7 @@ class World:
             new_ticket=lambda: f"ticket-{next(tickets)}",
             wall_ns=lambda: self.now_ns() + 10**18,
         )
+        self.videos = Videos(self.clock, new_ticket=lambda: f"ticket-{next(tickets)}")
         self.robot = self.registry.presence(1, "rover", "main")
         self.control = MemoryLink()
         self.link = MemoryLink()

@@ -146,7 +146,7 @@ def test_a_graph_that_takes_too_much_memory_is_refused_in_words() -> None:
 
 def test_figures_tell_robots_by_state_clients_and_channels(world: World) -> None:
     """As they are when they are asked for."""
-    figures = registry_of(RelayCollector(world.registry, world.channels, lambda: world.people))
+    figures = registry_of(RelayCollector(world.registry, world.channels, world.videos, lambda: world.people))
     assert figures.get_sample_value("switchboard_robots", {"state": "offline"}) == 1
     world.robot_comes()
     person = world.person()

@@ -100,7 +100,7 @@ def test_a_ticket_is_good_once_and_for_a_time(world: World) -> None:
     world.clock.advance(0)
     ticket = world.control.take(link.OpenChannel)[-1].ticket
     assert world.channels.redeem(ticket) is world.channel
-    old = world.channels._issue(world.channel)
+    old = world.channels._tickets.issue(world.channel)
     world.clock.advance(31)
     for each in (ticket, old, "unknown"):
         with pytest.raises(Refused, match="unknown, used or too old"):
@@ -114,7 +114,7 @@ def test_tickets_do_not_outlive_their_channel(world: World) -> None:
     channel.attach(Member())
     world.clock.advance(0)
     channel.shut()
-    assert not world.channels._tickets
+    assert not len(world.channels._tickets)
     assert not list(world.channels)
 
 

@@ -64,7 +64,14 @@ class Hall:
         clock = self.world.clock
         self.journal = Journal(store, clock.seconds)
         self.hall = RobotHall(
-            RELAY, store, self.registry, self.world.channels, self.journal, clock.seconds, lambda: 1000.0
+            RELAY,
+            store,
+            self.registry,
+            self.world.channels,
+            self.world.videos,
+            self.journal,
+            clock.seconds,
+            lambda: 1000.0,
         )
         timing = LinkTiming(2.0)
         self.factory = RobotFactory(

@@ -1,0 +1,41 @@
+"""What a robot's connection is for when it is the link of a stream of pictures (SPEC section 2.6)."""
+
+from __future__ import annotations
+
+from relay_protocol import jsontext, limits, link
+from relay_protocol.errors import MalformedMessage
+from relay_protocol.frames import SampleFrame, VideoFrame
+from relay_server.edges.robots import RobotConnection, Role
+from relay_server.video import Stream
+
+
+class VideoEnd(Role):
+    """The robot's end of a stream."""
+
+    def __init__(self, stream: Stream, connection: RobotConnection) -> None:
+        self._stream = stream
+        self._connection = connection
+
+    def message(self, body: bytes) -> None:
+        """What it plays, or that it does not."""
+        if len(body) > limits.JSON_BODY:
+            raise MalformedMessage(f"JSON of more than {limits.JSON_BODY} bytes is not taken on a video link")
+        message = jsontext.decode(link.robot_video_decoder, body)
+        if isinstance(message, (link.Ping, link.Pong)):
+            self._connection.heartbeat(message)
+        elif isinstance(message, link.Bye):
+            self._connection.close("bye")
+        else:
+            self._stream.message(message)
+
+    def sample(self, frame: SampleFrame) -> None:
+        """Topics have links of their own."""
+        raise MalformedMessage("samples go over the channel link, not the link of a stream")
+
+    def picture(self, frame: VideoFrame) -> None:
+        """A picture of the stream."""
+        self._stream.picture(frame)
+
+    def lost(self, reason: str) -> None:
+        """The link has ended."""
+        self._stream.lost(self._connection)
