@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import os
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from robot_client import config, logs
 from robot_client.enrolling import enroll as hand_in
 from robot_client.helptext import examples
 from robot_client.identity import Enrolment, StateFolder
+from robot_client.reactors import monotonic_reactor
 from robot_client.run import Runner, agent
 from robot_client.tls import endpoint, is_loopback, split_address
 
@@ -149,15 +149,6 @@ def run(state: Path, config_path: Path | None, log_json: bool, use_sim_time: boo
     runner.start()
     reactor.addSystemEventTrigger("before", "shutdown", runner.stop)
     reactor.run()
-
-
-def monotonic_reactor() -> Any:
-    """The reactor, on a clock that nobody can set: a watchdog must not wait for a clock put back an hour."""
-    from twisted.internet import reactor
-
-    clock: Any = reactor
-    clock.seconds = time.monotonic
-    return clock
 
 
 def _warn_if_plain(host: str, tls: bool) -> None:

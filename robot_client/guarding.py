@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from typing import Any
 
 import msgspec
 from twisted.internet.defer import Deferred, succeed
-from twisted.internet.error import ProcessExitedAlready
-from twisted.internet.protocol import ProcessProtocol
 from twisted.logger import Logger
-from twisted.python.failure import Failure
 
+from robot_client.child import Child
 from robot_client.guard_protocol import (
     Command,
     Forget,
@@ -38,7 +34,6 @@ DOUBTFUL = 2.0
 SILENT = 20.0
 """Seconds without an answer after which a guard is taken for frozen; its start may take some."""
 
-MAX_LINE = 4096
 RESTART = (1.0, 30.0)
 LEAVE = 2.0
 
@@ -59,7 +54,7 @@ class GuardKeeper:
         self._within_ms = str(within_ms)
         self._sim_time = sim_time
         self._started = 0
-        self._process: _Process | None = None
+        self._process: Child | None = None
         self._topics: dict[TypedTopic, Topic] = {}
         self._commands: dict[TypedTopic, Command] = {}
         self._ready: set[TypedTopic] = set()
@@ -72,22 +67,15 @@ class GuardKeeper:
     def start(self) -> None:
         """Start a guard and tell it all that matters now."""
         self._timer = None
-        self._process = process = _Process(self)
+        self._process = process = Child(self)
         try:
-            self._reactor.spawnProcess(
-                process,
-                sys.executable,
-                [sys.executable, *self._arguments()],
-                # Whole: the wheels of ROS keep their library path in it, and the domain must be the same.
-                env=dict(os.environ),
-                childFDs={0: "w", 1: "r", 2: 2},
-            )
+            process.start(self._reactor, self._arguments())
         except OSError as error:
             self.lost(f"it can't be started: {error.strerror}")
             return
         lines: list[Line] = [*self._topics.values(), *self._commands.values()]
         for line in lines:
-            process.tell(line)
+            process.tell(encode(line))
         self._heard = self._reactor.seconds()
         self._timer = self._reactor.callLater(self._pause, self._probe)
 
@@ -99,8 +87,8 @@ class GuardKeeper:
         if self._process is None:
             return succeed(None)
         self._left = Deferred()
-        self._process.tell(Leave())
-        self._process.transport.closeStdin()
+        self._process.tell(encode(Leave()))
+        self._process.leave()
         self._timer = self._reactor.callLater(LEAVE, self._process.kill)
         return self._left
 
@@ -174,7 +162,7 @@ class GuardKeeper:
 
     def _tell(self, line: Line) -> None:
         if self._process is not None:
-            self._process.tell(line)
+            self._process.tell(encode(line))
 
     def _probe(self) -> None:
         self._timer = None
@@ -184,7 +172,7 @@ class GuardKeeper:
             self._log.warn("the motion guard does not answer; it is ended and started anew")
             self._process.kill()
             return
-        self._process.tell(Probe())
+        self._process.tell(encode(Probe()))
         if self._asked is None:
             self._asked = self._reactor.seconds()
         self._timer = self._reactor.callLater(self._pause, self._probe)
@@ -201,35 +189,3 @@ class GuardKeeper:
     @property
     def _pause(self) -> float:
         return PROBE_MOVING if self._moving else PROBE_EVERY
-
-
-class _Process(ProcessProtocol):
-    """One guard process."""
-
-    transport: Any
-
-    def __init__(self, keeper: GuardKeeper) -> None:
-        self._keeper = keeper
-        self._said = b""
-
-    def tell(self, line: Line) -> None:
-        """Write a line to it."""
-        self.transport.write(encode(line))
-
-    def kill(self) -> None:
-        """End it the hard way."""
-        try:
-            self.transport.signalProcess("KILL")
-        except ProcessExitedAlready:
-            return
-
-    def outReceived(self, data: bytes) -> None:
-        """It answered."""
-        *lines, rest = (self._said + data).split(b"\n")
-        self._said = rest[-MAX_LINE:]
-        for line in lines:
-            self._keeper.heard(line)
-
-    def processEnded(self, reason: Failure) -> None:
-        """It is gone and reaped."""
-        self._keeper.lost(reason.getErrorMessage())

@@ -1,7 +1,7 @@
 """Robot links without sockets: bytes in, events and bytes out.
 
-A control link goes greeting → proving → registered, a channel link joining → open, an enrolment asks once.
-What may be said when is a table in each class; everything else breaks the contract. The edge is
+A control link goes greeting → proving → registered, one for a channel or for pictures joining → open, an enrolment asks
+once. What may be said when is a table in each class; everything else breaks the contract. The edge is
 :mod:`robot_client.transport`.
 """
 
@@ -49,7 +49,10 @@ class Registered(NamedTuple):
 
 
 class JoinedChannel(NamedTuple):
-    """The channel stands."""
+    """The channel or the stream of pictures stands.
+
+    :param channel: its name
+    """
 
     channel: str
 
@@ -279,8 +282,8 @@ class ControlLink(Link):
 _REQUESTS = tuple((State.OPEN, each) for each in get_args(link.RelayChannel) if each not in _EVERYWHERE)
 
 
-class ChannelLink(Link):
-    """A link for one channel, joined by ticket.
+class TicketLink(Link):
+    """A link that is joined by ticket.
 
     :param heartbeat: seconds between pings, as the control link agreed
     """
@@ -308,18 +311,36 @@ class ChannelLink(Link):
     def _on_request(self, message: link.Message) -> list[Event]:
         return [Said(message)]
 
+
+class ChannelLink(TicketLink):
+    """A link for one channel."""
+
     def _sample(self, frame: frames.Frame) -> list[Event]:
         if self.state is State.OPEN and isinstance(frame, frames.SampleFrame):
             return [Sampled(frame)]
         return super()._sample(frame)
 
     _table: ClassVar[Table] = {
-        (State.JOINING, link.Joined): _on_joined,
-        **dict.fromkeys(_REQUESTS, _on_request),
+        (State.JOINING, link.Joined): TicketLink._on_joined,
+        **dict.fromkeys(_REQUESTS, TicketLink._on_request),
     }
     _decoders: ClassVar[dict[State, msgspec.json.Decoder[Any]]] = {
         State.JOINING: link.opening_reply_decoder,
         State.OPEN: link.relay_channel_decoder,
+    }
+
+
+class VideoLink(TicketLink):
+    """A link for one stream of pictures."""
+
+    _table: ClassVar[Table] = {
+        (State.JOINING, link.Joined): TicketLink._on_joined,
+        (State.OPEN, link.Took): TicketLink._on_request,
+        (State.OPEN, link.KeyFrame): TicketLink._on_request,
+    }
+    _decoders: ClassVar[dict[State, msgspec.json.Decoder[Any]]] = {
+        State.JOINING: link.opening_reply_decoder,
+        State.OPEN: link.relay_video_decoder,
     }
 
 

@@ -16,12 +16,14 @@ from robot_client.link import (
     EnrolmentLink,
     Identity,
     JoinedChannel,
+    Link,
     LinkSilent,
     Registered,
     RelayRefused,
     Said,
     Sampled,
     State,
+    VideoLink,
     WrongRelay,
 )
 
@@ -43,7 +45,7 @@ def ticks() -> Ticks:
     return Ticks()
 
 
-def said(end: ControlLink | ChannelLink | EnrolmentLink) -> list[dict[str, object]]:
+def said(end: Link) -> list[dict[str, object]]:
     import json
 
     found = []
@@ -72,6 +74,14 @@ def opened(ticks: Ticks) -> ChannelLink:
     end.begin()
     end.take()
     end.receive(link.frame(link.Joined(channel="c", at=5)))
+    return end
+
+
+def shown(ticks: Ticks) -> VideoLink:
+    end = VideoLink("ticket", ticks, 2.0)
+    end.begin()
+    end.take()
+    end.receive(link.frame(link.Joined(channel="s", at=5)))
     return end
 
 
@@ -216,7 +226,7 @@ def test_enrolment_of_another_robot_is_refused(ticks: Ticks) -> None:
 @given(st.lists(st.binary(max_size=200), max_size=20), st.booleans())
 def test_hostile_bytes_end_in_words(pieces: list[bytes], framed: bool) -> None:
     """Whatever a relay sends, in whatever state, the link answers with events or an error of ours."""
-    for end in (ControlLink(ME, "t", Ticks()), registered(Ticks()), opened(Ticks())):
+    for end in (ControlLink(ME, "t", Ticks()), registered(Ticks()), opened(Ticks()), shown(Ticks())):
         try:
             for piece in pieces:
                 end.receive(frames.encode_json(piece) if framed else piece)
@@ -234,3 +244,35 @@ def test_wrong_utf8_is_refused(ticks: Ticks) -> None:
     """Bytes that are no UTF-8 are refused, also in a field nobody reads."""
     with pytest.raises(PeerError):
         registered(ticks).receive(frames.encode_json(b'{"op":"ping","t":1,"x":"\xff"}'))
+
+
+def test_video_link_joins_by_ticket(ticks: Ticks) -> None:
+    """It says the ticket, is told the stream's name, and asks for the clock at once."""
+    end = VideoLink("ticket", ticks, 2.0)
+    end.begin()
+    assert [(each["op"], each["ticket"]) for each in said(end)] == [("join", "ticket")]
+    assert end.receive(link.frame(link.Joined(channel="s", at=5))) == [JoinedChannel("s")]
+    assert {each["op"] for each in said(end)} == {"ping"}
+    assert end.offset.known
+
+
+def test_video_link_passes_on_what_the_relay_took(ticks: Ticks) -> None:
+    """Answers to pictures and the wish for a key frame are for the stream."""
+    end = shown(ticks)
+    told = link.frame(link.Took(number=3)) + link.frame(link.KeyFrame())
+    assert end.receive(told) == [Said(link.Took(number=3)), Said(link.KeyFrame())]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        link.frame(link.Joined(channel="s", at=6)),
+        link.frame(link.Unsubscribe(number=1)),
+        frames.encode_sample(1, 2, b"x"),
+        frames.encode_video(1, 2, b"x"),
+    ],
+)
+def test_video_link_takes_nothing_else(ticks: Ticks, wrong: bytes) -> None:
+    """What belongs on other links, and what robots send, breaks the contract."""
+    with pytest.raises(PeerError):
+        shown(ticks).receive(wrong)

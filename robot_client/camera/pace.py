@@ -1,0 +1,238 @@
+"""How much of a picture the uplink bears: measured by what the relay took, decided step by step.
+
+The link is taken for a pipe of one rate: a picture that leaves at once is there after the round trip and the time
+its bytes take. From each ``took`` follows that rate, from the rate how many bytes a picture may have, and from the size
+of the latest picture at its step the step at which the next one is as small as that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from relay_protocol.link import VideoSettings
+
+TARGET = 0.3
+"""Seconds from a picture's arrival at the robot to the relay's word that it is there."""
+
+UNDER_WAY = 2
+"""Most pictures the relay has not taken yet (SPEC 2.6)."""
+
+SHARE = 0.4
+"""Of the time that is left, what one picture's bytes may take: the one before it may still be on its way."""
+
+ROOM = 0.7
+"""How full the next better step may be as far as one can tell, for it to be tried."""
+
+HOLD = (0.5, 16.0)
+"""Seconds between two steps upwards; doubled up to the second when a step had to be taken back."""
+
+PROVED = 4.0
+"""Seconds after which a step upwards counts as good."""
+
+SLACK = 0.05
+"""Seconds by which a picture may be later than expected before another one is put behind it."""
+
+QUICKEST = 0.001
+"""Seconds; what is shorter says nothing of the link."""
+
+_LEAST_QUALITY = 35
+_QUALITIES = (65, 50, _LEAST_QUALITY)
+_SCALES = (0.75, 0.56, 0.42, 0.32, 0.24, 0.18)
+_RATES = (3.0, 2.0, 1.0)
+_BUSY = 0.5
+"""Of the time between two pictures at a lowered rate, what a picture may take."""
+
+
+class Step(NamedTuple):
+    """One way to make pictures.
+
+    :param fps: most pictures per second; 0 for all
+    :param weight: bytes of a picture, as a part of those at the first step, by experience with JPEG
+    """
+
+    quality: int
+    scale: float
+    fps: float
+    weight: float
+
+
+@dataclass
+class _Sent:
+    size: int
+    step: int
+    arrived: float
+    at: float
+
+
+def steps(settings: VideoSettings) -> list[Step]:
+    """From what was asked for down to the least there is: first quality goes, then size, then rate."""
+    found = [Step(settings.quality, 1.0, settings.fps, 1.0)]
+    if settings.codec != "png":
+        for quality in (each for each in _QUALITIES if each < settings.quality):
+            weight = _bytes_at(quality) / _bytes_at(settings.quality)
+            found.append(Step(quality, 1.0, settings.fps, weight))
+    quality, weight = found[-1].quality, found[-1].weight
+    found += [Step(quality, scale, settings.fps, weight * scale**1.6) for scale in _SCALES]
+    least = found[-1]
+    found += [least._replace(fps=rate) for rate in _RATES if not settings.fps or rate < settings.fps]
+    return found
+
+
+def _bytes_at(quality: int) -> float:
+    """Bytes of a JPEG by its quality, those at 80 being 1 (pictures of rooms and streets)."""
+    return 0.25 + 0.25 * quality / 50 + (0.35 * ((quality - 50) / 30) if quality > 50 else 0.0)
+
+
+class Pace:
+    """Decides for one stream when a picture is made, and how. Pure: times are given, in seconds of one clock.
+
+    :param target: delay to stay under; with a round trip of more than half of it, twice the round trip
+    :param rate: bytes per second another stream of this robot measured of late, where there is one
+    """
+
+    def __init__(self, settings: VideoSettings, target: float = TARGET, rate: float | None = None) -> None:
+        self.delay: float | None = None
+        """Seconds from arrival to ``took``, smoothed; ``None`` before the first."""
+        self.rate = rate
+        """Bytes per second the uplink carries, as measured."""
+        self._target = target
+        self._steps = steps(settings)
+        self._step = 0
+        self._under_way: dict[int, _Sent] = {}
+        self._free_at = 0.0
+        self._round_trip: float | None = None
+        self._own = 0.0
+        self._unit: float | None = None
+        self._last_sent: float | None = None
+        self._last_took = float("-inf")
+        self._hold = HOLD[0]
+        self._raised = self._changed = float("-inf")
+
+    @property
+    def quality(self) -> int:
+        """Of JPEG."""
+        return self._steps[self._step].quality
+
+    @property
+    def scale(self) -> float:
+        """Of width and height."""
+        return self._steps[self._step].scale
+
+    @property
+    def fps(self) -> float:
+        """Most pictures per second; 0 for all."""
+        return self._steps[self._step].fps
+
+    @property
+    def reduced(self) -> float:
+        """How far below what was asked for: 0 as asked, 1 the least there is."""
+        return self._step / (len(self._steps) - 1)
+
+    def may_send(self, now: float) -> bool:
+        """Whether a picture made now would be there in time, as far as one can tell."""
+        if len(self._under_way) >= UNDER_WAY or self.wait(now) > 0:
+            return False
+        if not self._under_way:
+            return True
+        if self.rate is None or self._unit is None:
+            return False  # the first picture alone shows what the link is like
+        last = max(each.at for each in self._under_way.values())
+        if now > max(self._free_at, last) + self._trip + SLACK:
+            return False  # it is slower than it was
+        ahead = max(0.0, self._free_at - now)
+        return self._own + ahead + self._bytes(self._step) / self.rate + self._trip <= self._goal
+
+    def wait(self, now: float) -> float:
+        """Seconds until the rate that is aimed at allows another picture."""
+        if not self.fps or self._last_sent is None:
+            return 0.0
+        # A camera's pictures are not quite even: one that is a little early must not wait for the next.
+        return max(0.0, self._last_sent + 0.9 / self.fps - now)
+
+    def sent(self, number: int, size: int, now: float, arrived: float) -> None:
+        """A picture was written.
+
+        :param size: bytes
+        :param arrived: when the camera's picture reached us
+        """
+        self._under_way[number] = _Sent(size, self._step, arrived, now)
+        self._own = _smooth(self._own, now - arrived, 0.2)
+        self._last_sent = now
+        unit = size / self._steps[self._step].weight
+        self._unit = unit if self._unit is None else _smooth(self._unit, unit, 0.5)
+        if self.rate is not None:
+            self._free_at = max(now, self._free_at) + size / self.rate
+            self._fit(now)
+
+    def took(self, number: int, now: float, round_trip: float | None = None) -> None:
+        """The relay has a picture; a number that is not under way is passed over.
+
+        :param round_trip: latest of the link, where known
+        """
+        sent = self._under_way.pop(number, None)
+        if sent is None:
+            return
+        if round_trip is not None:
+            self._round_trip = round_trip if self._round_trip is None else min(self._round_trip, round_trip)
+        delay = now - sent.arrived
+        self.delay = delay if self.delay is None else _smooth(self.delay, delay, 0.3)
+        # Behind another picture it began to go only when that one was there.
+        began = max(sent.at, self._last_took - self._trip)
+        self._measure(sent.size / max(now - began - self._trip, (now - began) / 8, QUICKEST), delay)
+        self._last_took = now
+        if not self._under_way:
+            self._free_at = now
+        self._fit(now)
+
+    def _measure(self, rate: float, delay: float) -> None:
+        if self.rate is None or (rate < self.rate and delay > self._goal):
+            self.rate = rate
+        else:
+            self.rate = _smooth(self.rate, rate, 0.4 if rate < self.rate else 0.25)
+
+    def _fit(self, now: float) -> None:
+        """Go down to where a picture is small enough at once, up by one step at a time."""
+        if self._too_large(self._step, 1.0):
+            best = self._step
+            while best < len(self._steps) - 1 and self._too_large(best, 0.9):
+                best += 1
+            if now - self._raised < PROVED:
+                self._hold = min(self._hold * 2, HOLD[1])
+                self._raised = float("-inf")
+            self._change(best, now)
+        elif self._step and now - self._changed >= self._hold and not self._too_large(self._step - 1, ROOM):
+            if now - self._raised >= PROVED and self._raised > float("-inf"):
+                self._hold = max(HOLD[0], self._hold / 2)
+            self._change(self._step - 1, now)
+            self._raised = now
+
+    def _change(self, step: int, now: float) -> None:
+        if step != self._step:
+            self._step = step
+            self._changed = now
+
+    def _too_large(self, step: int, full: float) -> bool:
+        """Whether a picture of this step would take more than a part of the time it may take."""
+        if self.rate is None:
+            return False
+        time = max(self._goal - self._trip - self._own, self._goal / 3) * SHARE
+        fps = self._steps[step].fps
+        if fps in _RATES:
+            time = max(time, _BUSY / fps)
+        return self._bytes(step) / self.rate > time * full
+
+    def _bytes(self, step: int) -> float:
+        return (self._unit or 0.0) * self._steps[step].weight
+
+    @property
+    def _trip(self) -> float:
+        return self._round_trip or 0.0
+
+    @property
+    def _goal(self) -> float:
+        return max(self._target, 2 * self._trip)
+
+
+def _smooth(old: float, new: float, share: float) -> float:
+    return old + share * (new - old)

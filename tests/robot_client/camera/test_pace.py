@@ -1,0 +1,242 @@
+"""The pace, on simulated uplinks: a pipe of one rate, a round trip, pictures whose size follows quality and size."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from typing import NamedTuple
+
+import pytest
+
+from relay_protocol.link import VideoSettings
+from robot_client.camera.pace import TARGET, UNDER_WAY, Pace, steps
+
+TICK = 0.001
+ENCODING = 0.008
+MBIT = 1e6 / 8
+JPEG = {80: 1.0, 65: 0.72, 50: 0.57, 35: 0.45}
+"""Bytes of the simulated JPEG by quality, measured on a street; not quite what the pace reckons with."""
+
+
+class Taken(NamedTuple):
+    at: float
+    delay: float
+    step: float
+
+
+class Uplink:
+    """A camera, a pace, and a pipe that carries ``rate`` bytes per second."""
+
+    def __init__(
+        self,
+        mbit: float,
+        trip: float = 0.02,
+        fps: float = 15,
+        full: int = 50_000,
+        settings: VideoSettings | None = None,
+        known: float | None = None,
+    ) -> None:
+        self.now = 0.0
+        self.rate = mbit * MBIT
+        self.pace = Pace(settings or VideoSettings(), rate=known)
+        self.trip = trip
+        self.most_under_way = 0
+        self.largest = 0
+        self._fps = fps
+        self._full = full
+        self._random = random.Random(4)
+        self._next = 0.0
+        self._newest: float | None = None
+        self._encoding: tuple[float, float] | None = None
+        self._pipe: list[list[float]] = []
+        self._coming: list[tuple[float, int, float]] = []
+        self._number = 0
+
+    def run(self, seconds: float) -> list[Taken]:
+        """What the relay took meanwhile."""
+        taken, until = [], self.now + seconds
+        while self.now < until:
+            self.now += TICK
+            self._carry()
+            taken += self._answers()
+            if self.now >= self._next:
+                self._next += 1 / self._fps
+                self._newest = self.now
+            self._make()
+        return taken
+
+    def _carry(self) -> None:
+        room = self.rate * TICK
+        while self._pipe and room > 0:
+            first = self._pipe[0]
+            part = min(first[1], room)
+            first[1] -= part
+            room -= part
+            if first[1] <= 0:
+                self._pipe.pop(0)
+                self._coming.append((self.now + self.trip, int(first[0]), first[2]))
+
+    def _answers(self) -> list[Taken]:
+        taken = []
+        while self._coming and self._coming[0][0] <= self.now:
+            _, number, arrived = self._coming.pop(0)
+            self.pace.took(number, self.now, self.trip)
+            taken.append(Taken(self.now, self.now - arrived, self.pace.reduced))
+        return taken
+
+    def _make(self) -> None:
+        if self._newest is not None and self._encoding is None and self.pace.may_send(self.now):
+            self._encoding, self._newest = (self.now + ENCODING, self._newest), None
+        if self._encoding is not None and self.now >= self._encoding[0]:
+            arrived, self._encoding = self._encoding[1], None
+            size = (
+                self._full * JPEG[self.pace.quality] * self.pace.scale**1.8 * self._random.uniform(0.85, 1.15)
+            )
+            self._number += 1
+            self.pace.sent(self._number, int(size) + 600, self.now, arrived)
+            self._pipe.append([self._number, size + 600, arrived])
+            self.most_under_way = max(self.most_under_way, len(self._pipe) + len(self._coming))
+
+
+def changes(taken: list[Taken]) -> int:
+    return sum(one.step != other.step for one, other in itertools.pairwise(taken))
+
+
+def reversals(taken: list[Taken]) -> int:
+    """How often it went up that had gone down before."""
+    ways = [other.step > one.step for one, other in itertools.pairwise(taken) if one.step != other.step]
+    return sum(not lower and before for before, lower in itertools.pairwise(ways))
+
+
+def test_steps_give_up_quality_then_size_then_rate() -> None:
+    """Each step is smaller than the one before; the first is what was asked for."""
+    found = steps(VideoSettings(quality=80, fps=15))
+    assert (found[0].quality, found[0].scale, found[0].fps) == (80, 1.0, 15)
+    kinds = [
+        "rate" if step.fps != 15 else "size" if step.scale < 1 else "quality" if step.quality < 80 else "all"
+        for step in found
+    ]
+    assert kinds == sorted(kinds, key=["all", "quality", "size", "rate"].index)
+    assert all(one.weight >= other.weight for one, other in itertools.pairwise(found))
+
+
+def test_png_has_no_quality_to_give_up() -> None:
+    """A PNG gets smaller by its size alone."""
+    assert {step.quality for step in steps(VideoSettings(codec="png"))} == {80}
+
+
+@pytest.mark.parametrize("trip", [0.002, 0.05])
+def test_wide_uplink_is_left_alone(trip: float) -> None:
+    """At 10 Mbit/s pictures of 50 KB go out as asked, all of them."""
+    uplink = Uplink(10, trip)
+    taken = uplink.run(20)
+    assert {each.step for each in taken} == {0.0}
+    assert len(taken) >= 20 * 15 - 3
+    assert max(each.delay for each in taken) < TARGET
+
+
+@pytest.mark.parametrize("trip", [0.002, 0.02, 0.05, 0.1])
+@pytest.mark.parametrize("mbit", [1, 0.2])
+def test_thin_uplink_is_in_time_within_5_s(mbit: float, trip: float) -> None:
+    """From the fifth second on every picture is there within the target, at three a second or more."""
+    uplink = Uplink(mbit, trip)
+    uplink.run(5)
+    taken = uplink.run(20)
+    assert max(each.delay for each in taken) < TARGET
+    assert len(taken) >= 20 * 3
+    assert min(each.step for each in taken) > 0
+
+
+@pytest.mark.parametrize("trip", [0.002, 0.05])
+@pytest.mark.parametrize("mbit", [1, 0.2])
+def test_squeezed_uplink_is_in_time_within_5_s_and_recovers(mbit: float, trip: float) -> None:
+    """A link squeezed while pictures go is under the target 5 s later; with room again all is as asked 10 s later."""
+    uplink = Uplink(10, trip)
+    uplink.run(10)
+    uplink.rate = mbit * MBIT
+    uplink.run(5)
+    taken = uplink.run(20)
+    assert max(each.delay for each in taken) < TARGET
+    assert uplink.pace.delay is not None
+    assert uplink.pace.delay < TARGET
+    uplink.rate = 10 * MBIT
+    uplink.run(10)
+    assert uplink.pace.reduced == 0.0
+    assert {each.step for each in uplink.run(10)} == {0.0}
+
+
+@pytest.mark.parametrize("mbit", [0.2, 0.5, 1, 2, 4])
+def test_steady_uplink_hardly_changes_the_picture(mbit: float) -> None:
+    """On a link that stays as it is a picture gets better and worse again twice a minute at most."""
+    uplink = Uplink(mbit)
+    uplink.run(10)
+    taken = uplink.run(60)
+    assert reversals(taken) <= 2
+    assert changes(taken) <= 5
+
+
+def test_wavering_uplink_stays_in_time() -> None:
+    """Where the rate changes by half every second, nineteen pictures in twenty are in time."""
+    uplink = Uplink(1)
+    uplink.run(5)
+    taken: list[Taken] = []
+    for second in range(60):
+        uplink.rate = (1.0, 0.5, 1.5)[second % 3] * MBIT
+        taken += uplink.run(1)
+    late = [each for each in taken if each.delay >= TARGET]
+    assert len(late) <= len(taken) / 20
+
+
+def test_two_pictures_are_under_way_at_most() -> None:
+    """However large the pictures and thin the link (SPEC 2.6)."""
+    for mbit in (10, 2, 0.2):
+        uplink = Uplink(mbit, fps=60, full=120_000)
+        uplink.run(10)
+        assert 1 <= uplink.most_under_way <= UNDER_WAY
+
+
+def test_first_picture_goes_alone() -> None:
+    """Before the first answer nothing is known of the link, so nothing is put behind it."""
+    pace = Pace(VideoSettings())
+    assert pace.may_send(1.0)
+    pace.sent(1, 50_000, 1.0, 0.99)
+    assert not pace.may_send(1.1)
+    pace.took(1, 1.05)
+    assert pace.may_send(1.1)
+
+
+def test_known_rate_makes_the_first_picture_fit() -> None:
+    """What another stream has learned of the uplink is used from the second picture on, before any answer."""
+    uplink = Uplink(0.2, known=0.2 * MBIT)
+    uplink.pace.sent(1, 50_000, 0.0, 0.0)
+    assert uplink.pace.reduced > 0.5
+
+
+def test_rate_asked_for_is_kept() -> None:
+    """Of 30 pictures a second five are made when five were asked for."""
+    uplink = Uplink(10, fps=30, settings=VideoSettings(fps=5))
+    assert 48 <= len(uplink.run(10)) <= 54
+
+
+def test_very_thin_uplink_gets_few_pictures_and_never_none() -> None:
+    """At 30 kbit/s the rate is lowered too; a picture a second still comes."""
+    uplink = Uplink(0.03)
+    uplink.run(30)
+    taken = uplink.run(20)
+    assert uplink.pace.reduced > 0.8
+    assert uplink.pace.fps > 0
+    assert len(taken) >= 15
+
+
+def test_long_round_trip_is_not_taken_for_a_thin_link() -> None:
+    """By satellite (600 ms) nothing can be in time; the pictures are not made useless over it."""
+    uplink = Uplink(10, trip=0.6)
+    uplink.run(20)
+    assert uplink.pace.reduced == 0.0
+
+
+def test_unknown_number_is_passed_over() -> None:
+    """An answer to no picture changes nothing."""
+    pace = Pace(VideoSettings())
+    pace.took(7, 1.0)
+    assert pace.delay is None
