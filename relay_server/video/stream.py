@@ -103,6 +103,7 @@ class Stream:
         self._unready.add(viewer)
         self._patience[viewer] = self._clock.callLater(FIRST_PICTURE_SECONDS, self._in_vain, viewer)
         self._happen(Event.WANTED)
+        self._look_for_camera()
         if self.state in LINKED:
             self._clock.callLater(0, self._greet, viewer)
             self._want_key()
@@ -287,8 +288,6 @@ class Stream:
             self._leave_link(event)
         if following is State.OPENING:
             self._open_later(event)
-        elif following is State.WAITING:
-            self._look_for_camera()
         elif following is State.LINGERING:
             self._timer = self._clock.callLater(LINGER_SECONDS, self._happen, Event.SHUT)
         elif following is State.CLOSED:

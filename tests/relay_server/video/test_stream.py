@@ -1,0 +1,435 @@
+"""A stream's life: every event in every state, and what viewers and the robot are told meanwhile."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_protocol import link
+from relay_protocol.errors import MalformedMessage, NotFound, Unavailable
+from relay_server.video import NothingCame, State
+from relay_server.video.states import LINKED, NEXT, Event
+from relay_server.video.stream import (
+    FIRST_PICTURE_SECONDS,
+    JOIN_SECONDS,
+    KEY_SECONDS,
+    LINGER_SECONDS,
+    MOST_REOPEN_SECONDS,
+    REOPEN_SECONDS,
+    STREAM_VIEWERS,
+    Hooks,
+    Stream,
+)
+from tests.relay_server.memory import MemoryLink, World
+from tests.relay_server.video.watching import (
+    CAMERA,
+    DELTA,
+    KEY,
+    OTHER,
+    Watcher,
+    asked,
+    jpeg,
+    png,
+    robot_comes,
+    robot_joins,
+    shows,
+)
+
+H264 = link.VideoSettings(codec="h264")
+PLAYING = link.Playing(width=32, height=24, quality=80)
+
+
+def watched(world: World, settings: link.VideoSettings | None = None) -> tuple[Stream, Watcher, MemoryLink]:
+    """An open stream with one viewer, and the robot's end."""
+    if world.robot.control is None:
+        robot_comes(world)
+    watcher = Watcher()
+    stream = watcher.watch(world, settings)
+    return stream, watcher, robot_joins(world)
+
+
+def brought_to(world: World, state: State) -> Stream:
+    """A stream in this state, by what really happens."""
+    if state is State.NEW:
+        hooks = Hooks(lambda stream: "ticket", lambda stream: None, lambda stream: None)
+        return Stream(world.clock, world.robot, CAMERA, link.VideoSettings(), "rover#video0", hooks)
+    watcher = Watcher()
+    stream = watcher.watch(world)
+    if state is State.WAITING:
+        return stream
+    robot_comes(world)
+    if state in (State.OPEN, State.LINGERING):
+        robot_joins(world)
+    if state in (State.LINGERING, State.CLOSED):
+        watcher.leave()
+    return stream
+
+
+@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("state", State)
+def test_every_event_in_every_state(world: World, state: State, event: Event) -> None:
+    """The table says what follows; what it does not list changes nothing."""
+    stream = brought_to(world, state)
+    assert stream.state is state
+    stream._happen(event)
+    assert stream.state is NEXT.get((state, event), state)
+    assert (stream._link is not None) == (state in LINKED and stream.state in LINKED)
+    assert (stream in world.robot.watchers) == (stream.state is not State.CLOSED)
+
+
+# --- viewers ----------------------------------------------------------------------------------------------
+
+
+def test_a_picture_goes_to_everybody_and_the_robot_is_told_at_once(world: World) -> None:
+    """With its own size, whatever the robot says, and the moment it was here."""
+    stream, first, end = watched(world)
+    second = Watcher(user=8)
+    assert second.watch(world) is stream
+    shows(world, stream, 5, jpeg(48, 32))
+    assert end.all(link.Took) == [link.Took(number=5)]
+    (picture,) = first.pictures
+    assert second.pictures == [picture]
+    assert (picture.number, picture.codec, picture.width, picture.height) == (5, "jpeg", 48, 32)
+    assert picture.key
+    assert picture.body == jpeg(48, 32)
+    assert picture.arrived == world.clock.seconds()
+    assert picture.stamp == pytest.approx(1.7e9 + world.clock.seconds())
+    assert stream.newest is picture
+
+
+def test_who_comes_later_is_told_what_the_others_know(world: World) -> None:
+    """What the robot plays, and the newest picture, if it is not too old to be shown."""
+    stream, _, _ = watched(world)
+    stream.message(PLAYING)
+    shows(world, stream, 1)
+    world.clock.advance(0.4)
+    late = Watcher()
+    late.watch(world)
+    world.clock.advance(0)
+    assert late.played == [PLAYING]
+    assert late.numbers == [1]
+    world.clock.advance(0.2)
+    later = Watcher()
+    later.watch(world)
+    world.clock.advance(0)
+    assert later.played == [PLAYING]
+    assert later.numbers == []
+
+
+def test_a_picture_comes_once_to_who_is_new(world: World) -> None:
+    """Also one that comes before he was greeted."""
+    stream, _, _ = watched(world)
+    shows(world, stream, 1)
+    late = Watcher()
+    late.watch(world)
+    shows(world, stream, 2)
+    world.clock.advance(0)
+    assert late.numbers == [2]
+
+
+def test_who_has_left_is_told_nothing(world: World) -> None:
+    """Neither pictures nor the end, nor that none came; leaving twice is nothing."""
+    stream, watcher, _ = watched(world)
+    stays = Watcher()
+    stays.watch(world)
+    watcher.leave()
+    watcher.leave()
+    shows(world, stream)
+    world.clock.advance(FIRST_PICTURE_SECONDS + 1)
+    stream.shut(Unavailable("over"))
+    assert watcher.pictures == []
+    assert watcher.error is None
+    assert str(stays.error) == "over"
+
+
+def test_one_viewer_may_leave_while_another_is_shown_a_picture(world: World) -> None:
+    """And takes others with him."""
+    stream, first, _ = watched(world)
+    second = Watcher()
+    second.watch(world)
+    for each, other in ((first, second), (second, first)):
+        each.picture = lambda picture, other=other: other.leave()  # type: ignore[method-assign]
+    shows(world, stream)
+    assert len(stream.viewers) == 1
+
+
+def test_a_stream_lingers_after_its_last_viewer(world: World) -> None:
+    """Who comes within the time finds it open; after it the robot is told to stop, within 2 s in all."""
+    stream, watcher, end = watched(world)
+    watcher.leave()
+    assert stream.state is State.LINGERING
+    world.clock.advance(LINGER_SECONDS - 0.1)
+    shows(world, stream, 9)
+    assert end.all(link.Took) == [link.Took(number=9)]
+    back = Watcher()
+    assert back.watch(world) is stream
+    world.clock.advance(0)
+    assert back.numbers == [9]
+    world.clock.advance(LINGER_SECONDS)
+    assert stream.state is State.OPEN
+    back.leave()
+    world.clock.advance(LINGER_SECONDS)
+    assert stream.state is State.CLOSED
+    assert end.closed
+    assert world.control.all(link.CloseVideo) == [link.CloseVideo(stream=stream.name)]
+    assert not [call for call in world.clock.getDelayedCalls() if call.active()]
+
+
+def test_nobody_left_before_it_opened(world: World) -> None:
+    """It is over at once; a robot that comes with its ticket is turned away."""
+    robot_comes(world)
+    watcher = Watcher()
+    stream = watcher.watch(world)
+    (ask,) = asked(world)
+    watcher.leave()
+    assert stream.state is State.CLOSED
+    assert len(world.control.all(link.CloseVideo)) == 1
+    assert world.videos.redeem(ask.ticket) is None
+    late = MemoryLink()
+    stream.joined(late)
+    assert late.closed
+
+
+def test_a_stream_takes_a_number_of_viewers(world: World) -> None:
+    """One more is refused in words."""
+    for user in range(STREAM_VIEWERS):
+        Watcher(user).watch(world)
+    with pytest.raises(Unavailable, match="256 viewers watch this stream already"):
+        Watcher(1000).watch(world)
+
+
+# --- no picture -------------------------------------------------------------------------------------------
+
+
+def test_who_gets_no_picture_is_told_why(world: World) -> None:
+    """The robot is away, has no such camera, does not join, or shows nothing."""
+
+    def told(settings: link.VideoSettings, camera: str = CAMERA) -> BaseException | None:
+        watcher = Watcher()
+        watcher.watch(world, settings, camera)
+        if settings.fps == 2:
+            robot_joins(world)
+        world.clock.advance(FIRST_PICTURE_SECONDS - 0.1)
+        assert watcher.error is None
+        world.clock.advance(0.1)
+        return watcher.error
+
+    assert str(told(link.VideoSettings())) == "robot rover is offline"
+    robot_comes(world)
+    nowhere = told(link.VideoSettings(), "/nowhere")
+    assert isinstance(nowhere, NotFound)
+    assert str(nowhere) == "robot rover has no camera /nowhere"
+    silent = told(link.VideoSettings(fps=1))
+    assert isinstance(silent, NothingCame)
+    assert "does not open the video" in str(silent)
+    dark = told(link.VideoSettings(fps=2))
+    assert isinstance(dark, NothingCame)
+    assert "has given no picture for 10 s" in str(dark)
+    world.clock.advance(LINGER_SECONDS)
+    assert list(world.videos) == []
+
+
+def test_who_has_got_a_picture_waits_for_more(world: World) -> None:
+    """Also while the robot is away: an image on a page goes on when it is back."""
+    stream, watcher, end = watched(world)
+    shows(world, stream, 1)
+    world.robot_goes()
+    assert end.closed
+    assert stream.state is State.WAITING
+    assert stream.newest is None
+    world.clock.advance(3600)
+    assert watcher.error is None
+    robot_comes(world)
+    robot_joins(world)
+    shows(world, stream, 1)
+    assert watcher.numbers == [1, 1]
+
+
+# --- the robot --------------------------------------------------------------------------------------------
+
+
+def test_the_robot_is_asked_when_it_has_the_camera(world: World) -> None:
+    """Not before it has said so, and once."""
+    settings = link.VideoSettings(width=320, quality=60)
+    stream = Watcher().watch(world, settings)
+    robot_comes(world, OTHER)
+    assert asked(world) == []
+    has = link.Cameras(cameras=[link.Camera(name=OTHER), link.Camera(name=CAMERA)])
+    for _ in range(2):
+        world.registry.cameras(world.robot, has)
+    (ask,) = asked(world)
+    assert ask == link.OpenVideo(stream=stream.name, ticket=ask.ticket, camera=CAMERA, settings=settings)
+    assert asked(world) == []
+
+
+def test_cameras_of_a_former_registration_count_no_more(world: World) -> None:
+    """The daemon may have been started with others."""
+    robot_comes(world)
+    world.registry.registered(world.robot, MemoryLink())
+    assert world.robot.cameras == ()
+
+
+def test_a_robot_that_does_not_join_is_asked_again(world: World) -> None:
+    """With another ticket, as long as somebody waits; the former one is good no more."""
+    robot_comes(world)
+    first, second = Watcher(), Watcher()
+    stream = first.watch(world)
+    (ask,) = asked(world)
+    world.clock.advance(1)
+    second.watch(world)
+    world.clock.advance(JOIN_SECONDS - 1)
+    (again,) = asked(world)
+    assert isinstance(first.error, NothingCame)
+    assert second.error is None
+    assert again.stream == ask.stream
+    assert world.videos.redeem(ask.ticket) is None
+    assert world.videos.redeem(again.ticket) is stream
+
+
+def test_a_broken_link_is_opened_anew_ever_more_slowly(world: World) -> None:
+    """Until a picture has come."""
+    stream, watcher, end = watched(world)
+
+    def pause() -> float:
+        stream.lost(end)
+        assert asked(world) == []
+        began = world.clock.seconds()
+        while not world.control.all(link.OpenVideo):
+            world.clock.advance(0.25)
+        return world.clock.seconds() - began
+
+    shows(world, stream)
+    for expected in (REOPEN_SECONDS, 1.0, 2.0, 4.0, MOST_REOPEN_SECONDS, MOST_REOPEN_SECONDS):
+        assert pause() == expected
+        end = robot_joins(world)
+    shows(world, stream, 2)
+    assert pause() == REOPEN_SECONDS
+    assert watcher.error is None
+
+
+def test_another_link_is_turned_away(world: World) -> None:
+    """What it loses is not the stream's."""
+    stream, _, end = watched(world)
+    other = MemoryLink()
+    stream.joined(other)
+    assert other.closed
+    stream.lost(other)
+    assert stream.state is State.OPEN
+    assert end.closed is None
+
+
+@pytest.mark.parametrize(
+    "body", [b"<html>", b"", png(), jpeg() + b"\n", jpeg()[:-2]], ids=lambda b: repr(b[:6])
+)
+def test_what_is_no_picture_ends_the_stream(world: World, body: bytes) -> None:
+    """Nobody gets it, everybody is told, and the link breaks."""
+    stream, watcher, end = watched(world)
+    shows(world, stream, 1)
+    with pytest.raises(MalformedMessage):
+        shows(world, stream, 2, body)
+    assert watcher.numbers == [1]
+    assert str(watcher.error).startswith("robot rover sent what is no picture: ")
+    assert stream.state is State.CLOSED
+    assert end.closed is None, "it is the connection that says why"
+    shows(world, stream, 3)
+    assert end.all(link.Took) == [link.Took(number=1), link.Took(number=2)]
+
+
+def test_a_robot_that_can_not_show_it_says_why(world: World) -> None:
+    """The viewers hear it, and the stream is over."""
+    stream, watcher, end = watched(world)
+    stream.message(link.NotPlaying(reason="no module named av"))
+    assert isinstance(watcher.error, Unavailable)
+    assert str(watcher.error) == "no module named av"
+    assert stream.state is State.CLOSED
+    assert end.closed
+
+
+def test_what_the_robot_plays_is_told_when_it_changes(world: World) -> None:
+    """And kept, until its link is gone."""
+    stream, watcher, end = watched(world)
+    less = link.Playing(width=16, height=12, quality=40, reduced=0.5)
+    stream.message(PLAYING)
+    stream.message(less)
+    assert watcher.played == [PLAYING, less]
+    assert stream.told == less
+    stream.lost(end)
+    assert stream.told is None
+
+
+# --- H.264 ------------------------------------------------------------------------------------------------
+
+
+def test_h264_is_shown_from_a_key_frame_on(world: World) -> None:
+    """The robot is asked for one when somebody comes; its size is what the robot plays."""
+    stream, first, end = watched(world, H264)
+    stream.message(PLAYING)
+    shows(world, stream, 1, KEY)
+    shows(world, stream, 2, DELTA)
+    assert [(each.key, each.width, each.height) for each in first.pictures] == [
+        (True, 32, 24),
+        (False, 32, 24),
+    ]
+    assert end.take(link.KeyFrame) == []
+    second = Watcher()
+    second.watch(world, H264)
+    assert len(end.take(link.KeyFrame)) == 1
+    shows(world, stream, 3, DELTA)
+    shows(world, stream, 4, KEY)
+    shows(world, stream, 5, DELTA)
+    world.clock.advance(KEY_SECONDS)
+    assert first.numbers == [1, 2, 3, 4, 5]
+    assert second.numbers == [4, 5]
+
+
+def test_key_frames_are_asked_for_now_and_then(world: World) -> None:
+    """Twice a second, the first time at once, whoever comes; and not for who has one already."""
+    stream, _, end = watched(world, H264)
+    stream.message(PLAYING)
+    for _ in range(20):
+        Watcher().watch(world, H264)
+        world.clock.advance(0.1)
+    assert len(end.take(link.KeyFrame)) == 1 + 2 * 2
+    Watcher().watch(world, H264)
+    shows(world, stream, 1, KEY)
+    world.clock.advance(5)
+    assert end.take(link.KeyFrame) == []
+
+
+def test_a_viewer_that_left_out_a_picture_starts_anew(world: World) -> None:
+    """What follows is of no use to him; the others see it."""
+    stream, slow, end = watched(world, H264)
+    fast = Watcher()
+    fast.watch(world, H264)
+    stream.message(PLAYING)
+    shows(world, stream, 1, KEY)
+    world.clock.advance(KEY_SECONDS)
+    end.take(link.KeyFrame)
+    stream.start_anew(slow)
+    assert len(end.take(link.KeyFrame)) == 1
+    shows(world, stream, 2, DELTA)
+    shows(world, stream, 3, KEY)
+    assert slow.numbers == [1, 3]
+    assert fast.numbers == [1, 2, 3]
+
+
+def test_after_a_break_everybody_starts_anew(world: World) -> None:
+    """The robot's encoder is another one."""
+    stream, watcher, end = watched(world, H264)
+    stream.message(PLAYING)
+    shows(world, stream, 1, KEY)
+    stream.lost(end)
+    world.clock.advance(REOPEN_SECONDS)
+    robot_joins(world)
+    stream.message(PLAYING)
+    shows(world, stream, 1, DELTA)
+    assert watcher.numbers == [1]
+    shows(world, stream, 2, KEY)
+    assert watcher.numbers == [1, 2]
+
+
+def test_h264_without_a_size_breaks_the_contract(world: World) -> None:
+    """``playing`` comes before the first picture."""
+    stream, watcher, _ = watched(world, H264)
+    with pytest.raises(MalformedMessage, match="before 'playing'"):
+        shows(world, stream, 1, KEY)
+    assert watcher.error is not None
