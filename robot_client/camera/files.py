@@ -1,0 +1,88 @@
+"""Pictures that are files already, JPEG and PNG: which of them, how large, where they end."""
+
+from __future__ import annotations
+
+import struct
+from typing import Literal
+
+from relay_protocol.errors import Invalid
+from robot_client.camera.messages import check_size
+
+Kind = Literal["jpeg", "png"]
+
+_BEGINNINGS: dict[bytes, Kind] = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}
+_ENDS: dict[Kind, bytes] = {"jpeg": b"\xff\xd9", "png": b"\0\0\0\0IEND\xaeB`\x82"}
+
+_SIDES = struct.Struct(">HH").unpack_from
+_LENGTH = struct.Struct(">H").unpack_from
+_IHDR = struct.Struct(">8xI4sII").unpack_from
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""JPEG markers that begin a frame, and so tell its size (T.81, table B.1)."""
+_BARE = frozenset({0x01, *range(0xD0, 0xD8)})
+"""JPEG markers without a length."""
+_DATA = (0xD9, 0xDA)
+"""JPEG markers after which no size comes: end, start of scan."""
+
+
+def kind_of(file: bytes, start: int = 0) -> Kind:
+    """What a file is, by its first bytes: what publishers say of it is often wrong.
+
+    :param start: where in ``file`` it begins
+    :raises Invalid: neither JPEG nor PNG
+    """
+    for beginning, kind in _BEGINNINGS.items():
+        if file.startswith(beginning, start):
+            return kind
+    raise Invalid("the file is neither JPEG nor PNG")
+
+
+def end_of(file: bytes, start: int, stop: int, kind: Kind) -> int:
+    """Where the picture ends; cameras that give JPEG pad it with what fills their buffers.
+
+    :raises Invalid: it ends in the middle
+    """
+    end = _ENDS[kind]
+    last = file.rfind(end, start, stop)
+    if last < 0:
+        raise Invalid(f"the {kind.upper()} ends in the middle")
+    return last + len(end)
+
+
+def size_of(file: bytes, kind: Kind) -> tuple[int, int]:
+    """Width and height in pixels, read from the head alone.
+
+    :raises Invalid: there is no size, or one that can't be shown
+    """
+    width, height = _png_size(file) if kind == "png" else _jpeg_size(file)
+    check_size(width, height)
+    return width, height
+
+
+def _png_size(file: bytes) -> tuple[int, int]:
+    if len(file) < 24:
+        raise Invalid("the PNG ends in the middle")
+    _, name, width, height = _IHDR(file)
+    if name != b"IHDR":
+        raise Invalid("the PNG has no head")
+    return width, height
+
+
+def _jpeg_size(file: bytes) -> tuple[int, int]:
+    """Go from segment to segment until one tells the size (T.81, B.1.1)."""
+    at = 2
+    while at + 9 <= len(file):
+        if file[at] != 0xFF:
+            break
+        marker = file[at + 1]
+        if marker in _FRAMES:
+            height, width = _SIDES(file, at + 5)
+            return width, height
+        if marker in _DATA:
+            break
+        if marker == 0xFF:
+            at += 1
+        elif marker in _BARE:
+            at += 2
+        else:
+            at += 2 + max(2, _LENGTH(file, at + 2)[0])
+    raise Invalid("the JPEG tells no size")

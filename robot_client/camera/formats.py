@@ -1,0 +1,278 @@
+"""Pictures as cameras publish them, turned into arrays: every usual encoding of sensor_msgs/msg/Image, JPEG and PNG.
+
+Colours mean what cv_bridge and image_encodings.hpp say. Sixteen bits become eight by 255 / 65535, whatever the camera
+uses of them, so that the brightness doesn't jump; depth gets colours of a fixed scale for the same reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from relay_protocol.errors import Invalid
+from robot_client.camera import files
+from robot_client.camera.messages import Image, read_compressed, read_image
+
+Pixels = npt.NDArray[np.uint8]
+
+NEAREST, FARTHEST = 250, 16_000
+"""Millimetres; depth is red up to the first and blue from the second. In between every doubling of the distance takes
+as many colours as the last, with green in the middle, at 2 m. What was not measured is black."""
+
+PIXELS = 1 << 25
+"""Most pixels of a file that is decoded: a few bytes of PNG can stand for any number."""
+
+_COLOURS = (235, 20)
+"""Part of OpenCV's palette Turbo that is used, near to far: its ends are nearly black."""
+
+
+class Raw(NamedTuple):
+    """A picture as pixels.
+
+    :param encoding: what it came in: ``rgb8``, ``16UC1``, ``jpeg``, …
+    :param width: pixels
+    :param height: pixels
+    :param pixels: (height, width, 3) as B, G, R, or (height, width) grey; may be part of the message, not writable
+    """
+
+    encoding: str
+    width: int
+    height: int
+    pixels: Pixels
+
+
+def image(cdr: bytes) -> Raw:
+    """Pixels of a sensor_msgs/msg/Image.
+
+    :param cdr: the message as ROS serialised it, with its four-byte header
+    :raises Invalid: no such message, an encoding that can't be shown, or a size that doesn't fit its pixels
+    """
+    found = read_image(cdr)
+    layout = _LAYOUTS.get(found.encoding)
+    if layout is None:
+        raise Invalid(
+            f"a camera of encoding '{found.encoding}' can't be shown; these can: {', '.join(ENCODINGS)}"
+        )
+    _check(found, layout)
+    return Raw(found.encoding, found.width, found.height, layout.read(found))
+
+
+def compressed(cdr: bytes) -> tuple[files.Kind, bytes]:
+    """The file in a sensor_msgs/msg/CompressedImage, from its first byte to its last and not decoded.
+
+    :param cdr: the message as ROS serialised it, with its four-byte header
+    :returns: ``"jpeg"`` or ``"png"``, and the file
+    :raises Invalid: no such message, or neither a whole JPEG nor a whole PNG
+    """
+    return _file(cdr)
+
+
+def _file(cdr: bytes) -> tuple[files.Kind, bytes]:
+    found = read_compressed(cdr)
+    if "compressedDepth" in found.format:
+        raise Invalid("compressedDepth can't be shown; take the topic with the raw depth")
+    kind = files.kind_of(cdr, found.start)
+    return kind, cdr[found.start : files.end_of(cdr, found.start, found.stop, kind)]
+
+
+def decoded(file: bytes) -> Raw:
+    """Pixels of a JPEG or PNG; grey ones stay grey.
+
+    :raises Invalid: it is neither, is broken, or has more than :data:`PIXELS`
+    """
+    kind = files.kind_of(file)
+    width, height = files.size_of(file, kind)
+    if width * height > PIXELS:
+        raise Invalid(f"a {kind.upper()} of {width}×{height} pixels is too large to be decoded")
+    try:
+        # A camera's rotation is the viewer's to ask for: sizes are those of the file's head.
+        pixels = cv2.imdecode(
+            np.frombuffer(file, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        )
+    except cv2.error:
+        pixels = None
+    if pixels is None or pixels.shape[:2] != (height, width):
+        raise Invalid(f"the {kind.upper()} is broken")
+    return Raw(kind, width, height, pixels.astype(np.uint8, copy=False))
+
+
+def looked_at(cdr: bytes, compressed: bool) -> tuple[str, int, int]:
+    """What a message holds: encoding, width and height in pixels. No pixel is touched.
+
+    :param compressed: whether it is a CompressedImage
+    :raises Invalid: no such message
+    """
+    if not compressed:
+        found = read_image(cdr)
+        return found.encoding, found.width, found.height
+    kind, file = _file(cdr)
+    return kind, *files.size_of(file, kind)
+
+
+class _Layout(NamedTuple):
+    """How the pixels of an encoding lie.
+
+    :param row: bytes a row takes for each of its pixels
+    :param read: gives the picture
+    :param lines: rows for every two rows of the picture; more than two where colour lies behind the grey
+    :param even: what width and height must be multiples of
+    :param least: pixels of the shortest side
+    """
+
+    row: int
+    read: Callable[[Image], Pixels]
+    lines: int = 2
+    even: tuple[int, int] = (1, 1)
+    least: int = 1
+
+
+def _check(found: Image, layout: _Layout) -> None:
+    size = f"{found.encoding} of {found.width}×{found.height} pixels"
+    if found.width % layout.even[0] or found.height % layout.even[1]:
+        raise Invalid(f"{size}: this encoding has pairs of pixels, so there is no odd size")
+    if min(found.width, found.height) < layout.least:
+        raise Invalid(f"{size}: this encoding needs at least {layout.least} pixels each way")
+    row = found.width * layout.row
+    if found.step < row:
+        raise Invalid(f"{size} has rows of {row} bytes, but step says {found.step}")
+    needed = found.step * found.height * layout.lines // 2
+    if len(found.pixels) < needed:
+        raise Invalid(f"{size} and step {found.step} takes {needed} bytes; there are {len(found.pixels)}")
+
+
+def _plane(found: Image, dtype: str = "u1", channels: int = 1) -> npt.NDArray[Any]:
+    """The values of all rows, where they lie: what pads the rows is stepped over."""
+    kind = np.dtype(dtype).newbyteorder(">" if found.big_endian else "<")
+    shape = (found.height, found.width, channels)
+    strides = (found.step, kind.itemsize * channels, kind.itemsize)
+    values: npt.NDArray[Any] = np.ndarray(shape, kind, found.pixels, strides=strides)
+    return values[:, :, 0] if channels == 1 else values
+
+
+def _eight_bit(channels: int, code: int | None = None) -> Callable[[Image], Pixels]:
+    def read(found: Image) -> Pixels:
+        return _converted(_plane(found, "u1", channels).view(np.uint8), code)
+
+    return read
+
+
+def _sixteen_bit(channels: int, code: int | None = None) -> Callable[[Image], Pixels]:
+    def read(found: Image) -> Pixels:
+        values = _plane(found, "u2", channels).astype(np.uint16)
+        return _converted(cv2.convertScaleAbs(values, alpha=255 / 65535).astype(np.uint8, copy=False), code)
+
+    return read
+
+
+def _bayer8(code: int) -> _Layout:
+    return _Layout(1, _eight_bit(1, code), least=_MOSAIC)
+
+
+def _bayer16(code: int) -> _Layout:
+    return _Layout(2, _sixteen_bit(1, code), least=_MOSAIC)
+
+
+def _converted(pixels: Pixels, code: int | None) -> Pixels:
+    return pixels if code is None else cv2.cvtColor(pixels, code).astype(np.uint8, copy=False)
+
+
+def _depth_colours() -> Pixels:
+    """BGR for each millimetre."""
+    octaves = np.log2(np.maximum(np.arange(1 << 16), 1) / NEAREST) / np.log2(FARTHEST / NEAREST)
+    shade = _COLOURS[0] + (_COLOURS[1] - _COLOURS[0]) * np.clip(octaves, 0, 1)
+    # A square, because releases of OpenCV disagree on what comes of a single row.
+    square = np.rint(shade).astype(np.uint8).reshape(256, 256)
+    colours: Pixels = cv2.applyColorMap(square, cv2.COLORMAP_TURBO).astype(np.uint8).reshape(1 << 16, 3)
+    colours[0] = 0
+    return colours
+
+
+_DEPTH = _depth_colours()
+
+
+def _millimetres(found: Image) -> Pixels:
+    """Depth in millimetres, 0 where nothing was measured (REP 118)."""
+    return _coloured(_plane(found, "u2"))
+
+
+def _metres(found: Image) -> Pixels:
+    """Depth in metres, NaN or infinite where nothing was measured (REP 118)."""
+    with np.errstate(over="ignore"):
+        depth = np.multiply(_plane(found, "f4"), 1000, dtype=np.float32)
+    depth[~(np.isfinite(depth) & (depth > 0))] = 0
+    return _coloured(np.minimum(depth, 65535).astype(np.uint16))
+
+
+def _coloured(millimetres: npt.NDArray[np.uint16]) -> Pixels:
+    return np.take(_DEPTH, millimetres, axis=0)
+
+
+def _nv21(found: Image) -> Pixels:
+    """Grey, then a pair V, U for every four pixels."""
+    return _converted(
+        _plane(found._replace(height=found.height * 3 // 2)).view(np.uint8), cv2.COLOR_YUV2BGR_NV21
+    )
+
+
+_FROM_YUV = np.array(
+    [
+        [1.164, 2.018, 0.0, -1.164 * 16 - 2.018 * 128],
+        [1.164, -0.391, -0.813, -1.164 * 16 + (0.391 + 0.813) * 128],
+        [1.164, 0.0, 1.596, -1.164 * 16 - 1.596 * 128],
+    ]
+)
+"""Y, U, V to B, G, R (ITU-R BT.601, Y from 16 to 235), as OpenCV has it for the other encodings of this kind."""
+
+
+def _nv24(found: Image) -> Pixels:
+    """Grey, then a pair U, V for every pixel. OpenCV knows no such encoding."""
+    grey = _plane(found)
+    behind = found._replace(pixels=found.pixels[found.step * found.height :], step=2 * found.step)
+    yuv = cv2.merge((grey.view(np.uint8), *cv2.split(_plane(behind, channels=2).view(np.uint8))))
+    return cv2.transform(yuv, _FROM_YUV).astype(np.uint8, copy=False)
+
+
+_MOSAIC = 3
+"""OpenCV makes black of less each way."""
+_PAIRS = (2, 1)
+_FOURS = (2, 2)
+
+_LAYOUTS: dict[str, _Layout] = {
+    "rgb8": _Layout(3, _eight_bit(3, cv2.COLOR_RGB2BGR)),
+    "bgr8": _Layout(3, _eight_bit(3)),
+    "rgba8": _Layout(4, _eight_bit(4, cv2.COLOR_RGBA2BGR)),
+    "bgra8": _Layout(4, _eight_bit(4, cv2.COLOR_BGRA2BGR)),
+    "mono8": _Layout(1, _eight_bit(1)),
+    "rgb16": _Layout(6, _sixteen_bit(3, cv2.COLOR_RGB2BGR)),
+    "bgr16": _Layout(6, _sixteen_bit(3)),
+    "rgba16": _Layout(8, _sixteen_bit(4, cv2.COLOR_RGBA2BGR)),
+    "bgra16": _Layout(8, _sixteen_bit(4, cv2.COLOR_BGRA2BGR)),
+    "mono16": _Layout(2, _sixteen_bit(1)),
+    "8UC1": _Layout(1, _eight_bit(1)),
+    "8UC3": _Layout(3, _eight_bit(3)),
+    "8UC4": _Layout(4, _eight_bit(4, cv2.COLOR_BGRA2BGR)),
+    "16UC1": _Layout(2, _millimetres),
+    "32FC1": _Layout(4, _metres),
+    "bayer_rggb8": _bayer8(cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr8": _bayer8(cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg8": _bayer8(cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg8": _bayer8(cv2.COLOR_BayerGRBG2BGR),
+    "bayer_rggb16": _bayer16(cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr16": _bayer16(cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg16": _bayer16(cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg16": _bayer16(cv2.COLOR_BayerGRBG2BGR),
+    # The names of old mean the same.
+    "uyvy": _Layout(2, _eight_bit(2, cv2.COLOR_YUV2BGR_UYVY), even=_PAIRS),
+    "yuv422": _Layout(2, _eight_bit(2, cv2.COLOR_YUV2BGR_UYVY), even=_PAIRS),
+    "yuyv": _Layout(2, _eight_bit(2, cv2.COLOR_YUV2BGR_YUY2), even=_PAIRS),
+    "yuv422_yuy2": _Layout(2, _eight_bit(2, cv2.COLOR_YUV2BGR_YUY2), even=_PAIRS),
+    "nv21": _Layout(1, _nv21, lines=3, even=_FOURS),
+    "nv24": _Layout(1, _nv24, lines=6),
+}
+
+ENCODINGS = tuple(_LAYOUTS)
+"""Of sensor_msgs/msg/Image, those that can be shown."""
