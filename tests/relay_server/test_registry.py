@@ -11,6 +11,7 @@ from relay_server.graph import GraphMirror
 from relay_server.metrics import RelayCollector, registry_of
 from relay_server.registry import State
 from tests.relay_server.memory import STRING, MemoryLink, World
+from tests.relay_server.video import watching
 
 
 class Watcher:
@@ -31,6 +32,10 @@ class Watcher:
         """As a channel."""
         self.saw.append("graph")
 
+    def described(self) -> None:
+        """As a stream."""
+        self.saw.append("described")
+
 
 def test_a_robot_is_offline_online_or_in_use(world: World) -> None:
     """In use while somebody works with it."""
@@ -48,6 +53,7 @@ def test_a_new_link_replaces_the_old_one_and_starts_afresh(world: World) -> None
     world.robot_comes()
     world.robot.types.add(STRING, "string data\n")
     world.robot.health = link.Health(battery=0.5)
+    world.registry.cameras(world.robot, link.Cameras(cameras=[link.Camera(name="/camera")]))
     watcher = Watcher()
     world.robot.watchers.append(watcher)
     former, newer = world.control, MemoryLink()
@@ -57,6 +63,21 @@ def test_a_new_link_replaces_the_old_one_and_starts_afresh(world: World) -> None
     assert not world.robot.graph.topics
     assert not world.robot.types.knows(STRING)
     assert world.robot.health.battery is None
+    assert world.robot.cameras == ()
+
+
+def test_watchers_and_listeners_hear_which_cameras_there_are(world: World) -> None:
+    """All of them each time, and as they were last while the robot is away."""
+    world.robot_comes()
+    watcher = Watcher()
+    world.robot.watchers.append(watcher)
+    changes: list[None] = []
+    world.registry.on_change(lambda: changes.append(None))
+    camera = link.Camera(name="/camera")
+    world.registry.cameras(world.robot, link.Cameras(cameras=[camera]))
+    assert (watcher.saw, len(changes)) == (["described"], 1)
+    world.robot_goes()
+    assert world.robot.cameras == (camera,)
 
 
 def test_the_end_of_a_replaced_link_changes_nothing(world: World) -> None:
@@ -144,7 +165,7 @@ def test_a_graph_that_takes_too_much_memory_is_refused_in_words() -> None:
     assert not mirror.topics
 
 
-def test_figures_tell_robots_by_state_clients_and_channels(world: World) -> None:
+def test_figures_tell_robots_by_state_clients_channels_and_streams(world: World) -> None:
     """As they are when they are asked for."""
     figures = registry_of(RelayCollector(world.registry, world.channels, world.videos, lambda: world.people))
     assert figures.get_sample_value("switchboard_robots", {"state": "offline"}) == 1
@@ -158,3 +179,7 @@ def test_figures_tell_robots_by_state_clients_and_channels(world: World) -> None
     assert figures.get_sample_value("switchboard_channels") == 1
     assert figures.get_sample_value("switchboard_client_waiting_bytes") == person.session.outbox.waiting_bytes
     assert person.session.outbox.waiting_bytes > 0
+    for watcher in (watching.Watcher(), watching.Watcher()):
+        watcher.watch(world)
+    assert figures.get_sample_value("switchboard_video_streams") == 1
+    assert figures.get_sample_value("switchboard_video_viewers") == 2
