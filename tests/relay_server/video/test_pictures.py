@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -87,6 +87,7 @@ def test_real_pictures_tell_their_size(codec: str, body: bytes) -> None:
 REAL = [("jpeg", body) for body in JPEGS.values()] + [("png", body) for body in PNGS.values()]
 
 
+@settings(deadline=None)
 @given(real=st.sampled_from(REAL), data=st.data())
 def test_a_picture_of_which_an_end_is_missing_is_none(real: tuple[str, bytes], data: st.DataObject) -> None:
     """Wherever it is cut."""
@@ -97,6 +98,7 @@ def test_a_picture_of_which_an_end_is_missing_is_none(real: tuple[str, bytes], d
             look_at(codec, rest)
 
 
+@settings(deadline=None)
 @given(real=st.sampled_from(REAL), more=st.binary(min_size=1, max_size=100))
 @example(real=REAL[0], more=b"<html>")
 @example(real=REAL[0], more=REAL[0][1])
@@ -109,6 +111,7 @@ def test_nothing_comes_before_or_after_a_picture(real: tuple[str, bytes], more: 
             look_at(codec, bad)
 
 
+@settings(deadline=None)
 @given(body=st.binary(max_size=300))
 @example(b"")
 @example(b"<!doctype html><script>alert(1)</script>")
@@ -127,6 +130,7 @@ def test_other_bytes_are_no_picture(body: bytes) -> None:
             look_at("h264", body)
 
 
+@settings(deadline=None)
 @given(real=st.sampled_from(REAL), data=st.data())
 def test_damage_is_an_answer_in_words_or_still_a_picture(
     real: tuple[str, bytes], data: st.DataObject
