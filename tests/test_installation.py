@@ -18,7 +18,8 @@ SERVER_ONLY = [
     "prometheus_client",
     "rich",
 ]
-ROBOT_ONLY = ["rclpy", "cv2", "psutil"]
+ROBOT_ONLY = ["rclpy", "cv2", "av", "psutil"]
+VIDEO_ONLY = ["numpy", "cv2", "av"]
 
 WITHOUT = """
 import sys
@@ -46,6 +47,28 @@ def test_the_daemon_imports_without_the_servers_dependencies(module: str) -> Non
     """A robot installs the extra 'robot' alone."""
     done = run_without(SERVER_ONLY, f"import {module}")
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("module", ["robot_client.cli", "robot_client.run", "robot_client.guard"])
+def test_the_daemon_imports_without_what_cameras_need(module: str) -> None:
+    """The extra 'video' is for robots that show pictures."""
+    done = run_without(VIDEO_ONLY, f"import {module}")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_robot_without_opencv_says_what_to_install() -> None:
+    """What is missing, and the command that brings it."""
+    body = """
+from relay_protocol.errors import Unavailable
+from robot_client.camera import check_installed
+try:
+    check_installed()
+except Unavailable as error:
+    print(error)
+"""
+    done = run_without(VIDEO_ONLY, body)
+    assert done.returncode == 0, done.stderr
+    assert "without numpy: No module named numpy (pip install 'robot-switchboard[video]')" in done.stdout
 
 
 @pytest.mark.parametrize("module", ["relay_server.cli", "relay_server.service", "relay_server.run"])

@@ -26,6 +26,9 @@ as many colours as the last, with green in the middle, at 2 m. What was not meas
 PIXELS = 1 << 25
 """Most pixels of a file that is decoded: a few bytes of PNG can stand for any number."""
 
+_MOST = 65_535
+"""Millimetres in sixteen bits."""
+
 _COLOURS = (235, 20)
 """Part of OpenCV's palette Turbo that is used, near to far: its ends are nearly black."""
 
@@ -182,11 +185,11 @@ def _converted(pixels: Pixels, code: int | None) -> Pixels:
 
 def _depth_colours() -> Pixels:
     """BGR for each millimetre."""
-    octaves = np.log2(np.maximum(np.arange(1 << 16), 1) / NEAREST) / np.log2(FARTHEST / NEAREST)
+    octaves = np.log2(np.maximum(np.arange(_MOST + 1), 1) / NEAREST) / np.log2(FARTHEST / NEAREST)
     shade = _COLOURS[0] + (_COLOURS[1] - _COLOURS[0]) * np.clip(octaves, 0, 1)
     # A square, because releases of OpenCV disagree on what comes of a single row.
     square = np.rint(shade).astype(np.uint8).reshape(256, 256)
-    colours: Pixels = cv2.applyColorMap(square, cv2.COLORMAP_TURBO).astype(np.uint8).reshape(1 << 16, 3)
+    colours: Pixels = cv2.applyColorMap(square, cv2.COLORMAP_TURBO).astype(np.uint8).reshape(-1, 3)
     colours[0] = 0
     return colours
 
@@ -201,10 +204,12 @@ def _millimetres(found: Image) -> Pixels:
 
 def _metres(found: Image) -> Pixels:
     """Depth in metres, NaN or infinite where nothing was measured (REP 118)."""
-    with np.errstate(over="ignore"):
-        depth = np.multiply(_plane(found, "f4"), 1000, dtype=np.float32)
-    depth[~(np.isfinite(depth) & (depth > 0))] = 0
-    return _coloured(np.minimum(depth, 65535).astype(np.uint16))
+    depth = _plane(found, "f4")
+    measured = np.isfinite(depth) & (depth > 0)
+    millimetres = (
+        np.minimum(depth, _MOST / 1000, where=measured, out=np.zeros(depth.shape, np.float32)) * 1000
+    )
+    return _coloured(millimetres.astype(np.uint16))
 
 
 def _coloured(millimetres: npt.NDArray[np.uint16]) -> Pixels:

@@ -1,0 +1,180 @@
+"""A test card of known colours, and messages with it in every encoding, made with nothing but numpy and struct."""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Pixels = npt.NDArray[np.uint8]
+
+PATCHES: dict[str, tuple[int, int, int]] = {
+    "white": (255, 255, 255),
+    "yellow": (255, 255, 0),
+    "cyan": (0, 255, 255),
+    "green": (0, 255, 0),
+    "magenta": (255, 0, 255),
+    "red": (255, 0, 0),
+    "blue": (0, 0, 255),
+    "grey": (128, 128, 128),
+}
+"""From left to right: R, G, B."""
+
+_MOSAICS = {"rggb": (0, 1, 1, 2), "bggr": (2, 1, 1, 0), "gbrg": (1, 2, 0, 1), "grbg": (1, 0, 2, 1)}
+"""Which of R, G, B the four pixels of a square have, as the encodings' names say them, row by row."""
+
+
+class Coded(NamedTuple):
+    """The pixels of a message: rows of ``step`` bytes."""
+
+    encoding: str
+    width: int
+    height: int
+    big_endian: bool
+    step: int
+    data: bytes
+
+
+def card(width: int = 320, height: int = 240) -> Pixels:
+    """Eight bars; in the lower quarter a ramp from black to white. RGB, shape (height, width, 3)."""
+    bar = np.arange(width) * len(PATCHES) // width
+    picture = np.repeat(np.array(list(PATCHES.values()), np.uint8)[bar][None], height, axis=0)
+    picture[-height // 4 :] = np.linspace(0, 255, width).astype(np.uint8)[None, :, None]
+    return picture
+
+
+def middle_of(patch: str, width: int = 320, height: int = 240) -> tuple[int, int]:
+    """Row and column in the middle of a bar."""
+    return height // 3, (2 * list(PATCHES).index(patch) + 1) * width // (2 * len(PATCHES))
+
+
+def depths(width: int = 320, height: int = 240) -> npt.NDArray[np.float64]:
+    """Metres from 0.25 at the left to 16 at the right, by octaves; the lower quarter was not measured."""
+    picture = np.repeat((0.25 * 2 ** np.linspace(0, 6, width))[None], height, axis=0)
+    picture[-height // 4 :] = 0
+    return picture
+
+
+def grey_of(rgb: Pixels) -> Pixels:
+    """ITU-R BT.601."""
+    grey: Pixels = np.rint(rgb @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
+    return grey
+
+
+def _yuv(rgb: Pixels) -> Pixels:
+    """ITU-R BT.601 with Y from 16 to 235, shape (height, width, 3)."""
+    red, green, blue = np.moveaxis(rgb.astype(float) / 255, 2, 0)
+    y = 0.299 * red + 0.587 * green + 0.114 * blue
+    planes = (16 + 219 * y, 128 + 224 * (blue - y) / 1.772, 128 + 224 * (red - y) / 1.402)
+    yuv: Pixels = np.rint(np.stack(planes, axis=2)).astype(np.uint8)
+    return yuv
+
+
+def _mosaic(rgb: Pixels, order: str) -> Pixels:
+    raw = np.empty(rgb.shape[:2], np.uint8)
+    for place, channel in enumerate(_MOSAICS[order]):
+        rows, columns = slice(place // 2, None, 2), slice(place % 2, None, 2)
+        raw[rows, columns] = rgb[rows, columns, channel]
+    return raw
+
+
+def _pairs(rgb: Pixels, grey_at: int) -> Pixels:
+    """Two bytes a pixel: its grey at one place, and U or V of its pair at the other."""
+    yuv = _yuv(rgb)
+    packed = np.empty((*rgb.shape[:2], 2), np.uint8)
+    packed[:, :, grey_at] = yuv[:, :, 0]
+    packed[:, 0::2, 1 - grey_at] = yuv[:, 0::2, 1]
+    packed[:, 1::2, 1 - grey_at] = yuv[:, 0::2, 2]
+    return packed
+
+
+def coded(
+    encoding: str, width: int = 320, height: int = 240, *, big_endian: bool = False, padding: int = 0
+) -> Coded:
+    """The card (of depth encodings: the depths) as a camera of this encoding publishes it.
+
+    :param padding: bytes of 0xA5 behind each row
+    """
+    rgb = card(width, height)
+    grey = _padded(_values(encoding, rgb, ">" if big_endian else "<"), padding)
+    step, data = grey.shape[1], grey.tobytes()
+    if encoding == "nv21":
+        data += _padded(_yuv(rgb)[::2, ::2, :0:-1], padding).tobytes()
+    elif encoding == "nv24":
+        # A row of its colours is as long as two of its grey, and so is what pads it.
+        data += _padded(_yuv(rgb)[:, :, 1:], 2 * padding).tobytes()
+    return Coded(encoding, width, height, big_endian, step, data)
+
+
+def _padded(plane: npt.NDArray[np.generic], padding: int) -> Pixels:
+    rows = np.ascontiguousarray(plane).view(np.uint8).reshape(plane.shape[0], -1)
+    return np.pad(rows, ((0, 0), (0, padding)), constant_values=0xA5)
+
+
+def _values(encoding: str, rgb: Pixels, order: str) -> npt.NDArray[np.generic]:
+    """What the pixels of an encoding are, of the many-planed ones the grey."""
+    height, width = rgb.shape[:2]
+    opaque = np.full((height, width, 1), 255, np.uint8)
+    wide = np.dtype("u2").newbyteorder(order)
+    if encoding.startswith("bayer_"):
+        raw = _mosaic(rgb, encoding[6:10])
+        return raw if encoding.endswith("8") else (raw * np.uint16(257)).astype(wide)
+    if encoding in ("rgb16", "bgr16", "rgba16", "bgra16", "mono16"):
+        return (_values(encoding[:-2] + "8", rgb, order) * np.uint16(257)).astype(wide)
+    return {
+        "rgb8": lambda: rgb,
+        "bgr8": lambda: rgb[:, :, ::-1],
+        "rgba8": lambda: np.concatenate((rgb, opaque), axis=2),
+        "bgra8": lambda: np.concatenate((rgb[:, :, ::-1], opaque), axis=2),
+        "mono8": lambda: grey_of(rgb),
+        "8UC1": lambda: grey_of(rgb),
+        "8UC3": lambda: rgb[:, :, ::-1],
+        "8UC4": lambda: np.concatenate((rgb[:, :, ::-1], opaque), axis=2),
+        "16UC1": lambda: np.rint(depths(width, height) * 1000).astype(wide),
+        "32FC1": lambda: np.where(depths(width, height) > 0, depths(width, height), np.nan).astype(
+            order + "f4"
+        ),
+        "uyvy": lambda: _pairs(rgb, 1),
+        "yuv422": lambda: _pairs(rgb, 1),
+        "yuyv": lambda: _pairs(rgb, 0),
+        "yuv422_yuy2": lambda: _pairs(rgb, 0),
+        "nv21": lambda: _yuv(rgb)[:, :, 0],
+        "nv24": lambda: _yuv(rgb)[:, :, 0],
+    }[encoding]()
+
+
+def image_cdr(picture: Coded, *, frame: str = "camera", order: str = "<") -> bytes:
+    """The sensor_msgs/msg/Image, by hand.
+
+    :param order: of the message's own numbers: ``<`` or ``>``
+    """
+    body = _header(frame, order)
+    body = _aligned(body) + struct.pack(order + "II", picture.height, picture.width)
+    body += _text(picture.encoding, order) + struct.pack("B", picture.big_endian)
+    body = _aligned(body) + struct.pack(order + "II", picture.step, len(picture.data))
+    return _encapsulation(order) + body + picture.data
+
+
+def compressed_cdr(file: bytes, format_: str = "jpeg", *, order: str = "<") -> bytes:
+    """The sensor_msgs/msg/CompressedImage, by hand."""
+    body = _aligned(_header("camera", order))
+    body = _aligned(body + _text(format_, order)) + struct.pack(order + "I", len(file))
+    return _encapsulation(order) + body + file
+
+
+def _encapsulation(order: str) -> bytes:
+    return b"\0\1\0\0" if order == "<" else b"\0\0\0\0"
+
+
+def _header(frame: str, order: str) -> bytes:
+    return struct.pack(order + "iI", 1_700_000_000, 5) + _text(frame, order)
+
+
+def _text(text: str, order: str) -> bytes:
+    return struct.pack(order + "I", len(text) + 1) + text.encode() + b"\0"
+
+
+def _aligned(body: bytes) -> bytes:
+    return body + bytes(-len(body) % 4)

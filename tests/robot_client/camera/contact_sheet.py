@@ -1,0 +1,88 @@
+"""Draws one PNG with a still of every encoding as a viewer gets it, to be looked at.
+
+    python -m tests.robot_client.camera.contact_sheet build/encodings.png
+
+Bars: white, yellow, cyan, green, magenta, red, blue, grey, over a ramp. Depth: red to blue over black.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+
+from relay_protocol.link import VideoSettings
+from robot_client.camera.editing import plan
+from robot_client.camera.encoding import Jpeg, Png, make_encoder
+from robot_client.camera.formats import ENCODINGS, compressed, decoded, image
+from tests.robot_client.camera.cards import Pixels, card, coded, compressed_cdr, image_cdr
+
+WIDTH, HEIGHT, COLUMNS, TITLE = 240, 180, 6, 24
+NOON = 1_763_726_400.789
+
+
+def stills() -> dict[str, Pixels]:
+    """Titles and BGR pictures: each went through the JPEG that a viewer gets."""
+    settings = VideoSettings(width=WIDTH, height=HEIGHT, stamp=True)
+    shown = {}
+    for encoding in ENCODINGS:
+        for title, cdr in {
+            encoding: image_cdr(coded(encoding, big_endian=False, padding=24)),
+            f"{encoding}, big endian": image_cdr(coded(encoding, big_endian=True), order=">"),
+        }.items():
+            raw = image(cdr)
+            edited = plan(settings, raw.width, raw.height).apply(raw.pixels, NOON)
+            shown[title] = decoded(Jpeg().encode(edited, 80, True)[0]).pixels
+    bgr = np.ascontiguousarray(card(WIDTH, HEIGHT)[:, :, ::-1])
+    for kind, encoder in (("jpeg", Jpeg()), ("png", Png())):
+        shown[f"{kind}, passed through"] = decoded(
+            compressed(compressed_cdr(encoder.encode(bgr, 80, True)[0]))[1]
+        ).pixels
+    for title, changed in {
+        "crop 80,60,80,60": {"crop": (80, 60, 80, 60)},
+        "rotate 90": {"rotate": 90},
+        "invert": {"invert": True},
+        "80 wide, stamp": {"width": 80, "stamp": True},
+        "1920 wide, stamp": {"width": 1920, "stamp": True},
+    }.items():
+        shown[title] = plan(VideoSettings(**changed), WIDTH, HEIGHT).apply(bgr, NOON)
+    picture, _ = make_encoder("h264", WIDTH, HEIGHT, 15).encode(bgr, 80, True)
+    shown["h264, key frame"] = h264_decoded([picture])[0]
+    return shown
+
+
+def h264_decoded(pictures: list[bytes]) -> list[Pixels]:
+    """BGR of each picture of a stream."""
+    context = av.VideoCodecContext.create("h264", "r")
+    frames = [frame for picture in pictures for frame in context.decode(av.Packet(picture))]
+    return [frame.to_ndarray(format="bgr24") for frame in [*frames, *context.decode(None)]]
+
+
+def sheet(shown: dict[str, Pixels]) -> Pixels:
+    """All of them, side by side."""
+    rows = -(-len(shown) // COLUMNS)
+    canvas = np.full((rows * (HEIGHT + TITLE), COLUMNS * (WIDTH + 8), 3), 64, np.uint8)
+    for place, (title, picture) in enumerate(shown.items()):
+        top, left = place // COLUMNS * (HEIGHT + TITLE), place % COLUMNS * (WIDTH + 8)
+        cv2.putText(
+            canvas,
+            title,
+            (left + 2, top + 16),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.5,
+            (255, 255, 255),
+            1,
+            cv2.LINE_AA,
+        )
+        scale = min(1, WIDTH / picture.shape[1], HEIGHT / picture.shape[0])
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        colour = small if small.ndim == 3 else cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+        canvas[top + TITLE : top + TITLE + small.shape[0], left : left + small.shape[1]] = colour
+    return canvas
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_bytes(Png().encode(sheet(stills()), 100, True)[0])

@@ -1,0 +1,374 @@
+"""Every encoding's colours against a card of known pixels, sizes that don't fit, and messages that are damaged."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import CompressedImage, Image
+
+from relay_protocol.errors import Invalid
+from robot_client.camera import formats
+from robot_client.camera.formats import ENCODINGS, PIXELS, compressed, decoded, image, looked_at
+from tests.robot_client.camera.cards import (
+    PATCHES,
+    Coded,
+    card,
+    coded,
+    compressed_cdr,
+    grey_of,
+    image_cdr,
+    middle_of,
+)
+
+DEPTH = ("16UC1", "32FC1")
+GREY = ("mono8", "mono16", "8UC1")
+SUBSAMPLED = ("uyvy", "yuv422", "yuyv", "yuv422_yuy2", "nv21")
+COLOUR = [each for each in ENCODINGS if each not in (*DEPTH, *GREY)]
+EXACT = [each for each in COLOUR if "bayer" not in each and each not in (*SUBSAMPLED, "nv24")]
+WAYS = [(big_endian, padding) for big_endian in (False, True) for padding in (0, 7)]
+
+JPEG = cv2.imencode(".jpg", card(64, 48)[:, :, ::-1])[1].tobytes()
+PNG = cv2.imencode(".png", card(64, 48)[:, :, ::-1])[1].tobytes()
+
+
+def small(of: str = "bgr8", **changed: object) -> Coded:
+    return coded(of, 12, 8)._replace(**changed)
+
+
+def test_every_usual_encoding_is_known() -> None:
+    """What cameras and drivers publish, by the names of image_encodings.hpp."""
+    usual = {"rgb8", "bgr8", "rgba8", "bgra8", "mono8", "mono16", "8UC1", "8UC3", "16UC1", "32FC1"}
+    yuv = {"yuv422", "yuv422_yuy2", "uyvy", "yuyv", "nv21", "nv24"}
+    bayer = {f"bayer_{order}{bits}" for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)}
+    assert usual | yuv | bayer <= set(ENCODINGS)
+
+
+@pytest.mark.parametrize(("big_endian", "padding"), WAYS)
+@pytest.mark.parametrize("encoding", COLOUR)
+def test_patches_have_their_colours(encoding: str, big_endian: bool, padding: int) -> None:
+    """In the middle of each bar is its colour, as B, G, R; YUV may round."""
+    raw = image(image_cdr(coded(encoding, big_endian=big_endian, padding=padding)))
+    assert raw.encoding == encoding
+    assert (raw.width, raw.height) == (320, 240)
+    assert raw.pixels.shape == (240, 320, 3)
+    assert raw.pixels.dtype == np.uint8
+    for name, (red, green, blue) in PATCHES.items():
+        assert raw.pixels[middle_of(name)].tolist() == pytest.approx([blue, green, red], abs=3), name
+
+
+@pytest.mark.parametrize(("big_endian", "padding"), WAYS)
+@pytest.mark.parametrize("encoding", EXACT)
+def test_packed_colours_are_exact_everywhere(encoding: str, big_endian: bool, padding: int) -> None:
+    """Where nothing is interpolated, every pixel of the card comes out."""
+    raw = image(image_cdr(coded(encoding, big_endian=big_endian, padding=padding)))
+    assert np.array_equal(raw.pixels, card()[:, :, ::-1])
+
+
+@pytest.mark.parametrize("encoding", [each for each in ENCODINGS if each not in DEPTH])
+def test_ramps_are_even(encoding: str) -> None:
+    """The card's ramp stays one: no value is off by more than rounding and interpolation make it."""
+    pixels = image(image_cdr(coded(encoding))).pixels[-20].astype(int)
+    expected = np.linspace(0, 255, 320)[:, None]
+    assert np.abs(pixels.reshape(320, -1) - expected).max() <= 4
+
+
+@pytest.mark.parametrize(("big_endian", "padding"), WAYS)
+@pytest.mark.parametrize("encoding", GREY)
+def test_grey_stays_grey(encoding: str, big_endian: bool, padding: int) -> None:
+    """One value a pixel; sixteen bits become eight by 255 / 65535."""
+    raw = image(image_cdr(coded(encoding, big_endian=big_endian, padding=padding)))
+    assert np.array_equal(raw.pixels, grey_of(card()))
+
+
+@pytest.mark.parametrize(("value", "shown"), [(0, 0), (128, 0), (129, 1), (257, 1), (4095, 16), (65535, 255)])
+def test_sixteen_bits_are_rounded(value: int, shown: int) -> None:
+    """The scale is that of the format, whatever the camera uses of it: nothing flickers."""
+    one = Coded("mono16", 1, 1, False, 2, struct.pack("<H", value))
+    assert image(image_cdr(one)).pixels.tolist() == [[shown]]
+
+
+@pytest.mark.parametrize(("big_endian", "padding"), WAYS)
+@pytest.mark.parametrize("encoding", DEPTH)
+def test_depth_goes_from_red_to_blue_over_black(encoding: str, big_endian: bool, padding: int) -> None:
+    """Near is red, 2 m green, far blue; what was not measured is black."""
+    pixels = image(image_cdr(coded(encoding, big_endian=big_endian, padding=padding))).pixels
+    assert pixels.shape == (240, 320, 3)
+    near, middle, far = (pixels[0, column].astype(int) for column in (2, 160, 317))
+    assert near[2] > near[0] + 100
+    assert near[2] > near[1] + 100
+    assert middle[1] > middle[0] + 100
+    assert far[0] > far[2] + 60
+    assert far[0] > far[1] + 60
+    assert not pixels[-1].any()
+
+
+def depth_colour(metres: float) -> tuple[int, ...]:
+    one = Coded("32FC1", 1, 1, False, 4, struct.pack("<f", metres))
+    return tuple(image(image_cdr(one)).pixels[0, 0].tolist())
+
+
+@pytest.mark.parametrize("millimetres", [1, 250, 999, 2000, 15_999, 16_000, 65_535])
+def test_metres_and_millimetres_have_the_same_colours(millimetres: int) -> None:
+    """A distance has its colour, by whichever encoding and whatever else is in the picture."""
+    one = Coded("16UC1", 1, 1, False, 2, struct.pack("<H", millimetres))
+    assert tuple(image(image_cdr(one)).pixels[0, 0].tolist()) == depth_colour(millimetres / 1000)
+
+
+@pytest.mark.parametrize("metres", [0.0, -1.0, math.nan, math.inf, -math.inf, 0.0004])
+def test_what_was_not_measured_is_black(metres: float) -> None:
+    """REP 118 has NaN for invalid, and infinities for too near and too far."""
+    assert depth_colour(metres) == (0, 0, 0)
+
+
+def test_depth_beyond_the_scale_keeps_its_ends() -> None:
+    """Nearer than the nearest is as red, farther than the farthest as blue."""
+    assert depth_colour(0.01) == depth_colour(0.25)
+    assert depth_colour(16.0) == depth_colour(3e38)
+    assert depth_colour(0.25) != depth_colour(0.3)
+
+
+def stamped(message: object) -> object:
+    """With the header the messages made by hand have."""
+    message.header.stamp.sec, message.header.stamp.nanosec = 1_700_000_000, 5
+    message.header.frame_id = "camera"
+    return message
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_messages_of_rclpy_are_read(encoding: str) -> None:
+    """ROS makes the same of them as these tests; what it leaves between the fields means nothing."""
+    made = coded(encoding, 12, 8, big_endian=True, padding=3)
+    message = stamped(
+        Image(height=8, width=12, encoding=encoding, is_bigendian=1, step=made.step, data=made.data)
+    )
+    assert deserialize_message(image_cdr(made), Image) == message
+    assert np.array_equal(image(serialize_message(message)).pixels, image(image_cdr(made)).pixels)
+
+
+@pytest.mark.parametrize("frame", ["", "a", "ab", "abc", "abcd"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_padding_in_the_message_follows_its_strings(frame: str, order: str) -> None:
+    """Numbers are aligned whatever the name of the frame, in both byte orders of the message."""
+    raw = image(image_cdr(small(), frame=frame, order=order))
+    assert np.array_equal(raw.pixels, card(12, 8)[:, :, ::-1])
+
+
+def test_bgr_is_not_copied() -> None:
+    """Two megapixels thirty times a second are not worth a copy."""
+    cdr = image_cdr(coded("bgr8"))
+    assert np.shares_memory(image(cdr).pixels, np.frombuffer(cdr, np.uint8))
+
+
+def test_unknown_encoding_is_named_with_those_that_are_known() -> None:
+    """Whoever set up the camera reads what to change."""
+    with pytest.raises(Invalid, match=r"'yuv999' can't be shown; these can: rgb8, bgr8, .*nv24"):
+        image(image_cdr(small(encoding="yuv999")))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (small(step=35), "rows of 36 bytes, but step says 35"),
+        (small(step=0), "rows of 36 bytes, but step says 0"),
+        (small(step=2**32 - 1), "takes 34359738360 bytes; there are 288"),
+        (small(data=small().data[:-1]), "takes 288 bytes; there are 287"),
+        (small(data=b""), "takes 288 bytes; there are 0"),
+        (small(width=0), "picture of 0×8 pixels"),
+        (small(height=0), "picture of 12×0 pixels"),
+        (small(height=8193), "1 to 8192"),
+        (small(width=2**31), "picture of 2147483648×8 pixels"),
+        (small("yuv422", width=11), "pairs of pixels"),
+        (small("nv21", height=7), "pairs of pixels"),
+        (small("nv21", height=10), "takes 180 bytes; there are 144"),
+        (small("nv24", height=9), "takes 324 bytes; there are 288"),
+        (small("bayer_rggb8", height=2), "at least 3 pixels"),
+        (small(encoding="x" * 255), "256 bytes; there are at most 255"),
+        (small(encoding="rgb8\n"), "printable"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused_in_words(wrong: Coded, words: str) -> None:
+    """Nothing is read beyond the message, and nothing is allocated for it."""
+    with pytest.raises(Invalid, match=words):
+        image(image_cdr(wrong))
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_every_cut_is_invalid(encoding: str) -> None:
+    """A message that ends early is never half a picture."""
+    whole = image_cdr(small(encoding))
+    for length in range(len(whole)):
+        with pytest.raises(Invalid):
+            image(whole[:length])
+
+
+BOUNDS = st.sampled_from([0, 1, 2, 3, 0x7F, 0xFF, 0x1FFF, 0x2000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF])
+
+
+@st.composite
+def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
+    """A message with some of its bytes, numbers or parts changed."""
+    bytes_ = bytearray(whole)
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, max(0, min(len(bytes_), 120) - 4)))
+        match draw(st.sampled_from(["byte", "number", "cut", "more"])):
+            case "byte":
+                bytes_[at : at + 1] = draw(st.binary(min_size=1, max_size=1))
+            case "number":
+                place = at // 4 * 4
+                bytes_[place : place + 4] = struct.pack(draw(st.sampled_from("<>")) + "I", draw(BOUNDS))
+            case "cut":
+                del bytes_[draw(st.integers(0, len(bytes_))) :]
+            case "more":
+                bytes_[at:at] = draw(st.binary(max_size=9))
+    return bytes(bytes_)
+
+
+@given(st.data())
+def test_damaged_images_are_invalid_or_pictures_no_larger_than_they(data: st.DataObject) -> None:
+    """Only Invalid is raised, and memory is bounded by what came."""
+    cdr = data.draw(damaged(image_cdr(small(data.draw(st.sampled_from(ENCODINGS))))))
+    try:
+        raw = image(cdr)
+    except Invalid:
+        return
+    assert raw.pixels.shape[:2] == (raw.height, raw.width)
+    assert raw.pixels.nbytes <= 3 * len(cdr)
+    assert looked_at(cdr, False) == (raw.encoding, raw.width, raw.height)
+
+
+@given(st.data())
+def test_damaged_files_are_invalid_or_pictures_of_the_size_they_say(data: st.DataObject) -> None:
+    """Whatever a publisher puts into a CompressedImage."""
+    cdr = data.draw(damaged(compressed_cdr(data.draw(st.sampled_from([JPEG, PNG])))))
+    try:
+        size = looked_at(cdr, True)[1:]
+        raw = decoded(compressed(cdr)[1])
+    except Invalid:
+        return
+    assert (raw.width, raw.height) == size == raw.pixels.shape[1::-1]
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_no_more_than_invalid(cdr: bytes) -> None:
+    """None of the four lets anything else out."""
+    for read in (
+        image,
+        compressed,
+        decoded,
+        lambda each: looked_at(each, True),
+        lambda each: looked_at(each, False),
+    ):
+        with pytest.raises(Invalid):
+            read(cdr)
+
+
+@pytest.mark.parametrize(("file", "kind"), [(JPEG, "jpeg"), (PNG, "png")])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_files_go_through_untouched(file: bytes, kind: str, order: str) -> None:
+    """The kind is what the bytes are, whatever the format says."""
+    assert compressed(compressed_cdr(file, "bgr8; tiff compressed", order=order)) == (kind, file)
+    assert looked_at(compressed_cdr(file, order=order), True) == (kind, 64, 48)
+
+
+def test_compressed_messages_of_rclpy_are_read() -> None:
+    """ROS makes the same of a CompressedImage as these tests."""
+    message = stamped(CompressedImage(format="jpeg", data=JPEG))
+    assert deserialize_message(compressed_cdr(JPEG), CompressedImage) == message
+    assert compressed(serialize_message(message)) == ("jpeg", JPEG)
+
+
+@pytest.mark.parametrize("file", [JPEG, PNG])
+def test_padding_behind_a_file_is_cut_off(file: bytes) -> None:
+    """Some drivers hand on their whole buffer; the relay takes nothing behind the end."""
+    assert compressed(compressed_cdr(file + bytes(500)))[1] == file
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        (JPEG[:-2], "JPEG ends in the middle"),
+        (PNG[:-12], "PNG ends in the middle"),
+        (b"<html></html>", "neither JPEG nor PNG"),
+        (b"", "neither JPEG nor PNG"),
+    ],
+)
+def test_what_is_no_whole_file_is_refused(file: bytes, words: str) -> None:
+    """The relay would end the stream for it."""
+    with pytest.raises(Invalid, match=words):
+        compressed(compressed_cdr(file))
+
+
+def test_compressed_depth_is_refused_with_advice() -> None:
+    """Its PNG has another head before it, and sixteen bits."""
+    with pytest.raises(Invalid, match="take the topic with the raw depth"):
+        compressed(compressed_cdr(b"\0" * 12 + PNG, "16UC1; compressedDepth png"))
+
+
+@pytest.mark.parametrize("file", [JPEG, PNG])
+def test_decoded_files_have_the_cards_colours(file: bytes) -> None:
+    """B, G, R; JPEG nearly so."""
+    raw = decoded(file)
+    for name, (red, green, blue) in PATCHES.items():
+        assert raw.pixels[middle_of(name, 64, 48)].tolist() == pytest.approx([blue, green, red], abs=12), name
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".png"])
+def test_decoded_grey_stays_grey(ending: str) -> None:
+    """A third of the bytes to work on."""
+    raw = decoded(cv2.imencode(ending, grey_of(card(64, 48)))[1].tobytes())
+    assert raw.pixels.shape == (48, 64)
+
+
+def test_a_png_of_sixteen_bits_or_with_alpha_becomes_colour_of_eight() -> None:
+    """What an encoder takes, whatever the file has."""
+    deep = np.full((4, 6, 3), 0x8001, np.uint16)
+    clear = np.full((4, 6, 4), 128, np.uint8)
+    for each in (deep, clear):
+        raw = decoded(cv2.imencode(".png", each)[1].tobytes())
+        assert raw.pixels.dtype == np.uint8
+        assert raw.pixels.tolist() == np.full((4, 6, 3), 128).tolist()
+
+
+@pytest.mark.parametrize(
+    "parameters", [(), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (cv2.IMWRITE_JPEG_RST_INTERVAL, 1)]
+)
+def test_jpeg_size_is_found_in_every_form(parameters: tuple[int, ...]) -> None:
+    """Baseline, progressive, with restarts; with a comment and filling before its frame."""
+    file = cv2.imencode(".jpg", card(64, 48), parameters)[1].tobytes()
+    commented = file[:2] + b"\xff\xff\xfe" + struct.pack(">H", 60_002) + b"\xff\xc0" * 30_000 + file[2:]
+    for each in (file, commented):
+        assert looked_at(compressed_cdr(each), True) == ("jpeg", 64, 48)
+        assert decoded(each).pixels.shape == (48, 64, 3)
+
+
+def test_a_file_that_would_unfold_to_gigabytes_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The size in its head is asked first."""
+    monkeypatch.delattr(cv2, "imdecode")
+    side = math.isqrt(PIXELS) + 1
+    bomb = PNG[:16] + struct.pack(">II", side, side) + PNG[24:]
+    with pytest.raises(Invalid, match="too large to be decoded"):
+        decoded(bomb)
+    huge = PNG[:16] + struct.pack(">II", 2**31, 2**31) + PNG[24:]
+    with pytest.raises(Invalid, match="each side may have"):
+        looked_at(compressed_cdr(huge), True)
+
+
+def test_a_broken_body_is_invalid() -> None:
+    """OpenCV's word for it is nothing at all."""
+    with pytest.raises(Invalid, match="PNG is broken"):
+        decoded(PNG[:40] + b"\0" * 30 + PNG[70:])
+
+
+def test_looking_touches_no_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras that nobody watches are looked at now and then; an unknown encoding is told of too."""
+    monkeypatch.delattr(formats, "cv2")
+    assert looked_at(image_cdr(small("16UC1")), False) == ("16UC1", 12, 8)
+    assert looked_at(image_cdr(small(encoding="yuv999")), False) == ("yuv999", 12, 8)
+    assert looked_at(compressed_cdr(JPEG), True) == ("jpeg", 64, 48)
