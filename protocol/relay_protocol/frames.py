@@ -60,7 +60,7 @@ class SampleFrame(_Frame, frozen=True, order=True, gc=False):
 
 
 class VideoFrame(_Frame, frozen=True, order=True, gc=False):
-    """Kind 2: one JPEG picture of a stream; ``stamp`` is the robot's wall clock in nanoseconds."""
+    """Kind 2: one picture of a stream; ``stamp`` is the robot's wall clock in nanoseconds."""
 
     number: int
     stamp: int

@@ -91,7 +91,7 @@ TICKET_SECONDS = 60
 """A single-use ticket for a websocket is good for this long."""
 
 CHANNEL_TICKET_SECONDS = 30
-"""A robot has this long to join a channel it was asked to open."""
+"""A robot has this long to join a channel or a stream it was asked to open."""
 
 HEARTBEAT_SECONDS = 2.0
 """Each end of a robot link pings this often; three missed and the link is lost."""
