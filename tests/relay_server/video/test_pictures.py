@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -147,6 +148,33 @@ def test_damage_is_an_answer_in_words_or_still_a_picture(
     else:
         assert 0 < seen.width <= limits.PICTURE_SIDE
         assert 0 < seen.height <= limits.PICTURE_SIDE
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"tune": "zerolatency"},
+        {"preset": "slow", "tune": "zerolatency", "x264-params": "slices=4:aud=1:repeat-headers=1"},
+        {
+            "tune": "zerolatency",
+            "x264-params": "interlaced=1:filler=1:nal-hrd=cbr:vbv-maxrate=900:vbv-bufsize=90",
+        },
+    ],
+    ids=["plain", "slices and delimiters", "fields and filler"],
+)
+def test_real_h264_tells_what_stands_alone(options: dict[str, str]) -> None:
+    """However the encoder is set; the first picture has its parameter sets."""
+    context = av.VideoCodecContext.create("libx264", "w")
+    context.width, context.height, context.pix_fmt, context.framerate = 64, 48, "yuv420p", 15
+    context.bit_rate = 900_000
+    context.options = options
+    kinds = []
+    for number in range(6):
+        pixels = np.random.default_rng(number).integers(0, 256, (72, 64), np.uint8)
+        frame = av.VideoFrame.from_ndarray(pixels, "yuv420p")
+        frame.pts = number
+        kinds += [look_at("h264", bytes(packet)) for packet in context.encode(frame)]
+    assert [seen.key for seen in kinds[:3]] == [True, False, False]
 
 
 def test_one_form_is_not_taken_for_another() -> None:
