@@ -10,7 +10,9 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
 from relay_db import queries
-from relay_protocol.errors import NotFound, SwitchboardError
+from relay_protocol import link
+from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
+from relay_protocol.rights import Operation
 from relay_server import closing
 from relay_server.access import Access, Permit, Principal
 from relay_server.auth import Authenticator, BadCredentials, TooManyTries
@@ -26,8 +28,16 @@ from relay_server.registry import Presence, Registry
 from relay_server.rounds import Rounds
 from relay_server.session import ClientTransport, Session, Timing
 from relay_server.store import Store
+from relay_server.video import Videos
+from relay_server.watching import Screen, Watching, check_view, view
 
 NO_ROBOT = "there is no such robot, or you have no right on it"
+
+
+class GoingDown(Unavailable):
+    """The relay ends, and with it what is open."""
+
+    code = "going_down"
 
 
 @dataclass(frozen=True)
@@ -55,6 +65,7 @@ class FrontDesk:
         access: Access,
         registry: Registry,
         channels: Channels,
+        videos: Videos,
         journal: Journal,
         origins: Origins,
         timing: Timing,
@@ -70,15 +81,17 @@ class FrontDesk:
         self._access = access
         self._registry = registry
         self._channels = channels
+        self._videos = videos
         self._journal = journal
         self._origins = origins
-        self._timing = timing
+        self.timing = timing
         self._rounds = Rounds(clock)
         self._budgets = Budgets(clock.seconds, time.thread_time)
         self._cookie = cookie
         self._clock_ns = clock_ns
         self._wall = wall
         self._sessions: dict[int, dict[int, Session]] = {}
+        self._watchings: set[Watching] = set()
         self._local = RelayNode(self.sessions_of)
 
     def __iter__(self) -> Iterator[Session]:
@@ -183,7 +196,7 @@ class FrontDesk:
             self._channels.of(robot),
             self._local,
             Freshness(self._clock_ns, opened_ns, lambda: secrets.token_bytes(8)),
-            self._timing,
+            self.timing,
             self._rounds,
             self._budgets.of(admission.permit.principal.user_id),
             address=admission.address,
@@ -220,6 +233,90 @@ class FrontDesk:
             refusals=session.refusals,
         )
         self._registry.changed()
+
+    # --- cameras ------------------------------------------------------------------------------------------
+
+    async def cameras(self, principal: Principal, robot: str) -> list[dict[str, Any]]:
+        """The cameras of a robot that the principal may view.
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        for record, rules in await self._access.robots(principal):
+            if record.name == robot:
+                there = self._registry.presence(record.id, record.name, record.realm)
+                streams = self._videos.of(there)
+                return [
+                    view(camera, streams)
+                    for camera in there.cameras
+                    if rules.judge(Operation.VIEW, camera.name).allowed
+                ]
+        raise NotFound(NO_ROBOT)
+
+    async def may_view(self, principal: Principal, robot: str, camera: str, address: str) -> None:
+        """Whether the principal may view this camera now.
+
+        :raises NotFound: no such robot, or no right on it or to view this
+        """
+        admission = await self.admit(principal, robot, address)
+        try:
+            check_view(admission.permit, camera)
+        finally:
+            self.turn_away(admission)
+
+    async def viewing(
+        self,
+        principal: Principal,
+        robot: str,
+        camera: str,
+        settings: link.VideoSettings,
+        screen: Screen,
+        address: str,
+    ) -> Watching:
+        """Have a camera shown, until :meth:`Watching.leave` or until the screen is told that it has ended.
+
+        :raises NotFound: no such robot, or no right on it or to view this
+        :raises Unavailable: too many watch, or the relay is going down
+        """
+        return self.watch(await self.admit(principal, robot, address), camera, settings, screen)
+
+    def watch(
+        self, admission: Admission, camera: str, settings: link.VideoSettings, screen: Screen
+    ) -> Watching:
+        """The same for somebody who was admitted; whatever comes of it, the admission is used up."""
+        watching = Watching(
+            admission.permit, admission.robot, camera, screen, address=admission.address, over=self._left
+        )
+        try:
+            if not self.accepting:
+                raise GoingDown("the relay is going down; come again in a moment")
+            check_view(admission.permit, camera)
+            watching.begin(self._videos, settings)
+        except SwitchboardError:
+            self.turn_away(admission)
+            raise
+        self._watchings.add(watching)
+        self._tell_of_video("video.joined", watching, address=watching.address)
+        return watching
+
+    def _left(self, watching: Watching) -> None:
+        self._access.release(watching.permit)
+        self._watchings.discard(watching)
+        self._tell_of_video("video.left", watching, pictures=watching.pictures)
+
+    def _tell_of_video(self, kind: str, watching: Watching, **data: Any) -> None:
+        principal = watching.permit.principal
+        self._journal.event(
+            kind,
+            f"user:{principal.name}",
+            # Not that of the user's other events: snapshots may come one a second.
+            cause=f"video:{principal.name}",
+            robot_id=watching.robot.robot_id,
+            user_id=principal.user_id,
+            camera=watching.camera,
+            **data,
+        )
+
+    # --- what robots there are ----------------------------------------------------------------------------
 
     async def issue_ticket(self, principal: Principal, robot: str) -> str:
         """A ticket for one websocket to a robot.
@@ -300,3 +397,5 @@ class FrontDesk:
         self.accepting = False
         for session in self:
             session.close(closing.GOING_AWAY, reason)
+        for watching in list(self._watchings):
+            watching.end(GoingDown(reason))

@@ -34,6 +34,7 @@ from relay_server.edges.caps import AddressCap
 from relay_server.edges.robot_roles import Opening, RobotHall
 from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
 from relay_server.edges.site import Portal, RelaySite, Robots, Root
+from relay_server.edges.video import Video, VideoFactory
 from relay_server.edges.websocket import ClientFactory
 from relay_server.folder import DataFolder
 from relay_server.frontdesk import FrontDesk
@@ -41,6 +42,7 @@ from relay_server.journal import Journal
 from relay_server.metrics import RelayCollector, registry_of
 from relay_server.origins import Origins
 from relay_server.registry import Registry
+from relay_server.rounds import Rounds
 from relay_server.session import Timing
 from relay_server.store import Store
 from relay_server.tls import ServerTls
@@ -134,6 +136,7 @@ class Relay:
             self._access,
             self._registry,
             self._channels,
+            self._videos,
             self._journal,
             origins,
             Timing(settings.client_ping, settings.driving_ping, settings.stall_limit),
@@ -146,7 +149,11 @@ class Relay:
         api = Api(self._reactor, desk, origins, metrics, cookie=cookie, secure=settings.tls)
         cap = AddressCap(settings.connections_per_address)
         websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk, cap))
-        root = Root(Robots(websocket, relay_server.VERSION), api.app.resource(), Portal(relay_server.PORTAL))
+        rounds = Rounds(self._reactor)
+        pictures = WebSocketResource(VideoFactory(self._reactor, time.monotonic_ns, desk, cap, rounds))
+        video = Video(self._reactor, rounds, desk, api.principal, pictures)
+        robots = Robots(websocket, video, relay_server.VERSION)
+        root = Root(robots, api.app.resource(), Portal(relay_server.PORTAL))
         return RelaySite(root, self._reactor, cap, settings.tls)
 
     def _robot_factory(self, hall: RobotHall) -> RobotFactory:

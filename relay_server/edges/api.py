@@ -18,12 +18,12 @@ from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
 from relay_protocol import jsontext
-from relay_protocol.errors import Invalid, MalformedMessage, NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
 from relay_server.access import Principal
-from relay_server.auth import SESSION_SECONDS, BadCredentials, TooManyTries
+from relay_server.auth import SESSION_SECONDS, BadCredentials
 from relay_server.clock import Clock, cancel
-from relay_server.edges.site import problem
+from relay_server.edges.problems import problem, problem_of
 from relay_server.origins import Origins
 
 T = TypeVar("T")
@@ -255,11 +255,7 @@ class Api:
         try:
             result = await work
         except SwitchboardError as error:
-            if isinstance(error, TooManyTries):
-                request.setHeader(b"retry-after", str(int(error.retry_after) + 1).encode())
-            if isinstance(error, BadCredentials):
-                request.setHeader(b"www-authenticate", b"Bearer")
-            return problem(request, _status_of(error), str(error), code=error.code)
+            return problem_of(request, error)
         if result is _STREAMED:
             return b""
         if result is None:
@@ -293,21 +289,6 @@ def _body(request: Request, kind: type[T]) -> T:
 
 def _me(principal: Principal) -> dict[str, Any]:
     return {"user": principal.name, "admin": principal.admin, "realm": principal.realm}
-
-
-_STATUS: list[tuple[type[SwitchboardError], int]] = [
-    (BadCredentials, 401),
-    (TooManyTries, 429),
-    (NotFound, 404),
-    (Refused, 403),
-    (Invalid, 400),
-    (MalformedMessage, 400),
-    (Unavailable, 503),
-]
-
-
-def _status_of(error: SwitchboardError) -> int:
-    return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
 
 
 class _RobotStream:

@@ -6,11 +6,12 @@ from typing import Protocol
 
 from autobahn.websocket.types import ConnectionRequest
 
-from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_server import closing
 from relay_server.access import BadCredentials, Principal
-from relay_server.frontdesk import Admission
-from relay_server.session import ClientTransport, Session
+from relay_server.frontdesk import Admission, GoingDown
+from relay_server.outbox import Outbox
+from relay_server.session import ClientTransport
 
 HANDSHAKE_STATUS = {
     closing.UNAUTHENTICATED: 401,
@@ -19,6 +20,41 @@ HANDSHAKE_STATUS = {
     closing.GOING_AWAY: 503,
 }
 """The HTTP status of a handshake that would close with this code."""
+
+
+class Occupant(Protocol):
+    """What goes on over a websocket once somebody is in: a session, or pictures of a camera."""
+
+    outbox: Outbox
+    """Its ``write`` is set by the websocket."""
+
+    @property
+    def not_before(self) -> int:
+        """What comes now was not sent before this; monotonic nanoseconds."""
+
+    def start(self) -> None:
+        """The client is in."""
+
+    def message(self, payload: bytes, *, since: int | None = None) -> None:
+        """One text message.
+
+        :param since: what :attr:`not_before` was when its first frame came
+        """
+
+    def pong(self, payload: bytes) -> None:
+        """The answer to a ping."""
+
+    def pause(self) -> None:
+        """The transport's buffer is full."""
+
+    def resume(self) -> None:
+        """The transport takes bytes again."""
+
+    def close(self, code: int, reason: str) -> None:
+        """Close the websocket with a code, and end."""
+
+    def end(self) -> None:
+        """The websocket is gone, or goes."""
 
 
 class Gate(Protocol):
@@ -41,7 +77,7 @@ class Gate(Protocol):
         :raises NotFound: it has none, or there is no such robot
         """
 
-    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> Session:
+    def open(self, admission: Admission, transport: ClientTransport, opened_ns: int) -> Occupant:
         """Begin a session that was admitted."""
 
     def turn_away(self, admission: Admission) -> None:
@@ -74,6 +110,13 @@ def code_of(error: SwitchboardError) -> int:
         return closing.UNAUTHENTICATED
     if isinstance(error, NotFound):
         return closing.NOT_FOUND
+    if isinstance(error, GoingDown):
+        return closing.GOING_AWAY
     if isinstance(error, Unavailable):
         return closing.UNAVAILABLE
     return closing.FORBIDDEN
+
+
+def status_of(error: SwitchboardError) -> int:
+    """The HTTP status of a handshake that is refused for this reason."""
+    return 400 if isinstance(error, Invalid) else HANDSHAKE_STATUS.get(code_of(error), 403)

@@ -10,11 +10,12 @@ from typing import Any
 from twisted.logger import Logger
 from twisted.web.http import HTTPChannel
 from twisted.web.resource import IResource, Resource
-from twisted.web.server import NOT_DONE_YET, Request, Site
+from twisted.web.server import Request, Site
 
 from relay_protocol import jsontext, limits
 from relay_server.clock import Timer, cancel
 from relay_server.edges.caps import AddressCap
+from relay_server.edges.problems import problem
 
 BODY_BYTES = limits.UNPROVEN_BYTES
 IDLE_SECONDS = 60.0
@@ -174,11 +175,15 @@ class Root(Resource):
 
 
 class Robots(Resource):
-    """``/robots/<robot>``: a websocket, or on a plain GET what speaks here (a websocket client's first question)."""
+    """``/robots/<robot>``: a websocket, or on a plain GET what speaks here (a websocket client's first question).
 
-    def __init__(self, websocket: IResource, version: str) -> None:
+    :param video: what is below ``/robots/<robot>/video``; a leaf, it finds the robot in the request's path
+    """
+
+    def __init__(self, websocket: IResource, video: IResource, version: str) -> None:
         super().__init__()
         self._websocket = websocket
+        self._video = video
         self._about = jsontext.encode(
             {
                 "product": "switchboard",
@@ -189,14 +194,20 @@ class Robots(Resource):
         )
 
     def getChild(self, path: bytes, request: Request) -> IResource:
-        upgrade = request.getHeader(b"upgrade")
-        if upgrade is not None and upgrade.lower() == b"websocket" and not request.postpath:
+        if request.postpath[:1] == [b"video"]:
+            return self._video
+        if wants_websocket(request) and not request.postpath:
             return self._websocket
         return self if not request.postpath else Missing()
 
     def render_GET(self, request: Request) -> bytes:
         request.setHeader(b"content-type", b"application/json")
         return self._about
+
+
+def wants_websocket(request: Request) -> bool:
+    """Whether the connection is to become a websocket (RFC 6455 section 4.1)."""
+    return (request.getHeader(b"upgrade") or b"").lower() == b"websocket"
 
 
 class Missing(Resource):
@@ -243,27 +254,3 @@ class Portal(Resource):
         hashed = path.parent.name == "assets"
         request.setHeader(b"cache-control", b"public, max-age=31536000, immutable" if hashed else b"no-cache")
         return content
-
-
-def problem(request: Request, status: int, detail: str, **more: Any) -> bytes:
-    """An error as problem details (RFC 9457)."""
-    request.setResponseCode(status)
-    request.setHeader(b"content-type", b"application/problem+json")
-    request.setHeader(b"cache-control", b"no-store")
-    title = {
-        400: "Bad request",
-        401: "Not logged in",
-        403: "Refused",
-        404: "Not found",
-        405: "Method not allowed",
-        413: "Too large",
-        415: "Unsupported media type",
-        429: "Too many requests",
-        500: "Internal error",
-        503: "Unavailable",
-    }.get(status, "Error")
-    body = {"type": "about:blank", "title": title, "status": status, "detail": detail, **more}
-    return jsontext.encode(body)
-
-
-__all__ = ["NOT_DONE_YET", "Missing", "Portal", "RelaySite", "Robots", "Root", "problem"]

@@ -21,13 +21,13 @@ from twisted.logger import Logger
 from relay_protocol import limits, rosbridge
 from relay_protocol.errors import PeerError, SwitchboardError, Unavailable
 from relay_server import closing, wsframe
+from relay_server.access import Principal
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.bounded import BoundedProtocol
 from relay_server.edges.caps import AddressCap, Place
 from relay_server.edges.fastpath import Turns
-from relay_server.edges.gate import HANDSHAKE_STATUS, Gate, code_of, identify
+from relay_server.edges.gate import HANDSHAKE_STATUS, Gate, Occupant, code_of, identify, status_of
 from relay_server.frontdesk import Admission
-from relay_server.session import Session
 
 T = TypeVar("T")
 
@@ -45,8 +45,8 @@ class ClientProtocol(BoundedProtocol):
         super().__init__()
         self._robot = ""
         self._admission: Admission | None = None
-        self._failure: tuple[int, str] | None = None
-        self._session: Session | None = None
+        self._failure: SwitchboardError | None = None
+        self._session: Occupant | None = None
         self._proving = False
         self._early: list[bytes] = []
         self._early_bytes = 0
@@ -92,29 +92,47 @@ class ClientProtocol(BoundedProtocol):
         return answer
 
     async def _connect(self, request: ConnectionRequest) -> str | None:
-        self._robot = unquote(request.path.removeprefix("/robots/"))
         chosen = None
         try:
+            self._robot = self._asked_for(request)
             if not self.factory.gate.accepting:
                 raise Unavailable("the relay is going down; connect again in a moment")
             if self._place is None:
                 raise Unavailable("too many clients connect at the same time; try again in a moment")
             principal, chosen = await identify(self.factory.gate, request, self._robot)
             if principal is not None:
-                self._admission = await self.factory.gate.admit(principal, self._robot, self._address())
+                self._admission = await self._admit(principal)
         except SwitchboardError as error:
-            self._failure = (code_of(error), str(error))
+            self._failure = error
         if self.state == self.STATE_CLOSED:
             self._turn_away()
             raise ConnectionDeny(HANDSHAKE_STATUS[closing.UNAVAILABLE], "the client has left")
         if self._failure is not None and not request.origin:
             # Programs read the status; browsers can't, so they get a close code after the handshake.
-            code, reason = self._failure
+            reason = str(self._failure)
             self.log.info(
                 "a client at {address} is refused: {reason}", address=self._address(), reason=reason
             )
-            raise ConnectionDeny(HANDSHAKE_STATUS.get(code, 403), reason)
+            raise ConnectionDeny(status_of(self._failure), reason)
         return chosen
+
+    def _asked_for(self, request: ConnectionRequest) -> str:
+        """The robot a handshake names.
+
+        :raises SwitchboardError: what it asks for makes no sense
+        """
+        return unquote(request.path.removeprefix("/robots/"))
+
+    async def _admit(self, principal: Principal) -> Admission:
+        """Whether it may come in.
+
+        :raises SwitchboardError: it may not
+        """
+        return await self.factory.gate.admit(principal, self._robot, self._address())
+
+    def _occupant(self, admission: Admission) -> Occupant:
+        """What begins now that it is in."""
+        return self.factory.gate.open(admission, self, self._opened_ns)
 
     def onOpen(self) -> None:
         """The handshake is done."""
@@ -126,7 +144,7 @@ class ClientProtocol(BoundedProtocol):
         self._opened_ns = self.factory.clock_ns()
         self.begun()
         if self._failure is not None:
-            self.close(*self._failure)
+            self.close(code_of(self._failure), str(self._failure))
         elif self._admission is not None:
             self._begin()
 
@@ -146,7 +164,7 @@ class ClientProtocol(BoundedProtocol):
         self._stop_deadline()
         self._known()
         self.take_at_most(limits.CLIENT_MESSAGE)
-        session = self._session = self.factory.gate.open(admission, self, self._opened_ns)
+        session = self._session = self._occupant(admission)
         # What the session sends goes to the socket without a look at the state; see nothing_more.
         session.outbox.write = self._writer.write
         session.start()
@@ -207,7 +225,7 @@ class ClientProtocol(BoundedProtocol):
 
     async def _authenticated(self, token: str) -> None:
         principal = await self.factory.gate.bearer(token)
-        self._admission = await self.factory.gate.admit(principal, self._robot, self._address())
+        self._admission = await self._admit(principal)
         if self._open:
             self._begin()
         else:
@@ -323,6 +341,6 @@ class ClientFactory(WebSocketServerFactory):
             maxConnections=0,
         )
         # Autobahn copies into each connection what its class does not have: options are the class's here.
-        options = {name: getattr(self, name) for name in ClientProtocol.CONFIG_ATTRS}
+        options = {name: getattr(self, name) for name in self.protocol.CONFIG_ATTRS}
         known = {name: staticmethod(each) if callable(each) else each for name, each in options.items()}
-        self.protocol = cast(type[ClientProtocol], type("ClientProtocol", (ClientProtocol,), known))
+        self.protocol = cast(type[ClientProtocol], type(self.protocol.__name__, (self.protocol,), known))

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from relay_protocol.rights import Level
 from relay_server import closing
+from relay_server.access import Permit
 from relay_server.clock import Clock
 from relay_server.freshness import Freshness
+from relay_server.outbox import Outbox
 from relay_server.rounds import Round, Rounds
 from relay_server.session.ends import ClientTransport, Timing
 
-if TYPE_CHECKING:
-    from relay_server.session.core import Session
+
+class Pinged(Protocol):
+    """Whose client is pinged: a session, or who watches a camera."""
+
+    permit: Permit
+    outbox: Outbox
+
+    def close(self, code: int, reason: str) -> None:
+        """Close with a code, and end."""
 
 
 class Pinging:
-    """Pings the client of one session, and cuts it when it answers none or takes nothing any more."""
+    """Pings one client, and cuts it when it answers none or takes nothing any more."""
 
     __slots__ = ("_clock", "_freshness", "_round", "_session", "_timing", "_transport")
 
     def __init__(
         self,
-        session: Session,
+        session: Pinged,
         clock: Clock,
         transport: ClientTransport,
         freshness: Freshness,

@@ -42,6 +42,7 @@ class Desk:
             self.access,
             self.world.registry,
             self.world.channels,
+            self.world.videos,
             Journal(store, self.wall),
             Origins("http"),
             Timing(2.0, 0.1, 5.0),

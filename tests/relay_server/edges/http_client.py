@@ -19,7 +19,7 @@ from relay_server.access import BadCredentials, Principal
 from relay_server.auth import TooManyTries
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
-from relay_server.edges.site import Portal, RelaySite, Robots, Root
+from relay_server.edges.site import Missing, Portal, RelaySite, Robots, Root
 from relay_server.edges.websocket import ClientFactory
 from relay_server.origins import Origins
 
@@ -126,6 +126,11 @@ class Transport(StringTransportWithDisconnection):
         """As TCP."""
 
 
+def api_of(clock: Any, desk: Any, origins: Origins, *, tls: bool = False) -> Api:
+    """The API in front of a desk."""
+    return Api(clock, desk, origins, CollectorRegistry(), cookie="sb", secure=tls)
+
+
 class World:
     """The site of a relay, and connections to it."""
 
@@ -134,9 +139,9 @@ class World:
         self.desk = MemoryDesk()
         self.cap = AddressCap(4)
         origins = Origins("https" if tls else "http")
-        api = Api(self.clock, self.desk, origins, CollectorRegistry(), cookie="sb", secure=tls)
+        api = api_of(self.clock, self.desk, origins, tls=tls)
         websocket = WebSocketResource(ClientFactory(self.clock, lambda: 0, self.desk, self.cap))  # type: ignore[arg-type]
-        root = Root(Robots(websocket, "1.2.3"), api.app.resource(), Portal(folder))
+        root = Root(Robots(websocket, Missing(), "1.2.3"), api.app.resource(), Portal(folder))
         self.site = RelaySite(root, self.clock, self.cap, tls)
 
     def connect(self) -> Transport:

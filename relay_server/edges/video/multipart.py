@@ -1,0 +1,153 @@
+"""MJPEG: one answer that never ends, a JPEG a part (``multipart/x-mixed-replace``), as web_video_server has it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.web.server import Request
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError
+from relay_server.clock import Clock
+from relay_server.edges.fastpath import Turns, Writer, writer_for
+from relay_server.edges.flow import Flow
+from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Waiting, narrow, unsent
+from relay_server.rounds import Round, Rounds
+from relay_server.video import Picture
+
+# That of web_video_server: some programs look for it without reading the header.
+_BOUNDARY = b"boundarydonotcross"
+_DELIMITER = b"--" + _BOUNDARY + b"\r\n"
+CONTENT_TYPE = b"multipart/x-mixed-replace; boundary=" + _BOUNDARY
+
+LEAVING_SECONDS = 2.0
+"""What was sent before the end has so long to go out; over TLS the peer, too, has to say something."""
+
+
+def part(picture: Picture, reduced: float) -> bytes:
+    """One part, and the delimiter behind it: browsers show a part when the next begins.
+
+    :param reduced: how far the picture is below what was asked for, 0 to 1
+    """
+    head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\nX-Timestamp: %.6f\r\n%b\r\n" % (
+        len(picture.body),
+        picture.stamp,
+        b"X-Reduced: %.3f\r\n" % reduced if reduced > 0 else b"",
+    )
+    return b"".join((head, picture.body, b"\r\n", _DELIMITER))
+
+
+class Multipart:
+    """The answer to one request: pictures as its connection takes them, until either side ends it.
+
+    :param made: of :func:`part`, shared by all streams
+    """
+
+    def __init__(self, clock: Clock, rounds: Rounds, turns: Turns, made: Made, request: Request) -> None:
+        self.done: Deferred[None] = Deferred()
+        """Fires when the connection is closed from here; fails when there was nothing to see at all."""
+        self._clock = clock
+        self._rounds = rounds
+        self._turns = turns
+        self._made = made
+        self._request = request
+        self._transport: Any = request.channel.transport
+        self._tcp: Any = None
+        self._writer: Writer | None = None
+        self._waiting = Waiting(clock.seconds)
+        self._round = Round(self._look, LOOK_SECONDS)
+        self._reduced = 0.0
+        self._full = False
+        self._left = 0
+        self._moved = 0.0
+
+    # --- Screen -------------------------------------------------------------------------------------------
+
+    def picture(self, picture: Picture) -> None:
+        """It goes now, or when the last has been taken, unless another comes before."""
+        self._waiting.put(picture)
+        self._send()
+
+    def playing(self, playing: link.Playing) -> None:
+        """Told with the pictures."""
+        self._reduced = playing.reduced
+
+    def ended(self, error: SwitchboardError) -> None:
+        """In words if nothing was sent yet; else the connection says it by its end."""
+        if self._writer is not None:
+            self._close()
+        elif not self.done.called:
+            self.done.errback(error)
+
+    def gone(self) -> None:
+        """The client has left, or was told why there is nothing to see."""
+        self._round.stop()
+
+    # --- Pausable -----------------------------------------------------------------------------------------
+
+    def pause(self) -> None:
+        """Something is left of what was written."""
+        self._full = True
+        self._note_progress()
+
+    def resume(self) -> None:
+        """All that was written has gone."""
+        self._full = False
+        self._send()
+
+    # --- the connection -----------------------------------------------------------------------------------
+
+    def _send(self) -> None:
+        if self._full or self.done.called:
+            return
+        for picture in self._waiting.take():
+            writer = self._writer or self._begin()
+            # TLS takes what it is given, and says only a turn later that it has something left.
+            self._full = self._tcp is not None and self._tcp is not self._transport
+            self._note_progress()
+            writer.write(self._made.of(picture, self._reduced))
+            # Whether the socket takes it decides which picture is next, so it is tried at once.
+            writer.flush()
+
+    def _begin(self) -> Writer:
+        """The head of the answer. Not by :meth:`Request.write`, which would make a chunk of each part."""
+        request, channel = self._request, self._request.channel
+        self._tcp = narrow(self._transport)
+        if self._tcp is not None:
+            # A picture is taken when nothing of it is left, so one byte is as full as many.
+            self._tcp.bufferSize = 0
+        writer = self._writer = writer_for(self._transport, self._turns)
+        request.registerProducer(Flow(self), True)
+        request.startedWriting = 1
+        channel.persistent = False
+        request.setHeader(b"connection", b"close")
+        channel.writeHeaders(b"HTTP/1.1", b"200", b"OK", request.responseHeaders)
+        writer.write(_DELIMITER)
+        self._rounds.start(self._round)
+        return writer
+
+    def _look(self) -> None:
+        if not self._full or self._unsent() != self._left:
+            self._note_progress()
+        elif self._clock.seconds() - self._moved >= STALL_SECONDS:
+            self._close()
+
+    def _note_progress(self) -> None:
+        self._left, self._moved = self._unsent(), self._clock.seconds()
+
+    def _unsent(self) -> int:
+        return 0 if self._tcp is None else unsent(self._tcp)
+
+    def _close(self) -> None:
+        """A picture that has begun is not finished when it takes time."""
+        if self.done.called:
+            return
+        self._round.stop()
+        self._request.unregisterProducer()
+        if self._full:
+            self._transport.abortConnection()
+        else:
+            self._request.channel.loseConnection()
+            self._clock.callLater(LEAVING_SECONDS, self._transport.abortConnection)
+        self.done.callback(None)

@@ -1,0 +1,218 @@
+"""``/robots/<robot>/video/…`` over HTTP: which cameras there are, streams, snapshots, the way to the websocket.
+
+A session cookie needs no Origin here, because an ``<img>`` sends none; but other sites' pages may not use it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any, Protocol
+
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+from twisted.web.resource import IResource, Resource
+from twisted.web.server import NOT_DONE_YET, Request
+
+from relay_protocol import jsontext, link
+from relay_protocol.errors import Refused, SwitchboardError
+from relay_server.access import Principal
+from relay_server.clock import Clock
+from relay_server.edges.fastpath import Turns
+from relay_server.edges.problems import problem, problem_of
+from relay_server.edges.site import wants_websocket
+from relay_server.edges.video.multipart import CONTENT_TYPE, Multipart, part
+from relay_server.edges.video.parameters import asked
+from relay_server.edges.video.snapshot import Snapshot
+from relay_server.edges.video.viewing import Made
+from relay_server.rounds import Rounds
+from relay_server.watching import Screen, Watching
+
+_METHODS = (b"GET", b"HEAD")
+_OWN_PAGES = (None, b"same-origin", b"none")
+"""``Sec-Fetch-Site`` (W3C Fetch Metadata) of what is no browser's, of the relay's own pages, of the address bar."""
+
+_PICTURES = {"jpeg": b"image/jpeg", "png": b"image/png"}
+
+
+class Desk(Protocol):
+    """What is asked for here; the front desk's."""
+
+    async def ticket(self, ticket: str, robot: str) -> Principal:
+        """The principal of a single-use ticket."""
+
+    async def cameras(self, principal: Principal, robot: str) -> list[dict[str, Any]]:
+        """The cameras the principal may view."""
+
+    async def may_view(self, principal: Principal, robot: str, camera: str, address: str) -> None:
+        """Whether it may view this one."""
+
+    async def viewing(
+        self,
+        principal: Principal,
+        robot: str,
+        camera: str,
+        settings: link.VideoSettings,
+        screen: Screen,
+        address: str,
+    ) -> Watching:
+        """Begin to watch."""
+
+
+class Video(Resource):
+    """All below ``/robots/<robot>/video``.
+
+    :param principal: who a request is from, by access token or cookie
+    :param websocket: what takes a request for ``…/video/ws`` over
+    """
+
+    isLeaf = True
+    log = Logger()
+
+    def __init__(
+        self,
+        clock: Clock,
+        rounds: Rounds,
+        desk: Desk,
+        principal: Callable[[Request], Awaitable[Principal]],
+        websocket: IResource,
+    ) -> None:
+        super().__init__()
+        self._clock = clock
+        self._rounds = rounds
+        self._turns = Turns(clock)
+        self._desk = desk
+        self._principal_of = principal
+        self._websocket = websocket
+        self._parts = Made(part)
+        self._answers: dict[bytes, Callable[[Request, str], Awaitable[bytes | None]]] = {
+            b"cameras": self._cameras,
+            b"stream": self._stream,
+            b"snapshot": self._snapshot,
+        }
+
+    def render(self, request: Request) -> Any:
+        """By what follows ``/video``."""
+        what = request.postpath[1] if len(request.postpath) == 2 else b""
+        if what == b"ws":
+            return self._to_websocket(request)
+        answer = self._answers.get(what)
+        if answer is None:
+            return problem(request, 404, "There is nothing at this address.")
+        if request.method not in _METHODS:
+            request.setHeader(b"allow", b", ".join(_METHODS))
+            return problem(request, 405, "This address does not take that method.")
+        request.setHeader(b"cache-control", b"no-store")
+        running = Deferred.fromCoroutine(self._finish(request, answer))
+        # A client that leaves early ends the work.
+        request.notifyFinish().addErrback(lambda _: running.cancel())
+        running.addErrback(self._failed, request)
+        return NOT_DONE_YET
+
+    def _to_websocket(self, request: Request) -> Any:
+        if wants_websocket(request):
+            return self._websocket.render(request)
+        request.setHeader(b"upgrade", b"websocket")
+        return problem(request, 426, "This is the address of a websocket.")
+
+    # --- answers ------------------------------------------------------------------------------------------
+
+    async def _cameras(self, request: Request, robot: str) -> bytes:
+        cameras = await self._desk.cameras(await self._principal(request, robot), robot)
+        request.setHeader(b"content-type", b"application/json")
+        return jsontext.encode({"cameras": cameras})
+
+    async def _stream(self, request: Request, robot: str) -> bytes | None:
+        wanted = asked(_query(request), "stream")
+        principal = await self._principal(request, robot)
+        if request.method == b"HEAD":
+            await self._desk.may_view(principal, robot, wanted.camera, _address(request))
+            request.setHeader(b"content-type", CONTENT_TYPE)
+            return b""
+        screen = Multipart(self._clock, self._rounds, self._turns, self._parts, request)
+        # No proxy shall hold it back.
+        request.setHeader(b"x-accel-buffering", b"no")
+        watching = await self._desk.viewing(
+            principal, robot, wanted.camera, wanted.settings, screen, _address(request)
+        )
+        request.setHeader(b"content-type", CONTENT_TYPE)
+        try:
+            await screen.done
+        finally:
+            watching.leave()
+            screen.gone()
+        return None
+
+    async def _snapshot(self, request: Request, robot: str) -> bytes:
+        wanted = asked(_query(request), "snapshot")
+        principal = await self._principal(request, robot)
+        if request.method == b"HEAD":
+            await self._desk.may_view(principal, robot, wanted.camera, _address(request))
+            request.setHeader(b"content-type", _PICTURES[wanted.settings.codec])
+            return b""
+        screen = Snapshot()
+        watching = await self._desk.viewing(
+            principal, robot, wanted.camera, wanted.settings, screen, _address(request)
+        )
+        try:
+            picture = await screen.done
+        finally:
+            watching.leave()
+        request.setHeader(b"content-type", _PICTURES[picture.codec])
+        request.setHeader(b"x-timestamp", b"%.6f" % picture.stamp)
+        if screen.reduced > 0:
+            request.setHeader(b"x-reduced", b"%.3f" % screen.reduced)
+        return picture.body
+
+    # --- who asks -----------------------------------------------------------------------------------------
+
+    async def _principal(self, request: Request, robot: str) -> Principal:
+        """Who sent this, by the credentials of SPEC section 1.1, in their order.
+
+        :raises BadCredentials: nobody that can be told
+        :raises Refused: a cookie that another site's page has the browser send
+        """
+        if not (request.getHeader("authorization") or "").lower().startswith("bearer "):
+            ticket = request.args.get(b"ticket")
+            if ticket:
+                return await self._desk.ticket(ticket[0].decode("ascii", "replace"), robot)
+            if request.getHeader(b"sec-fetch-site") not in _OWN_PAGES:
+                raise Refused("pages of other sites may not use your session; they need a ticket")
+        return await self._principal_of(request)
+
+    # --- answering ----------------------------------------------------------------------------------------
+
+    async def _finish(
+        self, request: Request, answer: Callable[[Request, str], Awaitable[bytes | None]]
+    ) -> None:
+        try:
+            body = await answer(request, request.prepath[-1].decode("utf-8", "replace"))
+        except SwitchboardError as error:
+            body = problem_of(request, error)
+        if body is not None:
+            self._send(request, body)
+
+    def _failed(self, failure: Failure, request: Request) -> None:
+        if failure.check(CancelledError):
+            return
+        self.log.failure("{method} {path} failed", failure, method=request.method, path=request.path)
+        if request.startedWriting:
+            request.transport.abortConnection()
+        else:
+            self._send(
+                request, problem(request, 500, "The relay failed on this request; its log tells more.")
+            )
+
+    def _send(self, request: Request, body: bytes) -> None:
+        if request.method != b"HEAD":
+            request.setHeader(b"content-length", b"%d" % len(body))
+        request.write(body)
+        request.finish()
+
+
+def _query(request: Request) -> str:
+    return str(request.uri.partition(b"?")[2].decode("latin-1"))
+
+
+def _address(request: Request) -> str:
+    return str(getattr(request.getClientAddress(), "host", "local"))

@@ -1,0 +1,32 @@
+"""A single picture: the first that comes."""
+
+from __future__ import annotations
+
+from twisted.internet.defer import Deferred
+
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError
+from relay_server.video import Picture
+
+
+class Snapshot:
+    """Waits for a picture; how long is for the stream to say."""
+
+    def __init__(self) -> None:
+        self.done: Deferred[Picture] = Deferred()
+        """The picture; fails when there is none."""
+        self.reduced = 0.0
+
+    def picture(self, picture: Picture) -> None:
+        """The first one is it."""
+        if not self.done.called:
+            self.done.callback(picture)
+
+    def playing(self, playing: link.Playing) -> None:
+        """Told with the picture."""
+        self.reduced = playing.reduced
+
+    def ended(self, error: SwitchboardError) -> None:
+        """There is none."""
+        if not self.done.called:
+            self.done.errback(error)

@@ -1,0 +1,256 @@
+"""Pictures over a websocket (``/robots/<robot>/video/ws``, SPEC section 1.8): a header in JSON, then the picture.
+
+Who comes in, how it is closed and pinged is as for every client's websocket.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from typing import Protocol
+from urllib.parse import unquote
+
+import msgspec
+from autobahn.websocket.types import ConnectionRequest
+
+from relay_protocol import jsontext, link
+from relay_protocol.errors import MalformedMessage, SwitchboardError
+from relay_protocol.message import Message
+from relay_server import closing, wsframe
+from relay_server.access import Principal
+from relay_server.clock import Clock
+from relay_server.edges.caps import AddressCap
+from relay_server.edges.gate import Gate, code_of
+from relay_server.edges.video.parameters import Asked, asked
+from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Waiting, narrow
+from relay_server.edges.websocket import ClientFactory, ClientProtocol
+from relay_server.freshness import Freshness
+from relay_server.frontdesk import Admission
+from relay_server.outbox import Outbox
+from relay_server.rounds import Round, Rounds
+from relay_server.session import ClientTransport, Timing
+from relay_server.session.pinging import Pinging
+from relay_server.video import Picture
+from relay_server.watching import Screen, Watching, check_view
+
+MISTAKES = 100
+"""Messages that make no sense before a viewer is cut."""
+
+
+class Took(Message, frozen=True, kw_only=True):
+    """Viewer: the picture of this number is here, send the next."""
+
+    number: int
+
+
+_decoder: msgspec.json.Decoder[Took] = msgspec.json.Decoder(Took)
+
+
+class VideoGate(Gate, Protocol):
+    """Who may come in, and what he may watch; the composition root's."""
+
+    timing: Timing
+
+    def watch(
+        self, admission: Admission, camera: str, settings: link.VideoSettings, screen: Screen
+    ) -> Watching:
+        """Have a camera shown to somebody who was admitted, which uses the admission up."""
+
+
+def framed(picture: Picture, reduced: float) -> bytes:
+    """Both messages of a picture as websocket frames. What is reduced ``playing`` tells."""
+    head = {
+        "op": "picture",
+        "number": picture.number,
+        "stamp": picture.stamp,
+        "width": picture.width,
+        "height": picture.height,
+        "size": len(picture.body),
+        "codec": picture.codec,
+        "key": picture.key,
+    }
+    return wsframe.text(jsontext.encode(head)) + wsframe.binary(picture.body)
+
+
+class VideoClient:
+    """What goes on over one viewer's websocket.
+
+    :param opened_ns: when its handshake was answered, monotonic nanoseconds
+    """
+
+    def __init__(
+        self,
+        shared: VideoFactory,
+        transport: ClientTransport,
+        admission: Admission,
+        wanted: Asked,
+        opened_ns: int,
+    ) -> None:
+        self.permit = admission.permit
+        self.outbox = Outbox(transport.send, shared.clock.seconds, self._overflow)
+        self._shared = shared
+        self._transport = transport
+        self._admission = admission
+        self._wanted = wanted
+        self._watching: Watching | None = None
+        self._waiting = Waiting(shared.clock.seconds, self._start_anew)
+        self._under_way: int | None = None
+        """Number of the last picture that was sent and that the viewer has not taken."""
+        self._sent_at = 0.0
+        self._mistakes = 0
+        self._ended = False
+        timing = shared.gate.timing
+        self._freshness = Freshness(shared.clock_ns, opened_ns, lambda: secrets.token_bytes(8))
+        # A viewer commands nothing, whatever his rights: nobody wants to know how old what he says is.
+        only_watches = Timing(timing.client_ping, timing.client_ping, timing.stall_limit)
+        self._pinging = Pinging(self, shared.clock, transport, self._freshness, only_watches)
+        self._round = Round(self._look, LOOK_SECONDS)
+
+    # --- Occupant -----------------------------------------------------------------------------------------
+
+    @property
+    def not_before(self) -> int:
+        """By the pings."""
+        return self._freshness.not_before
+
+    def start(self) -> None:
+        """Watch."""
+        try:
+            self._watching = self._shared.gate.watch(
+                self._admission, self._wanted.camera, self._wanted.settings, self
+            )
+        except SwitchboardError as error:
+            self.close(code_of(error), str(error))
+            return
+        self._pinging.start(self._shared.rounds)
+        self._shared.rounds.start(self._round)
+
+    def message(self, payload: bytes, *, since: int | None = None) -> None:
+        """``took`` opens the way for the next picture."""
+        try:
+            took = jsontext.decode(_decoder, payload)
+        except MalformedMessage:
+            self._mistakes += 1
+            if self._mistakes >= MISTAKES:
+                self.close(
+                    closing.TOO_MANY_ERRORS, "say nothing here but 'took' with the number of a picture"
+                )
+            return
+        if took.number == self._under_way:
+            self._under_way = None
+            self._send()
+
+    def pong(self, payload: bytes) -> None:
+        """It is still there."""
+        self._freshness.pong(payload)
+
+    def pause(self) -> None:
+        """The transport's buffer is full."""
+        self.outbox.pause()
+
+    def resume(self) -> None:
+        """The transport takes bytes again."""
+        self.outbox.resume()
+        self._send()
+
+    def close(self, code: int, reason: str) -> None:
+        """Close the websocket, and end."""
+        if not self._ended:
+            self._transport.close(code, reason)
+            self.end()
+
+    def end(self) -> None:
+        """The websocket is gone; give everything back."""
+        self._ended = True
+        self.outbox.close()
+        self._pinging.end()
+        self._round.stop()
+        watching, self._watching = self._watching, None
+        if watching is not None:
+            watching.leave()
+
+    # --- Screen -------------------------------------------------------------------------------------------
+
+    def picture(self, picture: Picture) -> None:
+        """It goes now, or when the last has been taken."""
+        self._waiting.put(picture)
+        self._send()
+
+    def playing(self, playing: link.Playing) -> None:
+        """Told between pictures; the latest counts."""
+        fields = {name: getattr(playing, name) for name in playing.__struct_fields__}
+        self.outbox.data("playing", wsframe.text(jsontext.encode({"op": "playing", **fields})), depth=1)
+
+    def ended(self, error: SwitchboardError) -> None:
+        """There is nothing to see, or no more."""
+        self.close(code_of(error), str(error))
+
+    # --- what goes ----------------------------------------------------------------------------------------
+
+    def _send(self) -> None:
+        if self._under_way is not None or not self.outbox.passing:
+            return
+        for picture in self._waiting.take():
+            self._under_way = picture.number
+            self._sent_at = self._shared.clock.seconds()
+            self.outbox.write(self._shared.frames.of(picture))
+
+    def _start_anew(self) -> None:
+        if self._watching is not None and self._wanted.settings.codec == "h264":
+            self._watching.start_anew()
+
+    def _look(self) -> None:
+        # Whose transport is full is cut by the pings.
+        waits = self._under_way is not None and self.outbox.paused_since is None
+        if waits and self._shared.clock.seconds() - self._sent_at >= STALL_SECONDS:
+            self.close(closing.TOO_SLOW, f"no 'took' for {STALL_SECONDS:g} s")
+
+    def _overflow(self) -> None:
+        self.close(closing.TOO_SLOW, "too much waits for you")
+
+
+class VideoProtocol(ClientProtocol):
+    """The websocket of one viewer."""
+
+    factory: VideoFactory
+    _wanted: Asked
+
+    def connectionMade(self) -> None:
+        """The site has handed over a connection that asked to become a websocket."""
+        narrow(self.transport)
+        super().connectionMade()
+
+    def _asked_for(self, request: ConnectionRequest) -> str:
+        # Autobahn's own look at the parameters leaves those without a value out.
+        self._wanted = asked(self.http_request_uri.partition("?")[2], "ws")
+        path = request.path.removeprefix("/robots/").removesuffix("/video/ws")
+        return unquote(path)
+
+    async def _admit(self, principal: Principal) -> Admission:
+        admission = await super()._admit(principal)
+        try:
+            check_view(admission.permit, self._wanted.camera)
+        except SwitchboardError:
+            self.factory.gate.turn_away(admission)
+            raise
+        return admission
+
+    def _occupant(self, admission: Admission) -> VideoClient:
+        return VideoClient(self.factory, self, admission, self._wanted, self._opened_ns)
+
+
+class VideoFactory(ClientFactory):
+    """Builds a :class:`VideoProtocol` for each websocket.
+
+    :param rounds: what is looked at now and then, of all viewers
+    """
+
+    protocol = VideoProtocol
+    gate: VideoGate
+
+    def __init__(
+        self, clock: Clock, clock_ns: Callable[[], int], gate: VideoGate, cap: AddressCap, rounds: Rounds
+    ) -> None:
+        super().__init__(clock, clock_ns, gate, cap)
+        self.rounds = rounds
+        self.frames = Made(framed)

@@ -1,0 +1,125 @@
+"""What all viewers have in common: which picture is next, what it is made into, how much of it the kernel may hold.
+
+The newest picture counts. Each viewer has one under way; whatever comes meanwhile waits here, where it can still be
+replaced, and not in the kernel, where it would only grow old.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import socket
+import struct
+import sys
+import termios
+from collections.abc import Callable
+from typing import Any
+
+from relay_protocol.limits import KIB, MIB
+from relay_server.video import STALE_SECONDS, Picture
+
+STALL_SECONDS = 5.0
+"""A viewer that takes nothing for so long is cut."""
+
+LOOK_SECONDS = 1.0
+"""How often that is looked at."""
+
+WAITING_BYTES = MIB
+"""Pictures of H.264 need those before them, so that several wait; more than this and it begins anew."""
+
+SOCKET_BYTES = 256 * KIB
+UNSENT_BYTES = 16 * KIB
+"""What the kernel holds for a viewer: all of it, and what has not gone over the network yet."""
+
+# Python 3.11 knows the name only where its C library did.
+_TCP_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", 25 if sys.platform == "linux" else None)
+
+
+class Waiting:
+    """The pictures that wait for a viewer's turn: the newest, or of H.264 all since the last that stands alone.
+
+    :param seconds: a monotonic clock, the one pictures are dated by
+    :param start_anew: called when a picture of H.264 is left out, without which the following are no use
+    """
+
+    __slots__ = ("_bytes", "_pictures", "_seconds", "_start_anew")
+
+    def __init__(self, seconds: Callable[[], float], start_anew: Callable[[], None] = lambda: None) -> None:
+        self._seconds = seconds
+        self._start_anew = start_anew
+        self._pictures: list[Picture] = []
+        self._bytes = 0
+
+    def put(self, picture: Picture) -> None:
+        """A new picture, which takes the place of all that it does not need."""
+        if picture.key:
+            self._pictures.clear()
+            self._bytes = 0
+        self._pictures.append(picture)
+        self._bytes += len(picture.body)
+        if self._bytes > WAITING_BYTES and len(self._pictures) > 1:
+            self._leave_out()
+
+    def take(self) -> list[Picture]:
+        """What goes to the viewer now; nothing when it is too old."""
+        if self._pictures and self._seconds() - self._pictures[0].arrived > STALE_SECONDS:
+            self._leave_out()
+        pictures, self._pictures, self._bytes = self._pictures, [], 0
+        return pictures
+
+    def _leave_out(self) -> None:
+        self._pictures.clear()
+        self._bytes = 0
+        self._start_anew()
+
+
+class Made:
+    """What was made of a picture last: all viewers that are ready get it at the same time, and the same bytes."""
+
+    def __init__(self, make: Callable[[Picture, float], bytes]) -> None:
+        self._make = make
+        self._of: tuple[Picture, float] | None = None
+        self._bytes = b""
+
+    def of(self, picture: Picture, reduced: float = 0.0) -> bytes:
+        """The bytes for a picture.
+
+        :param reduced: how far it is below what was asked for
+        """
+        if self._of is None or self._of[0] is not picture or self._of[1] != reduced:
+            self._bytes = self._make(picture, reduced)
+            self._of = (picture, reduced)
+        return self._bytes
+
+
+def narrow(transport: Any) -> Any:
+    """Keep what waits for a viewer out of the kernel; returns the TCP connection under a transport, if there is one."""
+    tcp = _tcp_of(transport)
+    if tcp is not None:
+        handle = tcp.getHandle()
+        handle.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
+        handle.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        if _TCP_NOTSENT_LOWAT is not None:
+            handle.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, UNSENT_BYTES)
+    return tcp
+
+
+def unsent(tcp: Any) -> int:
+    """Bytes the peer has not acknowledged: Twisted's, which are only read here, and the kernel's."""
+    left = int(tcp._tempDataLen + len(tcp.dataBuffer) - tcp.offset)
+    try:
+        # On Linux what is not acknowledged (tcp(7), SIOCOUTQ), elsewhere what is not sent.
+        answer = fcntl.ioctl(tcp.fileno(), termios.TIOCOUTQ, bytes(4))
+    except (OSError, ValueError):
+        # Closed meanwhile.
+        return left
+    return left + int(struct.unpack("i", answer)[0])
+
+
+def _tcp_of(transport: Any) -> Any:
+    """The connection itself, through TLS; ``None`` in memory."""
+    while transport is not None:
+        handle = getattr(transport, "getHandle", lambda: None)()
+        if isinstance(handle, socket.socket):
+            return transport
+        transport = getattr(transport, "transport", None)
+    return None

@@ -1,0 +1,151 @@
+"""One viewer of one camera, from the desk that let him in until he leaves; and cameras as one may see them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+from relay_protocol import link
+from relay_protocol.errors import NotFound, Refused, SwitchboardError
+from relay_protocol.rights import Operation
+from relay_server.access import BadCredentials, Permit
+from relay_server.registry import Presence
+from relay_server.video import Picture, Stream, Videos
+
+NO_CAMERA = "there is no such camera, or you have no right to view it"
+
+
+class Screen(Protocol):
+    """What a viewer looks at: an answer over HTTP, a websocket."""
+
+    def picture(self, picture: Picture) -> None:
+        """There is a new picture."""
+
+    def playing(self, playing: link.Playing) -> None:
+        """What the robot sends from now on."""
+
+    def ended(self, error: SwitchboardError) -> None:
+        """There is nothing to see, or no more. Called once, and not after :meth:`Watching.leave`."""
+
+
+def check_view(permit: Permit, camera: str) -> None:
+    """Whether this may be seen.
+
+    :raises NotFound: no right to; said like that there is no such camera
+    """
+    if not permit.judge(Operation.VIEW, camera).allowed:
+        raise NotFound(NO_CAMERA)
+
+
+class Watching:
+    """A viewer, as a stream has him. His right is judged again whenever rights change.
+
+    :param permit: kept till the end, then given to ``over`` with all the rest
+    :param over: called once, when nothing is watched any more
+    """
+
+    def __init__(
+        self,
+        permit: Permit,
+        robot: Presence,
+        camera: str,
+        screen: Screen,
+        *,
+        address: str,
+        over: Callable[[Watching], None],
+    ) -> None:
+        self.permit = permit
+        self.robot = robot
+        self.camera = camera
+        self.address = address
+        self.pictures = 0
+        """How many there were for this viewer."""
+        self._screen = screen
+        self._over = over
+        self._stream: Stream | None = None
+        permit.on_change = self._rights_changed
+        permit.on_revoke = self._revoked
+
+    @property
+    def user(self) -> int:
+        """Whose it is."""
+        return self.permit.principal.user_id
+
+    def begin(self, videos: Videos, settings: link.VideoSettings) -> None:
+        """Watch.
+
+        :raises Unavailable: too many do
+        """
+        self._stream = videos.watch(self.robot, self.camera, settings, self)
+
+    def start_anew(self) -> None:
+        """A picture of H.264 was left out: show nothing before the next one that stands alone."""
+        if self._stream is not None:
+            self._stream.start_anew(self)
+
+    def leave(self) -> None:
+        """The viewer wants no more; a second time does nothing."""
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.detach(self)
+            self._over(self)
+
+    def end(self, error: SwitchboardError) -> None:
+        """There is no more for him to see, and he is told why."""
+        if self._stream is not None:
+            self.leave()
+            self._screen.ended(error)
+
+    # --- Viewer -------------------------------------------------------------------------------------------
+
+    def picture(self, picture: Picture) -> None:
+        """From the stream."""
+        self.pictures += 1
+        self._screen.picture(picture)
+
+    def playing(self, playing: link.Playing) -> None:
+        """From the stream."""
+        self._screen.playing(playing)
+
+    def moved(self, stream: Stream) -> None:
+        """To another stream."""
+        self._stream = stream
+
+    def ended(self, error: SwitchboardError) -> None:
+        """Detached by the stream."""
+        self.end(error)
+
+    # --- rights -------------------------------------------------------------------------------------------
+
+    def _rights_changed(self) -> None:
+        if not self.permit.judge(Operation.VIEW, self.camera).allowed:
+            self.end(Refused(f"your right to view {self.camera} was revoked"))
+
+    def _revoked(self, reason: str) -> None:
+        self.end(Refused(reason) if "right" in reason else BadCredentials(reason))
+
+
+def view(camera: link.Camera, streams: Iterable[Stream]) -> dict[str, Any]:
+    """A camera as users see it (SPEC section 1.8)."""
+    return {
+        "name": camera.name,
+        "type": camera.type,
+        "encoding": camera.encoding or None,
+        "width": camera.width or None,
+        "height": camera.height or None,
+        "fps": camera.fps or None,
+        "streams": [_shown(stream) for stream in streams if stream.camera == camera.name],
+    }
+
+
+def _shown(stream: Stream) -> dict[str, Any]:
+    return {
+        "viewers": len(stream.viewers),
+        "state": stream.state.name.lower(),
+        "settings": _fields(stream.settings),
+        "playing": None if stream.told is None else _fields(stream.told),
+    }
+
+
+def _fields(said: link.VideoSettings | link.Playing) -> dict[str, Any]:
+    return {name: getattr(said, name) for name in said.__struct_fields__}

@@ -1,0 +1,18 @@
+"""A relay's site on a real port."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest_twisted
+
+from relay_server.store import Store
+from tests.relay_server.edges.video.show import Show
+
+
+@pytest_twisted.async_yield_fixture
+async def show(store: Store) -> AsyncIterator[Show]:
+    """A robot that is known and offline, and ann who may view it."""
+    made = Show(store)
+    yield made
+    await made.end()

@@ -1,0 +1,310 @@
+"""A relay's site on a real port, with the real desk and hub behind it; the robot's end is the test's."""
+
+from __future__ import annotations
+
+import email.parser
+import itertools
+import json
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from autobahn.twisted.resource import WebSocketResource
+from twisted.internet import reactor, task
+from twisted.internet.task import LoopingCall
+from twisted.internet.threads import deferToThread
+
+from relay_db import queries
+from relay_protocol import link
+from relay_protocol.frames import VideoFrame
+from relay_server import passwords
+from relay_server.access import Access
+from relay_server.auth import Authenticator
+from relay_server.channel import Channels
+from relay_server.edges.caps import AddressCap
+from relay_server.edges.site import Missing, RelaySite, Robots, Root
+from relay_server.edges.video import Video, VideoFactory
+from relay_server.edges.websocket import ClientFactory
+from relay_server.frontdesk import FrontDesk
+from relay_server.journal import Journal
+from relay_server.origins import Origins
+from relay_server.registry import Presence, Registry
+from relay_server.rounds import Rounds
+from relay_server.session import Timing
+from relay_server.store import Store
+from relay_server.video import Stream, Videos
+from tests.relay_server.edges.http_client import api_of
+from tests.relay_server.memory import MemoryLink
+
+HOST = "127.0.0.1:9090"
+CAMERA = "/camera/image"
+SECRET = "/secret/image"
+STREAM = f"/robots/rover/video/stream?topic={CAMERA}"
+SNAPSHOT = f"/robots/rover/video/snapshot?topic={CAMERA}"
+CAMERAS = "/robots/rover/video/cameras"
+
+
+def png() -> bytes:
+    """The same as PNG."""
+    return cv2.imencode(".png", np.zeros((24, 32, 3), np.uint8))[1].tobytes()
+
+
+def jpeg(size: int = 0) -> bytes:
+    """A black picture of 32×24, made at least so many bytes long by comments."""
+    picture = cv2.imencode(".jpg", np.zeros((24, 32, 3), np.uint8))[1].tobytes()
+    comments = b""
+    while len(picture) + len(comments) < size:
+        comments += b"\xff\xfe\x80\x00" + bytes(0x7FFE)
+    return picture[:2] + comments + picture[2:]
+
+
+class Show:
+    """A robot that shows ``CAMERA`` and has ``SECRET``; ann may view the first of them."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        clock: Any = reactor
+        self.registry = Registry(time.time)
+        self.access = Access(store, time.time)
+        self.auth = Authenticator(clock, store, time.monotonic, time.time)
+        self.videos = Videos(clock, new_ticket=passwords.new_token)
+        channels = Channels(clock, linger=5.0, new_ticket=passwords.new_token, wall_ns=time.time_ns)
+        origins = Origins("http")
+        self.desk = FrontDesk(
+            clock,
+            store,
+            self.auth,
+            self.access,
+            self.registry,
+            channels,
+            self.videos,
+            Journal(store, time.time),
+            origins,
+            Timing(2.0, 0.1, 5.0),
+            cookie="sb",
+            clock_ns=time.monotonic_ns,
+            wall=time.time,
+        )
+        api = api_of(clock, self.desk, origins)
+        cap, rounds = AddressCap(100), Rounds(clock)
+        websocket = WebSocketResource(ClientFactory(clock, time.monotonic_ns, self.desk, cap))
+        pictures = WebSocketResource(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds))
+        video = Video(clock, rounds, self.desk, api.principal, pictures)
+        root = Root(Robots(websocket, video, "1.2.3"), api.app.resource(), Missing())
+        self._port = clock.listenTCP(0, RelaySite(root, clock, cap, False), interface="127.0.0.1")
+        self.port: int = self._port.getHost().port
+        self.numbers = itertools.count(1)
+        self._filming: list[LoopingCall] = []
+        self._people()
+
+    def _people(self) -> None:
+        with self.store.database.begin() as session:
+            self.ann = queries.add_user(session, "ann", None)
+            self.rover = queries.add_robot(session, "rover")
+            queries.add_robot(session, "hidden")
+            queries.grant_right(
+                session, self.rover.id, "viewer", user_id=self.ann.id, deny=[f"view:{SECRET}"]
+            )
+            queries.create_token(
+                session,
+                self.ann.id,
+                passwords.token_hash("ann's"),
+                kind="session",
+                label="",
+                expires=time.time() + 3600,
+                now=time.time(),
+            )
+
+    async def end(self) -> None:
+        """Nothing goes on any more."""
+        for each in self._filming:
+            each.stop()
+        self.desk.say_goodbye("the test is over")
+        self.videos.shut()
+        await self._port.stopListening()
+
+    # --- the robot ----------------------------------------------------------------------------------------
+
+    @property
+    def robot(self) -> Presence:
+        """The robot as the relay sees it."""
+        return self.registry.presence(self.rover.id, "rover", self.rover.realm)
+
+    def robot_comes(self) -> MemoryLink:
+        """It registers and tells of its cameras."""
+        control = MemoryLink()
+        self.registry.registered(self.robot, control)
+        cameras = [link.Camera(name=CAMERA, width=32, height=24), link.Camera(name=SECRET)]
+        self.registry.cameras(self.robot, link.Cameras(cameras=cameras))
+        return control
+
+    async def joined(self, control: MemoryLink) -> Stream:
+        """The stream the robot was asked for, once it has joined it."""
+        (asked,) = await until(lambda: control.take(link.OpenVideo))
+        stream = self.videos.redeem(asked.ticket)
+        assert stream is not None
+        stream.joined(MemoryLink())
+        stream.message(link.Playing(width=32, height=24, quality=80))
+        return stream
+
+    def shows(self, stream: Stream, body: bytes, stamp: float = 1000.5) -> int:
+        """One picture; its number."""
+        number = next(self.numbers)
+        stream.picture(VideoFrame(number=number, stamp=round(stamp * 1e9), body=body))
+        return number
+
+    def films(self, stream: Stream, body: bytes, fps: float = 20.0) -> None:
+        """Pictures from now on, stamped with the monotonic clock."""
+        filming = LoopingCall(lambda: self.shows(stream, body, time.monotonic()))
+        filming.start(1 / fps)
+        self._filming.append(filming)
+
+    async def deny(self, *cameras: str) -> None:
+        """From now on ann may not view these."""
+        patterns = [f"view:{camera}" for camera in (SECRET, *cameras)]
+        await self.store.write(
+            queries.grant_right, self.rover.id, "viewer", user_id=self.ann.id, deny=patterns
+        )
+        await self.access.refresh()
+
+    # --- people -------------------------------------------------------------------------------------------
+
+    def looks(self, *arguments: Any, **headers: str) -> Looker:
+        """Somebody who asks for something by HTTP."""
+        return Looker(self.port, *arguments, **headers)
+
+    async def events(self, kind: str) -> list[Any]:
+        """What was recorded of a kind, once what is being written is written."""
+        await self.store.write(queries.revision)
+        return [each for each in await self.store.read(queries.list_events) if each.kind == kind]
+
+
+async def until(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
+    """What ``condition`` gives once it is true."""
+    end = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < end, "it has not happened in time"
+        await task.deferLater(reactor, 0.01)  # type: ignore[arg-type]
+    return found
+
+
+class Looker:
+    """A client of its own making, on a real socket; what takes time it does in a thread.
+
+    :param window: bytes its kernel takes without being asked, 0 for what is usual
+    """
+
+    def __init__(self, port: int, path: str, method: str = "GET", window: int = 0, **headers: str) -> None:
+        self.socket = socket.socket()
+        if window:
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window)
+            # On loopback a segment has 64 KiB, and no less is ever asked for.
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 1400)
+        self.socket.settimeout(15)
+        self.socket.connect(("127.0.0.1", port))
+        self._data = b""
+        self.asks(path, method, **headers)
+
+    def asks(self, path: str, method: str = "GET", **headers: str) -> None:
+        """One request, with ann's token unless another ``Authorization`` (or none, ``""``) is given."""
+        lines = {"Host": HOST, "Authorization": "Bearer ann's"}
+        lines |= {name.replace("_", "-"): value for name, value in headers.items()}
+        head = "".join(f"{name}: {value}\r\n" for name, value in lines.items() if value)
+        self.socket.sendall(f"{method} {path} HTTP/1.1\r\n{head}\r\n".encode())
+
+    async def head(self) -> tuple[int, Any]:
+        """Status and headers of the answer."""
+        return await deferToThread(self._head)
+
+    async def answer(self) -> tuple[int, Any, bytes]:
+        """Status, headers and the whole body."""
+        status, headers = await self.head()
+        body = await deferToThread(self._take, int(headers.get("content-length", 0)))
+        return status, headers, body
+
+    async def problem(self) -> tuple[int, str]:
+        """Status and words of an error."""
+        status, headers, body = await self.answer()
+        assert headers["content-type"] == "application/problem+json"
+        return status, json.loads(body)["detail"]
+
+    async def part(self) -> tuple[Any, bytes]:
+        """The next part of a stream: its headers, and its body by its length."""
+        return await deferToThread(self._part)
+
+    async def parts(self, seconds: float) -> list[float]:
+        """Read the head, and parts for so long: how old each was when it was here, seconds."""
+        return await deferToThread(self._parts, seconds)
+
+    async def slowly(self, rate: float, seconds: float) -> bytes:
+        """Read so many bytes a second for so long."""
+        return await deferToThread(self._slowly, rate, seconds)
+
+    async def closed(self, seconds: float = 10.0) -> float:
+        """Read to the end; the time it took, seconds."""
+        return await deferToThread(self._closed, seconds)
+
+    def leave(self) -> None:
+        """Hang up."""
+        self.socket.close()
+
+    def _head(self) -> tuple[int, Any]:
+        first, _, rest = self._until(b"\r\n\r\n").partition(b"\r\n")
+        return int(first.split()[1]), email.parser.BytesParser().parsebytes(rest)
+
+    def _part(self) -> tuple[Any, bytes]:
+        if not self._data.startswith(b"--boundarydonotcross\r\n"):
+            assert self._until(b"--boundarydonotcross\r\n").strip() == b""
+        else:
+            self._data = self._data.partition(b"\r\n")[2]
+        headers = email.parser.BytesParser().parsebytes(self._until(b"\r\n\r\n"))
+        return headers, self._take(int(headers["content-length"]))
+
+    def _parts(self, seconds: float) -> list[float]:
+        self._head()
+        end = time.monotonic() + seconds
+        ages = []
+        while time.monotonic() < end:
+            headers, _ = self._part()
+            ages.append(time.monotonic() - float(headers["x-timestamp"]))
+        return ages
+
+    def _slowly(self, rate: float, seconds: float) -> bytes:
+        began = time.monotonic()
+        data, self._data = self._data, b""
+        while (gone := time.monotonic() - began) < seconds:
+            if len(data) < rate * gone:
+                data += self.socket.recv(min(2048, int(rate * gone) - len(data) + 1))
+            else:
+                time.sleep(0.01)  # That is what slow means.
+        return data
+
+    def _closed(self, seconds: float) -> float:
+        began = time.monotonic()
+        self.socket.settimeout(seconds)
+        try:
+            while self.socket.recv(65536):
+                pass
+        except ConnectionResetError:
+            pass
+        return time.monotonic() - began
+
+    def _until(self, mark: bytes) -> bytes:
+        while mark not in self._data:
+            self._more()
+        found, _, self._data = self._data.partition(mark)
+        return found
+
+    def _take(self, count: int) -> bytes:
+        while len(self._data) < count:
+            self._more()
+        found, self._data = self._data[:count], self._data[count:]
+        return found
+
+    def _more(self) -> None:
+        data = self.socket.recv(65536)
+        assert data, f"the connection ended after {self._data!r}"
+        self._data += data

@@ -1,0 +1,175 @@
+"""The MJPEG stream on real sockets."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet.defer import DeferredList, ensureDeferred
+
+from relay_protocol import limits, link
+from relay_server.edges import site
+from relay_server.edges.video import multipart
+from relay_server.video import stream as streams
+from tests.relay_server.edges.video.show import CAMERA, STREAM, Show, jpeg, until
+
+
+async def together(*work: Any) -> list[Any]:
+    """What becomes of several at the same time."""
+    found = await DeferredList([ensureDeferred(each) for each in work], fireOnOneErrback=True)
+    return [result for _, result in found]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stream_is_a_jpeg_a_part_as_any_parser_of_mime_reads_it(show: Show) -> None:
+    """With its length, the time at the robot, and how far it is reduced; the head forbids keeping and sniffing."""
+    control = show.robot_comes()
+    looker = show.looks(STREAM)
+    stream = await show.joined(control)
+    show.shows(stream, jpeg())
+    status, headers = await looker.head()
+    assert status == 200
+    assert headers.get_content_type() == "multipart/x-mixed-replace"
+    assert headers.get_boundary() == "boundarydonotcross"
+    assert headers["cache-control"] == "no-store"
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["cross-origin-resource-policy"] == "same-origin"
+    assert headers["connection"] == "close"
+    assert headers["transfer-encoding"] is None
+    part, body = await looker.part()
+    assert body == jpeg()
+    assert part.get_content_type() == "image/jpeg"
+    assert float(part["x-timestamp"]) == 1000.5
+    assert part["x-reduced"] is None
+    stream.message(link.Playing(width=16, height=12, quality=40, reduced=0.25))
+    show.shows(stream, jpeg(100_000))
+    part, body = await looker.part()
+    assert (body, float(part["x-reduced"])) == (jpeg(100_000), 0.25)
+    looker.leave()
+    await until(lambda: not stream.viewers)
+
+
+@pytest_twisted.ensureDeferred
+async def test_viewers_who_stop_or_crawl_cost_the_fast_ones_nothing(show: Show) -> None:
+    """Who takes nothing is cut after 5 s; who takes 20 KB/s stays, and what he sees is not old."""
+    control = show.robot_comes()
+    fast = [show.looks(STREAM) for _ in range(5)]
+    stalled = show.looks(STREAM, window=4096)
+    slow = show.looks(STREAM, window=4096)
+    stream = await show.joined(control)
+    await until(lambda: len(stream.viewers) == 7)
+    began = time.monotonic()
+    show.films(stream, jpeg(20_000))
+    *ages, data = await together(*[each.parts(8.0) for each in fast], slow.slowly(20_000, 8.0))
+    ended = time.monotonic()
+    for each in ages:
+        assert len(each) > 8 * 20 * 0.9
+        assert sorted(each)[len(each) // 2] < 0.05
+    assert len(stream.viewers) == 6
+    assert ended - began > 5
+    *_, last = [line for line in data.split(b"\r\n") if line.startswith(b"X-Timestamp: ")]
+    assert ended - float(last.split()[1]) < 4.0
+    for each in (*fast, slow, stalled):
+        each.leave()
+    await until(lambda: not stream.viewers)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stalled_viewer_costs_one_picture_and_is_cut_in_time(
+    show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At most 4 MiB, whatever else is shown; what it does not read is let go at once."""
+    connections: list[Any] = []
+
+    def narrow(transport: Any) -> Any:
+        connections.append(transport)
+        return real(transport)
+
+    real = multipart.narrow
+    monkeypatch.setattr(multipart, "narrow", narrow)
+    control = show.robot_comes()
+    looker = show.looks(STREAM, window=4096)
+    stream = await show.joined(control)
+    began = time.monotonic()
+    show.films(stream, jpeg(3_900_000), fps=5)
+    await until(lambda: connections)
+    most = 0
+
+    def cut() -> bool:
+        nonlocal most
+        most = max(most, len(connections[0].dataBuffer) + connections[0]._tempDataLen)
+        return not stream.viewers
+
+    await until(cut)
+    assert 3_000_000 < most < 4 * limits.MIB
+    assert 5.0 <= time.monotonic() - began < 7.5
+    assert await looker.closed() < 1
+    assert await show.events("video.left")
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_revoked_right_ends_a_stream_that_runs(show: Show) -> None:
+    """At once when the relay has heard of it; the other way, a pattern that denies it, as well."""
+    control = show.robot_comes()
+    lookers = [show.looks(STREAM), show.looks(STREAM)]
+    stream = await show.joined(control)
+    show.films(stream, jpeg())
+    await until(lambda: len(stream.viewers) == 2)
+    for looker in lookers:
+        assert (await looker.head())[0] == 200
+    await show.deny(CAMERA)
+    assert not stream.viewers
+    for looker in lookers:
+        assert await looker.closed() < 1
+    kinds = [each.data["camera"] for each in await show.events("video.joined")]
+    assert kinds == [CAMERA, CAMERA]
+    assert len(await show.events("video.left")) == 2
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stream_outlives_the_deadlines_of_requests(
+    show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are for what comes from clients."""
+    monkeypatch.setattr(limits, "UNPROVEN_SECONDS", 0.2)
+    monkeypatch.setattr(site, "IDLE_SECONDS", 0.2)
+    control = show.robot_comes()
+    looker = show.looks(STREAM)
+    stream = await show.joined(control)
+    show.films(stream, jpeg())
+    assert len(await looker.parts(1.0)) > 10
+    looker.leave()
+
+
+@pytest.mark.parametrize("online", [False, True])
+@pytest_twisted.ensureDeferred
+async def test_where_nothing_comes_the_answer_says_why(
+    show: Show, monkeypatch: pytest.MonkeyPatch, online: bool
+) -> None:
+    """503 when the robot is not there, 504 when it is; the connection serves the next request."""
+    monkeypatch.setattr(streams, "FIRST_PICTURE_SECONDS", 0.2)
+    if online:
+        show.robot_comes()
+    looker = show.looks(STREAM)
+    status, detail = await looker.problem()
+    assert (status, "offline" in detail) == ((504, False) if online else (503, True))
+    looker.asks("/healthz")
+    assert (await looker.answer())[0] == 200
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_busy_robot_is_503_in_its_words(show: Show) -> None:
+    """Before the first picture; after it the connection ends."""
+    control = show.robot_comes()
+    looker = show.looks(STREAM)
+    stream = await show.joined(control)
+    stream.message(link.NotPlaying(reason="I have eyes for four", busy=True))
+    assert await looker.problem() == (503, "I have eyes for four")
+    looker = show.looks(STREAM)
+    stream = await show.joined(control)
+    show.shows(stream, jpeg())
+    assert (await looker.head())[0] == 200
+    stream.message(link.NotPlaying(reason="no more"))
+    assert await looker.closed() < 1

@@ -1,0 +1,87 @@
+"""What a viewer may ask for, in the words of web_video_server."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from relay_protocol import link
+from relay_protocol.errors import Invalid
+from relay_server.edges.video.parameters import Asked, Kind, asked
+
+
+def settings(query: str, kind: Kind = "stream") -> link.VideoSettings:
+    """How it is wanted."""
+    return asked(f"topic=/a&{query}", kind).settings
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("", {}),
+        ("width=320&height=240&quality=35", {"width": 320, "height": 240, "quality": 35}),
+        ("fps=12.5", {"fps": 12.5}),
+        ("crop=10,20,300,200&rotate=270", {"crop": (10, 20, 300, 200), "rotate": 270}),
+        ("invert&stamp", {"invert": True, "stamp": True}),
+        ("invert=true&stamp=false", {"invert": True}),
+        ("type=mjpeg", {}),
+        ("type=ros_compressed", {"transport": "compressed"}),
+        ("qos_profile=sensor_data&default_transport=raw", {"qos": "sensor_data", "transport": "raw"}),
+        ("qos_profile=system_default", {}),
+        ("codec=jpeg&ticket=xyz&bitrate=100000", {}),
+    ],
+)
+def test_the_parameters_of_web_video_server_are_understood(query: str, expected: dict[str, Any]) -> None:
+    """What it has and we don't is passed over."""
+    assert settings(query) == link.VideoSettings(**expected)
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("width=-1", "'width' is a whole number from 0 to 8192"),
+        ("height=8193", "from 0 to 8192"),
+        ("height=٣", "whole number"),
+        ("quality=0", "'quality' is a whole number from 1 to 100"),
+        ("fps=nan", "'fps' is a number from 0 to 1000"),
+        ("fps=1001", "from 0 to 1000"),
+        ("crop=1,2,3", "'crop' is x,y,width,height"),
+        ("crop=1,2,0,3", "width or height of 0"),
+        ("crop=1,2,3,99999", "up to 8192"),
+        ("rotate=45", "'rotate' is one of '0', '90', '180', '270'"),
+        ("invert=maybe", "'invert' is one of 'true', '1', 'false', '0', or empty"),
+        ("type=vp8", "'type' is one of 'mjpeg', 'ros_compressed'"),
+        ("type=png", "'type' is one of 'mjpeg', 'ros_compressed'"),
+        ("codec=h264", "'codec' is one of 'jpeg'"),
+        ("qos_profile=best", "'default', 'sensor_data', 'system_default', or empty"),
+        ("default_transport=theora", "'raw', 'compressed'"),
+        ("type=ros_compressed&default_transport=raw", "contradict"),
+        ("quality=5&quality=6", "'quality' is there 2 times"),
+        ("x=%ff", "not UTF-8"),
+        ("x&" * 65, "more than 64 parameters"),
+    ],
+)
+def test_what_makes_no_sense_is_an_error_that_says_what_may_be(query: str, words: str) -> None:
+    """In words for the one who asked."""
+    with pytest.raises(Invalid) as failed:
+        settings(query)
+    assert words in str(failed.value)
+
+
+@pytest.mark.parametrize("topic", ["", "topic=", "topic=/", "topic=/%0a", "topic=/" + "x" * 255])
+def test_a_camera_has_to_be_named(topic: str) -> None:
+    """By a name such as a topic has."""
+    with pytest.raises(Invalid, match="topic"):
+        asked(topic, "stream")
+
+
+def test_a_name_without_slash_is_taken_as_if_it_had_one() -> None:
+    """As everywhere."""
+    assert asked("topic=camera/image%20raw", "stream") == Asked("/camera/image raw", link.VideoSettings())
+
+
+def test_not_everything_can_be_had_everywhere() -> None:
+    """PNG are single pictures, H.264 needs a viewer that can read it."""
+    assert settings("type=png", "snapshot").codec == "png"
+    assert settings("codec=h264", "ws").codec == "h264"

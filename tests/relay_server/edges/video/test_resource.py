@@ -1,0 +1,198 @@
+"""Video over HTTP: who may see what, cameras, snapshots, and what is no question."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import pytest_twisted
+
+from relay_protocol import link
+from tests.relay_server.edges.video.show import (
+    CAMERA,
+    CAMERAS,
+    SECRET,
+    SNAPSHOT,
+    STREAM,
+    Show,
+    jpeg,
+    png,
+    until,
+)
+
+COOKIE = {"Authorization": "", "Cookie": "sb=ann's"}
+
+
+async def ticket(show: Show, robot: str = "rover") -> str:
+    """A ticket of ann's."""
+    return await show.desk.issue_ticket(await show.desk.token("ann's"), robot)
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Authorization": "Bearer ann's"}, 200),
+        ({"Authorization": "Bearer nobody's"}, 401),
+        ({"Authorization": ""}, 401),
+        (COOKIE, 200),
+        (COOKIE | {"Sec-Fetch-Site": "same-origin"}, 200),
+        (COOKIE | {"Sec-Fetch-Site": "none"}, 200),
+        (COOKIE | {"Sec-Fetch-Site": "cross-site"}, 403),
+        (COOKIE | {"Sec-Fetch-Site": "same-site"}, 403),
+        (COOKIE | {"Authorization": "Basic eDp5", "Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Authorization": "Bearer ann's", "Sec-Fetch-Site": "cross-site"}, 200),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_a_cookie_needs_no_origin_but_serves_no_other_site(
+    show: Show, headers: dict[str, str], status: int
+) -> None:
+    """An ``<img>`` sends no Origin; browsers say which pages it is on."""
+    answer, heads, body = await show.looks(CAMERAS, **headers).answer()
+    assert answer == status
+    assert (heads["www-authenticate"] == "Bearer") is (status == 401)
+    assert "cameras" in json.loads(body) or json.loads(body)["status"] == status
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_ticket_shows_one_stream_of_its_robot(show: Show) -> None:
+    """Once; then it is worth nothing, and for another robot never was anything."""
+    control = show.robot_comes()
+    for_img = await ticket(show)
+    looker = show.looks(f"{STREAM}&ticket={for_img}", Authorization="", Sec_Fetch_Site="cross-site")
+    stream = await show.joined(control)
+    show.shows(stream, jpeg())
+    assert (await looker.head())[0] == 200
+    again = show.looks(f"{STREAM}&ticket={for_img}", Authorization="")
+    assert (await again.problem())[0] == 401
+    other = show.looks(STREAM.replace("rover", "tank") + f"&ticket={await ticket(show)}", Authorization="")
+    assert (await other.problem())[0] == 401
+    looker.leave()
+
+
+@pytest_twisted.ensureDeferred
+async def test_cameras_are_those_one_may_view(show: Show) -> None:
+    """With how they are shown now; what is not known is null."""
+    control = show.robot_comes()
+    looker = show.looks(STREAM + "&width=16")
+    stream = await show.joined(control)
+    show.shows(stream, jpeg())
+    assert (await looker.head())[0] == 200
+    _, headers, body = await show.looks(CAMERAS).answer()
+    assert headers["content-type"] == "application/json"
+    (camera,) = json.loads(body)["cameras"]
+    (shown,) = camera.pop("streams")
+    assert camera == {
+        "name": CAMERA,
+        "type": "",
+        "encoding": None,
+        "width": 32,
+        "height": 24,
+        "fps": None,
+    }
+    assert (shown["viewers"], shown["state"]) == (1, "open")
+    assert (shown["settings"]["width"], shown["playing"]["quality"]) == (16, 80)
+    looker.leave()
+
+
+@pytest.mark.parametrize("topic", [SECRET, "/no/such"])
+@pytest_twisted.ensureDeferred
+async def test_a_camera_one_may_not_view_is_like_none(show: Show, topic: str) -> None:
+    """Whether somebody asks for a stream or a snapshot, with GET or HEAD."""
+    show.robot_comes()
+    await show.deny("/no/*")
+    for what in ("stream", "snapshot"):
+        path = f"/robots/rover/video/{what}?topic={topic}"
+        words = "there is no such camera, or you have no right to view it"
+        assert await show.looks(path).problem() == (404, words)
+        assert (await show.looks(path, "HEAD").head())[0] == 404
+
+
+@pytest.mark.parametrize("robot", ["tank", "hidden"])
+@pytest_twisted.ensureDeferred
+async def test_a_robot_without_rights_is_like_none(show: Show, robot: str) -> None:
+    """On every address."""
+    for path in (STREAM, SNAPSHOT, CAMERAS):
+        status, detail = await show.looks(path.replace("rover", robot)).problem()
+        assert (status, detail) == (404, "there is no such robot, or you have no right on it")
+
+
+@pytest.mark.parametrize(("query", "codec"), [("", "jpeg"), ("&type=png", "png")])
+@pytest_twisted.ensureDeferred
+async def test_a_snapshot_is_the_first_picture_that_comes(show: Show, query: str, codec: str) -> None:
+    """Not to be kept; the connection serves the next request."""
+    body = {"jpeg": jpeg(), "png": png()}[codec]
+    control = show.robot_comes()
+    looker = show.looks(SNAPSHOT + query)
+    stream = await show.joined(control)
+    assert stream.settings == link.VideoSettings(codec=codec)  # type: ignore[arg-type]
+    stream.message(link.Playing(width=16, height=12, quality=40, reduced=0.5))
+    show.shows(stream, body)
+    status, headers, got = await looker.answer()
+    assert (status, got) == (200, body)
+    assert headers["content-type"] == f"image/{codec}"
+    assert headers["cache-control"] == "no-store"
+    assert (float(headers["x-timestamp"]), float(headers["x-reduced"])) == (1000.5, 0.5)
+    assert not stream.viewers
+    looker.asks(CAMERAS)
+    assert (await looker.answer())[0] == 200
+
+
+@pytest.mark.parametrize(("path", "kind"), [(STREAM, "multipart/x-mixed-replace"), (SNAPSHOT, "image/jpeg")])
+@pytest_twisted.ensureDeferred
+async def test_head_tells_what_there_would_be_without_waking_the_robot(
+    show: Show, path: str, kind: str
+) -> None:
+    """And has no body."""
+    control = show.robot_comes()
+    looker = show.looks(path, "HEAD")
+    status, headers = await looker.head()
+    assert (status, headers.get_content_type()) == (200, kind)
+    looker.asks(CAMERAS)
+    assert (await looker.answer())[0] == 200
+    assert not control.all(link.OpenVideo)
+    assert not show.access._permits
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", STREAM + "&width=wide", 400),
+        ("GET", STREAM + "&type=png", 400),
+        ("GET", SNAPSHOT + "&codec=h264", 400),
+        ("POST", STREAM, 405),
+        ("GET", "/robots/rover/video", 404),
+        ("GET", "/robots/rover/video/", 404),
+        ("GET", "/robots/rover/video/stream/x", 404),
+        ("GET", "/robots/rover/video/ws", 426),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_what_is_no_question_is_answered_in_words(
+    show: Show, method: str, path: str, status: int
+) -> None:
+    """As problem details."""
+    assert (await show.looks(path, method).problem())[0] == status
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_viewer_who_leaves_before_the_first_picture_leaves_nothing(show: Show) -> None:
+    """Neither at the stream nor with the judge."""
+    show.robot_comes()
+    lookers = [show.looks(STREAM), show.looks(SNAPSHOT)]
+    await until(lambda: sum(len(stream.viewers) for stream in show.videos) == 2)
+    for looker in lookers:
+        looker.leave()
+    await until(lambda: not show.access._permits)
+    assert not any(stream.viewers for stream in show.videos)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_relay_that_goes_down_ends_streams_and_takes_no_new_ones(show: Show) -> None:
+    """With 503."""
+    show.robot_comes()
+    looker = show.looks(STREAM)
+    await until(lambda: list(show.videos))
+    show.desk.say_goodbye("the relay is going down")
+    assert await looker.problem() == (503, "the relay is going down")
+    assert (await show.looks(STREAM).problem())[0] == 503

@@ -1,0 +1,245 @@
+"""Pictures over a websocket, on real sockets."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet.threads import deferToThread
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from relay_db import queries
+from relay_protocol import link
+from relay_server import closing
+from relay_server.edges.video import socket as module
+from relay_server.video import Stream
+from tests.relay_server.edges.video.show import CAMERA, SECRET, Show, jpeg, until
+from tests.relay_server.video.watching import DELTA, KEY
+
+
+class Eye:
+    """A viewer's websocket."""
+
+    def __init__(self, end: ClientConnection) -> None:
+        self._end = end
+
+    async def picture(self) -> tuple[dict[str, Any], bytes]:
+        """The next picture."""
+        head = json.loads(await self._next())
+        body = await self._next()
+        assert (head.pop("op"), head.pop("size")) == ("picture", len(body))
+        assert isinstance(body, bytes)
+        return head, body
+
+    async def playing(self) -> dict[str, Any]:
+        """The next message, which says what is sent."""
+        told: dict[str, Any] = json.loads(await self._next())
+        assert told.pop("op") == "playing"
+        return told
+
+    async def _next(self) -> str | bytes:
+        return await deferToThread(self._end.recv, 10)
+
+    async def quiet(self, seconds: float = 0.3) -> bool:
+        """Whether nothing comes for so long."""
+        try:
+            await deferToThread(self._end.recv, seconds)
+        except TimeoutError:
+            return True
+        return False
+
+    async def took(self, number: int) -> None:
+        """Open the way for the next."""
+        await self.says(json.dumps({"op": "took", "number": number}))
+
+    async def says(self, text: str) -> None:
+        """Anything."""
+        await deferToThread(self._end.send, text)
+
+    async def closed(self) -> tuple[int, str]:
+        """Code and reason of the close that follows, whatever comes before."""
+        try:
+            while True:
+                await self._next()
+        except ConnectionClosed as error:
+            assert error.rcvd is not None
+            return error.rcvd.code, error.rcvd.reason
+
+    async def leave(self) -> None:
+        """Close."""
+        await deferToThread(self._end.close)
+
+
+async def opens(show: Show, query: str = "", token: str = "ann's", **options: Any) -> Eye:
+    """A websocket to the camera."""
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    url = f"ws://127.0.0.1:{show.port}/robots/rover/video/ws?topic={CAMERA}{query}"
+    return Eye(await deferToThread(connect, url, additional_headers=headers, close_timeout=2, **options))
+
+
+async def watched(show: Show, query: str = "") -> tuple[Eye, Stream]:
+    """An open websocket and its stream, joined by the robot."""
+    control = show.robot_comes()
+    eye = await opens(show, query)
+    return eye, await show.joined(control)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_picture_is_a_header_and_then_the_bytes(show: Show) -> None:
+    """What is sent from now on is told before, and when it changes."""
+    eye, stream = await watched(show)
+    assert (await eye.playing())["quality"] == 80
+    number = show.shows(stream, jpeg())
+    head, body = await eye.picture()
+    assert head == {
+        "number": number,
+        "stamp": 1000.5,
+        "width": 32,
+        "height": 24,
+        "codec": "jpeg",
+        "key": True,
+    }
+    assert body == jpeg()
+    stream.message(link.Playing(width=16, height=12, quality=40, reduced=0.25, delay_ms=80))
+    told = await eye.playing()
+    assert (told["width"], told["reduced"], told["delay_ms"]) == (16, 0.25, 80)
+    await eye.leave()
+    await until(lambda: not show.access._permits)
+    assert not stream.viewers
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_next_picture_comes_when_the_last_was_taken_and_is_the_newest(show: Show) -> None:
+    """What came meanwhile is left out; a number that is not awaited opens nothing."""
+    eye, stream = await watched(show)
+    await eye.playing()
+    first = show.shows(stream, jpeg())
+    assert (await eye.picture())[0]["number"] == first
+    numbers = [show.shows(stream, jpeg()) for _ in range(3)]
+    await eye.took(numbers[-1])
+    assert await eye.quiet()
+    await eye.took(first)
+    assert (await eye.picture())[0]["number"] == numbers[-1]
+    await eye.leave()
+
+
+@pytest_twisted.ensureDeferred
+async def test_of_h264_what_came_meanwhile_follows_at_once(show: Show) -> None:
+    """It begins with a picture that stands alone; the way is open again when the last is taken."""
+    eye, stream = await watched(show, "&codec=h264")
+    await eye.playing()
+    show.shows(stream, DELTA)
+    numbers = [show.shows(stream, body) for body in (KEY, DELTA, DELTA)]
+    head, body = await eye.picture()
+    assert (head["number"], head["key"], head["codec"], body) == (numbers[0], True, "h264", KEY)
+    await eye.took(numbers[0])
+    assert [(await eye.picture())[0]["number"] for _ in range(2)] == numbers[1:]
+    later = show.shows(stream, DELTA)
+    await eye.took(numbers[1])
+    assert await eye.quiet()
+    await eye.took(numbers[2])
+    assert (await eye.picture())[0]["number"] == later
+    await eye.leave()
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_takes_no_picture_is_cut(show: Show, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if he answers pings."""
+    monkeypatch.setattr(module, "STALL_SECONDS", 0.5)
+    monkeypatch.setattr(module, "LOOK_SECONDS", 0.1)
+    eye, stream = await watched(show)
+    show.shows(stream, jpeg())
+    assert (await eye.closed())[0] == closing.TOO_SLOW
+    assert not stream.viewers
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_revoked_right_closes_with_its_code(show: Show) -> None:
+    """4403 for a right, 4401 for the session."""
+    eye, _ = await watched(show)
+    other = await opens(show)
+    await until(lambda: len(show.access._permits) == 2)
+    await show.deny(CAMERA)
+    assert await eye.closed() == (closing.FORBIDDEN, f"your right to view {CAMERA} was revoked")
+    assert (await other.closed())[0] == closing.FORBIDDEN
+    await show.deny()
+    eye = await opens(show)
+    await until(lambda: show.access._permits)
+    token = (await show.desk.token("ann's")).token_id
+    await show.store.write(queries.revoke_token, token)
+    await show.access.refresh()
+    assert (await eye.closed())[0] == closing.UNAUTHENTICATED
+
+
+@pytest.mark.parametrize(
+    ("query", "token", "status", "code"),
+    [
+        ("", "nobody's", 401, closing.UNAUTHENTICATED),
+        ("&quality=best", "ann's", 400, closing.FORBIDDEN),
+        (f"&topic={SECRET}", "ann's", 400, closing.FORBIDDEN),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_who_may_not_come_in_reads_a_status_or_a_close_code(
+    show: Show, query: str, token: str, status: int, code: int
+) -> None:
+    """Programs the one, browsers the other."""
+    with pytest.raises(InvalidStatus) as refused:
+        await opens(show, query, token)
+    assert refused.value.response.status_code == status
+    browser = await opens(show, query, token, origin=f"http://127.0.0.1:{show.port}")
+    assert (await browser.closed())[0] == code
+    assert not show.access._permits
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_camera_one_may_not_view_is_like_none_here_too(show: Show) -> None:
+    """Before the handshake is answered."""
+    await show.deny(CAMERA)
+    with pytest.raises(InvalidStatus) as refused:
+        await opens(show)
+    assert refused.value.response.status_code == 403
+    browser = await opens(show, origin=f"http://127.0.0.1:{show.port}")
+    assert (await browser.closed())[0] == closing.NOT_FOUND
+    assert not show.access._permits
+
+
+@pytest_twisted.ensureDeferred
+async def test_credentials_may_be_a_subprotocol_or_the_first_message(show: Show) -> None:
+    """As on every websocket of the relay."""
+    control = show.robot_comes()
+    by_protocol = await opens(show, token="", subprotocols=["bearer.ann's"])
+    stream = await show.joined(control)
+    by_message = await opens(show, token="")
+    await by_message.says(json.dumps({"op": "auth", "mac": "ann's"}))
+    await until(lambda: len(stream.viewers) == 2)
+    await by_protocol.leave()
+    await by_message.leave()
+
+
+@pytest_twisted.ensureDeferred
+async def test_nonsense_and_bytes_are_not_for_here(show: Show) -> None:
+    """Bytes close at once, nonsense when it is too much."""
+    eye, stream = await watched(show)
+    for _ in range(module.MISTAKES):
+        await eye.says('{"op":"subscribe"}')
+    assert (await eye.closed())[0] == closing.TOO_MANY_ERRORS
+    eye = await opens(show)
+    await eye.says(b"\x00")  # type: ignore[arg-type]
+    assert (await eye.closed())[0] == closing.FORBIDDEN
+    assert not stream.viewers
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_ends_a_stream_is_told_with_a_code(show: Show) -> None:
+    """4503 from the robot, 1001 when the relay goes down."""
+    eye, stream = await watched(show)
+    stream.message(link.NotPlaying(reason="I have eyes for four"))
+    assert await eye.closed() == (closing.UNAVAILABLE, "I have eyes for four")
+    eye = await opens(show)
+    await until(lambda: show.access._permits)
+    show.desk.say_goodbye("the relay is going down")
+    assert await eye.closed() == (closing.GOING_AWAY, "the relay is going down")

@@ -1,0 +1,98 @@
+"""Which picture is next, and what it is made into."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_server.edges.video import viewing
+from relay_server.edges.video.viewing import Made, Waiting
+from relay_server.video import STALE_SECONDS, Picture
+from tests.relay_server.memory import Time
+
+
+def picture(number: int, at: float, codec: str = "jpeg", *, key: bool = True, size: int = 3) -> Picture:
+    """One that arrived then."""
+    return Picture(number, 0.0, at, codec, 32, 24, key, bytes(size))
+
+
+class Line:
+    """Pictures that wait, and how often a new beginning was asked for."""
+
+    def __init__(self, time: Time) -> None:
+        self.asked = 0
+        self.time = time
+        self.waiting = Waiting(time, self._anew)
+
+    def _anew(self) -> None:
+        self.asked += 1
+
+    def put(self, number: int, codec: str = "jpeg", *, key: bool = True, size: int = 3) -> None:
+        """A picture that comes now."""
+        self.waiting.put(picture(number, self.time(), codec, key=key, size=size))
+
+    @property
+    def taken(self) -> list[int]:
+        """Numbers of what goes now."""
+        return [each.number for each in self.waiting.take()]
+
+
+@pytest.fixture
+def line(time: Time) -> Line:
+    """Nothing waits."""
+    return Line(time)
+
+
+def test_the_newest_picture_takes_the_place_of_those_before(line: Line) -> None:
+    """And goes once."""
+    for number in (1, 2, 3):
+        line.put(number)
+    assert (line.taken, line.taken) == ([3], [])
+
+
+def test_a_picture_that_has_waited_too_long_is_not_sent(line: Line, time: Time) -> None:
+    """Half a second."""
+    line.put(1)
+    time.now += STALE_SECONDS + 0.01
+    assert line.taken == []
+    line.put(2)
+    time.now += STALE_SECONDS - 0.01
+    assert line.taken == [2]
+
+
+def test_of_h264_all_go_since_the_last_that_stands_alone(line: Line) -> None:
+    """The later ones need those before."""
+    line.put(1, "h264")
+    line.put(2, "h264", key=False)
+    line.put(3, "h264")
+    line.put(4, "h264", key=False)
+    line.put(5, "h264", key=False)
+    assert line.taken == [3, 4, 5]
+    assert not line.asked
+
+
+def test_where_one_of_h264_is_left_out_a_new_beginning_is_asked_for(line: Line, time: Time) -> None:
+    """Too old, or too much."""
+    line.put(1, "h264")
+    time.now += STALE_SECONDS + 0.01
+    line.put(2, "h264", key=False)
+    assert (line.taken, line.asked) == ([], 1)
+    line.put(3, "h264", size=viewing.WAITING_BYTES)
+    assert line.asked == 1
+    line.put(4, "h264", key=False)
+    assert (line.taken, line.asked) == ([], 2)
+
+
+def test_what_is_made_of_a_picture_is_made_once_for_all() -> None:
+    """Anew for another picture, or when something else is said of it."""
+    made: list[tuple[int, float]] = []
+
+    def make(each: Picture, reduced: float) -> bytes:
+        made.append((each.number, reduced))
+        return each.body
+
+    shared = Made(make)
+    one, two = picture(1, 0.0), picture(2, 0.0)
+    assert shared.of(one) is shared.of(one)
+    shared.of(one, 0.5)
+    shared.of(two, 0.5)
+    assert made == [(1, 0.0), (1, 0.5), (2, 0.5)]
