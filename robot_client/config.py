@@ -22,6 +22,8 @@ MOTION_TYPES = ["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 
+_SOURCE = re.compile(r"(v4l2:/dev/.|[a-z]+://.|/.)")
+
 Milliseconds = Annotated[int, msgspec.Meta(ge=50, le=10_000)]
 
 
@@ -47,7 +49,7 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             self, "motion_types", [_message_type(each) for each in self.motion_types]
         )
         msgspec.structs.force_setattr(
-            self, "motion_topics", [_topic_name(each) for each in self.motion_topics]
+            self, "motion_topics", [_topic_name("motion_topics", each) for each in self.motion_topics]
         )
 
     @property
@@ -83,12 +85,33 @@ class Monitor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     health_seconds: Annotated[float, msgspec.Meta(ge=0.1, le=3600)] = 3.0
 
 
+class Video(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How pictures are shown.
+
+    :param streams: most at a time; each takes a good part of a processor's core
+    """
+
+    streams: Annotated[int, msgspec.Meta(ge=1, le=64)] = 8
+
+
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All settings; each section is a table of the TOML file."""
+    """All settings; each section is a table of the TOML file.
+
+    :param cameras: those without ROS, by a name like a topic's: ``v4l2:/dev/video0``, an address such as
+        ``rtsp://…``, or the path of a file
+    """
 
     safety: Safety = msgspec.field(default_factory=Safety)
     ros: Ros = msgspec.field(default_factory=Ros)
     monitor: Monitor = msgspec.field(default_factory=Monitor)
+    video: Video = msgspec.field(default_factory=Video)
+    cameras: dict[str, str] = msgspec.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        named = {
+            _topic_name("cameras", name): _camera_source(name, source) for name, source in self.cameras.items()
+        }
+        msgspec.structs.force_setattr(self, "cameras", named)
 
 
 def _message_type(name: str) -> str:
@@ -101,11 +124,19 @@ def _message_type(name: str) -> str:
     return full
 
 
-def _topic_name(name: str) -> str:
+def _topic_name(where: str, name: str) -> str:
     full = "/" + name.strip().removeprefix("/")
     if not _TOPIC.match(full):
-        raise ValueError(f"motion_topics: '{name}' is no topic; write /name or /namespace/name")
+        raise ValueError(f"{where}: '{name}' is no topic; write /name or /namespace/name")
     return full
+
+
+def _camera_source(name: str, source: str) -> str:
+    if not _SOURCE.match(source):
+        raise ValueError(
+            f"cameras: '{source}' of {name} is none; write v4l2:/dev/video0, rtsp://host/path or /path/of/a/file"
+        )
+    return source
 
 
 def load(path: Path | None, environment: Mapping[str, str]) -> Settings:
@@ -140,6 +171,7 @@ def _from_environment(environment: Mapping[str, str]) -> list[tuple[str, str, An
     known = {
         f"{ENVIRONMENT}{section.name}_{key.name}".upper(): (section.name, key.name, key.type)
         for section in msgspec.structs.fields(Settings)
+        if section.name != "cameras"  # their names are chosen freely
         for key in msgspec.structs.fields(section.type)
     }
     found = []

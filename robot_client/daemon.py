@@ -18,6 +18,7 @@ from twisted.python.failure import Failure
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
+from robot_client.camera.desk import CameraDesk
 from robot_client.channel import Channel
 from robot_client.clocks import now_ns
 from robot_client.config import Settings
@@ -90,6 +91,7 @@ class Daemon:
         connection: Connection,
         platform: Platform,
         guard: GuardFeed,
+        cameras: CameraDesk,
         clock: Any,
         dial: Dial,
         agent: str,
@@ -99,6 +101,7 @@ class Daemon:
         self._settings = settings
         self._connection = connection
         self._platform = platform
+        self._cameras = cameras
         self._clock = clock
         self._dial = dial
         self._agent = agent
@@ -155,22 +158,29 @@ class Daemon:
         self._connection.say(self._description())
         self._told = self._read_graph() or GraphView()
         self._tell_graph(whole(self._told))
+        self._cameras.look(self._told)
+        self._cameras.registered(welcome.heartbeat)
         self._tell_health()
         while self._alerts:
             self._connection.say(self._alerts.popleft())
 
     def on_order(self, message: link.Message) -> None:
-        """The relay wants a channel opened or closed."""
+        """The relay wants a channel or a camera opened or closed."""
         if isinstance(message, link.OpenChannel):
             self._open(message)
         elif isinstance(message, link.CloseChannel):
             self._close(message.channel, "nobody is left on this channel")
+        elif isinstance(message, link.OpenVideo):
+            self._cameras.open(message)
+        elif isinstance(message, link.CloseVideo):
+            self._cameras.close(message)
 
     def on_unregistered(self, reason: str) -> None:
         """Without a control link nobody may drive; channels are joined anew."""
         self.motion.stop_all("the control link is lost")
         self._told = None
         self._close_channels(reason)
+        self._cameras.unregistered(reason)
 
     # --- channels ------------------------------------------------------------------------------------------
 
@@ -268,6 +278,7 @@ class Daemon:
         self._told = view
         if changes is not None:
             self._tell_graph(changes)
+            self._cameras.look(view)
 
     def _tell_graph(self, graph: link.Graph) -> None:
         for part in parts(graph):

@@ -271,6 +271,8 @@ class ControlLink(Link):
         (State.PROVING, link.Welcome): _on_welcome,
         (State.REGISTERED, link.OpenChannel): _on_order,
         (State.REGISTERED, link.CloseChannel): _on_order,
+        (State.REGISTERED, link.OpenVideo): _on_order,
+        (State.REGISTERED, link.CloseVideo): _on_order,
     }
     _decoders: ClassVar[dict[State, msgspec.json.Decoder[Any]]] = {
         State.GREETING: link.opening_reply_decoder,

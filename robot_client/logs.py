@@ -47,14 +47,14 @@ class LineObserver:
 
     def _plain(self, event: LogEvent) -> str:
         when = _time(event).isoformat(timespec="milliseconds")
-        return f"{when} {_level(event):8} {event.get('log_namespace', '-')}: {_text(event)}"
+        return f"{when} {_level(event):8} {event.get('log_namespace', '-')}: {text(event)}"
 
     def _json(self, event: LogEvent) -> str:
         entry = {
             "time": _time(event).isoformat(),
             "level": _level(event),
             "where": event.get("log_namespace", "-"),
-            "text": _text(event),
+            "text": text(event),
         }
         return msgspec.json.encode(entry).decode()
 
@@ -78,7 +78,7 @@ def _level(event: LogEvent) -> str:
     return level.name if level else "info"
 
 
-def _text(event: LogEvent) -> str:
+def text(event: LogEvent) -> str:
     text = formatEvent(event)
     failure = event.get("log_failure")
     if failure is not None:

@@ -12,6 +12,9 @@ from twisted.logger import Logger
 
 from relay_protocol.errors import Unavailable
 from robot_client.backoff import Backoff
+from robot_client.camera.desk import CameraDesk
+from robot_client.camera.keeper import CameraKeeper
+from robot_client.camera.lines import Settings as CameraSettings
 from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection
@@ -82,6 +85,18 @@ class Runner:
                 settings.safety.stop_within_ms,
                 settings.ros.use_sim_time,
             )
+        self.cameras = CameraKeeper(
+            reactor,
+            CameraSettings(
+                address=enrolment.address,
+                tls=enrolment.tls,
+                ca=enrolment.ca,
+                server_name=enrolment.server_name,
+                # Begins like the daemon's own, so that the graph is told without it.
+                node=f"switchboard_{suffix}_camera",
+                streams=settings.video.streams,
+            ),
+        )
         self._enrolment = enrolment
         connection = Connection(
             self._dial,
@@ -96,6 +111,7 @@ class Runner:
             connection,
             self.platform,
             self.keeper or NoGuard(),
+            CameraDesk(settings.cameras, self.cameras, connection.say, reactor),
             reactor,
             self._dial,
             agent(),
@@ -110,6 +126,7 @@ class Runner:
         :raises Unavailable: the platform can't start
         """
         self.platform.start()
+        self.cameras.on_alert = self.daemon.alert
         if self.keeper is not None:
             self.keeper.on_alert = self.daemon.alert
             self.keeper.start()
@@ -120,7 +137,7 @@ class Runner:
         """Stop the robot and leave, within seconds whatever hangs."""
         self._log.info("leaving")
         self._notifier.stop()
-        leaving: list[Deferred[Any]] = [self.daemon.stop()]
+        leaving: list[Deferred[Any]] = [self.daemon.stop(), self.cameras.stop()]
         if self.keeper is not None:
             # It watches until the last zero is said.
             leave = self.keeper.stop

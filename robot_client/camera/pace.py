@@ -88,13 +88,12 @@ class Pace:
     """Decides for one stream when a picture is made, and how. Pure: times are given, in seconds of one clock.
 
     :param target: delay to stay under; with a round trip of more than half of it, twice the round trip
-    :param rate: bytes per second another stream of this robot measured of late, where there is one
     """
 
-    def __init__(self, settings: VideoSettings, target: float = TARGET, rate: float | None = None) -> None:
+    def __init__(self, settings: VideoSettings, target: float = TARGET) -> None:
         self.delay: float | None = None
         """Seconds from arrival to ``took``, smoothed; ``None`` before the first."""
-        self.rate = rate
+        self.rate: float | None = None
         """Bytes per second the uplink carries, as measured."""
         self._target = target
         self._steps = steps(settings)

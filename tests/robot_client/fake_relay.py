@@ -16,7 +16,7 @@ import msgspec
 from relay_protocol import frames, identity, link
 from relay_protocol.errors import PeerError
 
-T = TypeVar("T", bound=link.Message | frames.SampleFrame)
+T = TypeVar("T", bound=link.Message | frames.SampleFrame | frames.VideoFrame)
 PATIENCE = 20.0
 
 
@@ -29,6 +29,8 @@ class Peer:
         self._inbox: queue.Queue[Any] = queue.Queue()
         self.read = link.opening_decoder
         self.skipped: list[Any] = []
+        self.takes = True
+        """Whether pictures are answered at once."""
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
@@ -41,7 +43,9 @@ class Peer:
         self._inbox.put(None)
 
     def _take(self, frame: frames.Frame) -> None:
-        if isinstance(frame, frames.SampleFrame):
+        if not isinstance(frame, frames.JsonFrame):
+            if isinstance(frame, frames.VideoFrame) and self.takes:
+                self.say(link.Took(number=frame.number))
             self._inbox.put(frame)
             return
         message = self.read.decode(frame.body)
@@ -159,6 +163,19 @@ class FakeRelay:
         control.say(link.OpenChannel(channel=name, ticket=ticket))
         peer = self.accept()
         assert peer.expect(link.Join).ticket == ticket
+        peer.say(link.Joined(channel=name, at=time.monotonic_ns()))
+        return peer
+
+    def video(
+        self, control: Peer, camera: str, settings: link.VideoSettings | None = None, name: str = "s1"
+    ) -> Peer:
+        """Have a stream of pictures opened and joined."""
+        ticket = secrets.token_hex(8)
+        wanted = settings or link.VideoSettings()
+        control.say(link.OpenVideo(stream=name, ticket=ticket, camera=camera, settings=wanted))
+        peer = self.accept()
+        assert peer.expect(link.Join).ticket == ticket
+        peer.read = link.robot_video_decoder
         peer.say(link.Joined(channel=name, at=time.monotonic_ns()))
         return peer
 

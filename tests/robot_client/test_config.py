@@ -43,6 +43,9 @@ def test_lists_in_variables_have_commas() -> None:
         ("[safety]\nstop_within_ms = 1\n", "stop_within_ms"),
         ('[ros]\nexecutor = "fast"\n', "executor"),
         ("[safety\n", "not TOML"),
+        ('[cameras]\n"a b" = "/film.mp4"\n', "a b"),
+        ('[cameras]\nusb = "video0"\n', "v4l2:/dev/video0"),
+        ("[video]\nstreams = 0\n", "streams"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
@@ -51,6 +54,17 @@ def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
     file.write_text(text)
     with pytest.raises(Invalid, match=named):
         load(file, {})
+
+
+def test_cameras_are_named_like_topics(tmp_path: Path) -> None:
+    """With a leading / or without; what they are is kept as it is written."""
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        '[cameras]\nusb = "v4l2:/dev/video0"\n"/gate/left" = "rtsp://gate/1"\n[video]\nstreams = 3\n'
+    )
+    settings = load(file, {})
+    assert settings.cameras == {"/usb": "v4l2:/dev/video0", "/gate/left": "rtsp://gate/1"}
+    assert settings.video.streams == 3
 
 
 def test_unknown_variable_is_named() -> None:

@@ -16,6 +16,9 @@ from twisted.python.failure import Failure
 
 from relay_protocol import frames, identity, link
 from robot_client.backoff import Backoff
+from robot_client.camera.desk import CameraDesk
+from robot_client.camera.keeper import CameraKeeper
+from robot_client.camera.lines import Settings as CameraSettings
 from robot_client.config import Settings
 from robot_client.connection import Connection
 from robot_client.daemon import Daemon
@@ -88,8 +91,17 @@ class Scene:
             "r1",
             "relay:1",
         )
+        self.cameras = CameraKeeper(self.clock, CameraSettings(address="relay:1", node="camera", streams=8))
         self.daemon = Daemon(
-            Settings(), self.connection, self.platform, NoGuard(), self.clock, self.dial, "test", self.now
+            Settings(),
+            self.connection,
+            self.platform,
+            NoGuard(),
+            CameraDesk({}, self.cameras, self.connection.say, self.clock),
+            self.clock,
+            self.dial,
+            "test",
+            self.now,
         )
         self.daemon.start()
 
@@ -137,6 +149,25 @@ def test_registered_robot_describes_itself(scene: Scene) -> None:
     assert by_op["graph"]["full"] is True
     assert "/talker" in by_op["graph"]["nodes"]
     assert by_op["describe"]["platform"] == "memory"
+
+
+def test_cameras_are_told_and_shown(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the graph, at once and when they change; streams are for the camera process, and end with the link."""
+    done: list[Any] = []
+    monkeypatch.setattr(scene.cameras, "open", lambda line: done.append(("open", line.topic)))
+    monkeypatch.setattr(scene.cameras, "close", lambda stream, why: done.append(("close", stream)))
+    monkeypatch.setattr(scene.cameras, "close_all", lambda why: done.append("all"))
+    image = link.Topic(types=["sensor_msgs/msg/Image"], publishers=["/driver"])
+    line = scene.register()
+    assert [each for each in line.heard() if each["op"] == "cameras"] == [{"op": "cameras"}]
+    scene.platform.view = GraphView(topics={"/front": image})
+    scene.run(1.5)
+    (told,) = [each for each in line.heard() if each["op"] == "cameras"]
+    assert [each["name"] for each in told["cameras"]] == ["/front"]
+    line.say(link.OpenVideo(stream="s", ticket="t", camera="/front", settings=link.VideoSettings()))
+    line.say(link.CloseVideo(stream="s"))
+    line.lose()
+    assert done == [("open", "/front"), ("close", "s"), "all"]
 
 
 def test_graph_is_told_in_differences(scene: Scene) -> None:

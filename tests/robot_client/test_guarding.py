@@ -5,54 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from twisted.internet.error import ProcessTerminated
-from twisted.internet.task import Clock
-from twisted.python.failure import Failure
 
 from robot_client.guard_protocol import Alive, Command, Forget, Leave, Probe, Ready, Topic, decoder, encode
 from robot_client.guarding import DOUBTFUL, PROBE_EVERY, PROBE_MOVING, SILENT, GuardKeeper
 from robot_client.topics import TypedTopic
+from tests.robot_client.processes import Process, Reactor
 
 CMD = TypedTopic("/cmd_vel", "T")
 
 
-class Process:
-    """The transport of a process that does nothing."""
-
-    def __init__(self, protocol: Any) -> None:
-        self.pid = 1
-        self.protocol = protocol
-        self.lines: list[Any] = []
-        self.closed = False
-        self.signals: list[str] = []
-
-    def write(self, data: bytes) -> None:
-        self.lines += [decoder.decode(line) for line in data.splitlines()]
-
-    def closeStdin(self) -> None:
-        self.closed = True
-
-    def signalProcess(self, name: str) -> None:
-        self.signals.append(name)
-        self.end()
-
-    def end(self) -> None:
-        self.protocol.processEnded(Failure(ProcessTerminated(signal=9)))
-
-
-class Reactor(Clock):
-    def __init__(self) -> None:
-        super().__init__()
-        self.processes: list[Process] = []
-
-    def spawnProcess(self, protocol: Any, executable: str, args: list[str], **options: Any) -> None:
-        protocol.transport = Process(protocol)
-        self.processes.append(protocol.transport)
-
-
 class Scene:
     def __init__(self) -> None:
-        self.reactor = Reactor()
+        self.reactor = Reactor(decoder.decode)
         self.alerts: list[str] = []
         self.keeper = GuardKeeper(self.reactor, "guard", 500)
         self.keeper.on_alert = lambda level, text: self.alerts.append(text)

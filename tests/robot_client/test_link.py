@@ -131,6 +131,15 @@ def test_welcome_registers(ticks: Ticks) -> None:
     assert order == Said(link.OpenChannel(channel="c", ticket="t"))
 
 
+def test_registered_link_takes_orders_for_video(ticks: Ticks) -> None:
+    """Streams are opened and closed like channels."""
+    orders = [
+        link.OpenVideo(stream="s", ticket="t", camera="/c", settings=link.VideoSettings(width=3)),
+        link.CloseVideo(stream="s"),
+    ]
+    assert registered(ticks).receive(b"".join(map(link.frame, orders))) == [Said(each) for each in orders]
+
+
 def test_welcome_before_proof_is_an_error(ticks: Ticks) -> None:
     """A relay that welcomes without a challenge is not trusted."""
     end = ControlLink(ME, "test", ticks)
@@ -236,7 +245,7 @@ def test_hostile_bytes_end_in_words(pieces: list[bytes], framed: bool) -> None:
 
 def test_states_have_decoders() -> None:
     """Every state a link can be in knows what may be said in it."""
-    known = {*ControlLink._decoders, *ChannelLink._decoders, *EnrolmentLink._decoders}
+    known = {*ControlLink._decoders, *ChannelLink._decoders, *VideoLink._decoders, *EnrolmentLink._decoders}
     assert known == set(State)
 
 

@@ -6,20 +6,18 @@ import json
 import os
 import signal
 import stat
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
-import psutil
 import pytest
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
 
 from relay_protocol import link
 from tests.robot_client.fake_relay import FakeRelay, Peer
+from tests.robot_client.robot_process import Robot, until
 from tests.robot_client.ros import PATIENCE
 from tests.robot_client.ros import Peer as Node
 
@@ -36,13 +34,6 @@ def command(x: float) -> bytes:
 GO = command(1.0)
 
 
-def until(true: Callable[[], object], timeout: float = PATIENCE) -> None:
-    deadline = time.monotonic() + timeout
-    while not true():
-        assert time.monotonic() < deadline, f"waited {timeout} s in vain"
-        time.sleep(0.02)  # what is waited for comes from other processes
-
-
 @pytest.fixture(scope="module")
 def node(environment: dict[str, str]) -> Iterator[Node]:
     with closing(Node(environment)) as made:
@@ -54,56 +45,6 @@ def node(environment: dict[str, str]) -> Iterator[Node]:
 def relay() -> Iterator[FakeRelay]:
     with closing(FakeRelay()) as made:
         yield made
-
-
-class Robot:
-    """A state folder and the processes that use it."""
-
-    def __init__(self, relay: FakeRelay, state: Path, environment: dict[str, str]) -> None:
-        self.relay = relay
-        self.state = state
-        self.log = state.with_suffix(".log")
-        self._environment = environment
-        self._processes: list[subprocess.Popen[str]] = []
-
-    def start(self, *arguments: str, stdin: str | None = None) -> subprocess.Popen[str]:
-        with self.log.open("a") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "robot_client.cli", *arguments, "--state", str(self.state)],
-                env=self._environment,
-                stdin=subprocess.PIPE if stdin is not None else subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                text=True,
-            )
-        self._processes.append(process)
-        if stdin is not None:
-            assert process.stdin is not None
-            process.stdin.write(stdin)
-            process.stdin.close()
-        return process
-
-    def enroll(self) -> None:
-        process = self.start(
-            "enroll", "--relay", self.relay.address, "--robot", "r1", "--code", "-", stdin="code-1\n"
-        )
-        self.asked = self.relay.enroll()
-        assert process.wait(PATIENCE) == 0, self.log.read_text()
-
-    def run(self, *arguments: str) -> subprocess.Popen[str]:
-        return self.start("run", *arguments)
-
-    def guards(self, process: subprocess.Popen[str]) -> list[psutil.Process]:
-        return [
-            each for each in psutil.Process(process.pid).children() if "robot_client.guard" in each.cmdline()
-        ]
-
-    def close(self) -> None:
-        for process in self._processes:
-            if process.poll() is None:
-                process.send_signal(signal.SIGCONT)
-                process.kill()
-            process.wait(10)
 
 
 @pytest.fixture

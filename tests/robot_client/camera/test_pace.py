@@ -34,11 +34,10 @@ class Uplink:
         fps: float = 15,
         full: int = 50_000,
         settings: VideoSettings | None = None,
-        known: float | None = None,
     ) -> None:
         self.now = 0.0
         self.rate = mbit * MBIT
-        self.pace = Pace(settings or VideoSettings(), rate=known)
+        self.pace = Pace(settings or VideoSettings())
         self.trip = trip
         self.most_under_way = 0
         self.largest = 0
@@ -203,13 +202,6 @@ def test_first_picture_goes_alone() -> None:
     assert not pace.may_send(1.1)
     pace.took(1, 1.05)
     assert pace.may_send(1.1)
-
-
-def test_known_rate_makes_the_first_picture_fit() -> None:
-    """What another stream has learned of the uplink is used from the second picture on, before any answer."""
-    uplink = Uplink(0.2, known=0.2 * MBIT)
-    uplink.pace.sent(1, 50_000, 0.0, 0.0)
-    assert uplink.pace.reduced > 0.5
 
 
 def test_rate_asked_for_is_kept() -> None:

@@ -1,0 +1,120 @@
+"""What the daemon and its camera process tell each other: one JSON object per line on two pipes."""
+
+from __future__ import annotations
+
+import msgspec
+
+from relay_protocol.link import VideoSettings
+from relay_protocol.message import lower_tag
+
+
+class _Line(msgspec.Struct, tag_field="line", tag=lower_tag, omit_defaults=True, frozen=True, kw_only=True):
+    pass
+
+
+class Settings(_Line, frozen=True, kw_only=True):
+    """The daemon's first word.
+
+    :param address: ``host:port`` of the relay, where ``open`` says none
+    :param tls: whether the link to it is TLS
+    :param ca: PEM file of the only authorities trusted, empty for the system's
+    :param server_name: name the certificate must bear, empty for the host
+    :param node: name of the node that subscribes to cameras
+    :param streams: most of them at a time
+    """
+
+    address: str
+    tls: bool = False
+    ca: str = ""
+    server_name: str = ""
+    node: str
+    streams: int
+
+
+class Open(_Line, frozen=True, kw_only=True):
+    """Dial, join with this ticket, and show this camera there.
+
+    :param stream: name of the stream
+    :param camera: as the relay calls it
+    :param topic: to subscribe to; empty for a camera without ROS
+    :param compressed: whether its messages are ``CompressedImage``
+    :param source: of a camera without ROS; with neither it nor a topic there is no such camera
+    :param address: ``host:port`` to dial; empty for the address of the control link
+    :param heartbeat: seconds, as the control link agreed
+    """
+
+    stream: str
+    ticket: str
+    camera: str
+    settings: VideoSettings
+    topic: str = ""
+    compressed: bool = False
+    source: str = ""
+    address: str = ""
+    heartbeat: float
+
+
+class Close(_Line, frozen=True, kw_only=True):
+    """Nobody watches this stream any more.
+
+    :param why: for the relay
+    """
+
+    stream: str
+    why: str
+
+
+class Alive(_Line, frozen=True, kw_only=True):
+    """The process lives; said every second."""
+
+
+class Taken(_Line, frozen=True, kw_only=True):
+    """The process has read that it is to open this stream."""
+
+    stream: str
+
+
+class Seen(_Line, frozen=True, kw_only=True):
+    """What a camera's pictures are like.
+
+    :param encoding: of the last picture
+    :param width: of the last picture, pixels
+    :param height: of the last picture, pixels
+    :param fps: pictures per second, as they came of late
+    """
+
+    camera: str
+    encoding: str
+    width: int
+    height: int
+    fps: float
+
+
+class Ended(_Line, frozen=True, kw_only=True):
+    """A stream is no more."""
+
+    stream: str
+    why: str
+
+
+class Log(_Line, frozen=True, kw_only=True):
+    """Something for the daemon's log.
+
+    :param level: ``info``, ``warn``, ``error``
+    """
+
+    level: str
+    text: str
+
+
+Line = Settings | Open | Close
+Answer = Alive | Taken | Seen | Ended | Log
+
+decoder: msgspec.json.Decoder[Line] = msgspec.json.Decoder(Line)
+answer_decoder: msgspec.json.Decoder[Answer] = msgspec.json.Decoder(Answer)
+_encoder = msgspec.json.Encoder()
+
+
+def encode(line: Line | Answer) -> bytes:
+    """A line with its end."""
+    return _encoder.encode(line) + b"\n"

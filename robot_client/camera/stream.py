@@ -1,0 +1,224 @@
+"""One stream: the newest picture of a camera, made when the uplink bears it, sent over a link of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from msgspec.structs import replace
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_protocol import frames, limits, link
+from relay_protocol.errors import SwitchboardError, Unavailable
+from robot_client.camera.lines import Open
+from robot_client.camera.pace import Pace
+from robot_client.camera.shot import Made, Shot, Wish
+from robot_client.link import Ended, Event, JoinedChannel, Said
+from robot_client.reactors import Clock, Timer
+from robot_client.transport import LinkLost, LinkProtocol
+
+FAULTS = 10
+"""Pictures in a row that may be broken before a stream that has shown some is given up."""
+
+TELL_EVERY = 1.0
+"""Seconds between two words of ``playing`` that differ in nothing but what is measured."""
+
+
+class Busy(Unavailable):
+    """As many streams are made as this robot can."""
+
+
+class View(Protocol):
+    """A camera as one stream has it."""
+
+    @property
+    def fps(self) -> float:
+        """Pictures per second, as they came of late."""
+
+    def make(self, shot: Shot, wish: Wish) -> Deferred[Made]:
+        """Make a picture to be sent, in a thread; one at a time."""
+
+    def close(self) -> None:
+        """Want it no more."""
+
+
+Watch = Callable[[Open, Callable[[Shot], None]], View]
+"""Gives a camera to a stream; raises a :class:`SwitchboardError` when it can't be had."""
+
+
+class Stream:
+    """Shows one camera on one link.
+
+    :param line: what was asked for
+    :param protocol: the connection
+    :param watch: gives the camera
+    :param on_gone: called once when the link is gone, with the reason
+    """
+
+    def __init__(
+        self,
+        line: Open,
+        protocol: LinkProtocol,
+        watch: Watch,
+        clock: Clock,
+        on_gone: Callable[[Stream, str], None],
+    ) -> None:
+        self.line = line
+        self.pace = Pace(line.settings)
+        self._protocol = protocol
+        self._watch = watch
+        self._clock = clock
+        self._on_gone = on_gone
+        self._view: View | None = None
+        self._newest: Shot | None = None
+        self._working = False
+        self._key = True
+        self._number = 0
+        self._faults = 0
+        self._told: link.Playing | None = None
+        self._told_at = 0.0
+        self._timer: Timer | None = None
+        self._log = Logger("camera")
+
+    # --- the link ------------------------------------------------------------------------------------------
+
+    def on_event(self, event: Event) -> None:
+        """The relay said something."""
+        if isinstance(event, JoinedChannel):
+            self._joined(event.channel)
+        elif isinstance(event, Said) and isinstance(event.message, link.Took):
+            self._took(event.message.number)
+        elif isinstance(event, Said):
+            self._key = True
+        elif isinstance(event, Ended):
+            self._protocol.end(LinkLost(f"the relay closed the stream: {event.reason}"), gently=True)
+
+    def on_lost(self, reason: SwitchboardError) -> None:
+        """The connection is gone."""
+        self._stop()
+        self._on_gone(self, str(reason))
+
+    def on_pause(self) -> None:
+        """What is not taken yet holds up the next picture; the transport's own limit adds nothing."""
+
+    def on_resume(self) -> None:
+        """See :meth:`on_pause`."""
+
+    def close(self, why: str) -> None:
+        """Show no more."""
+        self._stop()
+        self._say(link.Bye(reason=why))
+        self._protocol.end(LinkLost(why), gently=True)
+
+    def refuse(self, reason: str, busy: bool = False) -> None:
+        """Tell that it can't be shown."""
+        self._stop()
+        self._say(link.NotPlaying(reason=reason, busy=busy))
+        self._protocol.end(LinkLost(reason), gently=True)
+
+    def _joined(self, name: str) -> None:
+        if name != self.line.stream:
+            self._protocol.end(LinkLost(f"the relay joined us to '{name}' instead of '{self.line.stream}'"))
+            return
+        try:
+            self._view = self._watch(self.line, self._on_shot)
+        except SwitchboardError as error:
+            self.refuse(str(error), busy=isinstance(error, Busy))
+
+    def _say(self, message: link.Message) -> None:
+        self._protocol.link.say(message)
+        self._protocol.flush()
+
+    def _stop(self) -> None:
+        view, self._view = self._view, None
+        if view is not None:
+            view.close()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._newest = None
+
+    # --- pictures ------------------------------------------------------------------------------------------
+
+    def _on_shot(self, shot: Shot) -> None:
+        self._newest = shot
+        self._next()
+
+    def _next(self) -> None:
+        """Make the newest picture, if one made now would be there in time."""
+        if self._newest is None or self._working or self._view is None:
+            return
+        now = self._clock.seconds()
+        if not self.pace.may_send(now):
+            wait = self.pace.wait(now)
+            if wait > 0 and self._timer is None:
+                self._timer = self._clock.callLater(wait, self._waited)
+            return
+        shot, self._newest = self._newest, None
+        pace = self.pace
+        wish = Wish(pace.quality, pace.scale, pace.reduced > 0, self._key, pace.fps or self._view.fps)
+        self._working, self._key = True, False
+        self._view.make(shot, wish).addCallbacks(
+            self._made, self._not_made, callbackArgs=(shot, wish), errbackArgs=(wish,)
+        ).addErrback(self._failed)
+
+    def _waited(self) -> None:
+        self._timer = None
+        self._next()
+
+    def _made(self, made: Made, shot: Shot, wish: Wish) -> None:
+        self._working = False
+        if self._view is None:
+            return
+        self._faults = 0
+        self._number += 1
+        self._tell(made, wish)
+        self._protocol.write([frames.encode_video(self._number, shot.stamp, made.body)])
+        self.pace.sent(self._number, len(made.body), self._clock.seconds(), shot.arrived)
+        self._next()
+
+    def _not_made(self, failure: Failure, wish: Wish) -> None:
+        self._working = False
+        if self._view is None:
+            return
+        failure.trap(SwitchboardError)
+        self._key = self._key or wish.key
+        self._faults += 1
+        if not self._number or self._faults >= FAULTS:
+            self.refuse(failure.getErrorMessage())
+            return
+        self._next()
+
+    def _failed(self, failure: Failure) -> None:
+        self._log.failure("a picture could not be made", failure=failure)
+        if self._view is not None:
+            self.refuse("a picture could not be made; the robot's log says why")
+
+    def _took(self, number: int) -> None:
+        measured = self._protocol.link.offset.round_trip
+        round_trip = measured / 1e9 if measured is not None else None
+        self.pace.took(number, self._clock.seconds(), round_trip)
+        self._next()
+
+    def _tell(self, made: Made, wish: Wish) -> None:
+        """Say how this picture and those that follow are, if the relay does not know."""
+        delay, fps = self.pace.delay, self._view.fps if self._view is not None else 0.0
+        playing = link.Playing(
+            width=made.width,
+            height=made.height,
+            quality=wish.quality,
+            fps=self.pace.fps,
+            reduced=round(self.pace.reduced, 3),
+            delay_ms=None if delay is None else round(delay * 1000, 1),
+            encoding=made.encoding[: limits.LABEL],
+            source_fps=round(fps, 1),
+        )
+        now = self._clock.seconds()
+        if self._told is not None:
+            same = playing == replace(self._told, delay_ms=playing.delay_ms, source_fps=playing.source_fps)
+            if playing == self._told or (same and now - self._told_at < TELL_EVERY):
+                return
+        self._told, self._told_at = playing, now
+        self._protocol.link.say(playing)

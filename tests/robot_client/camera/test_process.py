@@ -1,0 +1,206 @@
+"""The camera process under a real daemon: a simulated ROS camera, a relay that takes its pictures."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import psutil
+import pytest
+from switchboard_processes import mortal
+
+from relay_protocol import frames, link
+from tests.robot_client.fake_relay import FakeRelay, Peer
+from tests.robot_client.robot_process import Robot, until
+
+RAW = "/camera/image_raw"
+COMPRESSED = "/camera/image_raw/compressed"
+PROCESS = "robot_client.camera.main"
+SIZE = (640, 480)
+
+
+@pytest.fixture(scope="module")
+def camera(environment: dict[str, str]) -> Iterator[None]:
+    """A simulated robot that publishes pictures while somebody wants them."""
+    command = mortal([sys.executable, "-m", "robot_client.sim.main", "--camera", "--seed", "1"])
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "READY\n"
+            yield
+        finally:
+            process.terminate()
+
+
+class Scene:
+    """A registered daemon beside that robot."""
+
+    def __init__(self, relay: FakeRelay, robot: Robot, *options: str) -> None:
+        self.relay = relay
+        self.robot = robot
+        self.process = robot.run(*options)
+        self.control = relay.register()
+
+    def cameras(self) -> list[psutil.Process]:
+        return self.robot.children(self.process, PROCESS)
+
+    def until_listed(self, name: str, **like: object) -> link.Camera:
+        """The camera, once the robot has told of it so."""
+        while True:
+            for each in self.control.expect(link.Cameras).cameras:
+                if each.name == name and all(getattr(each, key) == value for key, value in like.items()):
+                    return each
+
+    def video(self, name: str, settings: link.VideoSettings | None = None, stream: str = "s1") -> Peer:
+        return self.relay.video(self.control, name, settings, stream)
+
+
+@pytest.fixture
+def relay() -> Iterator[FakeRelay]:
+    with closing(FakeRelay()) as made:
+        yield made
+
+
+@pytest.fixture
+def robot(relay: FakeRelay, tmp_path: Path, environment: dict[str, str]) -> Iterator[Robot]:
+    with closing(Robot(relay, tmp_path / "state", environment)) as made:
+        made.enroll()
+        yield made
+
+
+@pytest.fixture
+def scene(relay: FakeRelay, robot: Robot, camera: None) -> Scene:
+    made = Scene(relay, robot)
+    made.until_listed(RAW)
+    return made
+
+
+def picture(peer: Peer) -> tuple[frames.VideoFrame, npt.NDArray[np.uint8]]:
+    frame = peer.expect(frames.VideoFrame)
+    decoded = cv2.imdecode(np.frombuffer(frame.body, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return frame, decoded.astype(np.uint8)
+
+
+def test_real_camera_is_shown_and_ends_with_its_stream(scene: Scene) -> None:
+    """JPEG of the camera's size comes, counted from 1 and stamped with the wall clock, `playing` before it; none comes
+    2 s after `close_video`, and the camera is known with size and rate.
+    """
+    assert scene.cameras() == []
+    peer = scene.video(RAW)
+    first, shown = picture(peer)
+    (playing,) = [each for each in peer.skipped if isinstance(each, link.Playing)]
+    assert (playing.width, playing.height, playing.quality, playing.reduced) == (*SIZE, 80, 0)
+    assert first.number == 1
+    assert abs(first.stamp / 1e9 - time.time()) < 5
+    assert first.body.startswith(b"\xff\xd8\xff")
+    assert shown.shape == (SIZE[1], SIZE[0], 3)
+    assert shown.std() > 10
+    for number in range(2, 12):
+        assert picture(peer)[0].number == number
+    seen = scene.until_listed(RAW, encoding="rgb8", width=SIZE[0], height=SIZE[1])
+    assert seen.type == "sensor_msgs/msg/Image"
+    scene.control.say(link.CloseVideo(stream="s1"))
+    closed = time.monotonic()
+    peer.expect(link.Bye)
+    peer.expect_end()
+    assert time.monotonic() - closed < 2
+
+
+def test_settings_are_followed_and_cameras_shared(scene: Scene) -> None:
+    """Two streams of one camera, one of them smaller, turned and slower, come from one process side by side."""
+    whole = scene.video(RAW)
+    small = scene.video(RAW, link.VideoSettings(width=160, rotate=90, fps=4, quality=50), "s2")
+    assert picture(whole)[1].shape == (480, 640, 3)
+    began, shown = picture(small)
+    assert shown.shape == (round(160 * 640 / 480), 160, 3)
+    for _ in range(8):
+        last, _ = picture(small)
+    assert 8 / ((last.stamp - began.stamp) / 1e9) < 5
+    assert len(scene.cameras()) == 1
+
+
+def test_jpeg_of_the_camera_itself_passes_untouched(scene: Scene) -> None:
+    """A CompressedImage nobody wants edited goes out as it came, also where a better quality was asked for."""
+    asked = scene.video(COMPRESSED, link.VideoSettings(quality=100))
+    frame, shown = picture(asked)
+    assert shown.shape == (480, 640, 3)
+    done, again = cv2.imencode(".jpg", shown, (cv2.IMWRITE_JPEG_QUALITY, 100))
+    assert done
+    assert len(frame.body) < 0.7 * len(again)
+
+
+def test_what_can_not_be_shown_is_said_on_the_link(scene: Scene) -> None:
+    """A camera that does not exist, and a crop outside of the picture, are refused in words, and the link ends."""
+    for camera, settings, words in (
+        ("/no/camera", link.VideoSettings(), "no camera /no/camera"),
+        (RAW, link.VideoSettings(crop=(9, 8000, 10, 10)), "8000"),
+    ):
+        peer = scene.video(camera, settings)
+        refused = peer.expect(link.NotPlaying)
+        assert words in refused.reason
+        assert not refused.busy
+        peer.expect_end()
+
+
+def test_killed_process_comes_back(scene: Scene) -> None:
+    """After kill -9 the links end, and the next stream is shown by another process."""
+    peer = scene.video(RAW)
+    picture(peer)
+    (process,) = scene.cameras()
+    process.kill()
+    peer.expect_end()
+    picture(scene.video(RAW, stream="s2"))
+    assert scene.cameras()[0].pid != process.pid
+    assert "camera process" in scene.control.expect(link.Alert).text
+
+
+def test_lost_control_link_ends_the_streams(scene: Scene) -> None:
+    """A robot that is not registered shows nothing; registered again it tells its cameras anew."""
+    peer = scene.video(RAW)
+    picture(peer)
+    scene.control.cut()
+    peer.expect_end()
+    scene.control = scene.relay.register()
+    scene.until_listed(RAW)
+    picture(scene.video(RAW))
+
+
+@pytest.mark.parametrize("how", ["terminate", "kill"])
+def test_process_ends_with_its_daemon(scene: Scene, how: str) -> None:
+    """Whether the daemon leaves in order or is killed."""
+    picture(scene.video(RAW))
+    (process,) = scene.cameras()
+    getattr(scene.process, how)()
+    scene.process.wait(10)
+    until(lambda: not process.is_running())
+
+
+def test_camera_without_ros_and_the_limit_of_streams(
+    relay: FakeRelay, robot: Robot, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    """A file is shown as a camera, over and over; one stream more than the settings allow is told to be too many."""
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
+    for grey in range(5):
+        writer.write(np.full((48, 64, 3), 40 * grey, np.uint8))
+    writer.release()
+    config = tmp_path / "robot.toml"
+    config.write_text(f'[cameras]\n"/film" = "{film}"\n[video]\nstreams = 1\n')
+    scene = Scene(relay, robot, "--config", str(config))
+    assert scene.until_listed("/film").type == ""
+    peer = scene.video("/film")
+    for _ in range(12):
+        assert picture(peer)[1].shape == (48, 64, 3)
+    refused = scene.video("/film", stream="s2").expect(link.NotPlaying)
+    assert refused.busy
+    scene.control.say(link.CloseVideo(stream="s1"))
+    peer.expect_end()
+    assert picture(scene.video("/film", stream="s3"))[0].number == 1

@@ -1,0 +1,73 @@
+"""The daemon as processes that tests start, watch and end."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+
+from tests.robot_client.fake_relay import FakeRelay
+from tests.robot_client.ros import PATIENCE
+
+
+def until(true: Callable[[], object], timeout: float = PATIENCE) -> None:
+    deadline = time.monotonic() + timeout
+    while not true():
+        assert time.monotonic() < deadline, f"waited {timeout} s in vain"
+        time.sleep(0.02)  # what is waited for comes from other processes
+
+
+class Robot:
+    """A state folder and the processes that use it."""
+
+    def __init__(self, relay: FakeRelay, state: Path, environment: dict[str, str]) -> None:
+        self.relay = relay
+        self.state = state
+        self.log = state.with_suffix(".log")
+        self._environment = environment
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def start(self, *arguments: str, stdin: str | None = None) -> subprocess.Popen[str]:
+        with self.log.open("a") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "robot_client.cli", *arguments, "--state", str(self.state)],
+                env=self._environment,
+                stdin=subprocess.PIPE if stdin is not None else subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                text=True,
+            )
+        self._processes.append(process)
+        if stdin is not None:
+            assert process.stdin is not None
+            process.stdin.write(stdin)
+            process.stdin.close()
+        return process
+
+    def enroll(self) -> None:
+        process = self.start(
+            "enroll", "--relay", self.relay.address, "--robot", "r1", "--code", "-", stdin="code-1\n"
+        )
+        self.asked = self.relay.enroll()
+        assert process.wait(PATIENCE) == 0, self.log.read_text()
+
+    def run(self, *arguments: str) -> subprocess.Popen[str]:
+        return self.start("run", *arguments)
+
+    def guards(self, process: subprocess.Popen[str]) -> list[psutil.Process]:
+        return self.children(process, "robot_client.guard")
+
+    def children(self, process: subprocess.Popen[str], module: str) -> list[psutil.Process]:
+        return [each for each in psutil.Process(process.pid).children() if module in each.cmdline()]
+
+    def close(self) -> None:
+        for process in self._processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+            process.wait(10)
