@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import base64
 import contextlib
 import json
 import math
@@ -16,9 +15,12 @@ import mimetypes
 import secrets
 import time
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl, unquote
 
+import av
 import cv2
 import numpy as np
 from websockets.frames import Opcode
@@ -63,6 +65,13 @@ TOPICS = {
     "/scan": "sensor_msgs/msg/LaserScan",
     "/tf": "tf2_msgs/msg/TFMessage",
 }
+CAMERAS = {
+    "/camera/image_raw": ("sensor_msgs/msg/Image", "rgb8"),
+    "/camera/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
+    "/camera_rear/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
+}
+CAMERA_SIZE = (640, 480)
+CAMERA_RATE = 12.0
 CSP = (
     "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; connect-src 'self' ws: wss:; "
     "object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
@@ -145,9 +154,10 @@ class World:
             "intensities": [],
         }
 
-    def picture(self) -> Json:
-        angles = np.linspace(0.55, -0.55, 160)
-        heights = np.clip(190 / (self.ranges(angles) * np.cos(angles)), 4, 239)
+    def picture(self, behind: bool) -> np.ndarray:
+        """What a camera sees; the one that looks behind has other colours."""
+        angles = np.linspace(0.55, -0.55, 160) + math.pi * behind
+        heights = np.clip(190 / (self.ranges(angles) * abs(np.cos(angles))), 4, 239)
         image = np.zeros((480, 640, 3), np.uint8)
         image[:240] = (74, 62, 52)
         image[240:] = (58, 66, 70)
@@ -160,8 +170,7 @@ class World:
             )
         clock = time.strftime("%H:%M:%S") + f".{int(time.time() * 10) % 10}"
         cv2.putText(image, clock, (16, 36), cv2.FONT_HERSHEY_SIMPLEX, 0.9, (235, 235, 235), 2, cv2.LINE_AA)
-        jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
-        return {"header": header("camera"), "format": "jpeg", "data": base64.b64encode(jpeg).decode()}
+        return image[:, :, ::-1].copy() if behind else image
 
 
 def header(frame: str) -> Json:
@@ -177,13 +186,23 @@ class Relay:
         self.sessions: dict[str, str] = {}
         self.codes = {"ONCE-ONLY": "admin"}
         self.log: list[Json] = []
-        self.channels: set[Channel] = set()
+        self.sockets: set[Socket] = set()
         self.worlds = {name: World() for name in ROBOTS}
         self.rights = {user: dict(levels) for user, levels in RIGHTS.items()}
         self.robots = {name: dict(robot) for name, robot in ROBOTS.items()}
         self.silent = False
         self.frozen = False
+        self.reduced = 0.0
+        self.ahead = 0.0
         self.last_seen = time.time() - 7200
+
+    @property
+    def channels(self) -> list[Channel]:
+        return [socket for socket in self.sockets if isinstance(socket, Channel)]
+
+    @property
+    def viewings(self) -> list[Viewing]:
+        return [socket for socket in self.sockets if isinstance(socket, Viewing)]
 
     def robot(self, user: str, name: str) -> Json:
         facts = self.robots[name]
@@ -207,38 +226,41 @@ class Relay:
         return {"robots": [self.robot(user, name) for name in self.rights[user]]}
 
     def do(self, order: Json) -> None:
-        """One order of a test: close, level, silent (no data), frozen (no answers), say, offline."""
+        """One order of a test: close, level, silent (no data), frozen (no answers), say, offline.
+
+        Of video: close_video, reduced (a thin link), ahead (seconds by which the robot's clock is wrong).
+        """
         self.silent = order.get("silent", self.silent)
         self.frozen = order.get("frozen", self.frozen)
+        self.reduced = order.get("reduced", self.reduced)
+        self.ahead = order.get("ahead", self.ahead)
         if "level" in order:
             self.rights[order["user"]][order["robot"]] = order["level"]
         if "state" in order:
             self.robots[order["robot"]]["state"] = order["state"]
         if order.get("clear_log"):
             self.log.clear()
-        for channel in list(self.channels):
+        for channel in self.channels:
             if "say" in order:
                 channel.send({"op": "status", "level": "error", "msg": order["say"], "id": "any"})
             if "close" in order:
                 channel.close(order["close"], order.get("reason", ""))
+        for viewing in self.viewings:
+            if "reduced" in order:
+                viewing.tell()
+            if "close_video" in order:
+                viewing.close(order["close_video"], order.get("reason", ""))
 
 
-class Channel:
-    """One rosbridge websocket."""
+class Socket:
+    """One websocket of a page."""
 
     def __init__(
         self, relay: Relay, user: str, robot: str, protocol: ServerProtocol, flush: Callable[[], None]
     ) -> None:
         self.relay, self.user, self.robot = relay, user, robot
         self.protocol, self.flush = protocol, flush
-        self.since = time.time()
-        self.subscribed: dict[str, set[str]] = {}
-        self.due: dict[str, float] = {}
-        relay.channels.add(self)
-
-    @property
-    def level(self) -> str:
-        return self.relay.rights[self.user].get(self.robot, "viewer")
+        relay.sockets.add(self)
 
     def send(self, message: Json) -> None:
         self.protocol.send_text(json.dumps(message, allow_nan=False).encode())
@@ -249,8 +271,31 @@ class Channel:
         self.flush()
 
     def take(self, message: Json) -> None:
-        op = message["op"]
+        raise NotImplementedError  # by the two kinds
+
+    def stream(self, now: float) -> None:
+        raise NotImplementedError  # by the two kinds
+
+    def note(self, message: Json) -> None:
         self.relay.log.append({"at": time.monotonic(), "user": self.user, "robot": self.robot, **message})
+
+
+class Channel(Socket):
+    """Rosbridge."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.since = time.time()
+        self.subscribed: dict[str, set[str]] = {}
+        self.due: dict[str, float] = {}
+
+    @property
+    def level(self) -> str:
+        return self.relay.rights[self.user].get(self.robot, "viewer")
+
+    def take(self, message: Json) -> None:
+        op = message["op"]
+        self.note(message)
         if op == "subscribe":
             self.subscribed.setdefault(message["topic"], set()).add(message["id"])
         elif op == "unsubscribe":
@@ -274,7 +319,7 @@ class Channel:
             values = {"topics": list(TOPICS), "types": list(TOPICS.values())}
         elif message["service"] == "/relay/ping":
             values = {
-                "relay_time_ns": time.monotonic_ns(),
+                "relay_time_ns": time.time_ns(),
                 "robot_rtt_ms": 4.2 if message["args"]["robot"] else None,
             }
         answer = {"op": "service_response", "service": message["service"], "result": True, "values": values}
@@ -285,7 +330,6 @@ class Channel:
         makers: dict[str, tuple[float, Callable[[], Json]]] = {
             "/odom": (20, world.odom),
             "/scan": (10, world.scan),
-            "/camera/image_raw/compressed": (12, world.picture),
             "/battery_state": (1, lambda: {"header": header(""), "percentage": 0.76, "voltage": 24.1}),
             "/relay/status": (1, self.status),
         }
@@ -308,6 +352,71 @@ class Channel:
             "motion": {"topics": ["/cmd_vel"], "types": [], "deadline_ms": 500, "stop_within_ms": 500},
             "health": {"battery": 0.76, "cpu": 0.23, "memory": 0.41, "rtt_ms": 4.2, "stale_commands": 0},
         }
+
+
+class Viewing(Socket):
+    """A camera that is watched: one picture under way at a time (protocol/SPEC.md 1.8)."""
+
+    def __init__(self, *given: Any, query: Json) -> None:
+        super().__init__(*given)
+        self.camera = query["topic"]
+        self.width = int(query.get("width", 0)) or CAMERA_SIZE[0]
+        self.height = CAMERA_SIZE[1] * self.width // CAMERA_SIZE[0]
+        self.quality = int(query.get("quality", 80))
+        self.rotate = int(query.get("rotate", 0))
+        self.rate = min(float(query.get("fps", 0)) or CAMERA_RATE, CAMERA_RATE)
+        self.codec = query.get("codec", "jpeg")
+        self.number, self.taken, self.due = 0, 0, 0.0
+        self.h264: Any = None
+        self.note({"op": "watch", **query})
+        self.tell()
+
+    def tell(self) -> None:
+        scale = 1 - self.relay.reduced / 2
+        facts = {
+            "width": int(self.width * scale),
+            "height": int(self.height * scale),
+            "quality": self.quality,
+        }
+        more = {"fps": self.rate, "reduced": self.relay.reduced, "delay_ms": 20.0}
+        self.send({"op": "playing", **facts, **more, "encoding": "jpeg", "source_fps": CAMERA_RATE})
+
+    def take(self, message: Json) -> None:
+        self.note(message)
+        self.taken = message["number"]
+
+    def stream(self, now: float) -> None:
+        if self.relay.silent or self.taken != self.number or now < self.due:
+            return
+        self.due = now + 1 / self.rate
+        self.number += 1
+        image = self.relay.worlds[self.robot].picture(behind=self.camera.startswith("/camera_rear"))
+        image = np.rot90(image, -self.rotate // 90)
+        size = (self.width, self.width * image.shape[0] // image.shape[1])
+        image = cv2.resize(np.ascontiguousarray(image), size)
+        if self.codec == "h264":
+            body, key = self.encoded(image)
+        else:
+            body = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1].tobytes()
+            key = True
+        facts = {
+            "number": self.number,
+            "stamp": time.time() + self.relay.ahead,
+            "codec": self.codec,
+            "key": key,
+        }
+        self.send({"op": "picture", **facts, "width": size[0], "height": size[1], "size": len(body)})
+        self.protocol.send_binary(body)
+        self.flush()
+
+    def encoded(self, image: np.ndarray) -> tuple[bytes, bool]:
+        if self.h264 is None:
+            self.h264 = av.CodecContext.create("libx264", "w")
+            self.h264.width, self.h264.height = image.shape[1], image.shape[0]
+            self.h264.pix_fmt, self.h264.time_base = "yuv420p", Fraction(1, 12)
+            self.h264.options = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline"}
+        [packet] = self.h264.encode(av.VideoFrame.from_ndarray(image, format="bgr24"))
+        return bytes(packet), packet.is_keyframe
 
 
 class Connection:
@@ -367,6 +476,8 @@ class Connection:
             self.session(method, body)
         elif path.startswith("/api/v1/"):
             await self.robots(path)
+        elif path.endswith("/video/cameras"):
+            self.cameras(path.split("/")[2])
         else:
             self.page(path)
 
@@ -411,6 +522,14 @@ class Connection:
         else:
             self.problem(404, f"There is no robot '{name}' for you.")
 
+    def cameras(self, robot: str) -> None:
+        if self.user is None or robot not in self.relay.rights[self.user]:
+            self.problem(401 if self.user is None else 404, f"There is no robot '{robot}' for you.")
+            return
+        size = {"width": CAMERA_SIZE[0], "height": CAMERA_SIZE[1], "fps": CAMERA_RATE, "streams": []}
+        cameras = [{"name": n, "type": t, "encoding": e, **size} for n, (t, e) in CAMERAS.items()]
+        self.reply(200, {"cameras": cameras})
+
     async def events(self, user: str) -> None:
         self.writer.write(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n")
         while not self.writer.is_closing():
@@ -429,22 +548,25 @@ class Connection:
         protocol.receive_data(head)
         protocol.send_response(protocol.accept(protocol.events_received()[0]))  # type: ignore[arg-type]
         self.flush(protocol)
-        robot = target.removeprefix("/robots/")
+        path, _, query = target.partition("?")
+        robot, video, _ = path.removeprefix("/robots/").partition("/video/ws")
+        robot, asked = unquote(robot), dict(parse_qsl(query))
         user = self.user
-        if user is None or robot not in self.relay.rights[user]:
+        if user is None or robot not in self.relay.rights[user] or (video and asked["topic"] not in CAMERAS):
             protocol.send_close(4401 if user is None else 4404, "")
             self.flush(protocol)
             return
-        channel = Channel(self.relay, user, robot, protocol, lambda: self.flush(protocol))
+        given = (self.relay, user, robot, protocol, lambda: self.flush(protocol))
+        socket: Socket = Viewing(*given, query=asked) if video else Channel(*given)
         try:
             while data := await self.reader.read(65536):
                 protocol.receive_data(data)
                 self.flush(protocol)
                 for frame in protocol.events_received():
                     if getattr(frame, "opcode", None) is Opcode.TEXT:
-                        channel.take(json.loads(frame.data))  # type: ignore[union-attr]
+                        socket.take(json.loads(frame.data))  # type: ignore[union-attr]
         finally:
-            self.relay.channels.discard(channel)
+            self.relay.sockets.discard(socket)
 
     def flush(self, protocol: ServerProtocol) -> None:
         for data in protocol.data_to_send():
@@ -459,9 +581,9 @@ async def stream(relay: Relay) -> None:
         await asyncio.sleep(0.02)
         for world in relay.worlds.values():
             world.step()
-        for channel in list(relay.channels):
-            if channel.protocol.state is State.OPEN and not relay.frozen:
-                channel.stream(time.monotonic())
+        for socket in list(relay.sockets):
+            if socket.protocol.state is State.OPEN and not relay.frozen:
+                socket.stream(time.monotonic())
 
 
 async def main(portal: Path, port: int) -> None:

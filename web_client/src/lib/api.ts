@@ -1,6 +1,7 @@
 /** The relay's HTTP API, as far as the portal uses it. */
 import { sentence } from './format'
 import type { Robot, Session } from './types'
+import type { Camera } from './video'
 
 /** A request the relay refused, in its own words. */
 export class Refusal extends Error {
@@ -82,6 +83,12 @@ export async function robot(name: string): Promise<Robot> {
   return (await (await request('GET', `/api/v1/robots/${encodeURIComponent(name)}`)).json()) as Robot
 }
 
+/** The cameras of a robot that the user may view. */
+export async function cameras(name: string): Promise<Camera[]> {
+  const answer = await request('GET', `/robots/${encodeURIComponent(name)}/video/cameras`)
+  return ((await answer.json()) as { cameras: Camera[] }).cameras
+}
+
 export interface FleetWatcher {
   robots(list: Robot[]): void
   /** The stream broke; the browser tries again by itself unless `final`. */
@@ -102,4 +109,12 @@ export function watchFleet(watcher: FleetWatcher): () => void {
 export function robotSocket(name: string, page: Pick<Location, 'protocol' | 'host'>): string {
   const scheme = page.protocol === 'https:' ? 'wss' : 'ws'
   return `${scheme}://${page.host}/robots/${encodeURIComponent(name)}`
+}
+
+/** Where the pictures of a camera are.
+ *
+ * @param query what is wanted, see `parameters` in `video.ts`
+ */
+export function videoSocket(name: string, query: string, page: Pick<Location, 'protocol' | 'host'>): string {
+  return `${robotSocket(name, page)}/video/ws?${query}`
 }

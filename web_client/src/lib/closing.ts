@@ -1,4 +1,4 @@
-/** What the close codes of a robot's websocket mean, and what to do about them. */
+/** What the close codes of the relay's websockets mean, and what to do about them (protocol/SPEC.md 1.4). */
 import { sentence } from './format'
 
 export type After = 'login' | 'give_up' | 'retry'
@@ -23,7 +23,30 @@ const ENDINGS: Record<number, Ending> = {
  */
 export function ending(code: number, reason: string): Ending {
   const known = ENDINGS[code] ?? { after: 'retry', words: 'The connection to the relay was lost.' }
-  const added = reason.trim()
-  if (code !== 4403 || added === '') return known
-  return { ...known, words: `${known.words} ${sentence(added)}` }
+  return code === 4403 ? withReason(known, reason) : known
+}
+
+const VIDEO_ENDINGS: Record<number, Ending> = {
+  1001: ENDINGS[1001]!,
+  4401: ENDINGS[4401]!,
+  4403: { after: 'give_up', words: 'You have no right to view this camera.' },
+  4404: { after: 'give_up', words: 'There is no camera of this name for you.' },
+  4408: { after: 'retry', words: 'This connection was too slow for the pictures.' },
+  4429: { after: 'give_up', words: 'The relay shows no more pictures for now.' },
+  4503: { after: 'retry', words: 'The camera can’t be shown now.' },
+}
+
+/** Tells what the end of a camera's websocket means.
+ *
+ * @param code close code of the websocket
+ * @param reason the relay's own words, may be empty
+ */
+export function videoEnding(code: number, reason: string): Ending {
+  const known = VIDEO_ENDINGS[code] ?? { after: 'retry', words: 'The connection for the pictures was lost.' }
+  return known.after === 'login' ? known : withReason(known, reason)
+}
+
+function withReason(ending: Ending, reason: string): Ending {
+  const added = sentence(reason)
+  return added === '' ? ending : { ...ending, words: `${ending.words} ${added}` }
 }

@@ -1,18 +1,20 @@
 /** The state of the cockpit: link, latency, rights, chosen topics, driving. One instance per open cockpit. */
-import { currentSession, robot as fetchRobot, robotSocket } from './api'
+import { cameras as fetchCameras, currentSession, robot as fetchRobot, robotSocket } from './api'
 import { app } from './app.svelte'
 import type { Ending } from './closing'
 import { Drive, type Limits, type Source, stopWords, type StopReason } from './drive'
-import { type Legs, Median, PING_DRIVING_MS, PING_IDLE_MS, PingTracker } from './latency'
+import { type Legs, Median, PING_DRIVING_MS, PING_IDLE_MS, PingTracker, RelayClock } from './latency'
 import { Gate } from './meter'
 import { Link, type LinkState } from './ros'
 import { recall, remember } from './storage'
-import { CAMERA, fullType, MOTION, ODOMETRY, ofType, pick, SCAN } from './topics'
+import { fullType, MOTION, ODOMETRY, ofType, pick, SCAN } from './topics'
 import type { RelayStatus, Robot, TopicInfo, Twist } from './types'
+import type { Camera } from './video'
 
 const TICK_MS = 33
 const ROBOT_PING_MS = 1000
 const TOPICS_MS = 5000
+const CAMERAS_MS = 5000
 /** A link without an answer for so long is dialled anew. */
 const SILENT_MS = 6000
 /** Longer than the silence above, so that a silent link is seen as one. Seconds. */
@@ -20,12 +22,11 @@ const PING_TIMEOUT_S = 10
 /** A loss shorter than this is not spoken of. */
 const LOSS_SHOWN_MS = 1000
 
-export type Role = 'camera' | 'scan' | 'odometry' | 'motion'
+export type Role = 'scan' | 'odometry' | 'motion'
 type Choice = Record<Role, string | null>
 
-const TYPES: Record<Role, string[]> = { camera: CAMERA, scan: SCAN, odometry: ODOMETRY, motion: MOTION }
+const TYPES: Record<Role, string[]> = { scan: SCAN, odometry: ODOMETRY, motion: MOTION }
 const USUAL: Record<Role, string[]> = {
-  camera: ['compressed'],
   scan: ['scan'],
   odometry: ['odom'],
   motion: ['cmd_vel'],
@@ -38,6 +39,8 @@ export class Cockpit {
   status = $state.raw<RelayStatus | null>(null)
   topics = $state.raw<TopicInfo[]>([])
   topicsKnown = $state(false)
+  /** Those the user may view; null before the relay told them. */
+  cameras = $state.raw<Camera[] | null>(null)
   legs = $state<Legs>({ clientRelay: null, relayRobot: null, clientRobot: null })
   late = $state(false)
   driving = $state(false)
@@ -50,7 +53,7 @@ export class Cockpit {
   nowMs = $state(performance.now())
   visible = $state(!document.hidden)
 
-  private chosen = $state<Choice>({ camera: null, scan: null, odometry: null, motion: null })
+  private chosen = $state<Choice>({ scan: null, odometry: null, motion: null })
   private answeredMs = $state<number | null>(null)
   private lostMs = $state<number | null>(null)
 
@@ -70,10 +73,12 @@ export class Cockpit {
   readonly blocked = $derived(this.whyBlocked())
 
   readonly link: Link
+  readonly relayClock = new RelayClock()
   private readonly drive: Drive
   private readonly pings = new PingTracker()
   private readonly robotGate = new Gate(ROBOT_PING_MS)
   private readonly topicsGate = new Gate(TOPICS_MS)
+  private readonly camerasGate = new Gate(CAMERAS_MS)
   private readonly nowGate = new Gate(200)
   private readonly idleGate = new Gate(PING_IDLE_MS)
   private readonly drivingGate = new Gate(PING_DRIVING_MS)
@@ -82,7 +87,7 @@ export class Cockpit {
   private timer: ReturnType<typeof setInterval> | undefined
 
   constructor(readonly name: string) {
-    this.chosen = recall<Choice>(`topics:${name}`, { camera: null, scan: null, odometry: null, motion: null })
+    this.chosen = recall<Choice>(`topics:${name}`, { scan: null, odometry: null, motion: null })
     this.limits = recall<Limits>(`limits:${name}`, { linear: 0.5, angular: 1 })
     this.drive = new Drive(
       (command) => this.send(command),
@@ -170,6 +175,7 @@ export class Cockpit {
     if (visible) {
       // Timers slept: what was out then says nothing about the link now.
       this.pings.reset()
+      this.relayClock.reset()
       this.late = false
     } else {
       this.drive.stop('page_hidden')
@@ -242,6 +248,7 @@ export class Cockpit {
   private linkGone(): void {
     this.drive.stop('link_closed')
     this.pings.reset()
+    this.relayClock.reset()
     this.robotPingOut = false
     this.late = false
   }
@@ -285,6 +292,15 @@ export class Cockpit {
     }
   }
 
+  private async fetchCameras(): Promise<void> {
+    try {
+      const found = await fetchCameras(this.name)
+      if (JSON.stringify(found) !== JSON.stringify(this.cameras)) this.cameras = found
+    } catch {
+      // Asked again in a moment; a lost link is shown elsewhere.
+    }
+  }
+
   // The clock
 
   private tick(): void {
@@ -296,14 +312,16 @@ export class Cockpit {
     if ((this.driving ? this.drivingGate : this.idleGate).open(now)) void this.pingRelay(now)
     if (!this.robotPingOut && this.robotState !== 'offline' && this.robotGate.open(now)) void this.pingRobot(now)
     if (this.topicsGate.open(now)) void this.fetchTopics()
+    if (this.camerasGate.open(now)) void this.fetchCameras()
     if (this.pings.silentFor(now) > SILENT_MS) this.link.abandon()
   }
 
   private async pingRelay(now: number): Promise<void> {
     const number = this.pings.sent(now)
     try {
-      await this.ping(false)
+      const answer = await this.ping(false)
       this.pings.answered(number, performance.now())
+      this.relayClock.told(now, performance.now(), answer.relay_time_ns / 1e6)
       this.answeredMs = performance.now()
       this.legs.clientRelay = this.pings.rtt
     } catch {
@@ -325,7 +343,7 @@ export class Cockpit {
     }
   }
 
-  private ping(robot: boolean): Promise<{ robot_rtt_ms: number | null }> {
+  private ping(robot: boolean): Promise<{ relay_time_ns: number; robot_rtt_ms: number | null }> {
     return this.link.call('/relay/ping', 'switchboard_msgs/srv/Ping', { robot }, PING_TIMEOUT_S)
   }
 }

@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest'
-import { ago, hertz, milliseconds, number, people, percent, pretty, sentence } from './format'
+import { ago, bytesPerSecond, hertz, milliseconds, number, people, percent, pretty, sentence } from './format'
 
 it('writes numbers with a real minus and without a negative zero', () => {
   expect(number(-1.234, 2)).toBe('−1.23')
@@ -62,4 +62,11 @@ describe('pretty', () => {
     for (let i = 0; i < 5000; i++) deep = { deep }
     expect(pretty(deep).split('\n').length).toBeLessThan(100)
   })
+})
+
+it('writes amounts per second in units people read', () => {
+  expect(bytesPerSecond(0)).toBe('0 kB/s')
+  expect(bytesPerSecond(312_400)).toBe('312 kB/s')
+  expect(bytesPerSecond(1_260_000)).toBe('1.3 MB/s')
+  expect(bytesPerSecond(25_000_000)).toBe('25 MB/s')
 })

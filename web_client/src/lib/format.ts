@@ -23,6 +23,11 @@ export function hertz(value: number): string {
   return value < 10 ? `${value.toFixed(1)} Hz` : `${Math.round(value)} Hz`
 }
 
+export function bytesPerSecond(value: number): string {
+  if (value < 1e6) return `${Math.round(value / 1000)} kB/s`
+  return `${(value / 1e6).toFixed(value < 1e7 ? 1 : 0)} MB/s`
+}
+
 /** How long ago a moment was, in words. Both in Unix seconds. */
 export function ago(then: number | null, now: number): string {
   if (then === null) return 'never'

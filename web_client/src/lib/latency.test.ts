@@ -1,5 +1,5 @@
 import { expect, it } from 'vitest'
-import { grade, PingTracker, PONG_TIMEOUT_MS } from './latency'
+import { grade, PingTracker, PONG_TIMEOUT_MS, RelayClock } from './latency'
 
 it('measures a round trip', () => {
   const pings = new PingTracker()
@@ -64,4 +64,16 @@ it('keeps a bounded number of unanswered pings', () => {
 
 it('grades round trips', () => {
   expect([20, 150, 400].map(grade)).toEqual(['good', 'fair', 'poor'])
+})
+
+it('knows the relay’s time by the quickest of its latest answers', () => {
+  const clock = new RelayClock()
+  expect(clock.unixMs(0)).toBeNull()
+  clock.told(1000, 1400, 51_390)
+  clock.told(2000, 2020, 52_010)
+  expect(clock.unixMs(3000)).toBe(53_000)
+  for (let i = 0; i < 20; i++) clock.told(5000, 5030, 65_015)
+  expect(clock.unixMs(6000)).toBe(66_000)
+  clock.reset()
+  expect(clock.unixMs(0)).toBeNull()
 })

@@ -88,6 +88,30 @@ export class PingTracker {
   }
 }
 
+/** The relay's clock as seen from the page; of the latest exchanges the quickest is the surest. */
+export class RelayClock {
+  private exchanges: { tripMs: number; aheadMs: number }[] = []
+
+  /** The relay told its time.
+   *
+   * @param relayMs Unix time in milliseconds, read between the two moments of the page
+   */
+  told(sentMs: number, nowMs: number, relayMs: number): void {
+    const exchange = { tripMs: nowMs - sentMs, aheadMs: relayMs - (sentMs + nowMs) / 2 }
+    this.exchanges = [...this.exchanges, exchange].slice(-16)
+  }
+
+  /** Unix time by the relay's clock, in milliseconds; null before it told any. */
+  unixMs(nowMs: number): number | null {
+    const [surest] = [...this.exchanges].sort((a, b) => a.tripMs - b.tripMs)
+    return surest === undefined ? null : nowMs + surest.aheadMs
+  }
+
+  reset(): void {
+    this.exchanges = []
+  }
+}
+
 export type Grade = 'good' | 'fair' | 'poor'
 
 /** How a round trip feels for driving. */

@@ -2,36 +2,37 @@
 
 export const STALE_MS = 1000
 
-/** Counts events in a sliding window. */
+/** Counts events, or adds up what they bring, in a sliding window. */
 export class RateMeter {
-  private times: number[] = []
+  private marks: { atMs: number; amount: number }[] = []
   private sinceMs: number | null = null
 
   constructor(private readonly windowMs = 2000) {}
 
-  mark(nowMs: number): void {
+  mark(nowMs: number, amount = 1): void {
     this.sinceMs ??= nowMs
-    this.times.push(nowMs)
+    this.marks.push({ atMs: nowMs, amount })
     this.trim(nowMs)
   }
 
-  /** Events per second over the window, 0 when nothing came. */
-  hz(nowMs: number): number {
+  /** Per second over the window, 0 when nothing came. */
+  perSecond(nowMs: number): number {
     this.trim(nowMs)
     if (this.sinceMs === null) return 0
     const span = nowMs - this.sinceMs
-    if (span >= this.windowMs) return (this.times.length * 1000) / this.windowMs
     // Before the window is full the first mark opens it and is not counted.
-    return this.times.length < 2 ? 0 : ((this.times.length - 1) * 1000) / Math.max(span, 1)
+    const counted = span >= this.windowMs ? this.marks : this.marks.slice(1)
+    const sum = counted.reduce((all, mark) => all + mark.amount, 0)
+    return (sum * 1000) / Math.max(Math.min(span, this.windowMs), 1)
   }
 
   reset(): void {
-    this.times = []
+    this.marks = []
     this.sinceMs = null
   }
 
   private trim(nowMs: number): void {
-    while (this.times.length > 0 && this.times[0]! <= nowMs - this.windowMs) this.times.shift()
+    while (this.marks.length > 0 && this.marks[0]!.atMs <= nowMs - this.windowMs) this.marks.shift()
   }
 }
 

@@ -1,7 +1,6 @@
 /** Choosing topics by their type. */
 import type { TopicInfo } from './types'
 
-export const CAMERA = ['sensor_msgs/msg/CompressedImage']
 export const SCAN = ['sensor_msgs/msg/LaserScan']
 export const ODOMETRY = ['nav_msgs/msg/Odometry']
 export const MOTION = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped']

@@ -81,9 +81,3 @@ export interface LaserScan {
   /** Metres; null where the robot measured nothing (JSON has no infinity). */
   ranges: (number | null)[]
 }
-
-export interface CompressedImage {
-  format: string
-  /** Base64. */
-  data: string
-}

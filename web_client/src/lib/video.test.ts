@@ -1,0 +1,210 @@
+import { afterEach, beforeEach, expect, it, vi } from 'vitest'
+import { videoSocket } from './api'
+import { videoEnding } from './closing'
+import { codecName, h264Missing } from './h264'
+import {
+  age,
+  fileName,
+  missedAfter,
+  MOST_PANES,
+  parameters,
+  pickCamera,
+  type PictureHeader,
+  PLAIN,
+  restored,
+  SILENT_MS,
+  VideoLink,
+} from './video'
+
+const compressed = (name: string) => ({ name, type: 'sensor_msgs/msg/CompressedImage' })
+const raw = (name: string) => ({ name, type: 'sensor_msgs/msg/Image' })
+
+it('takes a camera that needs no encoding, and a depth picture last', () => {
+  const depth = compressed('/a/depth/compressed')
+  expect(pickCamera([raw('/a'), depth, compressed('/front/image/compressed')])).toBe('/front/image/compressed')
+  expect(pickCamera([depth, raw('/cam/image_raw')])).toBe('/cam/image_raw')
+  expect(pickCamera([])).toBeNull()
+})
+
+it('adds a camera that is not shown yet, as long as there is one', () => {
+  const all = [compressed('/a'), compressed('/b')]
+  expect(pickCamera(all, ['/a'])).toBe('/b')
+  expect(pickCamera(all, ['/a', '/b'])).toBe('/a')
+})
+
+it('asks only for what is not as usual', () => {
+  expect(parameters('/cam/image', PLAIN)).toBe('topic=%2Fcam%2Fimage')
+  const wish = { ...PLAIN, width: 640, fps: 5, rotate: 90, codec: 'h264' as const }
+  expect(parameters('/cam', wish)).toBe('topic=%2Fcam&width=640&fps=5&rotate=90&codec=h264')
+  expect(videoSocket('r 1', 'topic=a', { protocol: 'https:', host: 'h' })).toBe('wss://h/robots/r%201/video/ws?topic=a')
+})
+
+it('restores what was shown, and passes over what makes no sense', () => {
+  expect(restored(undefined)).toEqual([PLAIN])
+  expect(restored('x')).toEqual([PLAIN])
+  expect(restored([null, { camera: '/a', width: 641, quality: 40, fps: '5', codec: 'vp9' }])).toEqual([
+    { ...PLAIN, camera: '/a', quality: 40 },
+  ])
+  expect(restored(Array(9).fill(PLAIN)).length).toBe(MOST_PANES)
+})
+
+it('misses a picture after a second, or later where they come slowly', () => {
+  expect(missedAfter(0, null)).toBe(1000)
+  expect(missedAfter(15, { fps: 0, source_fps: 30 })).toBe(1000)
+  expect(missedAfter(1, { fps: 1, source_fps: 30 })).toBe(2500)
+  expect(missedAfter(0, { fps: 0, source_fps: 0.5 })).toBe(5000)
+})
+
+it('tells the age by the relay’s clock, and not at all when the robot’s can’t be right', () => {
+  expect(age(1000, 1_000_080)).toBe(80)
+  expect(age(1000, 999_950)).toBe(0)
+  expect(age(1000, null)).toBeNull()
+  expect(age(1000, 990_000)).toBeNull()
+  expect(age(1000, 1_060_000)).toBeNull()
+})
+
+it('names a snapshot after robot, camera and time', () => {
+  const name = fileName('rover-1', '/camera/image raw/../x', Date.UTC(2026, 10, 21, 17, 3, 4, 56) / 1000)
+  expect(name).toBe('rover-1-camera-image-raw-x-2026-11-21T17-03-04-056Z.jpg')
+})
+
+it('says in words why a camera’s pictures ended', () => {
+  expect(videoEnding(4403, 'revoked by admin')).toEqual({
+    after: 'give_up',
+    words: 'You have no right to view this camera. Revoked by admin.',
+  })
+  expect(videoEnding(4401, 'x').after).toBe('login')
+  for (const code of [4404, 4429]) expect(videoEnding(code, '').after).toBe('give_up')
+  for (const code of [1001, 1006, 1011, 4408, 4503, 4999]) expect(videoEnding(code, '').after).toBe('retry')
+})
+
+it('says why there is no H.264', () => {
+  expect(h264Missing({ isSecureContext: false })).toContain('https')
+  expect(h264Missing({ isSecureContext: true })).toContain('WebCodecs')
+  expect(h264Missing({ isSecureContext: true, VideoDecoder: {} })).toBeNull()
+})
+
+it('reads the codec from the parameters of a key frame', () => {
+  const delimiter = [0, 0, 0, 1, 0x09, 0x10]
+  const parameters = [0, 0, 0, 1, 0x67, 0x42, 0xc0, 0x1e, 0xd9]
+  expect(codecName(new Uint8Array([...delimiter, ...parameters, 0, 0, 1, 0x65]))).toBe('avc1.42c01e')
+  expect(codecName(new Uint8Array([...delimiter, 0, 0, 1, 0x41, 1, 2, 3, 4]))).toBeNull()
+  expect(codecName(new Uint8Array([0, 0, 1, 0x67]))).toBeNull()
+})
+
+class FakeSocket {
+  binaryType = ''
+  sent: string[] = []
+  closed: number | null = null
+  onopen: () => void = () => undefined
+  onclose: (event: { code: number; reason: string }) => void = () => undefined
+  onmessage: (event: { data: unknown }) => void = () => undefined
+
+  send(text: string) {
+    this.sent.push(text)
+  }
+  close(code = 1005) {
+    this.closed = code
+  }
+  picture(number: number) {
+    this.onmessage({ data: JSON.stringify({ op: 'picture', number, stamp: 1, codec: 'jpeg', key: true }) })
+    this.onmessage({ data: new ArrayBuffer(8) })
+  }
+}
+
+function opened(picture: (header: PictureHeader) => Promise<void> = () => Promise.resolve()) {
+  const sockets: FakeSocket[] = []
+  const states: [string, number | null][] = []
+  const events = {
+    state: (state: string, _why: unknown, code: number | null) => states.push([state, code]),
+    playing: vi.fn(),
+    picture: vi.fn(picture),
+  }
+  const link = new VideoLink('ws://r', events, () => {
+    const socket = new FakeSocket()
+    sockets.push(socket)
+    return socket as unknown as WebSocket
+  })
+  link.open()
+  sockets[0]!.onopen()
+  return { link, sockets, states, events }
+}
+
+beforeEach(() => {
+  vi.useFakeTimers()
+  vi.spyOn(Math, 'random').mockReturnValue(0.5)
+})
+afterEach(() => {
+  vi.useRealTimers()
+  vi.restoreAllMocks()
+})
+
+it('takes a picture only when it was drawn', async () => {
+  let drawn = () => undefined as void
+  const { sockets } = opened(() => new Promise((done) => (drawn = done)))
+  sockets[0]!.picture(7)
+  await vi.advanceTimersByTimeAsync(50)
+  expect(sockets[0]!.sent).toEqual([])
+  drawn()
+  await vi.advanceTimersByTimeAsync(0)
+  expect(sockets[0]!.sent).toEqual(['{"op":"took","number":7}'])
+})
+
+it('hands on what the robot says about its stream', () => {
+  const { sockets, events } = opened()
+  sockets[0]!.onmessage({ data: '{"op":"playing","width":640,"reduced":0.5}' })
+  sockets[0]!.onmessage({ data: '{"op":"something new"}' })
+  expect(events.playing).toHaveBeenCalledExactlyOnceWith({ op: 'playing', width: 640, reduced: 0.5 })
+})
+
+it('comes back after pauses that grow until a picture comes', async () => {
+  const { sockets, states } = opened()
+  for (const [attempt, waited] of [500, 1000, 2000].entries()) {
+    sockets[attempt]!.onopen()
+    sockets[attempt]!.onclose({ code: 4503, reason: '' })
+    await vi.advanceTimersByTimeAsync(waited - 1)
+    expect(sockets.length).toBe(attempt + 1)
+    await vi.advanceTimersByTimeAsync(1)
+    expect(sockets.length).toBe(attempt + 2)
+  }
+  expect(states).toContainEqual(['waiting', 4503])
+  sockets[3]!.picture(1)
+  sockets[3]!.onclose({ code: 1006, reason: '' })
+  await vi.advanceTimersByTimeAsync(500)
+  expect(sockets.length).toBe(5)
+})
+
+it('gives up where trying again is useless, until it is told to', async () => {
+  const { link, sockets, states } = opened()
+  sockets[0]!.onclose({ code: 4403, reason: '' })
+  expect(states.at(-1)).toEqual(['ended', 4403])
+  await vi.advanceTimersByTimeAsync(60_000)
+  expect(sockets.length).toBe(1)
+  link.retryNow()
+  expect(sockets.length).toBe(2)
+})
+
+it('dials anew when a connection falls silent', async () => {
+  const { sockets } = opened()
+  await vi.advanceTimersByTimeAsync(SILENT_MS - 1)
+  sockets[0]!.picture(1)
+  await vi.advanceTimersByTimeAsync(SILENT_MS - 1)
+  expect(sockets[0]!.closed).toBeNull()
+  await vi.advanceTimersByTimeAsync(501)
+  expect(sockets[0]!.closed).not.toBeNull()
+  expect(sockets.length).toBe(2)
+})
+
+it('is quiet once it is closed', async () => {
+  let drawn = () => undefined as void
+  const { link, sockets, states } = opened(() => new Promise((done) => (drawn = done)))
+  sockets[0]!.picture(1)
+  link.close()
+  drawn()
+  const before = states.length
+  sockets[0]!.onclose({ code: 1000, reason: '' })
+  await vi.advanceTimersByTimeAsync(60_000)
+  expect(sockets[0]!.sent).toEqual([])
+  expect(states.length).toBe(before)
+  expect(sockets.length).toBe(1)
+})
