@@ -109,7 +109,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def __post_init__(self) -> None:
         named = {
-            _topic_name("cameras", name): _camera_source(name, source) for name, source in self.cameras.items()
+            _topic_name("cameras", name): _camera_source(name, source)
+            for name, source in self.cameras.items()
         }
         msgspec.structs.force_setattr(self, "cameras", named)
 

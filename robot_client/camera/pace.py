@@ -36,6 +36,12 @@ SLACK = 0.05
 QUICKEST = 0.001
 """Seconds; what is shorter says nothing of the link."""
 
+_TELLING = 4096
+"""Bytes; a smaller picture that is late says more of the processor than of the link, unless others are late too."""
+
+_UNMISTAKABLE = 2
+"""Times the target; what is later than that needs no second one to be believed."""
+
 _LEAST_QUALITY = 35
 _QUALITIES = (65, 50, _LEAST_QUALITY)
 _SCALES = (0.75, 0.56, 0.42, 0.32, 0.24, 0.18)
@@ -105,6 +111,7 @@ class Pace:
         self._unit: float | None = None
         self._last_sent: float | None = None
         self._last_took = float("-inf")
+        self._late = False
         self._hold = HOLD[0]
         self._raised = self._changed = float("-inf")
 
@@ -178,17 +185,24 @@ class Pace:
         self.delay = delay if self.delay is None else _smooth(self.delay, delay, 0.3)
         # Behind another picture it began to go only when that one was there.
         began = max(sent.at, self._last_took - self._trip)
-        self._measure(sent.size / max(now - began - self._trip, (now - began) / 8, QUICKEST), delay)
+        self._measure(sent.size, max(now - began - self._trip, (now - began) / 8, QUICKEST), delay)
         self._last_took = now
         if not self._under_way:
             self._free_at = now
         self._fit(now)
 
-    def _measure(self, rate: float, delay: float) -> None:
-        if self.rate is None or (rate < self.rate and delay > self._goal):
+    def _measure(self, size: int, seconds: float, delay: float) -> None:
+        """Take one measurement: so many bytes took so long, at most; a busy processor makes it longer."""
+        rate = size / seconds
+        late = delay / self._goal
+        sure = size >= _TELLING and late > (1 if self._late else _UNMISTAKABLE)
+        self._late = late > 1
+        if self.rate is None or (rate < self.rate and sure):
             self.rate = rate
+        elif rate < self.rate:
+            self.rate = _smooth(self.rate, rate, 0.4 * min(late, 1.0) ** 2)
         else:
-            self.rate = _smooth(self.rate, rate, 0.4 if rate < self.rate else 0.25)
+            self.rate = _smooth(self.rate, rate, 0.25)
 
     def _fit(self, now: float) -> None:
         """Go down to where a picture is small enough at once, up by one step at a time."""

@@ -34,11 +34,13 @@ class Uplink:
         fps: float = 15,
         full: int = 50_000,
         settings: VideoSettings | None = None,
+        stalls: float = 0.0,
     ) -> None:
         self.now = 0.0
         self.rate = mbit * MBIT
         self.pace = Pace(settings or VideoSettings())
         self.trip = trip
+        self._stalls = stalls
         self.most_under_way = 0
         self.largest = 0
         self._fps = fps
@@ -73,7 +75,8 @@ class Uplink:
             room -= part
             if first[1] <= 0:
                 self._pipe.pop(0)
-                self._coming.append((self.now + self.trip, int(first[0]), first[2]))
+                stalled = self._random.uniform(0.05, 0.35) if self._random.random() < self._stalls else 0.0
+                self._coming.append((self.now + self.trip + stalled, int(first[0]), first[2]))
 
     def _answers(self) -> list[Taken]:
         taken = []
@@ -225,6 +228,14 @@ def test_long_round_trip_is_not_taken_for_a_thin_link() -> None:
     uplink = Uplink(10, trip=0.6)
     uplink.run(20)
     assert uplink.pace.reduced == 0.0
+
+
+@pytest.mark.parametrize(("mbit", "full", "stalls"), [(10, 50_000, 0.05), (0.2, 1_500, 0.1)])
+def test_busy_processor_is_not_taken_for_a_thin_link(mbit: float, full: int, stalls: float) -> None:
+    """Where an answer is late by up to a third of a second now and then, what the link bears stays nearly as asked."""
+    uplink = Uplink(mbit, full=full, stalls=stalls)
+    taken = uplink.run(60)
+    assert sum(each.step for each in taken) / len(taken) < 0.2
 
 
 def test_unknown_number_is_passed_over() -> None:
