@@ -10,9 +10,7 @@ from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_protocol.rights import Operation
 from relay_server.access import BadCredentials, Permit
 from relay_server.registry import Presence
-from relay_server.video import Picture, Stream, Videos
-
-NO_CAMERA = "there is no such camera, or you have no right to view it"
+from relay_server.video import NO_CAMERA, Picture, Stream, Videos
 
 
 class Screen(Protocol):

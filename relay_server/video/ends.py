@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from relay_server.video.stream import Stream
 
 
+NO_CAMERA = "there is no such camera, or you have no right to view it"
+"""Which of both is nobody's business."""
+
+
 class NothingCame(Unavailable):
     """All that is needed is there, but no picture came in time."""
 

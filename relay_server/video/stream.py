@@ -12,7 +12,7 @@ from relay_protocol.errors import MalformedMessage, NotFound, SwitchboardError, 
 from relay_protocol.frames import VideoFrame
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.registry import Presence
-from relay_server.video.ends import NothingCame, VideoLink, Viewer
+from relay_server.video.ends import NO_CAMERA, NothingCame, VideoLink, Viewer
 from relay_server.video.pictures import STALE_SECONDS, Picture, look_at
 from relay_server.video.states import LINKED, NEXT, Event, State
 
@@ -176,7 +176,7 @@ class Stream:
         if self.robot.control is None:
             return Unavailable(f"robot {robot} is offline")
         if self.state is State.WAITING:
-            return NotFound(f"robot {robot} has no camera {self.camera}")
+            return NotFound(NO_CAMERA)
         if self.state is State.OPENING:
             return NothingCame(f"robot {robot} does not open the video of {self.camera}")
         return NothingCame(f"camera {self.camera} has given no picture for {FIRST_PICTURE_SECONDS:g} s")

@@ -149,3 +149,25 @@ def test_a_robot_whose_key_is_not_accepted_any_more_is_not_seen_any_more(shed: S
             assert not viewer.is_alive()
             assert end.ended()
         assert control.ended()
+
+
+@pytest.mark.parametrize("how", ["right", "pattern", "token"])
+def test_a_viewer_whose_right_is_revoked_sees_no_more(shed: Shed, how: str) -> None:
+    """Within a second; the robot, which nobody watches any more, is told to stop."""
+    with shed.robot() as control:
+        viewer = Viewer(shed)
+        with shed.showing(control) as end:
+            end.send_bytes(encode_video(1, time.time_ns(), JPEG))
+            viewer.sees_a_picture()
+            if how == "right":
+                shed.relay.cli("right", "revoke", "ann", "liar")
+            elif how == "pattern":
+                shed.relay.cli("right", "grant", "ann", "liar", "viewer", "--deny", f"view:{CAMERA}")
+            else:
+                (number,) = [each["id"] for each in shed.relay.cli("token", "list") if each["user"] == "ann"]
+                shed.relay.cli("token", "revoke", str(number))
+            viewer.join(1)
+            assert not viewer.is_alive()
+            assert control.until("close_video", 3)
+    answer = ask(shed.relay.http_port, "GET", PATH.format("stream"), token=shed.token)
+    assert answer.status == (401 if how == "token" else 404)

@@ -6,7 +6,7 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, Unavailable
-from relay_server.video import NothingCame, State
+from relay_server.video import NO_CAMERA, NothingCame, State
 from relay_server.video.states import LINKED, NEXT, Event
 from relay_server.video.stream import (
     FIRST_PICTURE_SECONDS,
@@ -217,7 +217,7 @@ def test_who_gets_no_picture_is_told_why(world: World) -> None:
     robot_comes(world)
     nowhere = told(link.VideoSettings(), "/nowhere")
     assert isinstance(nowhere, NotFound)
-    assert str(nowhere) == "robot rover has no camera /nowhere"
+    assert str(nowhere) == NO_CAMERA
     silent = told(link.VideoSettings(fps=1))
     assert isinstance(silent, NothingCame)
     assert "does not open the video" in str(silent)

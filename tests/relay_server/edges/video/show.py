@@ -6,6 +6,7 @@ import email.parser
 import itertools
 import json
 import socket
+import ssl
 import time
 from collections.abc import Callable
 from typing import Any
@@ -35,6 +36,7 @@ from relay_server.registry import Presence, Registry
 from relay_server.rounds import Rounds
 from relay_server.session import Timing
 from relay_server.store import Store
+from relay_server.tls import ServerTls
 from relay_server.video import Stream, Videos
 from tests.relay_server.edges.http_client import api_of
 from tests.relay_server.memory import MemoryLink
@@ -62,9 +64,12 @@ def jpeg(size: int = 0) -> bytes:
 
 
 class Show:
-    """A robot that shows ``CAMERA`` and has ``SECRET``; ann may view the first of them."""
+    """A robot that shows ``CAMERA`` and has ``SECRET``; ann may view the first of them.
 
-    def __init__(self, store: Store) -> None:
+    :param tls: listen by TLS
+    """
+
+    def __init__(self, store: Store, tls: ServerTls | None = None) -> None:
         self.store = store
         clock: Any = reactor
         self.registry = Registry(time.time)
@@ -94,8 +99,13 @@ class Show:
         pictures = WebSocketResource(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds))
         video = Video(clock, rounds, self.desk, api.principal, pictures)
         root = Root(Robots(websocket, video, "1.2.3"), api.app.resource(), Missing())
-        self._port = clock.listenTCP(0, RelaySite(root, clock, cap, False), interface="127.0.0.1")
-        self.port: int = self._port.getHost().port
+        site = RelaySite(root, clock, cap, tls is not None)
+        self._listening = (
+            clock.listenTCP(0, site, interface="127.0.0.1")
+            if tls is None
+            else clock.listenSSL(0, site, tls, interface="127.0.0.1")
+        )
+        self.port: int = self._listening.getHost().port
         self.numbers = itertools.count(1)
         self._filming: list[LoopingCall] = []
         self._people()
@@ -124,7 +134,7 @@ class Show:
             each.stop()
         self.desk.say_goodbye("the test is over")
         self.videos.shut()
-        await self._port.stopListening()
+        await self._listening.stopListening()
 
     # --- the robot ----------------------------------------------------------------------------------------
 
@@ -195,9 +205,19 @@ class Looker:
     """A client of its own making, on a real socket; what takes time it does in a thread.
 
     :param window: bytes its kernel takes without being asked, 0 for what is usual
+    :param tls: over TLS; whose certificate it is does not matter
     """
 
-    def __init__(self, port: int, path: str, method: str = "GET", window: int = 0, **headers: str) -> None:
+    def __init__(
+        self,
+        port: int,
+        path: str,
+        method: str = "GET",
+        *,
+        window: int = 0,
+        tls: bool = False,
+        **headers: str,
+    ) -> None:
         self.socket = socket.socket()
         if window:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window)
@@ -206,6 +226,15 @@ class Looker:
         self.socket.settimeout(15)
         self.socket.connect(("127.0.0.1", port))
         self._data = b""
+        self._request = (path, method, headers)
+        if not tls:
+            self.asks(path, method, **headers)
+
+    async def asks_by_tls(self) -> None:
+        """The handshake, which takes the reactor's turns as well, and then the request."""
+        context = ssl._create_unverified_context()
+        self.socket = await deferToThread(context.wrap_socket, self.socket)
+        path, method, headers = self._request
         self.asks(path, method, **headers)
 
     def asks(self, path: str, method: str = "GET", **headers: str) -> None:

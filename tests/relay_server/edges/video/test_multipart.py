@@ -160,6 +160,17 @@ async def test_where_nothing_comes_the_answer_says_why(
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_camera_that_never_appears_is_told_like_one_that_may_not_be_viewed(
+    show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """404 in the same words; the robot had time to tell of it."""
+    monkeypatch.setattr(streams, "FIRST_PICTURE_SECONDS", 0.2)
+    show.robot_comes()
+    looker = show.looks(STREAM.replace(CAMERA, "/nowhere"))
+    assert await looker.problem() == (404, "there is no such camera, or you have no right to view it")
+
+
+@pytest_twisted.ensureDeferred
 async def test_a_busy_robot_is_503_in_its_words(show: Show) -> None:
     """Before the first picture; after it the connection ends."""
     control = show.robot_comes()
