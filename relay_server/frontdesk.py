@@ -92,7 +92,7 @@ class FrontDesk:
         self._wall = wall
         self._sessions: dict[int, dict[int, Session]] = {}
         self._watchings: set[Watching] = set()
-        self._local = RelayNode(self.sessions_of)
+        self._local = RelayNode(self.sessions_of, videos)
 
     def __iter__(self) -> Iterator[Session]:
         return iter([session for each in self._sessions.values() for session in each.values()])

@@ -98,6 +98,7 @@ uint64 plain_instead
 uint64 refusals
 uint64 stale_commands
 Uplink uplink
+Video[] video
 Motion motion
 Health health
 {_LINE}
@@ -118,6 +119,18 @@ string state
 uint32 subscribed
 uint32 published
 bool sim_time
+{_LINE}
+MSG: switchboard_msgs/msg/Video
+string camera
+string codec
+string state
+uint32 viewers
+uint32 width
+uint32 height
+uint8 quality
+float64 fps
+float64 reduced
+float64 delay_ms
 {_LINE}
 MSG: switchboard_msgs/msg/Motion
 string[] types

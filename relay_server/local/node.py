@@ -8,8 +8,11 @@ from typing import Any
 
 import msgspec
 
+from relay_protocol import link
+from relay_protocol.rights import Operation
 from relay_server.local import rosapi
 from relay_server.session import Session
+from relay_server.video import Stream, Videos
 
 
 async def ping(session: Session, args: Any) -> dict[str, Any]:
@@ -29,10 +32,12 @@ class RelayNode:
     """Finds the relay's own services and topics by name.
 
     :param sessions: all sessions of a robot, by its id
+    :param videos: all streams of cameras
     """
 
-    def __init__(self, sessions: Callable[[int], list[Session]]) -> None:
+    def __init__(self, sessions: Callable[[int], list[Session]], videos: Videos) -> None:
         self._sessions = sessions
+        self._videos = videos
         self._services: dict[str, Callable[[Session, Any], Awaitable[Any]]] = {
             "/relay/ping": ping,
             **rosapi.SERVICES,
@@ -65,6 +70,11 @@ class RelayNode:
             "refusals": session.refusals,
             "stale_commands": session.stale_commands,
             "uplink": self._uplink(session),
+            "video": [
+                _shown(stream)
+                for stream in self._videos.of(robot)
+                if session.permit.judge(Operation.VIEW, stream.camera).allowed
+            ],
             "motion": _whole(robot.description.motion),
             "health": _whole(robot.health),
         }
@@ -77,6 +87,22 @@ class RelayNode:
             "published": len(ends.publishes),
             "sim_time": session.robot.description.sim_time,
         }
+
+
+def _shown(stream: Stream) -> dict[str, Any]:
+    told = stream.told or link.Playing(width=0, height=0, quality=stream.settings.quality)
+    return {
+        "camera": stream.camera,
+        "codec": stream.settings.codec,
+        "state": stream.state.value,
+        "viewers": len(stream.viewers),
+        "width": told.width,
+        "height": told.height,
+        "quality": told.quality,
+        "fps": told.fps,
+        "reduced": told.reduced,
+        "delay_ms": told.delay_ms,
+    }
 
 
 def _whole(struct: msgspec.Struct) -> dict[str, Any]:

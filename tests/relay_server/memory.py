@@ -279,7 +279,7 @@ class World:
             permit,
             self.robot,
             self.channel,
-            RelayNode(lambda robot_id: self.people),
+            RelayNode(lambda robot_id: self.people, self.videos),
             Freshness(self.now_ns, self.now_ns(), lambda: next(self._tokens).to_bytes(8, "big")),
             Timing(client_ping=2.0, driving_ping=0.1, stall_limit=5.0),
             self.rounds,

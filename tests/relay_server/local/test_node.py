@@ -11,6 +11,7 @@ from relay_protocol.rights import Grant, Level, Rules
 from relay_server.local.catalogue import SERVICES, STATUS, TYPES
 from tests.relay_server.local.asking import ask
 from tests.relay_server.memory import STRING, Person, World, text
+from tests.relay_server.video.watching import CAMERA, Watcher
 
 
 def test_ping_is_answered_at_once_or_after_a_round_trip(world: World, viewer: Person) -> None:
@@ -81,6 +82,31 @@ def test_status_tells_of_the_uplink(world: World, viewer: Person, operator: Pers
     viewer.says("subscribe", topic="/relay/status")
     (told,) = viewer.hears("publish")
     assert told["msg"]["uplink"] == {"state": "open", "subscribed": 1, "published": 1, "sim_time": False}
+
+
+def test_status_tells_of_the_streams_one_may_view(world: World, viewer: Person) -> None:
+    """Who watches, and what the robot sends for them; cameras one may not view are left out."""
+    watcher = Watcher()
+    stream = watcher.watch(world, link.VideoSettings(width=320))
+    Watcher(8).watch(world, camera="/vault/image")
+    stream.message(link.Playing(width=320, height=240, quality=55, fps=15.0, reduced=0.4, delay_ms=41.5))
+    viewer.says("subscribe", topic="/relay/status")
+    (told,) = viewer.hears("publish")
+    assert told["msg"]["video"] == [
+        {
+            "camera": CAMERA,
+            "codec": "jpeg",
+            "state": stream.state.value,
+            "viewers": 1,
+            "width": 320,
+            "height": 240,
+            "quality": 55,
+            "fps": 15.0,
+            "reduced": 0.4,
+            "delay_ms": 41.5,
+        }
+    ]
+    TYPES.from_json(STATUS, told["msg"], 0)
 
 
 def test_status_tells_of_which_topics_the_client_took_too_little(world: World, viewer: Person) -> None:
