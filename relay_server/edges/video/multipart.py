@@ -8,7 +8,7 @@ from twisted.internet.defer import Deferred
 from twisted.web.server import Request
 
 from relay_protocol import link
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import Refused, SwitchboardError
 from relay_server.clock import Clock
 from relay_server.edges.fastpath import Turns, Writer, writer_for
 from relay_server.edges.flow import Flow
@@ -18,7 +18,8 @@ from relay_server.video import Picture
 
 # That of web_video_server: some programs look for it without reading the header.
 _BOUNDARY = b"boundarydonotcross"
-_DELIMITER = b"--" + _BOUNDARY + b"\r\n"
+_MARK = b"--" + _BOUNDARY
+_DELIMITER = _MARK + b"\r\n"
 CONTENT_TYPE = b"multipart/x-mixed-replace; boundary=" + _BOUNDARY
 
 LEAVING_SECONDS = 2.0
@@ -29,7 +30,11 @@ def part(picture: Picture, reduced: float) -> bytes:
     """One part, and the delimiter behind it: browsers show a part when the next begins.
 
     :param reduced: how far the picture is below what was asked for, 0 to 1
+    :returns: nothing for a picture that holds the delimiter: browsers look for that, not at the length, and what
+        follows it would be a part as the robot likes it, of the relay's own site
     """
+    if _MARK in picture.body:
+        return b""
     head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\nX-Timestamp: %.6f\r\n%b\r\n" % (
         len(picture.body),
         picture.stamp,
@@ -76,7 +81,8 @@ class Multipart:
     def ended(self, error: SwitchboardError) -> None:
         """In words if nothing was sent yet; else the connection says it by its end."""
         if self._writer is not None:
-            self._close()
+            # A right that is gone is gone for the rest of a picture too.
+            self._close(abort=self._full and isinstance(error, Refused))
         elif not self.done.called:
             self.done.errback(error)
 
@@ -102,11 +108,14 @@ class Multipart:
         if self._full or self.done.called:
             return
         for picture in self._waiting.take():
+            made = self._made.of(picture, self._reduced)
+            if not made:
+                continue
             writer = self._writer or self._begin()
             # TLS takes what it is given, and says only a turn later that it has something left.
             self._full = self._tcp is not None and self._tcp is not self._transport
             self._note_progress()
-            writer.write(self._made.of(picture, self._reduced))
+            writer.write(made)
             # Whether the socket takes it decides which picture is next, so it is tried at once.
             writer.flush()
 
@@ -131,7 +140,7 @@ class Multipart:
         if not self._full or self._unsent() != self._left:
             self._note_progress()
         elif self._clock.seconds() - self._moved >= STALL_SECONDS:
-            self._close()
+            self._close(abort=True)
 
     def _note_progress(self) -> None:
         self._left, self._moved = self._unsent(), self._clock.seconds()
@@ -139,13 +148,16 @@ class Multipart:
     def _unsent(self) -> int:
         return 0 if self._tcp is None else unsent(self._tcp)
 
-    def _close(self) -> None:
-        """A picture that has begun is not finished when it takes time."""
+    def _close(self, abort: bool) -> None:
+        """End the connection.
+
+        :param abort: what was not taken yet goes no more
+        """
         if self.done.called:
             return
         self._round.stop()
         self._request.unregisterProducer()
-        if self._full:
+        if abort:
             self._transport.abortConnection()
         else:
             self._request.channel.loseConnection()

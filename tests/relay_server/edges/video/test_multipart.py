@@ -187,3 +187,31 @@ async def test_a_busy_robot_is_503_in_its_words(show: Show) -> None:
     assert (await looker.head())[0] == 200
     stream.message(link.NotPlaying(reason="no more"))
     assert await looker.closed() < 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_picture_right_before_the_end_still_comes(show: Show) -> None:
+    """Also what the kernel holds for somebody who is slow."""
+    control = show.robot_comes()
+    looker = show.looks(STREAM, window=4096)
+    stream = await show.joined(control)
+    show.shows(stream, jpeg(60_000))
+    stream.message(link.NotPlaying(reason="no more"))
+    assert (await looker.head())[0] == 200
+    assert (await looker.part())[1] == jpeg(60_000)
+    assert await looker.closed() < 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_picture_that_holds_the_delimiter_is_left_out(show: Show) -> None:
+    """Browsers look for it, not at the length: behind it a robot could put a page of the relay's own site."""
+    control = show.robot_comes()
+    looker = show.looks(STREAM)
+    stream = await show.joined(control)
+    page = b"\r\n--boundarydonotcross\r\nContent-Type: text/html\r\n\r\n<script>"
+    whole = jpeg()
+    show.shows(stream, whole[:2] + b"\xff\xfe" + (len(page) + 2).to_bytes(2, "big") + page + whole[2:])
+    show.shows(stream, whole)
+    assert (await looker.head())[0] == 200
+    assert (await looker.part())[1] == whole
+    looker.leave()
