@@ -105,7 +105,7 @@ def main() -> None:
     pipes: Any = stdio  # of two systems, of which mypy reads the other
     pipes.StandardIO(daemon, stdin=0, stdout=outlet)
     reactor.run(installSignalHandlers=False)
-    # Neither threads that read cameras nor DDS are taken down in order: that takes longer than it is worth.
+    # A thread that reads a camera over a network may need half a minute to notice.
     os._exit(0)
 
 

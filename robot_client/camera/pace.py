@@ -109,7 +109,7 @@ class Pace:
         self._round_trip: float | None = None
         self._own = 0.0
         self._unit: float | None = None
-        self._last_sent: float | None = None
+        self._due = float("-inf")
         self._last_took = float("-inf")
         self._late = False
         self._hold = HOLD[0]
@@ -151,10 +151,7 @@ class Pace:
 
     def wait(self, now: float) -> float:
         """Seconds until the rate that is aimed at allows another picture."""
-        if not self.fps or self._last_sent is None:
-            return 0.0
-        # A camera's pictures are not quite even: one that is a little early must not wait for the next.
-        return max(0.0, self._last_sent + 0.9 / self.fps - now)
+        return max(0.0, self._due - now) if self.fps else 0.0
 
     def sent(self, number: int, size: int, now: float, arrived: float) -> None:
         """A picture was written.
@@ -164,7 +161,9 @@ class Pace:
         """
         self._under_way[number] = _Sent(size, self._step, arrived, now)
         self._own = _smooth(self._own, now - arrived, 0.2)
-        self._last_sent = now
+        if self.fps:
+            # One that is late does not put off those that follow, by up to half of their distance.
+            self._due = max(self._due, now - 0.5 / self.fps) + 1 / self.fps
         unit = size / self._steps[self._step].weight
         self._unit = unit if self._unit is None else _smooth(self._unit, unit, 0.5)
         if self.rate is not None:

@@ -56,9 +56,12 @@ class Studio:
             self._close(line.stream, line.why)
 
     def stop(self, why: str) -> None:
-        """Close all; what was written still leaves."""
+        """Close all, and leave the graph; what was written still leaves."""
         for name in {*self._dialling, *self._streams}:
             self._close(name, why)
+        ros, self._ros = self._ros, None
+        if ros is not None:
+            ros.close()
 
     # --- streams -------------------------------------------------------------------------------------------
 

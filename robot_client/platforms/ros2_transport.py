@@ -1,4 +1,4 @@
-"""How the daemon and its guard talk to the robot's graph: by UDP alone where the middleware is Fast DDS.
+"""How the daemon, its guard and its camera process talk to the robot's graph: by UDP alone where it is of Fast DDS.
 
 Fast DDS prefers shared memory between processes of one machine. Whoever sends there takes a lock in the memory of the
 one who listens, and waits up to a second, again and again, when a listener that was stopped in the wrong moment holds
