@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable
 
@@ -13,6 +14,9 @@ from robot_client.camera.formats import Pixels
 V4L2 = "v4l2:"
 RETRY = (0.5, 5.0)
 """Seconds until it is opened again, growing."""
+
+_CREDENTIALS = re.compile("//.*@")
+"""What stands before the host in an address."""
 
 _BUFFERED = 1
 """Pictures the driver may keep: older ones are of no use."""
@@ -48,7 +52,9 @@ class Capture:
                 failures = 0
                 continue
             if failures == 0:
-                self._on_trouble(f"the camera {self._source} can't be read; it is tried again")
+                # Who may read the log may not know the camera's password.
+                shown = _CREDENTIALS.sub("//…@", self._source)
+                self._on_trouble(f"the camera {shown} can't be read; it is tried again")
             self._closed.wait(min(most, least * 2 ** min(failures, 16)))
             failures += 1
 

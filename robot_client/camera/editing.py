@@ -12,6 +12,9 @@ from relay_protocol.limits import PICTURE_SIDE
 from relay_protocol.link import VideoSettings
 from robot_client.camera.formats import Pixels
 
+ENLARGED = 1 << 23
+"""Most pixels a picture may be enlarged to: whoever may view must not make the robot spend its memory on nothing."""
+
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -61,11 +64,15 @@ def plan(settings: VideoSettings, width: int, height: int, scale: float = 1.0) -
     :param width: of the camera's picture, pixels
     :param height: of the camera's picture, pixels
     :param scale: 0 to 1, by how much each side is smaller than it is wanted, because the uplink is thin
-    :raises Invalid: the crop shows nothing of the picture, or a side would get too long
+    :raises Invalid: the crop shows nothing of the picture, or what comes out would be too large
     """
     crop = _crop(settings.crop, width, height)
     turn = (settings.rotate + 180 * settings.invert) % 360
     wide, high = _wanted(settings, *_turned_size(crop[2], crop[3], turn))
+    if wide * high > max(ENLARGED, crop[2] * crop[3]):
+        raise Invalid(
+            f"the picture would have {wide}×{high} pixels; none is enlarged beyond {ENLARGED} in all"
+        )
     least = step = 2 if settings.codec == "h264" else 1
     out = [max(least, round(side * min(scale, 1.0)) // step * step) for side in (wide, high)]
     whole = crop == (0, 0, width, height)

@@ -20,8 +20,11 @@ _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """JPEG markers that begin a frame, and so tell its size (T.81, table B.1)."""
 _BARE = frozenset({0x01, *range(0xD0, 0xD8)})
 """JPEG markers without a length."""
-_DATA = (0xD9, 0xDA)
-"""JPEG markers after which no size comes: end, start of scan."""
+_DATA = (0x00, 0xD9, 0xDA)
+"""JPEG markers after which no size comes: end, start of scan; and what is none, behind which decoders look for the next
+one where we would not."""
+_PARTS = 2048
+"""Most markers and bytes of filling before the size; a file of nothing else would keep the process busy for long."""
 
 
 def kind_of(file: bytes, start: int = 0) -> Kind:
@@ -70,8 +73,8 @@ def _png_size(file: bytes) -> tuple[int, int]:
 def _jpeg_size(file: bytes) -> tuple[int, int]:
     """Go from segment to segment until one tells the size (T.81, B.1.1)."""
     at = 2
-    while at + 9 <= len(file):
-        if file[at] != 0xFF:
+    for _ in range(_PARTS):
+        if at + 9 > len(file) or file[at] != 0xFF:
             break
         marker = file[at + 1]
         if marker in _FRAMES:

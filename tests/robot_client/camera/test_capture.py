@@ -55,6 +55,13 @@ def test_camera_that_comes_later_is_found(tmp_path: Path) -> None:
     assert seen.troubles.empty()
 
 
+def test_password_of_a_camera_is_not_told() -> None:
+    """Its address is, without what stands before the host."""
+    seen = Seen("rtsp://ann:s3c/r@t@127.0.0.1:1/front")
+    with closing(seen.capture):
+        assert "rtsp://…@127.0.0.1:1/front" in seen.troubles.get(timeout=PATIENCE)
+
+
 def test_closed_capture_reads_no_more(tmp_path: Path) -> None:
     """Its thread ends."""
     seen = Seen(film(tmp_path / "film.avi", 2))

@@ -162,6 +162,14 @@ def test_a_side_that_would_get_too_long_is_refused(settings: dict[str, object]) 
         plan(VideoSettings(**settings), 100, 1000)
 
 
+def test_pictures_are_not_enlarged_without_bound() -> None:
+    """8192×8192 are 200 MB for each stream; a camera that has so many may show them."""
+    with pytest.raises(Invalid, match="enlarged"):
+        plan(VideoSettings(width=8192, height=8192), 64, 48)
+    assert plan(VideoSettings(width=3840, height=2160), 64, 48).touches
+    assert not plan(VideoSettings(), 8192, 8192).touches
+
+
 @pytest.mark.parametrize("shape", [(480, 640, 3), (480, 640), (1, 1, 3), (3, 3000)])
 def test_time_is_burned_into_a_copy(shape: tuple[int, ...]) -> None:
     """Into the upper left corner alone; the camera's own pixels stay, and grey stays grey."""

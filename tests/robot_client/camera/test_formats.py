@@ -348,6 +348,30 @@ def test_jpeg_size_is_found_in_every_form(parameters: tuple[int, ...]) -> None:
         assert decoded(each).pixels.shape == (48, 64, 3)
 
 
+def test_a_jpeg_that_hides_its_size_from_us_is_not_decoded() -> None:
+    """A decoder passes over what is no marker, and finds the frame we took for what is in a segment."""
+    at = JPEG.index(b"\xff\xc0")
+    behind = at + 2 + int.from_bytes(JPEG[at + 2 : at + 4], "big")
+    frame = JPEG[at:behind]
+    large = frame[:5] + struct.pack(">HH", 8000, 8000) + frame[9:]
+    hidden = (
+        b"\xff\x00"
+        + struct.pack(">H", len(large) + 6)
+        + large
+        + b"\xff\xfe"
+        + struct.pack(">H", len(frame) + 2)
+    )
+    with pytest.raises(Invalid, match="tells no size"):
+        decoded(JPEG[:at] + hidden + frame + JPEG[behind:])
+
+
+@pytest.mark.parametrize("filling", [b"\xff\xff", b"\xff\xd0", b"\xff\xfe\x00\x02"])
+def test_a_jpeg_of_nothing_but_markers_is_given_up_soon(filling: bytes) -> None:
+    """However long it is."""
+    with pytest.raises(Invalid, match="tells no size"):
+        looked_at(compressed_cdr(b"\xff\xd8" + filling * 5_000 + JPEG[2:]), True)
+
+
 def test_a_file_that_would_unfold_to_gigabytes_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The size in its head is asked first."""
     monkeypatch.delattr(cv2, "imdecode")
