@@ -129,7 +129,9 @@ class CameraKeeper:
                 self._streams[answer.stream] = None
         elif isinstance(answer, Ended):
             self._log.info("stream {name} ended: {why}", name=answer.stream, why=answer.why)
-            self._gone(answer.stream)
+            # What was not taken yet is a stream opened anew meanwhile: it is the one before that has ended.
+            if self._streams.get(answer.stream) is None:
+                self._gone(answer.stream)
         elif isinstance(answer, Log):
             {"error": self._log.error, "warn": self._log.warn}.get(answer.level, self._log.info)(
                 "{text}", text=answer.text

@@ -74,7 +74,7 @@ def test_process_leaves_some_time_after_the_last_stream(scene: Scene) -> None:
     scene.keeper.open(opening("b"))
     scene.keeper.close("a", "why")
     assert scene.told()[-1] == Close(stream="a", why="why")
-    scene.answer(Ended(stream="b", why="lost"))
+    scene.answer(Taken(stream="b"), Ended(stream="b", why="lost"))
     scene.live(IDLE - 0.5)
     assert not scene.process.closed
     scene.live(0.5)
@@ -93,6 +93,16 @@ def test_stream_in_time_keeps_the_process(scene: Scene) -> None:
     scene.live(2 * IDLE)
     assert not scene.process.closed
     assert len(scene.reactor.processes) == 1
+
+
+def test_end_of_a_stream_is_not_that_of_the_one_opened_anew(scene: Scene) -> None:
+    """The process has not read of the new one when it tells that the old one has ended; it stays for the new one."""
+    scene.keeper.open(opening("a"))
+    scene.answer(Taken(stream="a"))
+    scene.keeper.open(opening("a"))
+    scene.answer(Ended(stream="a", why="lost"), Taken(stream="a"))
+    scene.live(2 * IDLE)
+    assert not scene.process.closed
 
 
 def test_stream_while_the_process_leaves_gets_another(scene: Scene) -> None:
