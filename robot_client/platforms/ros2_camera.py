@@ -1,8 +1,8 @@
 """Cameras in ROS 2: the camera process's node, and what it subscribes to.
 
-It shares no memory with other nodes either: who publishes pictures must not wait for a process that shows them. And of
-640×480 RGB at 15 Hz a quarter came through shared memory, whose segment is smaller than one of them; by UDP all did with
-4 MiB of socket buffer, and half with the 208 KiB that Linux grants by default.
+It shares no memory with other nodes either: who publishes pictures must not wait for a process that shows them. And
+of 640×480 RGB at 15 Hz a quarter came through shared memory, whose segment is smaller than one of them; by UDP all did
+with 4 MiB of socket buffer, and half with the 208 KiB that Linux grants by default.
 """
 
 from __future__ import annotations
