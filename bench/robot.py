@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,31 +23,6 @@ from bench.report import Options, Unavailable
 
 SETTLE_SECONDS = 8.0
 """A daemon that has just come up is busy for some seconds with what it finds."""
-
-
-class CountingProxy(ChaosProxy):
-    """A proxy between robot and relay that counts what comes from the robot."""
-
-    def __init__(self, target: int) -> None:
-        self.up = 0
-        self._relay = target
-        super().__init__(target)
-
-    def _pump(self, source: socket.socket, sink: socket.socket, gate: threading.Event) -> None:
-        if gate is not self.forward_up:
-            super()._pump(source, sink, gate)
-            return
-        try:
-            while data := source.recv(1 << 18):
-                sink.sendall(data)
-                self.up += len(data)
-        except OSError:
-            pass
-        finally:
-            for each in (source, sink):
-                with contextlib.suppress(OSError):
-                    each.shutdown(socket.SHUT_RDWR)
-            source.close()
 
 
 class Publisher(Child):
@@ -77,7 +50,7 @@ class RealRobot:
         self.folder = relay.folder / name
         self.folder.mkdir()
         self.environment = ros_environment(free_domain())
-        self.proxy = CountingProxy(relay.robots_port)
+        self.proxy = ChaosProxy(relay.robots_port)
         self.publisher = Publisher(self.environment, streams)
         state = str(self.folder / "state")
         code = relay.cli("robot", "add", name)["enrolment_code"]

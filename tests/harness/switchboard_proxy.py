@@ -5,16 +5,24 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
+
+PACKET_BYTES = 1460
+"""What goes at once over a thin uplink."""
 
 
 class ChaosProxy:
-    """A TCP proxy on loopback that can swallow bytes in either direction, or reset everything.
+    """A TCP proxy on loopback that can swallow bytes in either direction, be thin upwards, or reset everything.
 
     :param target: port it leads to
     """
 
     def __init__(self, target: int) -> None:
+        self.up = 0
+        """Bytes that went to the target, of all connections."""
         self._target = target
+        self._up_rate: float | None = None
+        self._up_free_at = 0.0
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._server.getsockname()[1])
         self._open: set[socket.socket] = set()
@@ -35,6 +43,11 @@ class ChaosProxy:
         """Everything passes again, late as it is."""
         self.forward_up.set()
         self.forward_down.set()
+
+    def squeeze(self, bits_per_second: float | None) -> None:
+        """From now on all connections share an uplink of this rate; ``None``: as fast as it goes."""
+        with self._lock:
+            self._up_rate = None if bits_per_second is None else bits_per_second / 8
 
     def reset(self) -> None:
         """Cut all connections at once."""
@@ -73,7 +86,10 @@ class ChaosProxy:
         try:
             while data := source.recv(65536):
                 gate.wait()
-                sink.sendall(data)
+                if gate is self.forward_up:
+                    self._send_up(sink, data)
+                else:
+                    sink.sendall(data)
         except OSError:
             pass
         finally:
@@ -84,3 +100,21 @@ class ChaosProxy:
                 with contextlib.suppress(OSError):
                     each.shutdown(socket.SHUT_RDWR)
             source.close()
+
+    def _send_up(self, sink: socket.socket, data: bytes) -> None:
+        """Packet by packet where it is thin, so that connections take turns."""
+        rest = memoryview(data)
+        while rest:
+            with self._lock:
+                rate = self._up_rate
+                packet = rest if rate is None else rest[:PACKET_BYTES]
+                self._up_free_at = max(self._up_free_at, time.monotonic()) if rate else 0.0
+                if rate:
+                    self._up_free_at += len(packet) / rate
+                free_at = self._up_free_at
+            # A packet is there when its last bit is.
+            time.sleep(max(0.0, free_at - time.monotonic()))
+            sink.sendall(packet)
+            rest = rest[len(packet) :]
+            with self._lock:
+                self.up += len(packet)
