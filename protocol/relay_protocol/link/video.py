@@ -14,6 +14,10 @@ from relay_protocol.message import Message
 
 Side = Annotated[int, Meta(ge=0, le=limits.PICTURE_SIDE)]
 
+Shown = Annotated[int, Meta(ge=1, le=limits.PICTURE_SIDE)]
+Count = Annotated[int, Meta(ge=0, lt=2**32)]
+Rate = Annotated[float, Meta(ge=0, le=1e6)]
+
 Codec = Literal["jpeg", "png", "h264"]
 
 
@@ -62,9 +66,9 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     name: Name
     type: Name = ""
     encoding: Label = ""
-    width: int = 0
-    height: int = 0
-    fps: float = 0.0
+    width: Count = 0
+    height: Count = 0
+    fps: Rate = 0.0
 
 
 class Cameras(Message, frozen=True, kw_only=True):
@@ -106,14 +110,14 @@ class Playing(Message, frozen=True, kw_only=True):
     :param source_fps: pictures per second the camera gives
     """
 
-    width: int
-    height: int
-    quality: int
-    fps: float = 0.0
-    reduced: float = 0.0
-    delay_ms: float | None = None
+    width: Shown
+    height: Shown
+    quality: Annotated[int, Meta(ge=0, le=100)]
+    fps: Rate = 0.0
+    reduced: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    delay_ms: Annotated[float, Meta(ge=0, le=1e9)] | None = None
     encoding: Label = ""
-    source_fps: float = 0.0
+    source_fps: Rate = 0.0
 
 
 class NotPlaying(Reasoned, frozen=True, kw_only=True):

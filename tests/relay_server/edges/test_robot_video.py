@@ -97,6 +97,31 @@ async def test_what_has_no_place_on_a_streams_link_ends_it(hall: Hall, data: byt
     assert stream.state is not State.OPEN
 
 
+@pytest.mark.parametrize(
+    "lie",
+    [
+        '"width":0',
+        '"width":-5',
+        '"height":8193',
+        '"width":1' + 30 * "0",
+        '"quality":101',
+        '"fps":-1',
+        '"reduced":1e308',
+        '"delay_ms":-1',
+        '"source_fps":1e300',
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_what_can_not_be_is_not_told_to_viewers(hall: Hall, lie: str) -> None:
+    """Who reads it need not check it again."""
+    end, stream, watcher = await joined(hall)
+    rest = ",".join(each for each in ('"width":1', '"height":1', '"quality":1') if each[:4] != lie[:4])
+    end.sends(encode_json(f'{{"op":"playing",{lie},{rest}}}'.encode()))
+    assert lie.split('"')[1] in end.refusal()["reason"]
+    assert watcher.played == []
+    assert stream.state is State.OPENING
+
+
 @pytest_twisted.ensureDeferred
 async def test_html_instead_of_a_picture_ends_the_stream(hall: Hall) -> None:
     """The viewer is told, and the robot is not asked again."""
