@@ -14,6 +14,7 @@ from relay_server.outbox import Outbox
 from relay_server.session import ClientTransport
 
 HANDSHAKE_STATUS = {
+    closing.INVALID: 400,
     closing.UNAUTHENTICATED: 401,
     closing.NOT_FOUND: 403,
     closing.UNAVAILABLE: 503,
@@ -106,6 +107,8 @@ async def identify(gate: Gate, request: ConnectionRequest, robot: str) -> tuple[
 
 def code_of(error: SwitchboardError) -> int:
     """The code a websocket closes with for this reason."""
+    if isinstance(error, Invalid):
+        return closing.INVALID
     if isinstance(error, BadCredentials):
         return closing.UNAUTHENTICATED
     if isinstance(error, NotFound):
@@ -119,4 +122,4 @@ def code_of(error: SwitchboardError) -> int:
 
 def status_of(error: SwitchboardError) -> int:
     """The HTTP status of a handshake that is refused for this reason."""
-    return 400 if isinstance(error, Invalid) else HANDSHAKE_STATUS.get(code_of(error), 403)
+    return HANDSHAKE_STATUS.get(code_of(error), 403)

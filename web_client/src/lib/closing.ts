@@ -28,6 +28,7 @@ export function ending(code: number, reason: string): Ending {
 
 const VIDEO_ENDINGS: Record<number, Ending> = {
   1001: ENDINGS[1001]!,
+  4400: { after: 'give_up', words: 'The camera can’t be shown like that.' },
   4401: ENDINGS[4401]!,
   4403: { after: 'give_up', words: 'You have no right to view this camera.' },
   4404: { after: 'give_up', words: 'There is no camera of this name for you.' },

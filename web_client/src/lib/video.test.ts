@@ -74,7 +74,7 @@ it('says in words why a camera’s pictures ended', () => {
     words: 'You have no right to view this camera. Revoked by admin.',
   })
   expect(videoEnding(4401, 'x').after).toBe('login')
-  for (const code of [4404, 4429]) expect(videoEnding(code, '').after).toBe('give_up')
+  for (const code of [4400, 4404, 4429]) expect(videoEnding(code, '').after).toBe('give_up')
   for (const code of [1001, 1006, 1011, 4408, 4503, 4999]) expect(videoEnding(code, '').after).toBe('retry')
 })
 

@@ -178,8 +178,8 @@ async def test_a_revoked_right_closes_with_its_code(show: Show) -> None:
     ("query", "token", "status", "code"),
     [
         ("", "nobody's", 401, closing.UNAUTHENTICATED),
-        ("&quality=best", "ann's", 400, closing.FORBIDDEN),
-        (f"&topic={SECRET}", "ann's", 400, closing.FORBIDDEN),
+        ("&quality=best", "ann's", 400, closing.INVALID),
+        (f"&topic={SECRET}", "ann's", 400, closing.INVALID),
     ],
 )
 @pytest_twisted.ensureDeferred
