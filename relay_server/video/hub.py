@@ -17,6 +17,10 @@ from relay_server.video.stream import Hooks, Stream
 ROBOT_STREAMS = 16
 """Most streams of one robot."""
 
+USER_STREAMS = 8
+"""Most streams of one robot that one user watches alone: who asks for ever other sizes, or for cameras that are not
+there, leaves room for others."""
+
 USER_VIEWERS = 32
 """Most viewers of one user on one robot, over all his connections."""
 
@@ -52,7 +56,9 @@ class Videos:
         watched = sum(each.user == viewer.user for stream in self.of(robot) for each in stream.viewers)
         if watched >= USER_VIEWERS:
             raise Unavailable(f"you watch robot {robot.name} {watched} times already")
-        stream = self._streams.get((robot.robot_id, camera, settings)) or self._place(robot, camera, settings)
+        stream = self._streams.get((robot.robot_id, camera, settings)) or self._place(
+            robot, camera, settings, viewer.user
+        )
         stream.attach(viewer)
         return stream
 
@@ -73,21 +79,32 @@ class Videos:
         for stream in self:
             stream.shut(Unavailable("the relay is going down"))
 
-    def _place(self, robot: Presence, camera: str, settings: link.VideoSettings) -> Stream:
+    def _place(self, robot: Presence, camera: str, settings: link.VideoSettings, user: int) -> Stream:
         """A new stream, or the nearest one where no more may be."""
         here = self.of(robot)
+        alone = sum({each.user for each in stream.viewers} == {user} for stream in here)
+        if alone >= USER_STREAMS:
+            return self._instead(
+                robot, camera, settings, f"you have {alone} streams of robot {robot.name} to yourself"
+            )
         if len(here) >= ROBOT_STREAMS:
             idle = next((stream for stream in here if stream.state is State.LINGERING), None)
             if idle is None:
-                nearest = self._nearest(robot, camera, settings)
-                if nearest is None:
-                    raise Unavailable(f"robot {robot.name} shows {ROBOT_STREAMS} streams already")
-                return nearest
+                return self._instead(
+                    robot, camera, settings, f"robot {robot.name} shows {ROBOT_STREAMS} streams already"
+                )
             idle.shut(Unavailable("others need the place"))
         name = f"{robot.name}#video{next(self._counter)}"
         stream = Stream(self._clock, robot, camera, settings, name, self._hooks)
         self._streams[robot.robot_id, camera, settings] = stream
         return stream
+
+    def _instead(self, robot: Presence, camera: str, settings: link.VideoSettings, why: str) -> Stream:
+        """What is nearest to a stream that can't be, or the reason."""
+        nearest = self._nearest(robot, camera, settings)
+        if nearest is None:
+            raise Unavailable(why)
+        return nearest
 
     def _busy(self, stream: Stream) -> None:
         nearest = self._nearest(stream.robot, stream.camera, stream.settings)

@@ -7,7 +7,7 @@ import pytest
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.video import State, Stream
-from relay_server.video.hub import ROBOT_STREAMS, USER_VIEWERS
+from relay_server.video.hub import ROBOT_STREAMS, USER_STREAMS, USER_VIEWERS
 from relay_server.video.stream import STREAM_VIEWERS
 from tests.relay_server.memory import World
 from tests.relay_server.video.watching import (
@@ -78,6 +78,19 @@ def test_a_user_watches_a_robot_so_many_times(world: World) -> None:
     Watcher(8).watch(world)
     watchers[0].leave()
     Watcher().watch(world)
+
+
+def test_nobody_takes_all_streams_of_a_robot_for_himself(world: World) -> None:
+    """Not with forms nobody else wants, nor with cameras that are not there; what others watch he may as well."""
+    robot_comes(world)
+    for number in range(USER_STREAMS):
+        Watcher().watch(world, camera=f"/nowhere/{number}")
+    with pytest.raises(Unavailable, match="you have 8 streams of robot rover to yourself"):
+        Watcher().watch(world)
+    shared = Watcher(8).watch(world)
+    assert Watcher().watch(world) is shared
+    Watcher(8).watch(world, camera="/nowhere/0")
+    Watcher().watch(world, camera=OTHER)
 
 
 def test_a_robot_has_so_many_streams(world: World) -> None:
