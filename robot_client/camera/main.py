@@ -92,7 +92,8 @@ def _own_stdout() -> int:
 def main() -> None:
     """Show cameras until standard input ends."""
     os.nice(NICE)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the daemon's terminal; the daemon says when it is time
+    for meant_for_the_daemon in (signal.SIGINT, signal.SIGTERM):  # it says when it is time, or its pipe ends
+        signal.signal(meant_for_the_daemon, signal.SIG_IGN)
     outlet = _own_stdout()
     reactor = monotonic_reactor()
     daemon = Daemon(reactor)
