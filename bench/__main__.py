@@ -23,6 +23,7 @@ MEASUREMENTS = {
     "endtoend": "LaserScan to ten viewers against rosbridge's way",
     "crowd": "fifty clients of mixed speed, and one that breaks every rule",
     "soak": "a minute of load: nothing is lost",
+    "video": "cameras: what viewers cost, how old a picture is, slow beside fast",
     "standstill": "from a fault to standstill",
 }
 

@@ -66,7 +66,7 @@ class Camera:
         self._draw_sky(frame, pose)
         self._draw_floor(frame, pose)
         self._draw_walls(frame, pose)
-        _draw_captions(frame, speed, at)
+        draw_captions(frame, speed, at)
         return frame
 
     def _draw_sky(self, frame: Image, pose: Pose) -> None:
@@ -150,7 +150,13 @@ def to_rgb(frame: Image) -> bytes:
     return bytes(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
 
 
-def _draw_captions(frame: Image, speed: float, at: float) -> None:
+def draw_captions(frame: Image, speed: float, at: float) -> None:
+    """Write clock and speed into a picture.
+
+    :param frame: BGR, shape (480, 640, 3)
+    :param speed: m/s
+    :param at: seconds since the epoch
+    """
     clock = datetime.fromtimestamp(at, tz=timezone.utc)
     _caption(frame, f"{clock:%H:%M:%S}.{clock.microsecond // 1000:03d} UTC", 12)
     _caption(frame, f"{speed:+.2f} m/s", WIDTH - 118)
