@@ -284,13 +284,18 @@ class FrontDesk:
     ) -> Watching:
         """The same for somebody who was admitted; whatever comes of it, the admission is used up."""
         watching = Watching(
-            admission.permit, admission.robot, camera, screen, address=admission.address, over=self._left
+            admission.permit,
+            admission.robot,
+            camera,
+            settings,
+            screen,
+            address=admission.address,
+            over=self._left,
         )
         try:
             if not self.accepting:
                 raise GoingDown("the relay is going down; come again in a moment")
-            check_view(admission.permit, camera)
-            watching.begin(self._videos, settings)
+            watching.begin(self._videos)
         except SwitchboardError:
             self.turn_away(admission)
             raise

@@ -26,13 +26,24 @@ class Screen(Protocol):
         """There is nothing to see, or no more. Called once, and not after :meth:`Watching.leave`."""
 
 
-def check_view(permit: Permit, camera: str) -> None:
+_COMPRESSED = "/compressed"
+"""What image_transport adds to the name of a topic for its compressed pictures."""
+
+
+def check_view(permit: Permit, camera: str, transport: str = "") -> None:
     """Whether this may be seen.
 
+    :param transport: as in :class:`~relay_protocol.link.VideoSettings`; with it the robot may show another topic
     :raises NotFound: no right to; said like that there is no such camera
     """
-    if not permit.judge(Operation.VIEW, camera).allowed:
+    if not _may_view(permit, camera, transport):
         raise NotFound(NO_CAMERA)
+
+
+def _may_view(permit: Permit, camera: str, transport: str) -> bool:
+    raw = camera.removesuffix(_COMPRESSED)
+    shown = {"compressed": raw + _COMPRESSED, "raw": raw}.get(transport, camera)
+    return all(permit.judge(Operation.VIEW, each).allowed for each in {camera, shown})
 
 
 class Watching:
@@ -47,6 +58,7 @@ class Watching:
         permit: Permit,
         robot: Presence,
         camera: str,
+        settings: link.VideoSettings,
         screen: Screen,
         *,
         address: str,
@@ -55,6 +67,7 @@ class Watching:
         self.permit = permit
         self.robot = robot
         self.camera = camera
+        self.settings = settings
         self.address = address
         self.pictures = 0
         """How many there were for this viewer."""
@@ -69,12 +82,14 @@ class Watching:
         """Whose it is."""
         return self.permit.principal.user_id
 
-    def begin(self, videos: Videos, settings: link.VideoSettings) -> None:
+    def begin(self, videos: Videos) -> None:
         """Watch.
 
+        :raises NotFound: without the right to
         :raises Unavailable: too many do
         """
-        self._stream = videos.watch(self.robot, self.camera, settings, self)
+        check_view(self.permit, self.camera, self.settings.transport)
+        self._stream = videos.watch(self.robot, self.camera, self.settings, self)
 
     def start_anew(self) -> None:
         """A picture of H.264 was left out: show nothing before the next one that stands alone."""
@@ -116,7 +131,7 @@ class Watching:
     # --- rights -------------------------------------------------------------------------------------------
 
     def _rights_changed(self) -> None:
-        if not self.permit.judge(Operation.VIEW, self.camera).allowed:
+        if not _may_view(self.permit, self.camera, self.settings.transport):
             self.end(Refused(f"your right to view {self.camera} was revoked"))
 
     def _revoked(self, reason: str) -> None:

@@ -126,6 +126,8 @@ class Videos:
             if stream.camera == camera
             and stream.settings != settings
             and stream.settings.codec == settings.codec
+            # Another transport may be another topic, with rights of its own.
+            and stream.settings.transport in ("", settings.transport)
             and stream.newest is not None
         ]
         return min(shown, key=distance, default=None)

@@ -134,6 +134,16 @@ def test_a_picture_with_the_same_edits_is_nearer_than_one_of_the_size(world: Wor
     assert busy(world, link.VideoSettings(width=24, height=32)).stream is upright
 
 
+def test_what_may_be_another_topic_is_not_near(world: World) -> None:
+    """By another transport, which not everybody may view who may view the camera."""
+    robot_comes(world)
+    showing(world, 40, 30, transport="compressed")
+    assert busy(world, link.VideoSettings(width=41)).error is not None
+    plain = showing(world, 80, 60)
+    assert busy(world, link.VideoSettings(width=41, transport="compressed")).stream is not plain
+    assert busy(world, link.VideoSettings(width=41, transport="raw")).stream is plain
+
+
 def test_a_busy_robot_without_such_a_stream_is_told_of(world: World) -> None:
     """In its own words; so it is to those whom the other stream does not take."""
     robot_comes(world)

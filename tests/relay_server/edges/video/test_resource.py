@@ -175,6 +175,35 @@ async def test_what_is_no_question_is_answered_in_words(
     assert (await show.looks(path, method).problem())[0] == status
 
 
+@pytest.mark.parametrize(
+    ("camera", "transport", "denied"),
+    [
+        ("/front", "compressed", "/front/compressed"),
+        ("/front/compressed", "raw", "/front"),
+        ("/front", "raw", None),
+        ("/front", "", None),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_the_topic_shown_in_a_cameras_stead_may_have_to_be_viewed_too(
+    show: Show, camera: str, transport: str, denied: str | None
+) -> None:
+    """Another transport is another topic, with rights of its own, also while it is watched."""
+    await show.deny("/front/compressed" if camera == "/front" else "/front")
+    path = f"/robots/rover/video/stream?topic={camera}&default_transport={transport}"
+    looker = show.looks(path)
+    if denied is not None:
+        assert (await looker.problem())[0] == 404
+        await show.deny()
+        looker = show.looks(path)
+    await until(lambda: show.access._permits)
+    if denied is not None:
+        await show.deny(denied)
+        assert (await looker.problem())[0] == 403
+    looker.leave()
+    await until(lambda: not show.access._permits)
+
+
 @pytest_twisted.ensureDeferred
 async def test_a_viewer_who_leaves_before_the_first_picture_leaves_nothing(show: Show) -> None:
     """Neither at the stream nor with the judge."""
