@@ -234,6 +234,23 @@ async def test_nonsense_and_bytes_are_not_for_here(show: Show) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_who_takes_what_was_not_sent_is_cut_when_it_is_too_much(show: Show) -> None:
+    """In a row: of several pictures at once each may be said to be taken, though only the last counts."""
+    eye, stream = await watched(show)
+    await eye.playing()
+    for _ in range(2):
+        for _ in range(module.MISTAKES - 1):
+            await eye.took(0)
+        number = show.shows(stream, jpeg())
+        assert (await eye.picture())[0]["number"] == number
+        await eye.took(number)
+    for _ in range(module.MISTAKES):
+        await eye.took(0)
+    assert (await eye.closed())[0] == closing.TOO_MANY_ERRORS
+    assert not stream.viewers
+
+
+@pytest_twisted.ensureDeferred
 async def test_what_ends_a_stream_is_told_with_a_code(show: Show) -> None:
     """4503 from the robot, 1001 when the relay goes down."""
     eye, stream = await watched(show)
