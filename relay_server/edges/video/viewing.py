@@ -30,6 +30,10 @@ SOCKET_BYTES = 256 * KIB
 UNSENT_BYTES = 16 * KIB
 """What the kernel holds for a viewer: all of it, and what has not gone over the network yet."""
 
+_PROBES = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
+"""Seconds, seconds, times: while a robot is away nothing is written, and a viewer who vanished is noticed by these alone
+(tcp(7); some systems know only some of them)."""
+
 # Python 3.11 knows the name only where its C library did.
 _TCP_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", 25 if sys.platform == "linux" else None)
 
@@ -98,6 +102,9 @@ def narrow(transport: Any) -> Any:
         handle = tcp.getHandle()
         handle.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
         handle.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _PROBES.items():
+            if hasattr(socket, name):
+                handle.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         if _TCP_NOTSENT_LOWAT is not None:
             handle.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, UNSENT_BYTES)
     return tcp

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import socket
+import sys
+from types import SimpleNamespace
+
 import pytest
 
 from relay_server.edges.video import viewing
@@ -80,6 +84,19 @@ def test_where_one_of_h264_is_left_out_a_new_beginning_is_asked_for(line: Line, 
     assert line.asked == 1
     line.put(4, "h264", key=False)
     assert (line.taken, line.asked) == ([], 2)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere not all of it is known")
+def test_a_viewer_who_vanished_is_noticed_while_nothing_is_written() -> None:
+    """In a minute, not in the two hours that are usual."""
+    with socket.socket() as handle:
+        assert viewing.narrow(SimpleNamespace(getHandle=lambda: handle)) is not None
+        assert handle.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        idle, between, times = (
+            handle.getsockopt(socket.IPPROTO_TCP, each)
+            for each in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+        )
+        assert idle + between * times <= 60
 
 
 def test_what_is_made_of_a_picture_is_made_once_for_all() -> None:
