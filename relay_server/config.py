@@ -63,6 +63,7 @@ class Settings:
     :param driving_ping: seconds between pings to a client that is driving
     :param stall_limit: seconds a client may take nothing before it is cut
     :param refresh: seconds between looks at the database's revision counter
+    :param recordings: bytes all recordings together may have
     """
 
     data: Path
@@ -80,6 +81,7 @@ class Settings:
     stall_limit: float = 5.0
     refresh: float = 0.25
     connections_per_address: int = 512
+    recordings: int = 10 * 10**9
 
     @property
     def tls(self) -> bool:

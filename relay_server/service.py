@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 import time
+from functools import partial
 from typing import Any
 
 from autobahn.twisted.resource import WebSocketResource
@@ -28,6 +29,7 @@ from relay_server.access import Access
 from relay_server.auth import Authenticator
 from relay_server.channel import Channels
 from relay_server.config import Endpoint, Settings
+from relay_server.edges import recordings
 from relay_server.edges.admin import AdminSocket
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
@@ -41,6 +43,7 @@ from relay_server.frontdesk import FrontDesk
 from relay_server.journal import Journal
 from relay_server.metrics import RelayCollector, registry_of
 from relay_server.origins import Origins
+from relay_server.recording import Library, RecordingDesk, Recordings
 from relay_server.registry import Registry
 from relay_server.rounds import Rounds
 from relay_server.session import Timing
@@ -78,6 +81,8 @@ class Relay:
             reactor, linger=settings.linger, new_ticket=passwords.new_token, wall_ns=time.time_ns
         )
         self._videos = Videos(reactor, new_ticket=passwords.new_token)
+        library = Library(settings.data / "recordings", settings.recordings)
+        self._recordings = Recordings(reactor, reactor, library, self._channels, self._videos, time.time)
         self._journal = Journal(self._store, time.time)
         self._ports: list[Any] = []
         self._revision = -1
@@ -100,6 +105,7 @@ class Relay:
         self._database.upgrade()
         self._store.start()
         self._auth.start()
+        self._recordings.open()
         self._revision = await self._store.read(queries.revision)
         name = self.settings.name or self._folder.relay_name()
         http = await self._listen(self.settings.http, self._site(name))
@@ -146,7 +152,9 @@ class Relay:
         )
         desk = self._desk
         metrics = registry_of(RelayCollector(self._registry, self._channels, self._videos, lambda: desk))
-        api = Api(self._reactor, desk, origins, metrics, cookie=cookie, secure=settings.tls)
+        keeper = RecordingDesk(desk, self._recordings, self._store, self._journal, time.time)
+        below = {"recordings": partial(recordings.below, self._reactor, keeper)}
+        api = Api(self._reactor, desk, origins, metrics, below, cookie=cookie, secure=settings.tls)
         cap = AddressCap(settings.connections_per_address)
         websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk, cap))
         rounds = Rounds(self._reactor)
@@ -320,6 +328,7 @@ class Relay:
 
         def finish() -> None:
             self._auth.stop()
+            self._recordings.close()
             self._store.stop()
             self._reactor.callFromThread(done.callback, None)
 
@@ -330,6 +339,7 @@ class Relay:
     async def _say_goodbye(self) -> None:
         if self._desk is not None:
             self._desk.say_goodbye("the relay is going down")
+        await self._recordings.shut("the relay is going down")
         for robot in self._registry:
             if robot.control is not None:
                 robot.control.close("the relay is going down")

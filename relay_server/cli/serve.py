@@ -52,6 +52,12 @@ if TYPE_CHECKING:
 )
 @click.option("--name", default="", help="Name robots sign for; made up once when not given.")
 @click.option("--heartbeat", default=2.0, show_default=True, help="Seconds between pings on robot links.")
+@click.option(
+    "--recordings-gb",
+    default=10.0,
+    show_default=True,
+    help="How much recordings may take in all, gigabytes. 0: nothing is recorded.",
+)
 @click.option("--log-json", is_flag=True, help="Log one JSON object a line.")
 @click.option("--debug", is_flag=True, help="Log more.")
 @pass_app
@@ -65,6 +71,7 @@ def serve(
     origins: tuple[str, ...],
     name: str,
     heartbeat: float,
+    recordings_gb: float,
     log_json: bool,
     debug: bool,
 ) -> None:
@@ -83,6 +90,8 @@ def serve(
         raise Invalid("--tls-cert and --tls-key go together")
     if heartbeat <= 0:
         raise Invalid("--heartbeat must be more than 0 s")
+    if recordings_gb < 0:
+        raise Invalid("--recordings-gb must not be less than 0")
     app.data.mkdir(mode=0o700, parents=True, exist_ok=True)
     settings = Settings(
         data=app.data,
@@ -94,6 +103,7 @@ def serve(
         origins=origins,
         name=name,
         heartbeat=heartbeat,
+        recordings=round(recordings_gb * 10**9),
     )
     logs.begin(log_json, debug)
     sys.exit(run(settings, _ready))

@@ -5,7 +5,7 @@ A cookie that changes state counts only with a listed Origin. Every error is pro
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Protocol, TypeVar
 
 import msgspec
@@ -14,8 +14,10 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
+from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
+from werkzeug.exceptions import NotFound as NothingHere
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
@@ -82,6 +84,7 @@ Handler = Callable[..., Awaitable[Any]]
 class Api:
     """The HTTP API as a klein application.
 
+    :param below: what serves the addresses below those of robots, by their first part
     :param cookie: name of the session cookie
     :param secure: cookies only over TLS
     """
@@ -95,6 +98,7 @@ class Api:
         desk: Desk,
         origins: Origins,
         metrics: CollectorRegistry,
+        below: Mapping[str, Callable[[Api, str], IResource]],
         *,
         cookie: str,
         secure: bool,
@@ -103,6 +107,7 @@ class Api:
         self._desk = desk
         self._origins = origins
         self._metrics = metrics
+        self._below = below
         self._cookie = cookie
         self._secure = secure
 
@@ -141,12 +146,12 @@ class Api:
 
     @app.route("/api/v1/session", methods=["POST"])
     def login(self, request: Request) -> Any:
-        return self._answer(request, self._login(request))
+        return self.answer(request, self._login(request))
 
     async def _login(self, request: Request) -> Any:
         if request.getHeader("origin") is not None:
             self._origins.check(request.getHeader("origin"), request.getHeader("host") or "")
-        body = _body(request, Login)
+        body = body_of(request, Login)
         address = getattr(request.getClientAddress(), "host", "local")
         if body.code:
             principal, token = await self._desk.login_code(body.code, address)
@@ -159,14 +164,14 @@ class Api:
 
     @app.route("/api/v1/session", methods=["GET"])
     def session(self, request: Request) -> Any:
-        return self._answer(request, self._session(request))
+        return self.answer(request, self._session(request))
 
     async def _session(self, request: Request) -> Any:
         return _me(await self.principal(request))
 
     @app.route("/api/v1/session", methods=["DELETE"])
     def logout(self, request: Request) -> Any:
-        return self._answer(request, self._logout(request))
+        return self.answer(request, self._logout(request))
 
     async def _logout(self, request: Request) -> Any:
         await self._desk.logout(await self.principal(request))
@@ -177,14 +182,14 @@ class Api:
 
     @app.route("/api/v1/robots", methods=["GET"])
     def robots(self, request: Request) -> Any:
-        return self._answer(request, self._robots(request))
+        return self.answer(request, self._robots(request))
 
     async def _robots(self, request: Request) -> Any:
         return {"robots": await self._desk.robots(await self.principal(request))}
 
     @app.route("/api/v1/robots/stream", methods=["GET"])
     def stream(self, request: Request) -> Any:
-        return self._answer(request, self._stream(request))
+        return self.answer(request, self._stream(request))
 
     async def _stream(self, request: Request) -> Any:
         await self.principal(request)
@@ -192,11 +197,11 @@ class Api:
         request.setHeader(b"cache-control", b"no-store")
         request.setHeader(b"x-accel-buffering", b"no")
         await _RobotStream(self._clock, self, self._desk, request).run()
-        return _STREAMED
+        return STREAMED
 
     @app.route("/api/v1/robots/<name>", methods=["GET"])
     def robot(self, request: Request, name: str) -> Any:
-        return self._answer(request, self._robot(request, name))
+        return self.answer(request, self._robot(request, name))
 
     async def _robot(self, request: Request, name: str) -> Any:
         for robot in await self._desk.robots(await self.principal(request)):
@@ -204,13 +209,21 @@ class Api:
                 return robot
         raise NotFound("there is no such robot, or you have no right on it")
 
+    @app.route("/api/v1/robots/<name>/<part>", branch=True)
+    def below(self, request: Request, name: str, part: str) -> Any:
+        if part not in self._below:
+            raise NothingHere
+        # Without this, klein would redirect from the address without a slash at its end.
+        request.postpath = request.postpath or [b""]
+        return self._below[part](self, name)
+
     @app.route("/api/v1/tickets", methods=["POST"])
     def tickets(self, request: Request) -> Any:
-        return self._answer(request, self._tickets(request))
+        return self.answer(request, self._tickets(request))
 
     async def _tickets(self, request: Request) -> Any:
         principal = await self.principal(request)
-        robot = _body(request, TicketFor).robot
+        robot = body_of(request, TicketFor).robot
         request.setResponseCode(201)
         return {
             "ticket": await self._desk.issue_ticket(principal, robot),
@@ -222,7 +235,7 @@ class Api:
 
     @app.route("/healthz", methods=["GET"])
     def healthz(self, request: Request) -> Any:
-        return self._answer(request, self._healthz(request))
+        return self.answer(request, self._healthz(request))
 
     async def _healthz(self, request: Request) -> Any:
         if not await self._desk.healthy():
@@ -231,7 +244,7 @@ class Api:
 
     @app.route("/metrics", methods=["GET"])
     def metrics(self, request: Request) -> Any:
-        return self._answer(request, self._show_metrics(request))
+        return self.answer(request, self._show_metrics(request))
 
     async def _show_metrics(self, request: Request) -> Any:
         principal = await self.principal(request)
@@ -239,11 +252,12 @@ class Api:
             raise Refused("metrics are for administrators")
         request.setHeader(b"content-type", CONTENT_TYPE_LATEST.encode())
         request.write(generate_latest(self._metrics))
-        return _STREAMED
+        return STREAMED
 
     # --- answering ----------------------------------------------------------------------------------------
 
-    def _answer(self, request: Request, work: Any) -> Deferred[bytes]:
+    def answer(self, request: Request, work: Any) -> Deferred[bytes]:
+        """Answer a request with what comes of a coroutine: JSON, nothing, :data:`STREAMED`, or an error in words."""
         request.setHeader(b"cache-control", b"no-store")
         running = Deferred.fromCoroutine(self._finish(request, work))
         # A client that leaves early ends the work.
@@ -256,7 +270,7 @@ class Api:
             result = await work
         except SwitchboardError as error:
             return problem_of(request, error)
-        if result is _STREAMED:
+        if result is STREAMED:
             return b""
         if result is None:
             request.setResponseCode(204)
@@ -271,17 +285,24 @@ class Api:
         return problem(request, 500, "The relay failed on this request; its log tells more.")
 
     @app.handle_errors(HTTPException)
-    def _unrouted(self, request: Request, failure: Any) -> bytes:
+    def unrouted(self, request: Request, failure: Any) -> bytes:
+        """There is nothing here, or not by this method."""
         error = failure.value
         details = {404: "There is nothing at this address.", 405: "This address does not take that method."}
         status = error.code or 500
         return problem(request, status, details.get(status, "The request can't be served."))
 
 
-_STREAMED = object()
+STREAMED = object()
+"""Result of a handler that has written the answer itself."""
 
 
-def _body(request: Request, kind: type[T]) -> T:
+def body_of(request: Request, kind: type[T]) -> T:
+    """A request's JSON, checked.
+
+    :raises Invalid: it is not said to be JSON
+    :raises MalformedMessage: it is none, or not of this form
+    """
     if (request.getHeader("content-type") or "").partition(";")[0].strip().lower() != "application/json":
         raise Invalid("send the body as application/json")
     return jsontext.decode(msgspec.json.Decoder(kind), request.content.read())

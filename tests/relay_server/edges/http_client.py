@@ -128,7 +128,7 @@ class Transport(StringTransportWithDisconnection):
 
 def api_of(clock: Any, desk: Any, origins: Origins, *, tls: bool = False) -> Api:
     """The API in front of a desk."""
-    return Api(clock, desk, origins, CollectorRegistry(), cookie="sb", secure=tls)
+    return Api(clock, desk, origins, CollectorRegistry(), {}, cookie="sb", secure=tls)
 
 
 class World:

@@ -1,0 +1,12 @@
+"""Recordings: what topics and cameras of a robot say, kept by the relay in MCAP files.
+
+``recorder`` is one recording while it runs, a member of the robot's channel like any client; ``writer`` writes its
+file in a thread of its own, ``mcap_file`` knows the format; ``library`` has the files, ``recordings`` all of a relay's;
+``desk`` says who may have which.
+"""
+
+from relay_server.recording.desk import Download, RecordingDesk
+from relay_server.recording.library import Library
+from relay_server.recording.recordings import Ask, Recordings
+
+__all__ = ["Ask", "Download", "Library", "RecordingDesk", "Recordings"]

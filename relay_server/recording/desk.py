@@ -1,0 +1,251 @@
+"""What the edge asks about recordings: judged by the rights on all that a recording holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from relay_db import queries
+from relay_protocol.errors import NotFound, Refused, Unavailable
+from relay_protocol.rights import Operation
+from relay_server.access import Permit, Principal
+from relay_server.bucket import TokenBucket
+from relay_server.frontdesk import Admission, FrontDesk
+from relay_server.journal import Journal
+from relay_server.recording.library import READABLE, RUNNING, UNKNOWN, Entry
+from relay_server.recording.recorder import may
+from relay_server.recording.recordings import Ask, Recordings
+from relay_server.store import Store
+
+RATE = 1.0
+BURST = 20
+"""What one user may have put on record about recordings: so much a second, and so much at once."""
+
+
+class Download:
+    """A file on its way to somebody. Give it back by :meth:`close`.
+
+    :ivar name: for the one who gets it
+    :ivar size: bytes
+    """
+
+    def __init__(
+        self, recordings: Recordings, entry: Entry, permit: Permit, close: Callable[[], None]
+    ) -> None:
+        self._recordings = recordings
+        self._entry = entry
+        self._permit = permit
+        self._path: Path = recordings.library.path(entry)
+        self.name = f"{entry.robot}-{entry.id}.mcap"
+        self.size = entry.bytes
+        self.close = close
+
+    def watch(self, denied: Callable[[str], None]) -> None:
+        """Tell when it may not go on, and why."""
+        self._permit.on_revoke = denied
+
+        def changed() -> None:
+            reason = may(self._permit, self._entry)
+            if reason:
+                denied(reason)
+
+        self._permit.on_change = changed
+        changed()
+
+    async def part(self, offset: int, size: int) -> bytes:
+        """Some of its bytes; none when it is not there any more.
+
+        :raises OSError: it can't be read
+        """
+        return await self._recordings.read(self._path, offset, size)
+
+
+class RecordingDesk:
+    """Recordings as users have them.
+
+    :param wall: Unix time in seconds
+    """
+
+    def __init__(
+        self,
+        desk: FrontDesk,
+        recordings: Recordings,
+        store: Store,
+        journal: Journal,
+        wall: Callable[[], float],
+    ) -> None:
+        self._desk = desk
+        self._recordings = recordings
+        self._store = store
+        self._journal = journal
+        self._wall = wall
+        self._buckets: dict[int, TokenBucket] = {}
+
+    # --- what users ask for -------------------------------------------------------------------------------
+
+    async def start(self, principal: Principal, robot: str, ask: Ask, address: str) -> dict[str, Any]:
+        """Begin a recording.
+
+        :raises NotFound: no such robot, or no right on it
+        :raises Refused: no right to what is to be recorded
+        :raises SwitchboardError: see :meth:`Recordings.start`
+        """
+        admission = await self._desk.admit(principal, robot, address)
+        try:
+            entry = self._recordings.entry(ask, admission.robot, admission.permit)
+            reason = may(admission.permit, entry)
+            if reason:
+                raise Refused(reason)
+            await self._on_record("recording.start", entry, admission)
+            await self._recordings.start(
+                entry, admission.robot, admission.permit, lambda entry: self._ended(entry, admission)
+            )
+        except BaseException:
+            self._desk.turn_away(admission)
+            raise
+        self._event("recording.started", entry, address=address)
+        return _view(entry)
+
+    async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
+        """The recordings of a robot that the principal may have, the latest first.
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            entries = self._recordings.library.of(admission.robot.robot_id)
+            return [
+                _view(self._recordings.look(entry)) for entry in entries if not may(admission.permit, entry)
+            ]
+
+    async def one(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
+        """One recording.
+
+        :raises NotFound: no such robot or recording, or no right to all of it
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            return _view(self._recordings.look(self._find(admission, id)))
+
+    async def stop(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
+        """Finish a recording; one that is finished stays what it is.
+
+        :raises NotFound: as :meth:`one`
+        :raises Refused: somebody else's, and no right to manage the robot
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            entry = self._find(admission, id)
+            self._check_own(admission.permit, entry)
+        await self._recordings.stop(entry, f"stopped by {principal.name}")
+        return _view(entry)
+
+    async def delete(self, principal: Principal, robot: str, id: str, address: str) -> None:
+        """Delete a recording; one that runs is stopped before.
+
+        :raises NotFound: as :meth:`one`
+        :raises Refused: somebody else's, and no right to manage the robot
+        :raises Unavailable: it can't be deleted
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            entry = self._find(admission, id)
+            self._check_own(admission.permit, entry)
+            await self._on_record("recording.delete", entry, admission)
+        await self._recordings.stop(entry, f"deleted by {principal.name}")
+        await self._recordings.delete(entry)
+
+    async def download(self, principal: Principal, robot: str, id: str, address: str) -> Download:
+        """The file of a recording; it must be closed.
+
+        :raises NotFound: as :meth:`one`
+        :raises Unavailable: it is not finished
+        """
+        admission = await self._desk.admit(principal, robot, address)
+        try:
+            entry = self._find(admission, id)
+            if entry.state in RUNNING:
+                raise Unavailable("it is still being recorded: stop it, or wait for its end")
+            if entry.state not in READABLE:
+                raise Unavailable("it broke off, and the file is not recovered yet")
+            await self._on_record("recording.download", entry, admission)
+        except BaseException:
+            self._desk.turn_away(admission)
+            raise
+        return Download(self._recordings, entry, admission.permit, lambda: self._desk.turn_away(admission))
+
+    # --- rights -------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _admitted(self, admission: Admission) -> Iterator[Admission]:
+        try:
+            yield admission
+        finally:
+            self._desk.turn_away(admission)
+
+    def _find(self, admission: Admission, id: str) -> Entry:
+        entry = self._recordings.library.find(admission.robot.robot_id, id)
+        if may(admission.permit, entry):
+            raise NotFound(UNKNOWN)
+        return entry
+
+    @staticmethod
+    def _check_own(permit: Permit, entry: Entry) -> None:
+        if entry.user_id != permit.principal.user_id:
+            for name in (*entry.topics, *entry.cameras):
+                verdict = permit.judge(Operation.MANAGE, name)
+                if not verdict.allowed:
+                    raise Refused(f"it is a recording of {entry.user}; {verdict.reason}")
+
+    # --- what is put on record ----------------------------------------------------------------------------
+
+    async def _on_record(self, action: str, entry: Entry, admission: Admission) -> None:
+        """Who does it is on record before it is done.
+
+        :raises Unavailable: it can't be, or the user does too much
+        """
+        principal = admission.permit.principal
+        bucket = self._buckets.setdefault(principal.user_id, TokenBucket(RATE, BURST, self._wall))
+        if not bucket.take():
+            raise Unavailable("you do too much with recordings at once; try again in a moment")
+        await self._store.write(
+            queries.append_audit,
+            at=self._wall(),
+            actor=f"user:{principal.name}",
+            action=action,
+            target=f"{entry.robot}/{entry.id}",
+            origin=admission.address,
+            data={"topics": list(entry.topics), "cameras": list(entry.cameras)},
+        )
+
+    def _ended(self, entry: Entry, admission: Admission) -> None:
+        self._desk.turn_away(admission)
+        self._event(
+            "recording.ended",
+            entry,
+            state=entry.state.value,
+            reason=entry.reason[:200],
+            bytes=entry.bytes,
+            messages=entry.messages,
+            drops=entry.drops,
+        )
+
+    def _event(self, kind: str, entry: Entry, **data: Any) -> None:
+        self._journal.event(
+            kind,
+            f"user:{entry.user}",
+            cause=f"user:{entry.user}",
+            robot_id=entry.robot_id,
+            user_id=entry.user_id,
+            recording=entry.id,
+            **data,
+        )
+
+
+def _view(entry: Entry) -> dict[str, Any]:
+    """What its users see of a recording."""
+    shown: dict[str, Any] = msgspec.to_builtins(entry)
+    for hidden in ("robot_id", "user_id"):
+        del shown[hidden]
+    shown["megabytes"] = shown.pop("limit") / 10**6
+    return shown

@@ -1,0 +1,190 @@
+"""The recordings of a relay as files: each a ``.mcap``, and beside it a ``.json`` that says what it is."""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import os
+from pathlib import Path
+
+import msgspec
+from twisted.logger import Logger
+
+from relay_protocol.errors import Invalid, NotFound, Unavailable
+
+UNKNOWN = "there is no such recording, or it holds what you may not record and see"
+
+
+class State(enum.Enum):
+    """How far a recording has come."""
+
+    RECORDING = "recording"
+    FINISHING = "finishing"
+    """No more comes; what waits is being written."""
+    COMPLETE = "complete"
+    INCOMPLETE = "incomplete"
+    """It broke off, and the file can't be read yet."""
+    RECOVERED = "recovered"
+    """It broke off; what was on the disk by then can be read."""
+
+
+READABLE = frozenset({State.COMPLETE, State.RECOVERED})
+RUNNING = frozenset({State.RECORDING, State.FINISHING})
+
+
+class Entry(msgspec.Struct):
+    """One recording.
+
+    :param robot_id: numbers of robots are never used again
+    :param begun: Unix seconds
+    :param ended: Unix seconds
+    :param reason: why it ended
+    :param limit: bytes the file may have
+    :param seconds: it may take
+    :param bytes: of the file
+    :param drops: messages that came and are not in it
+    :param problems: what was not recorded as it was wanted, in words
+    """
+
+    id: str
+    robot_id: int
+    robot: str
+    user_id: int
+    user: str
+    topics: tuple[str, ...]
+    cameras: tuple[str, ...]
+    begun: float
+    limit: int
+    seconds: float
+    state: State = State.RECORDING
+    ended: float | None = None
+    reason: str = ""
+    bytes: int = 0
+    messages: int = 0
+    drops: int = 0
+    problems: list[str] = []
+
+
+_decoder = msgspec.json.Decoder(Entry)
+
+
+class Library:
+    """The folder of recordings. What is in it is read once, by :meth:`open`.
+
+    :param quota: bytes all recordings together may have
+    """
+
+    log = Logger()
+
+    def __init__(self, folder: Path, quota: int) -> None:
+        self._folder = folder
+        self._quota = quota
+        self._entries: dict[str, Entry] = {}
+
+    def open(self) -> None:
+        """Find out what is there.
+
+        :raises Invalid: the folder can't be used
+        """
+        try:
+            self._folder.mkdir(mode=0o700, exist_ok=True)
+            for left in [*self._folder.glob("*.part"), *self._folder.glob("*.new")]:
+                left.unlink()
+            for path in self._folder.glob("*.json"):
+                self._read(path)
+        except OSError as error:
+            raise Invalid(f"the folder of recordings can't be used: {error.strerror}") from None
+
+    def _read(self, path: Path) -> None:
+        try:
+            entry = _decoder.decode(path.read_bytes())
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            self.log.error("{file} in the folder of recordings is not understood", file=path.name)
+            return
+        if entry.state in RUNNING:
+            entry.state = State.INCOMPLETE
+            entry.reason = "the relay ended without warning"
+        self._entries[entry.id] = entry
+
+    # --- what is there ------------------------------------------------------------------------------------
+
+    def of(self, robot_id: int) -> list[Entry]:
+        """A robot's recordings, the latest first."""
+        found = [entry for entry in self._entries.values() if entry.robot_id == robot_id]
+        return sorted(found, key=lambda entry: (entry.begun, entry.id), reverse=True)
+
+    def find(self, robot_id: int, id: str) -> Entry:
+        """One recording of a robot.
+
+        :raises NotFound: there is none
+        """
+        entry = self._entries.get(id)
+        if entry is None or entry.robot_id != robot_id:
+            raise NotFound(UNKNOWN)
+        return entry
+
+    def has(self, entry: Entry) -> bool:
+        """Whether it is still there."""
+        return entry.id in self._entries
+
+    def incomplete(self) -> list[Entry]:
+        """Those whose file can't be read yet."""
+        return [entry for entry in self._entries.values() if entry.state is State.INCOMPLETE]
+
+    @property
+    def used(self) -> int:
+        """Bytes that are taken, with all that is being recorded may still become."""
+        return sum(entry.limit if entry.state in RUNNING else entry.bytes for entry in self._entries.values())
+
+    def path(self, entry: Entry) -> Path:
+        """The file."""
+        return self._folder / f"{entry.id}.mcap"
+
+    # --- changes; the reactor's thread --------------------------------------------------------------------
+
+    def add(self, entry: Entry) -> None:
+        """One more.
+
+        :raises Unavailable: it could become more than there may be
+        """
+        left = self._quota - self.used
+        if entry.limit > left:
+            raise Unavailable(
+                f"recordings may have {self._quota // 10**6} MB in all, of which {max(0, left) // 10**6} MB "
+                f"are left: delete some, or record at most that much"
+            )
+        self._entries[entry.id] = entry
+
+    def forget(self, entry: Entry) -> None:
+        """It is there no more."""
+        self._entries.pop(entry.id, None)
+
+    # --- the disk; any thread -----------------------------------------------------------------------------
+
+    def save(self, id: str, text: bytes) -> None:
+        """Put on the disk what a recording is.
+
+        :param text: by :func:`text_of`
+        :raises OSError: it can't be written
+        """
+        path = self._folder / f"{id}.json"
+        fresh = path.with_suffix(".new")
+        with fresh.open("wb") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        fresh.replace(path)
+
+    def delete(self, id: str) -> None:
+        """Take a recording off the disk: the file first, so that none is left that nobody knows of.
+
+        :raises OSError: it can't be deleted
+        """
+        for suffix in (".mcap", ".json"):
+            with contextlib.suppress(FileNotFoundError):
+                (self._folder / f"{id}{suffix}").unlink()
+
+
+def text_of(entry: Entry) -> bytes:
+    """What :meth:`Library.save` writes."""
+    return msgspec.json.encode(entry)

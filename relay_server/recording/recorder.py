@@ -1,0 +1,303 @@
+"""One recording while it runs: a member of the robot's channel and a viewer of its cameras that writes what comes."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+
+from twisted.logger import Logger
+
+from relay_protocol import link, rosbridge
+from relay_protocol.errors import SwitchboardError
+from relay_protocol.rights import Operation
+from relay_server.access import Permit, Principal
+from relay_server.budget import Budgets
+from relay_server.channel import Channel
+from relay_server.channel.listener import Listener
+from relay_server.channel.sample import Converter, Sample
+from relay_server.clock import Clock, Timer, cancel
+from relay_server.recording import compressed
+from relay_server.recording.library import Entry, State
+from relay_server.recording.mcap_file import Track
+from relay_server.recording.writer import Message, Outcome, Writer
+from relay_server.video import Picture, Stream, Videos
+
+AGAIN_SECONDS = 5.0
+"""A camera that is not shown any more is asked for anew after so long."""
+
+PROBLEMS = 20
+"""Most that is kept of what was not as it should be."""
+
+_NOBODY = -1
+
+
+class Event(enum.Enum):
+    """What happens to a recording."""
+
+    ENOUGH = "enough"
+    WRITTEN = "written"
+    BROKEN = "broken"
+
+
+NEXT: dict[tuple[State, Event], State] = {
+    (State.RECORDING, Event.ENOUGH): State.FINISHING,
+    (State.RECORDING, Event.WRITTEN): State.COMPLETE,
+    (State.RECORDING, Event.BROKEN): State.INCOMPLETE,
+    (State.FINISHING, Event.WRITTEN): State.COMPLETE,
+    (State.FINISHING, Event.BROKEN): State.INCOMPLETE,
+}
+"""An event that is not listed for a state changes nothing."""
+
+
+def may(permit: Permit, entry: Entry) -> str:
+    """Why somebody may not have what a recording holds; empty when he may."""
+    asked = [(Operation.SUBSCRIBE, topic) for topic in entry.topics]
+    asked += [(Operation.VIEW, camera) for camera in entry.cameras]
+    for see, name in asked:
+        for operation in (Operation.RECORD, see):
+            verdict = permit.judge(operation, name)
+            if not verdict.allowed:
+                return verdict.reason
+    return ""
+
+
+class Recorder:
+    """See the module's text.
+
+    :param permit: of who records; the recording ends with it
+    :param make_writer: makes the writer of the file, given what to call at its end
+    :param wall: Unix time in seconds
+    :param ended: called once, when the file is whole or has been given up
+    """
+
+    log = Logger()
+    plain_instead = 0
+    queued_bytes = 0
+    allowance = Budgets(lambda: 0.0, lambda: 0.0).of(_NOBODY)
+    """Nothing is taken from it: samples are written as the robot sends them."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        entry: Entry,
+        permit: Permit,
+        channel: Channel,
+        videos: Videos,
+        make_writer: Callable[[Callable[[Outcome], None]], Writer],
+        *,
+        wall: Callable[[], float],
+        ended: Callable[[Recorder], None],
+    ) -> None:
+        self._clock = clock
+        self.entry = entry
+        self.permit = permit
+        self._channel = channel
+        self._videos = videos
+        self._writer = make_writer(self._written)
+        self._wall = wall
+        self._ended = ended
+        self._timer: Timer | None = None
+        self._tracks: dict[str, tuple[Converter, Track]] = {}
+        self._eyes = [_Eye(clock, self, camera) for camera in entry.cameras]
+        self._lost = 0
+
+    @property
+    def principal(self) -> Principal:
+        """Who records."""
+        return self.permit.principal
+
+    @property
+    def user(self) -> int:
+        """Whose it is."""
+        return self.principal.user_id
+
+    # --- life ---------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin.
+
+        :raises SwitchboardError: something can't be recorded; then nothing has begun
+        """
+        self._channel.attach(self)
+        try:
+            for topic in self.entry.topics:
+                listener = _Ear(self._clock, self, topic)
+                listener.add(rosbridge.Subscribe(topic=topic))
+                self._channel.subscriptions.add(self, listener, "", None)
+            for eye in self._eyes:
+                eye.open()
+        except SwitchboardError:
+            self._let_go()
+            raise
+        self.permit.on_change = self._rights_changed
+        self.permit.on_revoke = self.stop
+        self._timer = self._clock.callLater(self.entry.seconds, self.stop, "it has taken its time")
+        self._writer.start()
+
+    def stop(self, reason: str) -> None:
+        """It is enough: finish the file. What came so far is in it."""
+        if self._happen(Event.ENOUGH, reason):
+            self._let_go()
+            self._writer.finish()
+
+    def count(self) -> None:
+        """Bring what the entry says of the file up to date."""
+        writer = self._writer
+        self.entry.bytes, self.entry.messages = writer.bytes, writer.messages
+        self.entry.drops = self._lost + writer.broken
+
+    def _happen(self, event: Event, reason: str) -> bool:
+        following = NEXT.get((self.entry.state, event))
+        if following is None:
+            return False
+        self.entry.state = following
+        self.entry.reason = self.entry.reason or reason
+        return True
+
+    def _written(self, outcome: Outcome) -> None:
+        """The writer has ended, because it was told to or by itself."""
+        if self._happen(Event.WRITTEN if outcome.finished else Event.BROKEN, outcome.reason):
+            self._let_go()
+            self.count()
+            self.entry.ended = self._wall()
+            self._ended(self)
+
+    def _let_go(self) -> None:
+        cancel(self._timer)
+        for eye in self._eyes:
+            eye.close()
+        self._channel.detach(self)
+
+    def _rights_changed(self) -> None:
+        reason = may(self.permit, self.entry)
+        if reason:
+            self.stop(reason)
+
+    # --- what comes ---------------------------------------------------------------------------------------
+
+    @property
+    def now_ns(self) -> int:
+        """The robot's time, nanoseconds."""
+        return self._channel.now_ns()
+
+    def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
+        """What a client would be told is kept with the recording."""
+        problems = self.entry.problems
+        if text not in problems and len(problems) < PROBLEMS:
+            problems.append(text)
+
+    def dropped(self, listener: Listener) -> None:
+        """A sample gave way before it came here."""
+        self._lost += 1
+
+    def deliver(self, listener: Listener, parcel: Sample) -> None:
+        """A sample of a topic, as it comes."""
+        self.keep(listener.topic, parcel, parcel.stamp)
+
+    def keep(self, topic: str, sample: Sample, log_time: int) -> None:
+        """Have a sample written.
+
+        :param log_time: nanoseconds
+        """
+        converter = sample.converter
+        found = self._tracks.get(topic)
+        if found is None or found[0] is not converter:
+            found = self._tracks[topic] = (converter, _track(topic, converter))
+        make = None if converter.cdr else _anew(converter)
+        self._put(Message(found[1], log_time, sample.stamp, sample.body, make))
+
+    def saw(self, camera: str, picture: Picture) -> None:
+        """Have a picture written."""
+        # A robot whose time is simulated has no other for its pictures either.
+        simulated = self._channel.robot.description.sim_time
+        stamp = self.now_ns if simulated else round(picture.stamp * 1e9)
+
+        def make(body: bytes) -> bytes:
+            return compressed.message(body, stamp, picture.codec)
+
+        track = Track(compressed.topic_of(camera), compressed.TYPE, "cdr", compressed.TEXT)
+        self._put(Message(track, stamp, stamp, picture.body, make))
+
+    def _put(self, message: Message) -> None:
+        if not self._writer.put(message):
+            self._lost += 1
+
+    def watch(self, camera: str, eye: _Eye) -> Stream:
+        """Have a camera shown; see :meth:`Videos.watch`."""
+        return self._videos.watch(self._channel.robot, camera, link.VideoSettings(), eye)
+
+
+class _Ear(Listener):
+    """Takes every sample of a topic at once."""
+
+    def __init__(self, clock: Clock, recorder: Recorder, topic: str) -> None:
+        super().__init__(clock, recorder, topic)
+        self._recorder = recorder
+
+    def replay(self, sample: Sample) -> None:
+        """A latched sample that came long ago: a recording must not seem to have begun then."""
+        self._recorder.keep(self.topic, sample, max(sample.stamp, self._recorder.now_ns))
+
+
+class _Eye:
+    """Watches one camera as long as the recording runs, again when it could not be shown for a while."""
+
+    def __init__(self, clock: Clock, recorder: Recorder, camera: str) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._camera = camera
+        self._stream: Stream | None = None
+        self._timer: Timer | None = None
+
+    @property
+    def user(self) -> int:
+        """Whose it is."""
+        return self._recorder.user
+
+    def open(self) -> None:
+        """Begin to watch.
+
+        :raises Unavailable: too many do already
+        """
+        self._stream = self._recorder.watch(self._camera, self)
+
+    def close(self) -> None:
+        """Watch no more."""
+        cancel(self._timer)
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.detach(self)
+
+    def picture(self, picture: Picture) -> None:
+        """Every one is recorded."""
+        self._recorder.saw(self._camera, picture)
+
+    def playing(self, playing: link.Playing) -> None:
+        """Pictures say themselves how large they are."""
+
+    def moved(self, stream: Stream) -> None:
+        """The robot is at its limit: what others watch is recorded."""
+        self._stream = stream
+
+    def ended(self, error: SwitchboardError) -> None:
+        """It is not to be had at present."""
+        self._stream = None
+        self._recorder.tell("error", f"{self._camera}: {error}")
+        self._timer = self._clock.callLater(AGAIN_SECONDS, self._again)
+
+    def _again(self) -> None:
+        try:
+            self.open()
+        except SwitchboardError as error:
+            self.ended(error)
+
+
+def _track(topic: str, converter: Converter) -> Track:
+    if converter.cdr:
+        return Track(topic, converter.type, "cdr", converter.types.full_text(converter.type))
+    return Track(topic, converter.type, "json")
+
+
+def _anew(converter: Converter) -> Callable[[bytes], bytes]:
+    """A robot's own JSON, written anew: what is in the file is well-formed whatever came in."""
+    return lambda body: converter.convert("json", body)

@@ -1,0 +1,166 @@
+"""Writes a recording in a thread of its own, behind a bounded queue: a slow disk never holds up the relay."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from twisted.logger import Logger
+
+from relay_protocol.errors import SwitchboardError
+from relay_protocol.limits import MIB
+from relay_server.recording.mcap_file import Full, McapFile, Track
+
+QUEUE_BYTES = 32 * MIB
+QUEUE_MESSAGES = 10_000
+"""What may wait for the disk. What comes then is dropped, and counted."""
+
+FLUSH_SECONDS = 1.0
+"""How much a relay that is killed may lose."""
+
+
+class Message(NamedTuple):
+    """Something to be written.
+
+    :param log_time: nanoseconds
+    :param publish_time: nanoseconds
+    :param body: as it came
+    :param make: what is to be written of it; called in the writer's thread, raises :class:`SwitchboardError`
+    """
+
+    track: Track
+    log_time: int
+    publish_time: int
+    body: bytes
+    make: Callable[[bytes], bytes] | None = None
+
+
+class CallsBack(Protocol):
+    """The reactor, as a thread uses it."""
+
+    def callFromThread(self, call: Callable[..., object], *args: object) -> None:
+        """Call this in the reactor's thread."""
+
+
+class Outcome(NamedTuple):
+    """How the writing ended.
+
+    :param finished: whether the file is whole
+    :param reason: why it ended, where nobody asked for it
+    """
+
+    finished: bool
+    reason: str
+
+
+class Writer:
+    """The file of one recording, from its beginning to its end. All but the thread's own is the reactor's.
+
+    :param path: where nothing is yet
+    :param limit: bytes the file may have
+    :param ros: whether messages are those of ROS 2
+    :param ended: called once in the reactor's thread
+    """
+
+    log = Logger()
+
+    def __init__(
+        self, reactor: CallsBack, path: Path, limit: int, ros: bool, ended: Callable[[Outcome], None]
+    ) -> None:
+        self._reactor = reactor
+        self._path = path
+        self._limit = limit
+        self._ros = ros
+        self._ended = ended
+        self._waiting: deque[Message] = deque()
+        self._waiting_bytes = 0
+        self._closing = False
+        self._changed = threading.Condition()
+        self.bytes = 0
+        self.messages = 0
+        self.broken = 0
+        """Messages that could not be made into what is written."""
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+
+    def start(self) -> None:
+        """Begin the file."""
+        self._thread.start()
+
+    def put(self, message: Message) -> bool:
+        """Have a message written; whether there is room for it."""
+        with self._changed:
+            if (
+                self._closing
+                or len(self._waiting) >= QUEUE_MESSAGES
+                or self._waiting_bytes + len(message.body) > QUEUE_BYTES
+            ):
+                return False
+            self._waiting.append(message)
+            self._waiting_bytes += len(message.body)
+            self._changed.notify()
+        return True
+
+    def finish(self) -> None:
+        """Nothing more comes: write what waits and finish the file."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+
+    # --- the thread ---------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            outcome = self._write()
+        except OSError as error:
+            outcome = Outcome(False, f"the file can't be written: {error.strerror}")
+        except Exception:
+            self.log.failure("writing a recording failed")
+            outcome = Outcome(False, "the relay failed on it; its log tells more")
+        self.finish()
+        self._reactor.callFromThread(self._ended, outcome)
+
+    def _write(self) -> Outcome:
+        reason = ""
+        with self._path.open("xb") as stream:
+            file = McapFile(stream, self._limit, self._ros)
+            flush_at = time.monotonic() + FLUSH_SECONDS
+            while True:
+                batch, closing = self._take(flush_at - time.monotonic())
+                try:
+                    for message in batch:
+                        self._add(file, message)
+                except Full:
+                    reason = "it has reached its size"
+                    break
+                if closing and not batch:
+                    break
+                if time.monotonic() >= flush_at:
+                    file.flush()
+                    flush_at = time.monotonic() + FLUSH_SECONDS
+                self.bytes, self.messages = file.size, file.messages
+            file.finish()
+            self.bytes, self.messages = file.size, file.messages
+        return Outcome(True, reason)
+
+    def _take(self, seconds: float) -> tuple[list[Message], bool]:
+        """What waits, after at most so long; and whether more may come."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closing, max(0.0, seconds))
+            batch = list(self._waiting)
+            self._waiting.clear()
+            self._waiting_bytes = 0
+            return batch, self._closing
+
+    def _add(self, file: McapFile, message: Message) -> None:
+        body = message.body
+        if message.make is not None:
+            try:
+                body = message.make(body)
+            except SwitchboardError:
+                self.broken += 1
+                return
+        file.add(message.track, message.log_time, message.publish_time, body)

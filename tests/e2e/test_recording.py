@@ -1,0 +1,241 @@
+"""Recordings of the simulated robot, asked for over HTTP; the files as MCAP's own library and rosbags read them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from switchboard_http import Answer, ask
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_waiting import wait_for
+
+from relay_protocol.ros_types import TypeRegistry
+
+CAMERA = "/camera/image_raw"
+
+
+class Recorder:
+    """Somebody who asks for recordings."""
+
+    def __init__(self, relay: Relay, robot: str, token: str) -> None:
+        self._relay = relay
+        self._token = token
+        self._path = f"/api/v1/robots/{robot}/recordings"
+
+    def ask(self, method: str, path: str = "", body: Any = None) -> Answer:
+        """One request."""
+        return ask(self._relay.http_port, method, self._path + path, body, token=self._token)
+
+    def start(self, *topics: str, **more: Any) -> str:
+        """Begin one; its id."""
+        answer = self.ask("POST", "", {"topics": topics, **more})
+        assert answer.status == 201, answer.body
+        assert answer.headers["Location"] == f"{self._path}/{answer.json['id']}"
+        return str(answer.json["id"])
+
+    def look(self, id: str) -> dict[str, Any]:
+        """What is said of it."""
+        return dict(self.ask("GET", f"/{id}").json)
+
+    def until(self, id: str, messages: int) -> None:
+        """Wait until so many are in the file."""
+        wait_for(f"{messages} messages", lambda: self.look(id)["messages"] >= messages)
+
+    def stop(self, id: str) -> dict[str, Any]:
+        """End it."""
+        answer = self.ask("POST", f"/{id}/stop")
+        assert answer.status == 200, answer.body
+        return dict(answer.json)
+
+    def fetch(self, id: str, folder: Path) -> Path:
+        """Download it."""
+        answer = self.ask("GET", f"/{id}/file")
+        assert answer.status == 200, answer.body
+        assert f'filename="rover-{id}.mcap"' in answer.headers["Content-Disposition"]
+        path = folder / f"{id}.mcap"
+        path.write_bytes(answer.body)
+        return path
+
+
+def read(path: Path) -> list[tuple[Any, Any, Any]]:
+    """All messages with schema and channel, every checksum checked."""
+    with path.open("rb") as stream:
+        list(StreamReader(stream, validate_crcs=True).records)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        return list(reader.iter_messages())
+
+
+@pytest.fixture
+def operator(world: Any) -> Recorder:
+    """Who may record."""
+    return Recorder(world.relay, "rover", world.operator)
+
+
+def test_what_is_recorded_is_what_a_subscriber_gets(world: Any, operator: Recorder, tmp_path: Path) -> None:
+    """As the robot serialised it, readable by the definitions in the file alone."""
+    id = operator.start("/odom", "tf")
+    operator.until(id, 20)
+    with world.relay.connect("rover", world.viewer) as client:
+        client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
+        heard = [client.until(op="publish", topic="/odom")["msg"] for _ in range(10)]
+        done = operator.stop(id)
+    assert (done["state"], done["drops"], done["problems"]) == ("complete", 0, [])
+    path = operator.fetch(id, tmp_path)
+    messages = read(path)
+    assert len(messages) == done["messages"]
+    assert path.stat().st_size == done["bytes"]
+    assert {channel.topic for _, channel, _ in messages} == {"/odom", "/tf"}
+    types, recorded = TypeRegistry(), []
+    for schema, channel, message in messages:
+        assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+        types.add(schema.name, schema.data.decode())
+        if channel.topic == "/odom":
+            recorded.append(json.loads(types.to_json(schema.name, message.data)))
+    # What was heard while nothing was lost is there in one piece.
+    first = recorded.index(heard[0])
+    assert recorded[first : first + len(heard)] == heard
+
+
+def test_rosbags_reads_the_file(operator: Recorder, tmp_path: Path) -> None:
+    """As a rosbag2 file of MCAP, with no other knowledge of the types than the file's."""
+    id = operator.start("/odom", "/scan")
+    operator.until(id, 30)
+    done = operator.stop(id)
+    path = operator.fetch(id, tmp_path)
+    store = get_typestore(Stores.EMPTY)
+    for schema, _, _ in read(path):
+        store.register(
+            {
+                name: definition
+                for name, definition in get_types_from_msg(schema.data.decode(), schema.name).items()
+                if name not in store.types
+            }
+        )
+    reader = McapReader(path)
+    reader.open()
+    try:
+        found = [
+            store.deserialize_cdr(bytes(raw), connection.msgtype)
+            for connection, _, raw in reader.messages(reader.connections)
+        ]
+    finally:
+        reader.close()
+    assert len(found) == done["messages"]
+    assert {type(each).__name__ for each in found} == {
+        "nav_msgs__msg__Odometry",
+        "sensor_msgs__msg__LaserScan",
+    }
+
+
+def test_a_cameras_pictures_are_recorded(operator: Recorder, tmp_path: Path) -> None:
+    """As CompressedImage, each a JPEG of the camera's size."""
+    id = operator.start(cameras=[CAMERA])
+    operator.until(id, 5)
+    operator.stop(id)
+    types = TypeRegistry()
+    for schema, channel, message in read(operator.fetch(id, tmp_path)):
+        assert channel.topic == f"{CAMERA}/compressed"
+        types.add(schema.name, schema.data.decode())
+        fields = json.loads(types.to_json("sensor_msgs/msg/CompressedImage", message.data))
+        assert fields["format"] == "jpeg"
+        stamp = fields["header"]["stamp"]
+        assert stamp["sec"] * 10**9 + stamp["nanosec"] == message.log_time
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(fields["data"]), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None and picture.shape[2] == 3
+
+
+def test_it_ends_by_its_limits(operator: Recorder) -> None:
+    """Of time here, and says so."""
+    id = operator.start("/odom", seconds=1)
+    done = wait_for("its end", lambda: (found := operator.look(id))["state"] == "complete" and found)
+    assert done["reason"] == "it has taken its time"
+    assert done["messages"] > 5
+    assert operator.ask("DELETE", f"/{id}").status == 204
+    assert operator.ask("GET", f"/{id}").status == 404
+
+
+def test_who_may_not_record_gets_nothing(world: Any, operator: Recorder) -> None:
+    """Neither a recording nor what others recorded; who is nobody here is told no more than of any robot."""
+    id = operator.start("/odom")
+    viewer = Recorder(world.relay, "rover", world.viewer)
+    assert viewer.ask("POST", "", {"topics": ["/odom"]}).status == 403
+    assert viewer.ask("GET").json == {"recordings": []}
+    stranger = Recorder(world.relay, "rover", world.stranger)
+    for method, path in (
+        ("GET", f"/{id}"),
+        ("GET", f"/{id}/file"),
+        ("POST", f"/{id}/stop"),
+        ("DELETE", f"/{id}"),
+    ):
+        assert viewer.ask(method, path).status == 404
+        assert stranger.ask(method, path).status == 404
+    assert operator.ask("GET", f"/{id}/file").status == 503
+    assert operator.ask("PUT", f"/{id}").status == 405
+    assert operator.ask("GET", f"/{id}/nothing").status == 404
+    assert operator.ask("POST", "", {"topics": ["/odom"], "megabytes": 0}).status == 400
+    operator.stop(id)
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Iterator[tuple[Relay, Robot, str]]:
+    """A relay and a robot to be killed, and who may record."""
+    relay = Relay(tmp_path)
+    try:
+        robot = Robot(relay, "rover")
+        try:
+            token = relay.user("operator")
+            relay.cli("right", "grant", "operator", "rover", "operator")
+            yield relay, robot, token
+        finally:
+            robot.stop()
+    finally:
+        relay.stop()
+
+
+def test_a_recording_outlives_its_robot_and_its_relay(own: tuple[Relay, Robot, str], tmp_path: Path) -> None:
+    """A daemon that comes back goes on in the same file; what a killed relay wrote can be read after its next start;
+    a relay that is stopped finishes the file; a right that is revoked ends the recording."""
+    relay, robot, token = own
+    recorder = Recorder(relay, "rover", token)
+    wait_for("the graph", lambda: recorder.ask("POST", "", {"topics": ["/odom"], "seconds": 1}).status == 201)
+    id = recorder.start("/odom")
+    recorder.until(id, 10)
+    robot.daemon.signal(signal.SIGKILL)
+    robot.daemon.stop()
+    robot.start_daemon()
+    before = recorder.look(id)["messages"]
+    recorder.until(id, before + 60)
+    relay.kill()
+    relay.start()
+    wait_for("it is recovered", lambda: recorder.look(id)["state"] == "recovered")
+    # Of what comes at 20 Hz, what was in memory for a second is lost.
+    assert len(read(recorder.fetch(id, tmp_path))) >= before + 20
+    robot.wait_online()
+    id = recorder.start("/odom")
+    recorder.until(id, 10)
+    assert relay.stop() == 0
+    relay.start()
+    done = recorder.look(id)
+    assert (done["state"], done["reason"]) == ("complete", "the relay is going down")
+    assert len(read(recorder.fetch(id, tmp_path))) == done["messages"]
+    robot.wait_online()
+    id = recorder.start("/odom")
+    recorder.until(id, 10)
+    relay.cli("right", "revoke", "operator", "rover")
+    relay.cli("right", "grant", "operator", "rover", "operator")
+    done = wait_for("its end", lambda: (found := recorder.look(id)).get("state") == "complete" and found)
+    assert "revoked" in done["reason"]

@@ -1,0 +1,267 @@
+"""Recordings as users have them, on a real database and real files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+
+from relay_db import queries
+from relay_protocol import link
+from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
+from relay_server.access import Access, Principal
+from relay_server.frontdesk import NO_ROBOT, Admission
+from relay_server.journal import Journal
+from relay_server.recording import Ask, Library, RecordingDesk, Recordings
+from relay_server.recording.recordings import USER_RECORDINGS
+from relay_server.store import Store
+from tests.relay_server.memory import World, text
+from tests.relay_server.recording.reading import read
+
+HERE = "192.0.2.1"
+CHATTER = Ask(topics=["chatter"], megabytes=1)
+
+
+class Doors:
+    """Lets in who has a right; of the front desk no more is needed."""
+
+    def __init__(self, store: Store, access: Access, world: World) -> None:
+        self._store = store
+        self._access = access
+        self._world = world
+        self.inside = 0
+
+    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
+        """Somebody who has a right on the robot."""
+        record = await self._store.read(queries.find_robot, robot, principal.realm)
+        permit = None if record is None else await self._access.permit(principal, record.id)
+        if permit is None:
+            raise NotFound(NO_ROBOT)
+        self.inside += 1
+        return Admission(permit, self._world.robot, address)
+
+    def turn_away(self, admission: Admission) -> None:
+        """He leaves."""
+        self.inside -= 1
+        self._access.release(admission.permit)
+
+
+class Desk:
+    """A desk, and what it is made of."""
+
+    def __init__(self, store: Store, folder: Path) -> None:
+        self.store = store
+        self.folder = folder
+        self.world = World()
+        self.access = Access(store, self.wall)
+        self.doors = Doors(store, self.access, self.world)
+        self.recordings = self.begins()
+        journal = Journal(store, self.wall)
+        self.desk = RecordingDesk(self.doors, self.recordings, store, journal, self.wall)  # type: ignore[arg-type]
+        with store.database.begin() as session:
+            self._robot = queries.add_robot(session, "rover").id
+        self.ann, self.bob, self.eve = (self._principal(name) for name in ("ann", "bob", "eve"))
+
+    def begins(self) -> Recordings:
+        """A relay that starts on the folder."""
+        library = Library(self.folder, 5 * 10**6)
+        world = self.world
+        made = Recordings(reactor, world.clock, library, world.channels, world.videos, self.wall)
+        made.open()
+        return made
+
+    def wall(self) -> float:
+        """Unix time."""
+        return 1000.0 + self.world.clock.seconds()
+
+    def _principal(self, name: str) -> Principal:
+        with self.store.database.begin() as session:
+            user = queries.add_user(session, name, None)
+            token = queries.create_token(
+                session, user.id, name.encode().hex().ljust(64, "0"), kind="access", expires=None, now=1000.0
+            )
+            level = "viewer" if name == "eve" else "operator"
+            queries.grant_right(session, self._robot, level, user_id=user.id)
+        return Principal(user.id, name, user.realm, False, token, None)
+
+    async def revoke(self, name: str) -> None:
+        """A right is gone."""
+        who = {"ann": self.ann, "bob": self.bob}[name]
+        await self.store.write(queries.revoke_right, self._robot, user_id=who.user_id)
+        await self.access.refresh()
+
+    def says(self, *words: str) -> None:
+        """The robot, which is at work, says something."""
+        number = self.world.link.all(link.Subscribe)[-1].number
+        self.world.subscribed(number)
+        self.world.define()
+        for stamp, word in enumerate(words):
+            self.world.channel.sample(number, text(word), stamp + 1)
+
+    async def recorded(self, who: Principal, *words: str) -> dict[str, Any]:
+        """A recording that is finished."""
+        begun = await self.desk.start(who, "rover", CHATTER, HERE)
+        self.says(*words)
+        return await self.desk.stop(who, "rover", begun["id"], HERE)
+
+    async def fetch(self, who: Principal, id: str) -> bytes:
+        """The file."""
+        file = await self.desk.download(who, "rover", id, HERE)
+        try:
+            return await file.part(0, file.size + 1)
+        finally:
+            file.close()
+
+    async def audit(self) -> list[tuple[str, str, str]]:
+        """Who did what from where, the oldest first."""
+        entries = await self.store.read(queries.list_audit)
+        return [(each.actor, each.action, each.origin) for each in reversed(entries)]
+
+
+@pytest.fixture
+def desk(store: Store, tmp_path: Path) -> Iterator[Desk]:
+    """A desk, and a robot that is at work."""
+    made = Desk(store, tmp_path / "recordings")
+    made.world.at_work()
+    yield made
+    pytest_twisted.blockon(Deferred.fromCoroutine(made.recordings.shut("the test is over")))
+    made.recordings.close()
+
+
+async def failure(work: Any, kind: type[SwitchboardError]) -> str:
+    """How something fails, in words."""
+    with pytest.raises(kind) as caught:
+        await work
+    return str(caught.value)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_recording_is_begun_looked_at_stopped_and_fetched(desk: Desk, tmp_path: Path) -> None:
+    """The file holds what was said meanwhile; nobody stays inside."""
+    begun = await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    assert (begun["state"], begun["topics"], begun["megabytes"]) == ("recording", ("/chatter",), 1.0)
+    assert "robot_id" not in begun
+    desk.says("a", "b")
+    assert "still being recorded" in await failure(
+        desk.desk.download(desk.ann, "rover", begun["id"], HERE), Unavailable
+    )
+    done = await desk.desk.stop(desk.ann, "rover", begun["id"], HERE)
+    assert (done["state"], done["messages"], done["drops"]) == ("complete", 2, 0)
+    assert done["reason"] == "stopped by ann"
+    path = tmp_path / "copy.mcap"
+    path.write_bytes(await desk.fetch(desk.bob, begun["id"]))
+    assert [each.body for each in read(path)] == [text("a"), text("b")]
+    assert path.stat().st_size == done["bytes"]
+    assert await desk.desk.all(desk.bob, "rover", HERE) == [done]
+    assert await desk.desk.one(desk.ann, "rover", begun["id"], HERE) == done
+    assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_does_what_is_on_record(desk: Desk) -> None:
+    """In the audit before it is done; what becomes of it in the journal."""
+    done = await desk.recorded(desk.ann, "a")
+    await desk.fetch(desk.bob, done["id"])
+    await desk.desk.delete(desk.ann, "rover", done["id"], HERE)
+    assert await desk.audit() == [
+        ("user:ann", "recording.start", HERE),
+        ("user:bob", "recording.download", HERE),
+        ("user:ann", "recording.delete", HERE),
+    ]
+    kinds = [each.kind for each in await desk.store.read(queries.list_events)]
+    assert kinds == ["recording.ended", "recording.started"]
+    assert list(desk.folder.iterdir()) == []
+    assert await desk.desk.all(desk.ann, "rover", HERE) == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_may_not_see_or_record_it_does_not_find_it(desk: Desk) -> None:
+    """A viewer can't get by the file at what he may not record; nor can a stranger."""
+    done = await desk.recorded(desk.ann, "a")
+    assert "needs the level operator" in await failure(
+        desk.desk.start(desk.eve, "rover", CHATTER, HERE), Refused
+    )
+    assert await desk.desk.all(desk.eve, "rover", HERE) == []
+    for ask in (desk.desk.one, desk.desk.stop, desk.desk.delete, desk.desk.download):
+        assert "no such recording" in await failure(ask(desk.eve, "rover", done["id"], HERE), NotFound)
+        assert await failure(ask(desk.ann, "tank", done["id"], HERE), NotFound) == NO_ROBOT
+    assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_only_its_maker_or_an_owner_stops_and_deletes_it(desk: Desk) -> None:
+    """Others with the right to record may have the file."""
+    done = await desk.recorded(desk.ann, "a")
+    for ask in (desk.desk.stop, desk.desk.delete):
+        assert "a recording of ann" in await failure(ask(desk.bob, "rover", done["id"], HERE), Refused)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_right_that_is_revoked_ends_recording_and_download(desk: Desk) -> None:
+    """The file is whole."""
+    await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    desk.says("a")
+    done = await desk.recorded(desk.bob, "b")
+    download = await desk.desk.download(desk.ann, "rover", done["id"], HERE)
+    denied: list[str] = []
+    download.watch(denied.append)
+    await desk.revoke("ann")
+    assert denied == ["your right on this robot was revoked"]
+    download.close()
+    await desk.recordings.shut("over")
+    (found,) = [each for each in await desk.desk.all(desk.bob, "rover", HERE) if each["user"] == "ann"]
+    assert (found["state"], found["reason"]) == ("complete", "your right on this robot was revoked")
+    assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_can_not_be_recorded_leaves_nothing(desk: Desk) -> None:
+    """No file, no place taken, nobody inside."""
+    for ask in (
+        Ask(),
+        Ask(topics=["no name"]),
+        Ask(topics=["/camera/compressed"], cameras=["/camera"]),
+        Ask(topics=["/nowhere"], megabytes=1),
+    ):
+        await failure(desk.desk.start(desk.ann, "rover", ask, HERE), Invalid)
+    assert list(desk.folder.iterdir()) == []
+    assert desk.recordings.library.used == 0
+    assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_no_more_is_recorded_than_there_is_room_for(desk: Desk) -> None:
+    """By the size of all together, and by how many run for one user."""
+    assert "of which 5 MB are left" in await failure(
+        desk.desk.start(desk.ann, "rover", Ask(topics=["/chatter"], megabytes=6), HERE), Unavailable
+    )
+    for _ in range(USER_RECORDINGS):
+        await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    assert "recordings running" in await failure(
+        desk.desk.start(desk.ann, "rover", CHATTER, HERE), Unavailable
+    )
+    await desk.desk.start(desk.bob, "rover", CHATTER, HERE)
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_a_killed_relay_left_is_made_readable(desk: Desk) -> None:
+    """At the next start; a recording whose file had not begun is forgotten."""
+    done = await desk.recorded(desk.ann, "a", "b")
+    other = await desk.recorded(desk.ann, "c")
+    for each in (done, other):
+        file = desk.folder / f"{each['id']}.json"
+        file.write_bytes(file.read_bytes().replace(b'"complete"', b'"recording"'))
+    path = desk.folder / f"{done['id']}.mcap"
+    path.write_bytes(path.read_bytes()[:-50])
+    (desk.folder / f"{other['id']}.mcap").unlink()
+    again = desk.begins()
+    await again.mended
+    (found,) = again.library.of(1)
+    assert (found.state.value, found.messages, found.ended is not None) == ("recovered", 2, True)
+    assert [each.body for each in read(path)] == [text("a"), text("b")]
+    again.close()

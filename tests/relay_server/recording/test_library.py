@@ -1,0 +1,82 @@
+"""The folder of recordings, and what is found there at the start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from relay_protocol.errors import Invalid, NotFound, Unavailable
+from relay_server.recording.library import Entry, Library, State, text_of
+
+
+def entry(id: str = "a", *, robot: int = 1, begun: float = 1.0, limit: int = 1000) -> Entry:
+    """A recording that runs."""
+    return Entry(id, robot, "rover", 7, "ann", ("/odom",), (), begun=begun, limit=limit, seconds=60.0)
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> Library:
+    """A folder with room for 3000 bytes."""
+    library = Library(tmp_path / "recordings", 3000)
+    library.open()
+    return library
+
+
+def test_a_robots_recordings_are_listed_the_latest_first(library: Library) -> None:
+    """Those of others are neither listed nor found."""
+    for each in (entry("a", begun=1), entry("b", begun=2), entry("c", robot=2)):
+        library.add(each)
+    assert [each.id for each in library.of(1)] == ["b", "a"]
+    assert library.find(1, "a").id == "a"
+    for robot, id in ((2, "a"), (1, "c"), (1, "../x")):
+        with pytest.raises(NotFound):
+            library.find(robot, id)
+
+
+def test_what_runs_takes_what_it_may_become(library: Library) -> None:
+    """What is finished takes what it has; more than the quota is refused."""
+    first = entry("a", limit=2000)
+    library.add(first)
+    with pytest.raises(Unavailable, match="delete some"):
+        library.add(entry("b", limit=1001))
+    first.state, first.bytes = State.COMPLETE, 500
+    library.add(entry("b", limit=2500))
+    library.forget(first)
+    assert library.used == 2500
+
+
+def test_it_is_all_there_after_a_new_start(library: Library, tmp_path: Path) -> None:
+    """What ran is incomplete then, and what was begun only to be replaced is gone."""
+    running, done = entry("a"), entry("b")
+    done.state, done.bytes, done.problems = State.COMPLETE, 5, ["late"]
+    for each in (running, done):
+        library.save(each.id, text_of(each))
+    folder = tmp_path / "recordings"
+    (folder / "b.part").write_bytes(b"x")
+    (folder / "c.new").write_bytes(b"x")
+    (folder / "d.json").write_bytes(b"nonsense")
+    again = Library(folder, 3000)
+    again.open()
+    assert again.find(1, "b") == done
+    assert [each.id for each in again.incomplete()] == ["a"]
+    assert again.find(1, "a").reason == "the relay ended without warning"
+    assert sorted(each.name for each in folder.iterdir()) == ["a.json", "b.json", "d.json"]
+    assert folder.stat().st_mode & 0o077 == 0
+
+
+def test_a_deleted_recording_leaves_nothing(library: Library, tmp_path: Path) -> None:
+    """Also if only one of its files is there, or none."""
+    gone = entry()
+    library.save(gone.id, text_of(gone))
+    library.path(gone).write_bytes(b"x")
+    for _ in range(2):
+        library.delete(gone.id)
+    assert list((tmp_path / "recordings").iterdir()) == []
+
+
+def test_a_folder_that_can_not_be_used_is_told(tmp_path: Path) -> None:
+    """In words."""
+    (tmp_path / "recordings").write_text("a file")
+    with pytest.raises(Invalid, match="the folder of recordings can't be used"):
+        Library(tmp_path / "recordings", 1).open()

@@ -1,0 +1,113 @@
+"""Files that are written up to a limit, and what is left of those that were not finished."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from relay_server.recording.mcap_file import Full, McapFile, Track, mend
+from tests.relay_server.memory import text
+from tests.relay_server.recording.reading import CHATTER, WORDS, profile, read
+
+
+def write(path: Path, count: int, *, finish: bool = True, track: Track = CHATTER) -> None:
+    """So many messages, each in a chunk of its own."""
+    with path.open("wb") as stream:
+        file = McapFile(stream, 10**6, track.encoding == "cdr")
+        for number in range(count):
+            file.add(track, number, number, text(f"{number}"))
+            file.flush()
+        if finish:
+            file.finish()
+
+
+def test_a_file_holds_what_was_added(tmp_path: Path) -> None:
+    """Of each track with its type, its definition and both times, in the profile of ROS 2."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        file = McapFile(stream, 10**6, ros=True)
+        file.add(CHATTER, 5, 3, text("a"))
+        file.add(WORDS, 6, 6, b'{"data":"b"}')
+        file.add(CHATTER._replace(topic="/other"), 7, 7, text("c"))
+        file.finish()
+        assert file.size == path.stat().st_size
+    first, second, third = read(path)
+    assert first == ("/chatter", "std_msgs/msg/String", "ros2msg", b"string data\n", 5, 3, text("a"))
+    assert (second.encoding, second.body) == ("jsonschema", b'{"data":"b"}')
+    assert third.topic == "/other"
+    assert profile(path) == "ros2"
+
+
+def test_a_topic_whose_definition_changes_becomes_another_channel(tmp_path: Path) -> None:
+    """Each message can be read by what was true when it came."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        file = McapFile(stream, 10**6, ros=True)
+        file.add(CHATTER, 1, 1, text("a"))
+        file.add(CHATTER._replace(definition="string data\nint8 more\n"), 2, 2, text("b"))
+        file.finish()
+    assert [each.schema for each in read(path)] == [b"string data\n", b"string data\nint8 more\n"]
+
+
+@pytest.mark.parametrize("size", [10, 1000, 100_000])
+@pytest.mark.parametrize("flush", [False, True])
+def test_a_file_is_never_larger_than_its_limit(tmp_path: Path, size: int, flush: bool) -> None:
+    """Not with what can't be compressed, nor with many chunks; most of the room is used."""
+    path, limit = tmp_path / "a.mcap", 1_000_000
+    body = os.urandom(size)
+    with path.open("wb") as stream:
+        file = McapFile(stream, limit, ros=True)
+        with pytest.raises(Full):
+            for number in range(100_000):
+                file.add(CHATTER._replace(topic=f"/t{number % 50}"), number, number, body)
+                if flush:
+                    file.flush()
+        file.finish()
+    assert path.stat().st_size <= limit
+    assert len(read(path)) == file.messages
+
+
+@pytest.mark.parametrize("cut", [1, 9, 40, 200])
+def test_what_is_whole_of_a_file_is_kept(tmp_path: Path, cut: int) -> None:
+    """However it broke off."""
+    path = tmp_path / "a.mcap"
+    write(path, 10, finish=False)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-cut])
+    kept = mend(path, lambda: False)
+    bodies = [each.body for each in read(path)]
+    assert bodies == [text(f"{number}") for number in range(len(bodies))]
+    assert kept == len(bodies) >= 8
+    assert profile(path) == "ros2"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_whole_file_stays_what_it_is(tmp_path: Path) -> None:
+    """Its messages are there once; nobody may have noted that it was finished."""
+    path = tmp_path / "a.mcap"
+    write(path, 3, track=WORDS)
+    before = read(path)
+    assert mend(path, lambda: False) == 3
+    assert read(path) == before
+    assert profile(path) == ""
+
+
+@pytest.mark.parametrize("left", [b"", b"\x89MCAP", os.urandom(5000)])
+def test_of_a_file_that_says_nothing_an_empty_one_is_made(tmp_path: Path, left: bytes) -> None:
+    """It can be opened at least."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(left)
+    assert mend(path, lambda: False) == 0
+    assert read(path) == []
+
+
+def test_mending_stops_when_it_is_told_to(tmp_path: Path) -> None:
+    """And leaves all as it was."""
+    path = tmp_path / "a.mcap"
+    write(path, 10, finish=False)
+    before = path.read_bytes()
+    assert mend(path, lambda: True) is None
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,308 @@
+"""One recording while it runs, in a world in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from relay_protocol import link
+from relay_protocol.errors import Invalid, Unavailable
+from relay_protocol.rights import Grant, Level, Rules
+from relay_server.access import Permit, Principal
+from relay_server.recording import compressed
+from relay_server.recording.library import Entry, State
+from relay_server.recording.recorder import AGAIN_SECONDS, Recorder, may
+from relay_server.recording.writer import Message, Outcome
+from tests.relay_server.memory import STRING, World, text
+from tests.relay_server.video import watching as video
+from tests.relay_server.video.watching import CAMERA, jpeg
+
+HERE = "/chatter"
+
+
+class Paper:
+    """A writer that keeps what it is given."""
+
+    def __init__(self, ended: Callable[[Outcome], None]) -> None:
+        self._ended = ended
+        self.begun = self.closing = False
+        self.room = 1000
+        self.messages = 0
+        self.bytes = 77
+        self.broken = 0
+        self.written: list[Message] = []
+
+    def start(self) -> None:
+        """Begin."""
+        assert not self.begun
+        self.begun = True
+
+    def put(self, message: Message) -> bool:
+        """Keep it."""
+        if len(self.written) >= self.room:
+            return False
+        self.written.append(message)
+        self.messages += 1
+        return True
+
+    def finish(self) -> None:
+        """It is told to end."""
+        assert not self.closing
+        self.closing = True
+
+    def ends(self, finished: bool = True, reason: str = "") -> None:
+        """It has ended."""
+        self._ended(Outcome(finished, reason))
+
+    @property
+    def bodies(self) -> list[bytes]:
+        """What stands in the file."""
+        return [each.body if each.make is None else each.make(each.body) for each in self.written]
+
+
+class Desk:
+    """Who records what, and what becomes of it."""
+
+    def __init__(
+        self, world: World, topics: tuple[str, ...] = (HERE,), cameras: tuple[str, ...] = ()
+    ) -> None:
+        self.world = world
+        self.entry = Entry("id", 1, "rover", 7, "ann", topics, cameras, begun=1.0, limit=10**6, seconds=600.0)
+        principal = Principal(7, "ann", "main", False, 1, None)
+        self.permit = Permit(principal, 1, Rules([Grant(Level.OPERATOR)]))
+        self.over: list[Recorder] = []
+        self.papers: list[Paper] = []
+        self.recorder = Recorder(
+            world.clock,
+            self.entry,
+            self.permit,
+            world.channel,
+            world.videos,
+            self._paper,  # type: ignore[arg-type]
+            wall=lambda: 5.0,
+            ended=self.over.append,
+        )
+
+    def _paper(self, ended: Callable[[Outcome], None]) -> Paper:
+        self.papers.append(Paper(ended))
+        return self.papers[-1]
+
+    @property
+    def paper(self) -> Paper:
+        """What is written on."""
+        return self.papers[0]
+
+    def starts(self) -> None:
+        """It begins."""
+        self.recorder.start()
+
+    def hears(self, encoding: str = "cdr") -> int:
+        """The robot confirms the topic and tells its type; the number of the topic."""
+        number = self.world.link.all(link.Subscribe)[-1].number
+        self.world.subscribed(number, encoding=encoding)
+        if encoding == "cdr":
+            self.world.define()
+        return number
+
+    def rights(self, *denied: str, level: Level = Level.OPERATOR) -> None:
+        """The rights change."""
+        self.permit.rules = Rules([Grant(level, (), denied)])
+        self.permit.on_change()
+
+
+def begun(world: World, encoding: str = "cdr") -> tuple[Desk, int]:
+    """A recording of one topic of a robot that is there."""
+    world.robot_comes((encoding,))
+    desk = Desk(world)
+    desk.starts()
+    world.robot_joins()
+    return desk, desk.hears(encoding)
+
+
+def test_samples_are_written_as_they_came(world: World) -> None:
+    """With the robot's time, the type and its definition; no sample is left out."""
+    desk, number = begun(world)
+    assert world.link.all(link.Subscribe)[0].throttle_ms == 0
+    for stamp in (5, 6, 7):
+        world.channel.sample(number, text(f"{stamp}"), stamp)
+    assert desk.paper.bodies == [text("5"), text("6"), text("7")]
+    assert [(each.log_time, each.publish_time) for each in desk.paper.written] == [(5, 5), (6, 6), (7, 7)]
+    (track,) = {each.track for each in desk.paper.written}
+    assert track == (HERE, STRING, "cdr", "string data\n")
+
+
+def test_samples_of_a_robot_that_speaks_json_are_written_as_json(world: World) -> None:
+    """Anew, so that no robot writes what is not JSON into the file."""
+    desk, number = begun(world, "json")
+    world.channel.sample(number, b' {"data":  "a"}', 5)
+    world.channel.sample(number, b"no json", 6)
+    assert desk.paper.written[0].track == (HERE, STRING, "json", "")
+    first, second = desk.paper.written
+    assert first.make is not None and first.make(first.body) == b'{"data":"a"}'
+    with pytest.raises(Exception, match="JSON"):
+        assert second.make is not None and second.make(second.body)
+
+
+def test_a_latched_sample_does_not_seem_to_have_come_long_ago(world: World) -> None:
+    """It stands at the beginning of the recording, and says when it was published."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    person.says("subscribe", topic=HERE)
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number, latched=True)
+    world.define()
+    world.channel.sample(number, text("old"), 5)
+    desk = Desk(world)
+    desk.starts()
+    (message,) = desk.paper.written
+    assert (message.log_time, message.publish_time) == (world.channel.now_ns(), 5)
+
+
+def test_a_robot_that_comes_back_goes_on_in_the_same_file(world: World) -> None:
+    """With another number and another definition, if it has one."""
+    desk, number = begun(world)
+    world.channel.sample(number, text("a"), 5)
+    world.robot_goes()
+    world.clock.advance(60)
+    world.robot_comes()
+    world.robot_joins()
+    number = desk.hears()
+    world.channel.sample(number, text("b"), 6)
+    assert desk.paper.bodies == [text("a"), text("b")]
+    assert desk.entry.state is State.RECORDING
+
+
+def test_what_finds_no_room_is_counted(world: World) -> None:
+    """With what could not be made into a message."""
+    desk, number = begun(world)
+    desk.paper.room = 2
+    desk.paper.broken = 1
+    for _ in range(5):
+        world.channel.sample(number, text("x"), 5)
+    desk.recorder.count()
+    assert (desk.entry.messages, desk.entry.drops, desk.entry.bytes) == (2, 4, 77)
+
+
+def test_it_ends_when_its_time_is_over(world: World) -> None:
+    """The robot is told that nobody listens, the file is finished, and nothing more comes."""
+    desk, number = begun(world)
+    world.clock.advance(599)
+    assert not desk.paper.closing
+    world.clock.advance(1)
+    assert desk.paper.closing
+    assert desk.entry.state is State.FINISHING
+    assert world.link.all(link.Unsubscribe) == [link.Unsubscribe(number=number)]
+    desk.recorder.stop("too late")
+    assert desk.over == []
+    desk.paper.ends()
+    assert desk.over == [desk.recorder]
+    assert (desk.entry.state, desk.entry.reason) == (State.COMPLETE, "it has taken its time")
+    assert desk.entry.ended == 5.0
+    world.clock.advance(10)
+    assert world.channel.state.value == "new", "the channel has closed, and this is another one"
+
+
+def test_it_ends_when_the_writer_does(world: World) -> None:
+    """At its size, or when the disk is full."""
+    desk, _ = begun(world)
+    desk.paper.ends(True, "it has reached its size")
+    assert (desk.entry.state, desk.entry.reason) == (State.COMPLETE, "it has reached its size")
+    assert not world.channel.members
+    other = Desk(world)
+    other.starts()
+    other.paper.ends(False, "the disk is full")
+    assert (other.entry.state, other.entry.reason) == (State.INCOMPLETE, "the disk is full")
+
+
+@pytest.mark.parametrize("denied", ["record:/chatter", "subscribe:/chatter", "*:*"])
+def test_it_ends_with_the_right(world: World, denied: str) -> None:
+    """To record, or to subscribe to what is recorded; a right on anything else may go."""
+    desk, number = begun(world)
+    desk.rights("record:/other", "publish:*")
+    assert not desk.paper.closing
+    desk.rights(denied)
+    assert desk.paper.closing
+    assert denied in desk.entry.reason
+    world.channel.sample(number, text("x"), 5)
+    assert desk.paper.written == []
+
+
+def test_it_ends_when_who_records_may_nothing_any_more(world: World) -> None:
+    """Logged out, or the robot was removed."""
+    desk, _ = begun(world)
+    desk.permit.on_revoke("your right on this robot was revoked")
+    assert desk.paper.closing
+    assert desk.entry.reason == "your right on this robot was revoked"
+
+
+def test_what_a_viewer_may_is_not_enough(world: World) -> None:
+    """Nor to record what may not be seen."""
+    desk = Desk(world, (HERE,), (CAMERA,))
+    assert may(desk.permit, desk.entry) == ""
+    desk.rights(level=Level.VIEWER)
+    assert "needs the level operator" in may(desk.permit, desk.entry)
+    for denied in (f"view:{CAMERA}", f"record:{CAMERA}", "subscribe:/chatter"):
+        desk.rights(denied)
+        assert denied in may(desk.permit, desk.entry)
+
+
+def test_a_topic_that_is_not_there_is_refused_and_nothing_has_begun(world: World) -> None:
+    """The robot is asked for nothing."""
+    world.at_work()
+    desk = Desk(world, (HERE, "/nowhere"))
+    with pytest.raises(Invalid, match="/nowhere does not exist"):
+        desk.starts()
+    assert desk.recorder not in world.channel.members
+    assert world.link.all(link.Subscribe)[-1].topic == HERE
+    assert len(world.link.all(link.Unsubscribe)) == 1
+    assert not desk.paper.begun
+
+
+def test_why_a_topic_does_not_come_is_kept_with_the_recording(world: World) -> None:
+    """Once for each reason."""
+    world.robot_comes()
+    desk = Desk(world)
+    desk.starts()
+    world.robot_joins()
+    number = world.link.all(link.Subscribe)[0].number
+    for _ in range(3):
+        world.channel.message(link.Failed(what="subscribe", ref=str(number), reason="no such luck"))
+    assert desk.entry.problems == ["subscribe /chatter: no such luck"]
+
+
+def test_pictures_are_written_as_messages(world: World) -> None:
+    """Each with the time it was taken."""
+    video.robot_comes(world)
+    desk = Desk(world, (), (CAMERA,))
+    desk.starts()
+    video.robot_joins(world)
+    (stream,) = world.videos.of(world.robot)
+    assert stream.settings == link.VideoSettings()
+    for number in (1, 2):
+        video.shows(world, stream, number)
+    first, second = desk.paper.written
+    assert first.track == (f"{CAMERA}/compressed", compressed.TYPE, "cdr", compressed.TEXT)
+    assert first.log_time == first.publish_time
+    assert desk.paper.bodies[0] == compressed.message(jpeg(), first.log_time, "jpeg")
+    assert second.log_time >= first.log_time
+    desk.recorder.stop("enough")
+    assert not stream.viewers
+
+
+def test_a_camera_that_is_not_to_be_had_is_asked_for_again(world: World) -> None:
+    """As long as the recording runs; why it was not is kept."""
+    video.robot_comes(world)
+    desk = Desk(world, (), (CAMERA,))
+    desk.starts()
+    video.robot_joins(world)
+    (stream,) = world.videos.of(world.robot)
+    stream.shut(Unavailable("the lens is covered"))
+    assert desk.entry.problems == [f"{CAMERA}: the lens is covered"]
+    world.clock.advance(AGAIN_SECONDS)
+    (stream,) = world.videos.of(world.robot)
+    stream.shut(Unavailable("the lens is covered"))
+    desk.recorder.stop("enough")
+    world.clock.advance(AGAIN_SECONDS)
+    assert world.videos.of(world.robot) == []
