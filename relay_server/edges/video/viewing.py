@@ -31,7 +31,7 @@ UNSENT_BYTES = 16 * KIB
 """What the kernel holds for a viewer: all of it, and what has not gone over the network yet."""
 
 _PROBES = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
-"""Seconds, seconds, times: while a robot is away nothing is written, and a viewer who vanished is noticed by these alone
+"""Seconds, seconds, times: while a robot is away nothing is written, and these alone notice a viewer who vanished
 (tcp(7); some systems know only some of them)."""
 
 # Python 3.11 knows the name only where its C library did.
