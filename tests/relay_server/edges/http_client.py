@@ -126,9 +126,13 @@ class Transport(StringTransportWithDisconnection):
         """As TCP."""
 
 
-def api_of(clock: Any, desk: Any, origins: Origins, *, tls: bool = False) -> Api:
+def api_of(
+    clock: Any, desk: Any, origins: Origins, below: dict[str, Any] | None = None, *, tls: bool = False
+) -> Api:
     """The API in front of a desk."""
-    return Api(clock, desk, origins, CollectorRegistry(), {}, cookie="sb", secure=tls)
+    return Api(
+        clock, desk, origins, CollectorRegistry(), {} if below is None else below, cookie="sb", secure=tls
+    )
 
 
 class World:
@@ -139,7 +143,8 @@ class World:
         self.desk = MemoryDesk()
         self.cap = AddressCap(4)
         origins = Origins("https" if tls else "http")
-        api = api_of(self.clock, self.desk, origins, tls=tls)
+        self.below: dict[str, Any] = {}
+        api = api_of(self.clock, self.desk, origins, self.below, tls=tls)
         websocket = WebSocketResource(ClientFactory(self.clock, lambda: 0, self.desk, self.cap))  # type: ignore[arg-type]
         root = Root(Robots(websocket, Missing(), "1.2.3"), api.app.resource(), Portal(folder))
         self.site = RelaySite(root, self.clock, self.cap, tls)

@@ -1,0 +1,201 @@
+"""``/api/v1/robots/<robot>/recordings`` on transports in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from twisted.internet.defer import Deferred
+
+from relay_protocol.errors import NotFound
+from relay_server.access import Principal
+from relay_server.edges import recordings as module
+from relay_server.recording import Ask
+from tests.relay_server.edges.http_client import HOST, Transport, World, parse
+
+HERE = "/api/v1/robots/rover/recordings"
+ANN = {"Authorization": "Bearer ann"}
+CONTENT = bytes(range(256)) * 4096
+
+
+class File:
+    """A file whose parts the test gives when it wants to."""
+
+    name = "rover-a.mcap"
+
+    def __init__(self, size: int = len(CONTENT)) -> None:
+        self.size = size
+        self.open = True
+        self.denied: Callable[[str], None] = lambda reason: None
+        self.asked: list[tuple[int, int, Deferred[bytes]]] = []
+
+    def watch(self, denied: Callable[[str], None]) -> None:
+        """Keep who is to be told."""
+        self.denied = denied
+
+    async def part(self, offset: int, size: int) -> bytes:
+        """When the test says so."""
+        part: Deferred[bytes] = Deferred()
+        self.asked.append((offset, size, part))
+        return await part
+
+    def close(self) -> None:
+        """Once."""
+        assert self.open
+        self.open = False
+
+    def gives(self) -> None:
+        """The part that is asked for."""
+        offset, size, part = self.asked.pop()
+        part.callback(CONTENT[offset : offset + size])
+
+
+class Desk:
+    """Keeps what it is asked; one recording is there."""
+
+    def __init__(self) -> None:
+        self.asks: list[Ask] = []
+        self.deleted: list[str] = []
+        self.file = File()
+
+    async def start(self, principal: Principal, robot: str, ask: Ask, address: str) -> dict[str, Any]:
+        """It begins."""
+        assert (principal.name, robot, address) == ("ann", "rover", "192.0.2.9")
+        self.asks.append(ask)
+        return {"id": "a"}
+
+    async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
+        """The one."""
+        return [await self.one(principal, robot, "a", address)]
+
+    async def one(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
+        """Only this."""
+        if id != "a":
+            raise NotFound("there is no such recording")
+        return {"id": id}
+
+    async def stop(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
+        """It is over."""
+        return {"id": id, "state": "complete"}
+
+    async def delete(self, principal: Principal, robot: str, id: str, address: str) -> None:
+        """It is gone."""
+        self.deleted.append(id)
+
+    async def download(self, principal: Principal, robot: str, id: str, address: str) -> File:
+        """Its file."""
+        return self.file
+
+
+@pytest.fixture
+def desk() -> Desk:
+    """Who is asked."""
+    return Desk()
+
+
+@pytest.fixture
+def world(tmp_path: Path, desk: Desk) -> World:
+    """A site with recordings."""
+    made = World(tmp_path)
+    made.below["recordings"] = partial(module.below, made.clock, desk)
+    return made
+
+
+def fetch(world: World) -> Transport:
+    """Somebody downloads; the head of the answer and the beginning of the file come later."""
+    transport = world.connect()
+    head = f"GET {HERE}/a/file HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\n\r\n"
+    world.send(transport, head.encode())
+    return transport
+
+
+def test_each_address_does_its_own(world: World, desk: Desk) -> None:
+    """With and without a slash at the end of the first."""
+    assert world.ask("GET", HERE, **ANN).json == {"recordings": [{"id": "a"}]}
+    answer = world.ask("POST", HERE, {"topics": ["/odom"], "seconds": 5}, **ANN)
+    assert (answer.status, answer.headers["location"]) == (201, f"{HERE}/a")
+    assert desk.asks == [Ask(topics=["/odom"], seconds=5.0)]
+    assert world.ask("GET", f"{HERE}/a", **ANN).json == {"id": "a"}
+    assert world.ask("POST", f"{HERE}/a/stop", **ANN).json["state"] == "complete"
+    assert world.ask("DELETE", f"{HERE}/a", **ANN).status == 204
+    assert desk.deleted == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", f"{HERE}/b", 404),
+        ("GET", f"{HERE}/a/b/c", 404),
+        ("GET", "/api/v1/robots/rover/others", 404),
+        ("PUT", HERE, 405),
+        ("POST", HERE, 400),
+    ],
+)
+def test_what_is_not_there_is_told_as_problem_details(
+    world: World, method: str, path: str, status: int
+) -> None:
+    """Also where no recording is meant."""
+    answer = world.ask(method, path, **ANN)
+    assert (answer.status, answer.headers["content-type"]) == (status, "application/problem+json")
+
+
+@pytest.mark.parametrize(
+    "body", [{"topics": "/odom"}, {"seconds": 0}, {"megabytes": 1e9}, {"topics": ["/a"] * 65}, {"topic": []}]
+)
+def test_an_ask_beyond_the_bounds_is_refused(world: World, desk: Desk, body: dict[str, Any]) -> None:
+    """Before anybody is asked; a word that is not known may be a mistake."""
+    assert world.ask("POST", HERE, body, **ANN).status == 400
+    assert desk.asks == []
+
+
+def test_nobody_asks_without_a_credential(world: World, desk: Desk) -> None:
+    """Nor with a cookie from another page."""
+    assert world.ask("GET", HERE).status == 401
+    cookie = {"Cookie": "sb=ann", "Origin": "http://evil.example"}
+    assert world.ask("POST", HERE, {"topics": ["/odom"]}, **cookie).status == 403
+    assert world.ask("DELETE", f"{HERE}/a", **cookie).status == 403
+
+
+def test_a_file_comes_in_parts(world: World, desk: Desk) -> None:
+    """Under its name, and no more of it is read than is taken."""
+    transport = fetch(world)
+    while desk.file.asked:
+        assert desk.file.asked[0][1] <= module.PART_BYTES
+        desk.file.gives()
+    answer = parse(transport.value())
+    assert answer.headers["content-disposition"] == 'attachment; filename="rover-a.mcap"'
+    assert answer.headers["content-length"] == str(len(CONTENT))
+    assert answer.body == CONTENT
+    assert not desk.file.open
+
+
+def test_who_takes_nothing_of_a_file_is_waited_for_and_then_cut(world: World, desk: Desk) -> None:
+    """Nothing is read meanwhile."""
+    transport = fetch(world)
+    transport.producer.pauseProducing()
+    desk.file.gives()
+    assert desk.file.asked == []
+    transport.producer.resumeProducing()
+    assert len(desk.file.asked) == 1
+    transport.producer.pauseProducing()
+    desk.file.gives()
+    world.clock.advance(module.STALL_SECONDS)
+    assert not transport.connected
+    assert not desk.file.open
+
+
+@pytest.mark.parametrize("how", ["denied", "gone"])
+def test_a_file_that_may_or_can_not_be_sent_on_breaks_off(world: World, desk: Desk, how: str) -> None:
+    """The client sees that it has not got all."""
+    transport = fetch(world)
+    desk.file.gives()
+    if how == "denied":
+        desk.file.denied("your right was revoked")
+    else:
+        desk.file.asked.pop()[2].errback(OSError("it was deleted"))
+    assert not transport.connected
+    assert not desk.file.open
+    assert len(parse(transport.value()).body) < len(CONTENT)
