@@ -9,7 +9,7 @@ from twisted.web.server import Request
 
 from relay_protocol import link
 from relay_protocol.errors import Refused, SwitchboardError
-from relay_server.clock import Clock
+from relay_server.clock import Clock, cancel
 from relay_server.edges.fastpath import Turns, Writer, writer_for
 from relay_server.edges.flow import Flow
 from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Waiting, narrow, unsent
@@ -161,5 +161,7 @@ class Multipart:
             self._transport.abortConnection()
         else:
             self._request.channel.loseConnection()
-            self._clock.callLater(LEAVING_SECONDS, self._transport.abortConnection)
+            leaving = self._clock.callLater(LEAVING_SECONDS, self._transport.abortConnection)
+            # A connection by TLS that is gone can't be aborted.
+            self._request.notifyFinish().addErrback(lambda _: cancel(leaving))
         self.done.callback(None)

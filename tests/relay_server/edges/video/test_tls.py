@@ -5,9 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest_twisted
+from twisted.internet import reactor
+from twisted.logger import LogEvent, globalLogPublisher
 
+from relay_protocol import link
+from relay_server.edges.video.multipart import LEAVING_SECONDS
 from relay_server.store import Store
 from relay_server.tls import ServerTls
 from tests.relay_server.edges.video.show import CAMERA, STREAM, Looker, Show, jpeg, until
@@ -42,6 +47,26 @@ async def test_pictures_of_any_size_come_whole_and_in_order(show: Show) -> None:
         assert (await looker.part())[1] == body
     looker.leave()
     await until(lambda: not stream.viewers)
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_end_of_a_stream_leaves_nothing_behind(show: Show) -> None:
+    """The last picture still comes, and nobody aborts what is gone."""
+    told: list[LogEvent] = []
+    globalLogPublisher.addObserver(told.append)
+    control = show.robot_comes()
+    looker = await looks(show)
+    stream = await show.joined(control)
+    show.shows(stream, jpeg(60_000))
+    stream.message(link.NotPlaying(reason="no more"))
+    assert (await looker.head())[0] == 200
+    assert (await looker.part())[1] == jpeg(60_000)
+    assert await looker.closed() < LEAVING_SECONDS
+    looker.leave()
+    clock: Any = reactor
+    await until(lambda: not any("abortConnection" in str(each) for each in clock.getDelayedCalls()))
+    globalLogPublisher.removeObserver(told.append)
+    assert [each for each in told if "log_failure" in each] == []
 
 
 @pytest_twisted.ensureDeferred
