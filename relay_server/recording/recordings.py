@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
-from twisted.internet.defer import Deferred, DeferredList, succeed
+from twisted.internet.defer import Deferred, DeferredList, TimeoutError, succeed
 from twisted.logger import Logger
 
 from relay_protocol.errors import Invalid, Refused, Unavailable
@@ -36,6 +36,9 @@ RECORDINGS = 16
 THREADS = 2
 WAITING = 64
 """Pieces of work on files that may be under way or wait."""
+
+FINISH_SECONDS = 5.0
+"""A relay that is going down waits no longer for the disk."""
 
 SECONDS = 86400.0
 MEGABYTES = 100_000
@@ -107,7 +110,15 @@ class Recordings:
         """Finish all that run."""
         self._stopping.set()
         running = list(self._running.values())
-        await DeferredList([self.stop(recorder.entry, reason) for recorder in running])
+        finishing = DeferredList([self.stop(recorder.entry, reason) for recorder in running])
+        # Twisted's types want a whole IReactorTime, of which only callLater is used.
+        finishing.addTimeout(FINISH_SECONDS, self._clock)  # type: ignore[arg-type]
+        try:
+            await finishing
+        except TimeoutError:
+            self.log.error(
+                "recordings are not finished within {limit} s; they are recovered later", limit=FINISH_SECONDS
+            )
 
     def close(self) -> None:
         """Finish what is being done with files; blocks for as long as that takes."""

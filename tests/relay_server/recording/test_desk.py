@@ -18,7 +18,8 @@ from relay_server.access import Access, Principal
 from relay_server.frontdesk import NO_ROBOT, Admission
 from relay_server.journal import Journal
 from relay_server.recording import Ask, Library, RecordingDesk, Recordings
-from relay_server.recording.recordings import USER_RECORDINGS
+from relay_server.recording.recordings import FINISH_SECONDS, USER_RECORDINGS
+from relay_server.recording.writer import Writer
 from relay_server.store import Store
 from tests.relay_server.memory import World, text
 from tests.relay_server.recording.reading import read
@@ -265,3 +266,17 @@ async def test_what_a_killed_relay_left_is_made_readable(desk: Desk) -> None:
     assert (found.state.value, found.messages, found.ended is not None) == ("recovered", 2, True)
     assert [each.body for each in read(path)] == [text("a"), text("b")]
     again.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_disk_that_hangs_does_not_keep_the_relay(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It leaves; the file is recovered at the next start."""
+    finish, stuck = Writer.finish, list[Writer]()
+    monkeypatch.setattr(Writer, "finish", lambda writer: stuck.append(writer))
+    begun = await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    leaving = Deferred.fromCoroutine(desk.recordings.shut("going down"))
+    desk.world.clock.advance(FINISH_SECONDS)
+    await leaving
+    assert desk.recordings.library.find(1, begun["id"]).state.value == "finishing"
+    monkeypatch.undo()
+    finish(stuck[0])
