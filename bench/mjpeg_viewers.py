@@ -32,6 +32,8 @@ class Viewer:
         self.socket.sendall(request)
         self.socket.setblocking(False)
         self.pictures = 0
+        self.sees = False
+        """Whether there was any picture yet."""
         self.bytes = 0
         self._tail = b""
 
@@ -45,6 +47,7 @@ class Viewer:
             return False
         self.bytes += len(data)
         self.pictures += (self._tail + data).count(DELIMITER)
+        self.sees = self.sees or self.pictures > 1
         self._tail = data[1 - len(DELIMITER) :]
         return bool(data)
 
@@ -72,7 +75,8 @@ def main() -> None:
             if not sys.stdin.readline():
                 return
             pictures = [each.pictures for each in viewers]
-            told = {"least": min(pictures), "pictures": sum(pictures)}
+            waiting = sum(not each.sees for each in viewers)
+            told = {"waiting": waiting, "least": min(pictures), "pictures": sum(pictures)}
             print(json.dumps({**told, "bytes": sum(each.bytes for each in viewers)}), flush=True)
             for each in viewers:
                 each.pictures = each.bytes = 0
