@@ -17,7 +17,7 @@ from relay_server.video.stream import Hooks, Stream
 ROBOT_STREAMS = 16
 """Most streams of one robot."""
 
-USER_STREAMS = 8
+USER_STREAMS = 12
 """Most streams of one robot that one user watches alone: who asks for ever other sizes, or for cameras that are not
 there, leaves room for others."""
 

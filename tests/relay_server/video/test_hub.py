@@ -85,7 +85,7 @@ def test_nobody_takes_all_streams_of_a_robot_for_himself(world: World) -> None:
     robot_comes(world)
     for number in range(USER_STREAMS):
         Watcher().watch(world, camera=f"/nowhere/{number}")
-    with pytest.raises(Unavailable, match="you have 8 streams of robot rover to yourself"):
+    with pytest.raises(Unavailable, match="you have 12 streams of robot rover to yourself"):
         Watcher().watch(world)
     shared = Watcher(8).watch(world)
     assert Watcher().watch(world) is shared
