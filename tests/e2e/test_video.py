@@ -488,7 +488,7 @@ def test_a_thin_uplink_makes_pictures_smaller_not_late(thin: Thin, kilobits: int
 
 
 def test_pictures_go_on_when_the_daemon_is_started_again(thin: Thin) -> None:
-    """On the same websocket, by themselves; what was killed leaves no camera process behind."""
+    """On the same websocket, by themselves."""
     known(thin.relay, thin.token, "thin")
     with Eye(thin.relay, thin.token, "thin") as eye:
         before = eye.picture()
