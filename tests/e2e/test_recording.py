@@ -218,11 +218,11 @@ def test_a_recording_outlives_its_robot_and_its_relay(own: tuple[Relay, Robot, s
     robot.daemon.stop()
     robot.start_daemon()
     before = recorder.look(id)["messages"]
-    recorder.until(id, before + 60)
+    recorder.until(id, before + 200)
     relay.kill()
     relay.start()
     wait_for("it is recovered", lambda: recorder.look(id)["state"] == "recovered")
-    # Of what comes at 20 Hz, what was in memory for a second is lost.
+    # What was in memory for about a second is lost, of what comes 20 to 50 times a second.
     assert len(read(recorder.fetch(id, tmp_path))) >= before + 20
     robot.wait_online()
     id = recorder.start("/odom")

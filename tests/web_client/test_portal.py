@@ -191,6 +191,7 @@ class TestCockpit:
         expect(seen(page, "odom-x")).to_have_text("−1.00")
         shown = {"/relay/status", "/scan", "/odom"}
         assert {entry["topic"] for entry in relay.log(op="subscribe")} == shown
+        relay.until(lambda: relay.log(op="watch"), "no camera was watched")
         assert [entry["topic"] for entry in relay.log(op="watch")] == ["/camera/image_raw/compressed"]
         row = page.locator("[data-testid=topic-row][data-topic='/battery_state']")
         row.click()
