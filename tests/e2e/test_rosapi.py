@@ -265,7 +265,9 @@ def test_no_answer_shows_what_is_denied(guest: Client, name: str) -> None:
     assert ("is denied to you" in values.pop("reason", "")) is (values.get("successful") is False)
     assert values.get("exists") is not True
     text = json.dumps(values)
-    assert not [each for each in ("/vault/gold", "/vault/open", "/vault/dig", "safe:code", "1234") if each in text]
+    assert not [
+        each for each in ("/vault/gold", "/vault/open", "/vault/dig", "safe:code", "1234") if each in text
+    ]
 
 
 def test_a_viewer_has_no_parameters(lab: Any) -> None:
