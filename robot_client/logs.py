@@ -17,7 +17,7 @@ from twisted.logger import (
     formatEvent,
     globalLogBeginner,
 )
-from zope.interface import implementer  # type: ignore[import-untyped]  # zope has no types
+from zope.interface import implementer
 
 from relay_protocol.text import inert
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 try:
-    import psutil  # type: ignore[import-untyped]  # psutil has no types
+    import psutil
 except ImportError:  # a robot without it has no figures, and no trouble
     psutil = None
 

@@ -14,7 +14,7 @@ from twisted.internet import error, ssl
 from twisted.internet.endpoints import HostnameEndpoint, wrapClientTLS
 from twisted.internet.interfaces import IOpenSSLClientConnectionCreator
 from twisted.python.failure import Failure
-from zope.interface import implementer  # type: ignore[import-untyped]  # zope has no types
+from zope.interface import implementer
 
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from robot_client.reactors import Endpoint

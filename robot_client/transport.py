@@ -12,7 +12,7 @@ from twisted.internet.protocol import Protocol as TwistedProtocol
 from twisted.internet.protocol import connectionDone
 from twisted.internet.tcp import Client
 from twisted.python.failure import Failure
-from zope.interface import implementer  # type: ignore[import-untyped]  # zope has no types
+from zope.interface import implementer
 
 from relay_protocol.errors import PeerError, SwitchboardError
 from relay_protocol.limits import KIB, UNPROVEN_SECONDS

@@ -13,7 +13,7 @@ from typing import Any
 
 from twisted.internet.interfaces import IReadDescriptor
 from twisted.logger import Logger
-from zope.interface import implementer  # type: ignore[import-untyped]  # zope has no types
+from zope.interface import implementer
 
 from relay_protocol.limits import MIB
 
