@@ -19,7 +19,7 @@ from relay_server.channel.round_trips import RoundTrips
 from relay_server.channel.serving import call_seconds
 from relay_server.channel.states import State
 from relay_server.channel.wire import Member, Wire
-from relay_server.clock import Clock
+from relay_server.clock import Clock, as_twisted
 
 T = TypeVar("T")
 
@@ -142,8 +142,7 @@ class Asking:
                 raise late
             return result
 
-        # Twisted's types want a whole IReactorTime, of which only callLater is used.
-        running.addTimeout(seconds, self._clock, too_late)  # type: ignore[arg-type]
+        running.addTimeout(seconds, as_twisted(self._clock), too_late)
         return await running
 
     async def _open(self) -> None:
