@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -21,7 +22,7 @@ PLACE_SECONDS = 30.0
 """What nobody waits for any more keeps its place for so long, or until it is answered: it may not be read yet."""
 
 
-class Errand:
+class Errand(ABC):
     """One call or goal on its way to the client that offers the service or action.
 
     :param id: unguessable; only the client that was asked knows it
@@ -34,9 +35,9 @@ class Errand:
         self.size = len(args)
         self.fading: Timer | None = None
 
+    @abstractmethod
     def withdrawn(self, reason: str) -> None:
         """The client will never answer."""
-        raise NotImplementedError
 
 
 E = TypeVar("E", bound=Errand)

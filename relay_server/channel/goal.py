@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
 from twisted.internet.defer import CancelledError, Deferred
@@ -51,7 +52,7 @@ class Asker(Protocol):
         """
 
 
-class Goal:
+class Goal(ABC):
     """One goal from its asking to its end.
 
     :param wants_feedback: whether the asker does
@@ -100,13 +101,13 @@ class Goal:
         elif self.beginning is not None:
             self.beginning.cancel()
 
+    @abstractmethod
     def tell_feedback(self, body: bytes) -> None:
         """Hand feedback to the asker."""
-        raise NotImplementedError
 
+    @abstractmethod
     def tell_end(self, end: End) -> None:
         """Hand the end to the asker."""
-        raise NotImplementedError
 
 
 class Pursuer(Protocol):
