@@ -109,7 +109,7 @@ class Fleet:
         """The log of a process that has ended by itself, if one has."""
         for process in self._running:
             if process.poll() is not None and not self._stopping:
-                return f"{Path(str(process.args[0])).name} ended with code {process.returncode}"  # type: ignore[index]
+                return f"{Path(str(process.args[0])).name} ended with code {process.returncode}"  # type: ignore[index]  # a list, see _start
         return None
 
     def stop(self) -> None:

@@ -6,7 +6,7 @@ The link of a stream of pictures has its role in :mod:`~relay_server.edges.robot
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -98,8 +98,8 @@ class Opening(Role):
     def lost(self, reason: str) -> None:
         """Nothing was opened."""
 
-    def _run(self, work: object) -> None:
-        self._connection.wait_for(Deferred.fromCoroutine(work))  # type: ignore[arg-type]
+    def _run(self, work: Coroutine[Deferred[Any], Any, None]) -> None:
+        self._connection.wait_for(Deferred.fromCoroutine(work))
 
     def _challenge(self, hello: link.Hello) -> None:
         # Unknown robots are challenged like known ones: who is enrolled here is nobody's business.
