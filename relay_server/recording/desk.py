@@ -17,7 +17,7 @@ from relay_server.bucket import TokenBucket
 from relay_server.frontdesk import Admission, FrontDesk
 from relay_server.journal import Journal
 from relay_server.recording.library import READABLE, RUNNING, UNKNOWN, Entry
-from relay_server.recording.recorder import may
+from relay_server.recording.recorder import why_denied
 from relay_server.recording.recordings import Ask, Recordings
 from relay_server.store import Store
 
@@ -49,7 +49,7 @@ class Download:
         self._permit.on_revoke = denied
 
         def changed() -> None:
-            reason = may(self._permit, self._entry)
+            reason = why_denied(self._permit, self._entry)
             if reason:
                 denied(reason)
 
@@ -97,7 +97,7 @@ class RecordingDesk:
         admission = await self._desk.admit(principal, robot, address)
         try:
             entry = self._recordings.entry(ask, admission.robot, admission.permit)
-            reason = may(admission.permit, entry)
+            reason = why_denied(admission.permit, entry)
             if reason:
                 raise Refused(reason)
             await self._on_record("recording.start", entry, admission)
@@ -118,7 +118,9 @@ class RecordingDesk:
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             entries = self._recordings.library.of(admission.robot.robot_id)
             return [
-                _view(self._recordings.look(entry)) for entry in entries if not may(admission.permit, entry)
+                _view(self._recordings.look(entry))
+                for entry in entries
+                if not why_denied(admission.permit, entry)
             ]
 
     async def one(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
@@ -185,7 +187,7 @@ class RecordingDesk:
 
     def _find(self, admission: Admission, id: str) -> Entry:
         entry = self._recordings.library.find(admission.robot.robot_id, id)
-        if may(admission.permit, entry):
+        if why_denied(admission.permit, entry):
             raise NotFound(UNKNOWN)
         return entry
 

@@ -49,8 +49,8 @@ NEXT: dict[tuple[State, Event], State] = {
 """An event that is not listed for a state changes nothing."""
 
 
-def may(permit: Permit, entry: Entry) -> str:
-    """Why somebody may not have what a recording holds; empty when he may."""
+def why_denied(permit: Permit, entry: Entry) -> str:
+    """Why somebody may not have all that a recording holds; empty when he may."""
     asked = [(Operation.SUBSCRIBE, topic) for topic in entry.topics]
     asked += [(Operation.VIEW, camera) for camera in entry.cameras]
     for see, name in asked:
@@ -169,7 +169,7 @@ class Recorder:
         self._channel.detach(self)
 
     def _rights_changed(self) -> None:
-        reason = may(self.permit, self.entry)
+        reason = why_denied(self.permit, self.entry)
         if reason:
             self.stop(reason)
 

@@ -18,11 +18,11 @@ from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_protocol.limits import NAME
 from relay_server.access import Permit
 from relay_server.channel import Channels, resolve
-from relay_server.clock import Clock
+from relay_server.clock import Clock, as_twisted
 from relay_server.recording import compressed
 from relay_server.recording.library import Entry, Library, State, text_of
 from relay_server.recording.mcap_file import mend
-from relay_server.recording.recorder import Recorder, may
+from relay_server.recording.recorder import Recorder, why_denied
 from relay_server.recording.writer import Outcome, Writer
 from relay_server.registry import Presence
 from relay_server.store import Threads
@@ -111,8 +111,7 @@ class Recordings:
         self._stopping.set()
         running = list(self._running.values())
         finishing = DeferredList([self.stop(recorder.entry, reason) for recorder in running])
-        # Twisted's types want a whole IReactorTime, of which only callLater is used.
-        finishing.addTimeout(FINISH_SECONDS, self._clock)  # type: ignore[arg-type]
+        finishing.addTimeout(FINISH_SECONDS, as_twisted(self._clock))
         try:
             await finishing
         except TimeoutError:
@@ -167,7 +166,7 @@ class Recordings:
         self.library.add(entry)
         try:
             await self._threads.run(self.library.save, entry.id, text_of(entry))
-            reason = may(permit, entry)
+            reason = why_denied(permit, entry)
             if reason:
                 raise Refused(reason)
             if self._stopping.is_set():

@@ -12,7 +12,7 @@ from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
 from relay_server.recording import compressed
 from relay_server.recording.library import Entry, State
-from relay_server.recording.recorder import AGAIN_SECONDS, Recorder, may
+from relay_server.recording.recorder import AGAIN_SECONDS, Recorder, why_denied
 from relay_server.recording.writer import Message, Outcome
 from tests.relay_server.memory import STRING, World, text
 from tests.relay_server.video import watching as video
@@ -240,12 +240,12 @@ def test_it_ends_when_who_records_may_nothing_any_more(world: World) -> None:
 def test_what_a_viewer_may_is_not_enough(world: World) -> None:
     """Nor to record what may not be seen."""
     desk = Desk(world, (HERE,), (CAMERA,))
-    assert may(desk.permit, desk.entry) == ""
+    assert why_denied(desk.permit, desk.entry) == ""
     desk.rights(level=Level.VIEWER)
-    assert "needs the level operator" in may(desk.permit, desk.entry)
+    assert "needs the level operator" in why_denied(desk.permit, desk.entry)
     for denied in (f"view:{CAMERA}", f"record:{CAMERA}", "subscribe:/chatter"):
         desk.rights(denied)
-        assert denied in may(desk.permit, desk.entry)
+        assert denied in why_denied(desk.permit, desk.entry)
 
 
 def test_a_topic_that_is_not_there_is_refused_and_nothing_has_begun(world: World) -> None:
