@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
+import msgspec
+
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
@@ -379,7 +381,7 @@ class FrontDesk:
                 "rtt_ms": milliseconds(robot.rtt),
                 "battery": robot.health.battery,
                 "last_seen": robot.last_seen,
-                "health": {name: getattr(robot.health, name) for name in robot.health.__struct_fields__},
+                "health": msgspec.structs.asdict(robot.health),
                 "clients": [
                     {
                         "user": each.name,

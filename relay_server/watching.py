@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
+import msgspec
+
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_protocol.rights import Operation
@@ -155,10 +157,6 @@ def _shown(stream: Stream) -> dict[str, Any]:
     return {
         "viewers": len(stream.viewers),
         "state": stream.state.name.lower(),
-        "settings": _fields(stream.settings),
-        "playing": None if stream.told is None else _fields(stream.told),
+        "settings": msgspec.structs.asdict(stream.settings),
+        "playing": None if stream.told is None else msgspec.structs.asdict(stream.told),
     }
-
-
-def _fields(said: link.VideoSettings | link.Playing) -> dict[str, Any]:
-    return {name: getattr(said, name) for name in said.__struct_fields__}

@@ -75,8 +75,8 @@ class RelayNode:
                 for stream in self._videos.of(robot)
                 if session.permit.judge(Operation.VIEW, stream.camera).allowed
             ],
-            "motion": _whole(robot.description.motion),
-            "health": _whole(robot.health),
+            "motion": msgspec.structs.asdict(robot.description.motion),
+            "health": msgspec.structs.asdict(robot.health),
         }
 
     def _uplink(self, session: Session) -> dict[str, Any]:
@@ -103,8 +103,3 @@ def _shown(stream: Stream) -> dict[str, Any]:
         "reduced": told.reduced,
         "delay_ms": told.delay_ms,
     }
-
-
-def _whole(struct: msgspec.Struct) -> dict[str, Any]:
-    """All fields of a message, also those at their default."""
-    return {name: getattr(struct, name) for name in struct.__struct_fields__}

@@ -178,8 +178,8 @@ class VideoClient:
 
     def playing(self, playing: link.Playing) -> None:
         """Told between pictures; the latest counts."""
-        fields = {name: getattr(playing, name) for name in playing.__struct_fields__}
-        self.outbox.data("playing", wsframe.text(jsontext.encode({"op": "playing", **fields})), depth=1)
+        told = {"op": "playing", **msgspec.structs.asdict(playing)}
+        self.outbox.data("playing", wsframe.text(jsontext.encode(told)), depth=1)
 
     def ended(self, error: SwitchboardError) -> None:
         """There is nothing to see, or no more."""
