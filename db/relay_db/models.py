@@ -4,14 +4,14 @@ Times are Unix seconds. Numbers of rows are never given out twice (AUTOINCREMENT
 remembers its token by number, and a new token must not inherit it.
 
 No secret is stored: tokens and enrolment codes as SHA-256 in hex, passwords as argon2id, of robot keys the
-public half only.
+public half only. Rules of alerts are the exception: what signs a message, or sends one, must be at hand.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Any
 
-from sqlalchemy import CheckConstraint, Double, ForeignKey, Index, LargeBinary, String, UniqueConstraint
+from sqlalchemy import CheckConstraint, Double, ForeignKey, Index, LargeBinary, String, Text, UniqueConstraint
 from sqlalchemy.orm import Mapped, mapped_column
 
 from relay_db.base import Base, JsonText
@@ -97,6 +97,28 @@ class Robot(Base):
     realm_id: Mapped[int] = mapped_column(ForeignKey("realm.id", ondelete="RESTRICT"))
     name: Mapped[str] = mapped_column(String(ROBOT_NAME))
     description: Mapped[Label]
+
+
+class RobotGroup(Base):
+    """Robots to which one order can be given. It gives nobody a right."""
+
+    __tablename__ = "robot_group"
+    __table_args__ = (UniqueConstraint("realm_id", "name"), _NO_REUSE)
+
+    id: Mapped[Key]
+    realm_id: Mapped[int] = mapped_column(ForeignKey("realm.id", ondelete="RESTRICT"))
+    name: Mapped[Name]
+
+
+class RobotMembership(Base):
+    """A robot is in a group."""
+
+    __tablename__ = "robot_membership"
+
+    group_id: Mapped[int] = mapped_column(ForeignKey("robot_group.id", ondelete="CASCADE"), primary_key=True)
+    robot_id: Mapped[int] = mapped_column(
+        ForeignKey("robot.id", ondelete="CASCADE"), primary_key=True, index=True
+    )
 
 
 class RobotKey(Base):
@@ -215,6 +237,70 @@ class AuditEntry(Base):
     origin: Mapped[Label]
     data: Mapped[dict[str, Any]] = mapped_column(JsonText)
     hash: Mapped[Digest]
+
+
+class StopOrder(Base):
+    """A robot is to stop and has not confirmed it yet: it is told as soon as it is there."""
+
+    __tablename__ = "stop_order"
+
+    robot_id: Mapped[int] = mapped_column(
+        ForeignKey("robot.id", ondelete="CASCADE"), primary_key=True, autoincrement=False
+    )
+    by: Mapped[Label]
+    why: Mapped[str] = mapped_column(Text)
+    at: Mapped[Seconds]
+
+
+class Alert(Base):
+    """What people should know of a robot; all that was told of the same while it lasted is one row."""
+
+    __tablename__ = "alert"
+    __table_args__ = (
+        Index(None, "robot_id", "last_at"),
+        Index(None, "last_at"),
+        Index(None, "over_at"),
+        CheckConstraint("level IN ('info', 'warning', 'error')", name="level"),
+    )
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    robot_id: Mapped[int] = _owned_by("robot.id", index=False)
+    kind: Mapped[Name]
+    about: Mapped[Label]
+    level: Mapped[str] = mapped_column(String(16))
+    text: Mapped[str] = mapped_column(Text)
+    first_at: Mapped[Seconds]
+    last_at: Mapped[Seconds]
+    times: Mapped[int]
+    news: Mapped[int]
+    over_at: Mapped[Seconds | None]
+    ack_by: Mapped[Label | None]
+    ack_at: Mapped[Seconds | None]
+
+
+class AlertRule(Base):
+    """Which alerts a user is told of, when, and by which way."""
+
+    __tablename__ = "alert_rule"
+    __table_args__ = (
+        CheckConstraint("channel IN ('portal', 'webhook', 'apprise')", name="channel"),
+        CheckConstraint("level IN ('info', 'warning', 'error')", name="level"),
+        _NO_REUSE,
+    )
+
+    id: Mapped[Key]
+    user_id: Mapped[int] = _owned_by("user_account.id")
+    label: Mapped[Label]
+    robots: Mapped[Label]
+    kinds: Mapped[list[str]] = mapped_column(JsonText)
+    level: Mapped[str] = mapped_column(String(16))
+    channel: Mapped[str] = mapped_column(String(16))
+    url: Mapped[str] = mapped_column(Text)
+    secret: Mapped[Label]
+    over: Mapped[bool]
+    group_s: Mapped[Seconds]
+    quiet: Mapped[dict[str, str] | None] = mapped_column(JsonText)
+    created: Mapped[Seconds]
 
 
 class Revision(Base):

@@ -17,11 +17,15 @@ JSON = 0
 SAMPLE = 1
 VIDEO = 2
 PART = 3
+PICTURE_PART = 4
+COMMAND = 5
 
 _LENGTH = struct.Struct("!I").unpack_from
 _HEAD = struct.Struct("!IB")
 _SAMPLE_HEAD = struct.Struct("!IBIQ").pack
 _NUMBERED = struct.Struct("!IQ").unpack_from
+_COMMAND_HEAD = struct.Struct("!IBIQI").pack
+_COMMAND = struct.Struct("!IQI").unpack_from
 _PART_HEAD = struct.Struct("!IBIQII")
 _PART = struct.Struct("!IQII")
 
@@ -30,6 +34,9 @@ MAX_U64 = 2**64 - 1
 
 SAMPLE_HEAD = 13
 """Kind, number and stamp of a sample, counted by the length of its frame."""
+
+COMMAND_HEAD = 17
+"""The same of a command, which has a source too."""
 
 UNFINISHED = 1024
 """Most samples that have come in part only, over one link."""
@@ -59,6 +66,21 @@ class SampleFrame(_Frame, frozen=True, order=True, gc=False):
     body: bytes
 
 
+class CommandFrame(_Frame, frozen=True, order=True, gc=False):
+    """Kind 5: one message to a topic that moves the robot.
+
+    :param number: publication it belongs to
+    :param stamp: nanoseconds of the relay's monotonic clock; the command can't have been sent before
+    :param source: the connection it came from, as the relay numbers them
+    :param body: the message in the encoding agreed
+    """
+
+    number: int
+    stamp: int
+    source: int
+    body: bytes
+
+
 class VideoFrame(_Frame, frozen=True, order=True, gc=False):
     """Kind 2: one picture of a stream; ``stamp`` is the robot's wall clock in nanoseconds."""
 
@@ -67,7 +89,22 @@ class VideoFrame(_Frame, frozen=True, order=True, gc=False):
     body: bytes
 
 
-Frame = JsonFrame | SampleFrame | VideoFrame
+class PicturePart(_Frame, frozen=True, order=True, gc=False):
+    """Kind 4: one part of a picture; who takes it answers each, so :class:`PictureJoiner` is not the decoder's.
+
+    :param number: of the picture, like ``stamp``
+    :param total: bytes of the whole picture
+    :param offset: bytes of it that went before
+    """
+
+    number: int
+    stamp: int
+    total: int
+    offset: int
+    body: bytes
+
+
+Frame = JsonFrame | SampleFrame | CommandFrame | VideoFrame | PicturePart
 """What a stream is cut into; parts of a sample (kind 3) come out as the sample they make."""
 
 
@@ -79,6 +116,11 @@ def encode_json(body: bytes) -> bytes:
 def encode_sample(number: int, stamp: int, body: bytes) -> bytes:
     """The frame around one topic sample; see :class:`SampleFrame`."""
     return _SAMPLE_HEAD(len(body) + 13, SAMPLE, number, stamp) + body
+
+
+def encode_command(number: int, stamp: int, source: int, body: bytes) -> bytes:
+    """The frame around one command; see :class:`CommandFrame`."""
+    return _COMMAND_HEAD(len(body) + COMMAND_HEAD, COMMAND, number, stamp, source) + body
 
 
 def encode_video(number: int, stamp: int, body: bytes) -> bytes:
@@ -93,6 +135,11 @@ def encode_part(number: int, stamp: int, total: int, offset: int, piece: bytes) 
     :param offset: bytes of it that went before
     """
     return _PART_HEAD.pack(len(piece) + 21, PART, number, stamp, total, offset) + piece
+
+
+def encode_picture_part(number: int, stamp: int, total: int, offset: int, piece: bytes | memoryview) -> bytes:
+    """The frame around one part of a picture; see :class:`PicturePart`."""
+    return _PART_HEAD.pack(len(piece) + 21, PICTURE_PART, number, stamp, total, offset) + piece
 
 
 class FrameDecoder:
@@ -223,6 +270,53 @@ class _Parts:
             self.size -= len(known.body)
 
 
+class PictureJoiner:
+    """Makes a picture of its parts; memory grows with what came, not with what was announced.
+
+    :param limit: most bytes of a picture
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._head: tuple[int, int, int] | None = None
+        self._body = bytearray()
+
+    @property
+    def size(self) -> int:
+        """Bytes of the picture that is not whole."""
+        return len(self._body)
+
+    def join(self, part: PicturePart) -> VideoFrame | None:
+        """Take one part; return the picture it completes. One that begins ends what was not whole.
+
+        :raises FrameTooLarge: the picture would be over the limit
+        :raises MalformedMessage: the part does not follow the one before, or is longer than its picture
+        """
+        if part.total > self._limit:
+            raise FrameTooLarge(
+                f"a picture of {part.total} bytes was announced; at most {self._limit} are taken here"
+            )
+        head = (part.number, part.stamp, part.total)
+        if part.offset == 0:
+            self.drop()
+            self._head = head
+        elif head != self._head or part.offset != len(self._body):
+            raise MalformedMessage(f"a part of picture {part.number} does not follow the one before it")
+        if part.offset + len(part.body) > part.total:
+            raise MalformedMessage(f"parts of picture {part.number} are longer than its {part.total} bytes")
+        self._body += part.body
+        if len(self._body) < part.total:
+            return None
+        whole = VideoFrame(part.number, part.stamp, bytes(self._body))
+        self.drop()
+        return whole
+
+    def drop(self) -> None:
+        """Forget what is not whole: it was given up."""
+        self._head = None
+        self._body = bytearray()
+
+
 def _parse(buffer: bytes, start: int, end: int) -> Frame:
     kind = buffer[start]
     if kind == JSON:
@@ -233,6 +327,19 @@ def _parse(buffer: bytes, start: int, end: int) -> Frame:
         number, stamp = _NUMBERED(buffer, start + 1)
         body = buffer[start + 13 : end]
         return SampleFrame(number, stamp, body) if kind == SAMPLE else VideoFrame(number, stamp, body)
+    if kind == COMMAND:
+        if end - start < COMMAND_HEAD:
+            raise MalformedMessage("a command needs 16 bytes of number, stamp and source")
+        number, stamp, source = _COMMAND(buffer, start + 1)
+        return CommandFrame(number, stamp, source, buffer[start + 17 : end])
+    if kind == PICTURE_PART:
+        if end - start < 22:
+            raise MalformedMessage(
+                "a part of a picture needs 20 bytes of head, and at least one of the picture"
+            )
+        number, stamp, total, offset = _PART.unpack_from(buffer, start + 1)
+        return PicturePart(number, stamp, total, offset, buffer[start + 21 : end])
     raise MalformedMessage(
-        f"frame kind {kind} is not known; 0 is JSON, 1 a sample, 2 a picture, 3 a part of a sample"
+        f"frame kind {kind} is not known; 0 is JSON, 1 a sample, 2 a picture, 3 and 4 parts of these, "
+        "5 a command"
     )

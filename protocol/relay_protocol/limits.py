@@ -88,13 +88,13 @@ ENROLMENT_SECONDS = 15 * 60
 """An enrolment code is good for this long, once."""
 
 TICKET_SECONDS = 60
-"""A single-use ticket for a websocket is good for this long."""
+"""A single-use ticket for an address of a client is good for this long."""
 
 CHANNEL_TICKET_SECONDS = 30
 """A robot has this long to join a channel or a stream it was asked to open."""
 
-HEARTBEAT_SECONDS = 2.0
-"""Each end of a robot link pings this often; three missed and the link is lost."""
+HEARTBEAT_SECONDS = 1.25
+"""Each end of a robot link pings this often; three missed and the link is lost, and people are told within 5 s."""
 
 HEARTBEATS_MISSED = 3
 
@@ -103,6 +103,15 @@ COMMAND_DEADLINE_MS = 500
 
 STOP_WITHIN_MS = 500
 """A robot stands still within this time of its last valid motion command."""
+
+SUPPRESS_MS = (50, 200)
+"""Least and greatest time, in milliseconds, for which a topic's commands come from others than the holder."""
+
+INHIBIT_MS = 60_000
+"""Greatest time, in milliseconds, for which a topic says nothing."""
+
+SOURCES = 256
+"""Most connections a suppression names."""
 
 LINGER_SECONDS = 5.0
 """A channel stays open this long after its last client."""

@@ -35,9 +35,15 @@ class Operation(str, enum.Enum):
     RECORD = "record"
     """Have the relay keep what a topic or camera says, and get at what was kept."""
     PUBLISH = "publish"
+    CONTROL = "control"
+    """Be the one who moves the robot."""
     CALL = "call"
     PROVIDE = "provide"
     """Offer a service or an action to the robot's graph."""
+    SUPPRESS = "suppress"
+    """Command a topic in the place of who holds control, for moments."""
+    INHIBIT = "inhibit"
+    """Have a topic say nothing, for a time."""
     MANAGE = "manage"
     """Change who may do what on this robot."""
 
@@ -52,8 +58,11 @@ _NEEDED = {
     Operation.VIEW: Level.VIEWER,
     Operation.RECORD: Level.OPERATOR,
     Operation.PUBLISH: Level.OPERATOR,
+    Operation.CONTROL: Level.OPERATOR,
     Operation.CALL: Level.OPERATOR,
     Operation.PROVIDE: Level.OPERATOR,
+    Operation.SUPPRESS: Level.OWNER,
+    Operation.INHIBIT: Level.OWNER,
     Operation.MANAGE: Level.OWNER,
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sqlalchemy import Text, delete, func, insert, select, type_coerce, update
@@ -119,6 +119,16 @@ def append_audit(
     s.execute(insert(AuditEntry).values(**entry._asdict()))
     s.execute(update(Revision).values(audit_id=entry.id, audit_hash=entry.hash))
     return entry
+
+
+def removed_robots(s: Session, names: Collection[str]) -> dict[str, float]:
+    """When robots of these names were removed the last time, Unix seconds; those that never were are left out."""
+    query = (
+        select(AuditEntry.target, func.max(AuditEntry.at).label("at"))
+        .where(AuditEntry.action == "robot.remove", AuditEntry.target.in_(names))
+        .group_by(AuditEntry.target)
+    )
+    return {row.target: row.at for row in s.execute(query)} if names else {}
 
 
 def verify_audit(s: Session) -> int | None:

@@ -43,6 +43,15 @@ class RobotRecord(NamedTuple):
     description: str
 
 
+class RobotGroupRecord(NamedTuple):
+    """A group of robots and their names."""
+
+    id: int
+    name: str
+    realm: str
+    robots: tuple[str, ...]
+
+
 class RobotKeyRecord(NamedTuple):
     """A live key of a robot: 32 raw bytes of Ed25519."""
 
@@ -95,6 +104,67 @@ class TokenRecord(NamedTuple):
     label: str
     created: float
     expires: float | None
+
+
+class StopRecord(NamedTuple):
+    """An order to stop that a robot has not confirmed yet.
+
+    :param at: Unix time it was given; names it
+    """
+
+    robot_id: int
+    by: str
+    why: str
+    at: float
+
+
+class AlertRecord(NamedTuple):
+    """What people should know of a robot.
+
+    :param first: Unix time it was told first; ``last``: and last
+    :param times: how often it was told
+    :param news: how often there was something worth telling
+    :param over: Unix time it was over, None while it lasts
+    :param ack_by: who looks after it, if anybody
+    """
+
+    id: str
+    robot_id: int
+    robot: str
+    kind: str
+    about: str
+    level: str
+    text: str
+    first: float
+    last: float
+    times: int
+    news: int
+    over: float | None
+    ack_by: str | None
+    ack_at: float | None
+
+
+class AlertRuleRecord(NamedTuple):
+    """Which alerts a user is told of, and how. ``url`` and ``secret`` are nobody's to see.
+
+    :param group_s: least seconds between two messages
+    """
+
+    id: int
+    user_id: int
+    user: str
+    realm: str
+    label: str
+    robots: str
+    kinds: tuple[str, ...]
+    level: str
+    channel: str
+    url: str
+    secret: str
+    over: bool
+    group_s: float
+    quiet: dict[str, str] | None
+    created: float
 
 
 class EventRecord(NamedTuple):

@@ -46,6 +46,13 @@ def list_robots(s: Session, realm: str | None = None) -> list[RobotRecord]:
     return [RobotRecord(*row) for row in s.execute(query)]
 
 
+def enrolled_robots(s: Session) -> list[RobotRecord]:
+    """Robots of which a key is live: those that may come."""
+    live = select(RobotKey.robot_id).where(RobotKey.retired.is_(None))
+    query = _robots().where(Robot.id.in_(live)).order_by(Robot.name)
+    return [RobotRecord(*row) for row in s.execute(query)]
+
+
 def add_robot(s: Session, name: str, description: str = "", realm: str = DEFAULT_REALM) -> RobotRecord:
     """:raises Invalid: the name can't be, or is taken
     :raises NotFound: no such realm

@@ -5,8 +5,9 @@ Every message is an object with ``op``. Unknown fields are passed over, an unkno
 A sender leaves out fields at their default.
 
 ``opening`` is said before a robot is known, ``control`` on its control link, ``requests`` (relay) and ``answers``
-(robot) on a channel link, ``both_ways`` by either end; ``video`` is all about pictures; ``wire`` reads and writes them
-all. Whoever uses them says ``link.Subscribe``, because client operations have the same names: so all of them are here.
+(robot) on a channel link, ``both_ways`` by either end; ``moving`` is about who moves the robot, ``video`` pictures;
+``wire`` reads and writes them all. Whoever uses them says ``link.Subscribe``, because client operations have the same
+names: so all of them are here.
 """
 
 from relay_protocol.link.answers import (
@@ -33,6 +34,7 @@ from relay_protocol.link.both_ways import (
 )
 from relay_protocol.link.control import (
     Alert,
+    AlertsTold,
     CloseChannel,
     Describe,
     Graph,
@@ -47,6 +49,19 @@ from relay_protocol.link.control import (
 from relay_protocol.link.fields import (
     from_base64,
     to_base64,
+)
+from relay_protocol.link.moving import (
+    Control,
+    Done,
+    Inhibit,
+    Inhibited,
+    Limits,
+    Resume,
+    Safety,
+    Stop,
+    Stopped,
+    Suppress,
+    Suppressed,
 )
 from relay_protocol.link.opening import (
     Challenge,
@@ -88,6 +103,8 @@ from relay_protocol.link.video import (
     RobotVideo,
     Took,
     VideoSettings,
+    compressed_of,
+    raw_of,
 )
 from relay_protocol.link.wire import (
     frame,
@@ -115,6 +132,7 @@ __all__ = [
     "AdvertisedAction",
     "AdvertisedService",
     "Alert",
+    "AlertsTold",
     "BothChannel",
     "Bye",
     "CallService",
@@ -125,7 +143,9 @@ __all__ = [
     "CloseChannel",
     "CloseVideo",
     "Codec",
+    "Control",
     "Describe",
+    "Done",
     "Enroll",
     "Enrolled",
     "Failed",
@@ -134,10 +154,13 @@ __all__ = [
     "Graph",
     "Health",
     "Hello",
+    "Inhibit",
+    "Inhibited",
     "Interfaces",
     "Join",
     "Joined",
     "KeyFrame",
+    "Limits",
     "Message",
     "MotionPolicy",
     "NotPlaying",
@@ -154,14 +177,20 @@ __all__ = [
     "RelayChannel",
     "RelayControl",
     "RelayVideo",
+    "Resume",
     "RobotChannel",
     "RobotControl",
     "RobotVideo",
+    "Safety",
     "SendActionGoal",
     "Service",
     "ServiceResponse",
+    "Stop",
+    "Stopped",
     "Subscribe",
     "Subscribed",
+    "Suppress",
+    "Suppressed",
     "Took",
     "Topic",
     "TypeDefinition",
@@ -171,11 +200,13 @@ __all__ = [
     "Unsubscribe",
     "VideoSettings",
     "Welcome",
+    "compressed_of",
     "frame",
     "from_base64",
     "lower_tag",
     "opening_decoder",
     "opening_reply_decoder",
+    "raw_of",
     "relay_channel_decoder",
     "relay_control_decoder",
     "relay_video_decoder",

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import msgspec
 
-from relay_protocol.link.fields import Label, Name, Reasoned
+from relay_protocol.link.fields import Label, Name, Reasoned, Source, Stamp
 from relay_protocol.message import Body, Message
 
 
@@ -34,12 +34,17 @@ class CallService(Message, frozen=True, kw_only=True):
 
     :param id: chosen by the caller; the answer carries it
     :param timeout: seconds the caller waits for the answer; 0 when it did not say
+    :param source: from the relay, the connection that calls
+    :param stamp: from the relay, its monotonic nanoseconds before which the call can't have been sent; ``None`` when
+        it did not say
     """
 
     id: Label
     service: Name
     type: Name
     timeout: float = 0.0
+    source: Source = 0
+    stamp: Stamp | None = None
     cdr: str | None = None
     args: Body = msgspec.UNSET
 
@@ -63,12 +68,16 @@ class SendActionGoal(Message, frozen=True, kw_only=True):
 
     :param id: chosen by the asker; everything about this goal carries it
     :param feedback: whether the asker wants ``action_feedback``
+    :param source: from the relay, the connection whose goal it is
+    :param stamp: as in :class:`CallService`
     """
 
     id: Label
     action: Name
     type: Name
     feedback: bool = False
+    source: Source = 0
+    stamp: Stamp | None = None
     cdr: str | None = None
     args: Body = msgspec.UNSET
 

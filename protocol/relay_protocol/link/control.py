@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
 import msgspec
@@ -11,6 +12,7 @@ from relay_protocol import limits
 from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
 from relay_protocol.link.both_ways import Bye, Ping, Pong
 from relay_protocol.link.fields import Ends, Few, Label, Name, cut
+from relay_protocol.link.moving import Control, Done, Inhibit, Resume, Safety, Stop, Suppress
 from relay_protocol.link.video import Cameras, CloseVideo, OpenVideo
 from relay_protocol.message import Message
 
@@ -19,15 +21,35 @@ class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """What the robot's own safety counts as motion, and its times. The robot is the authority on it.
 
     :param types: message types whose topics are motion topics
-    :param topics: further topics by name
+    :param topics: further topics, by patterns of their names (shell wildcards, like those of rights)
+    :param services: patterns of the services that move the robot
+    :param actions: patterns of the actions that do
     :param deadline_ms: a command older than this is dropped
     :param stop_within_ms: the robot stands still this long after the last valid command
     """
 
     types: Few = msgspec.field(default_factory=list)
     topics: Few = msgspec.field(default_factory=list)
+    services: Few = msgspec.field(default_factory=list)
+    actions: Few = msgspec.field(default_factory=list)
     deadline_ms: int = COMMAND_DEADLINE_MS
     stop_within_ms: int = STOP_WITHIN_MS
+
+    def moves_by_topic(self, topic: str, type: str) -> bool:
+        """Whether what is published there moves the robot."""
+        return type in self.types or _any(self.topics, topic)
+
+    def moves_by_service(self, service: str) -> bool:
+        """Whether calls of it do."""
+        return _any(self.services, service)
+
+    def moves_by_action(self, action: str) -> bool:
+        """Whether goals of it do."""
+        return _any(self.actions, action)
+
+
+def _any(patterns: list[str], name: str) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 class Describe(Message, frozen=True, kw_only=True):
@@ -89,6 +111,8 @@ class Health(Message, frozen=True, kw_only=True):
     :param rtt_ms: round trip to the relay as the robot measures it, milliseconds
     :param stale_commands: motion commands dropped because they were too old, since start
     :param unguarded_commands: motion commands dropped because the guard could not have stopped them, since start
+    :param refused_commands: motion commands dropped because their source does not move the robot now, since start
+    :param limited_commands: motion commands made slower, since start
     :param watchdog_stops: times the watchdog sent zero because commands ceased, since start
     :param dropped_samples: samples dropped because the uplink was full, since start
     """
@@ -99,18 +123,33 @@ class Health(Message, frozen=True, kw_only=True):
     rtt_ms: float | None = None
     stale_commands: int = 0
     unguarded_commands: int = 0
+    refused_commands: int = 0
+    limited_commands: int = 0
     watchdog_stops: int = 0
     dropped_samples: int = 0
 
 
 class Alert(Message, frozen=True, kw_only=True):
-    """Robot: something a person should know. ``level`` is ``info``, ``warning`` or ``error``."""
+    """Robot: something a person should know.
+
+    :param level: ``info``, ``warning`` or ``error``
+    :param kind: ``battery``, ``diagnostics``, ``module``, …
+    :param about: the part of the robot it comes from
+    :param over: what was told under this kind and part is well again
+    """
 
     level: Label
     text: str
+    kind: Label = ""
+    about: Label = ""
+    over: bool = False
 
     def __post_init__(self) -> None:
         cut(self, "text")
+
+
+class AlertsTold(Message, frozen=True, kw_only=True):
+    """Robot: every alert that lasts was told since ``welcome``; the others of its modules and diagnostics are over."""
 
 
 class OpenChannel(Message, frozen=True, kw_only=True):
@@ -130,5 +169,18 @@ class CloseChannel(Message, frozen=True, kw_only=True):
     channel: str
 
 
-RobotControl = Describe | Graph | Cameras | Health | Alert | Ping | Pong | Bye
-RelayControl = OpenChannel | CloseChannel | OpenVideo | CloseVideo | Ping | Pong | Bye
+RobotControl = Describe | Graph | Cameras | Health | Alert | AlertsTold | Safety | Done | Ping | Pong | Bye
+RelayControl = (
+    OpenChannel
+    | CloseChannel
+    | OpenVideo
+    | CloseVideo
+    | Control
+    | Stop
+    | Resume
+    | Suppress
+    | Inhibit
+    | Ping
+    | Pong
+    | Bye
+)

@@ -6,6 +6,7 @@ import base64
 import binascii
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 from msgspec.structs import force_setattr
 
@@ -16,10 +17,16 @@ from relay_protocol.message import Message
 Name = Annotated[str, Meta(max_length=limits.NAME)]
 Label = Annotated[str, Meta(max_length=limits.LABEL)]
 Ends = Annotated[list[Name], Meta(max_length=limits.GRAPH_ENDS)]
+Source = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+"""A connection of a client, as the relay numbers them; 0 is nobody."""
+
+Stamp = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+"""A moment of the relay's monotonic clock, nanoseconds, before which something can't have been sent."""
+
 Few = Annotated[list[Name], Meta(max_length=limits.FACTS)]
 
 
-def cut(message: Message, *fields: str) -> None:
+def cut(message: msgspec.Struct, *fields: str) -> None:
     """Words for people are cut, on either end: they are no reason to lose a link."""
     for field in fields:
         text = getattr(message, field)

@@ -15,10 +15,24 @@ from relay_protocol.message import Message
 Side = Annotated[int, Meta(ge=0, le=limits.PICTURE_SIDE)]
 
 Shown = Annotated[int, Meta(ge=1, le=limits.PICTURE_SIDE)]
-Count = Annotated[int, Meta(ge=0, lt=2**32)]
+Count = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Rate = Annotated[float, Meta(ge=0, le=1e6)]
 
 Codec = Literal["jpeg", "png", "h264"]
+
+
+_COMPRESSED = "/compressed"
+"""What image_transport adds to the name of a topic for its compressed pictures."""
+
+
+def raw_of(camera: str) -> str:
+    """The topic of a camera's raw pictures, by that or by the one of its compressed pictures."""
+    return camera.removesuffix(_COMPRESSED)
+
+
+def compressed_of(camera: str) -> str:
+    """The topic of a camera's compressed pictures, by that or by the one of its raw pictures."""
+    return raw_of(camera) + _COMPRESSED
 
 
 class VideoSettings(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
@@ -61,6 +75,7 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     :param width: of the last picture, pixels
     :param height: of the last picture, pixels
     :param fps: pictures per second, as they came of late
+    :param seen: when they were like this, Unix time at the robot: its last picture by the time this was told
     """
 
     name: Name
@@ -69,12 +84,17 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     width: Count = 0
     height: Count = 0
     fps: Rate = 0.0
+    seen: Annotated[float, Meta(ge=0, le=1e11)] = 0.0
 
 
 class Cameras(Message, frozen=True, kw_only=True):
-    """Robot, control link: all cameras I have; after ``welcome`` and whenever they change."""
+    """Robot, control link: all cameras I have; after ``welcome`` and whenever they change.
+
+    :param streams: most I show at a time; 0 when I don't know
+    """
 
     cameras: Annotated[list[Camera], Meta(max_length=limits.CAMERAS)] = msgspec.field(default_factory=list)
+    streams: Count = 0
 
 
 class OpenVideo(Message, frozen=True, kw_only=True):
@@ -131,9 +151,13 @@ class NotPlaying(Reasoned, frozen=True, kw_only=True):
 
 
 class Took(Message, frozen=True, kw_only=True):
-    """Relay, video link: the picture of this number is here. The robot measures its uplink by it."""
+    """Relay, video link: the picture of this number is here, or a part. The robot measures its uplink by it.
+
+    :param upto: bytes of a picture in parts that are here; ``None`` when all of it is
+    """
 
     number: int
+    upto: int | None = None
 
 
 class KeyFrame(Message, frozen=True, kw_only=True):

@@ -1,0 +1,266 @@
+"""Alerts, and the rules by which people are told of them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+from sqlalchemy import and_, case, delete, func, insert, literal, or_, select, update
+from sqlalchemy.orm import Session
+
+from relay_db.models import Alert, AlertRule, Realm, Robot, User
+from relay_db.names import label, recorded
+from relay_db.queries.records import AlertRecord, AlertRuleRecord
+from relay_db.queries.state import bump
+from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.limits import WORDS
+
+RULES = 32
+"""Most rules of one user."""
+
+ALERTS = 100_000
+"""Most alerts kept, whatever their age."""
+
+_RECENT = 10_000
+_PAGE = 1000
+
+
+def save_alerts(s: Session, records: Iterable[AlertRecord]) -> None:
+    """Keep alerts as they are now, new ones and known ones; those of robots that are gone are let go.
+
+    Who looks after one may have been written by somebody else meanwhile, and stays unless there was news since.
+    """
+    records = list(records)
+    asked = {each.robot_id for each in records}
+    there = set(s.scalars(select(Robot.id).where(Robot.id.in_(asked)))) if asked else set()
+    for each in records:
+        if each.robot_id not in there:
+            continue
+        values = _values(each)
+        there_too = s.execute(
+            update(Alert)
+            .where(Alert.id == each.id)
+            .values({**values, **_looked_after(each)})
+            .returning(Alert.id)
+        )
+        if there_too.first() is None:
+            s.execute(insert(Alert).values(id=each.id, **values))
+
+
+def _looked_after(record: AlertRecord) -> dict[str, Any]:
+    """What a row that is there says of who looks after it, once the record is written."""
+    if record.ack_at is not None:
+        return {}
+    same = or_(literal(record.over is not None), and_(Alert.over_at.is_(None), Alert.news == record.news))
+    return {
+        "ack_by": case((same, Alert.ack_by), else_=None),
+        "ack_at": case((same, Alert.ack_at), else_=None),
+    }
+
+
+def _values(record: AlertRecord) -> dict[str, Any]:
+    return {
+        "robot_id": record.robot_id,
+        "kind": recorded(record.kind, 63),
+        "about": recorded(record.about),
+        "level": record.level,
+        "text": recorded(record.text, WORDS),
+        "first_at": record.first,
+        "last_at": record.last,
+        "times": record.times,
+        "news": record.news,
+        "over_at": record.over,
+        "ack_by": record.ack_by,
+        "ack_at": record.ack_at,
+    }
+
+
+def list_alerts(
+    s: Session,
+    robots: Collection[int] | None = None,
+    *,
+    open: bool | None = None,
+    limit: int = 100,
+    offset: int = 0,
+) -> list[AlertRecord]:
+    """Alerts, the latest first.
+
+    :param robots: of these robots only; ``None`` for all
+    :param open: only those that last, or only those that are over
+    """
+    query = _alerts().order_by(Alert.last_at.desc(), Alert.id).limit(limit).offset(offset)
+    if robots is not None:
+        query = query.where(Alert.robot_id.in_(list(robots)))
+    if open is not None:
+        query = query.where(Alert.over_at.is_(None) if open else Alert.over_at.is_not(None))
+    return [AlertRecord(*row) for row in s.execute(query)]
+
+
+def recent_alerts(s: Session, since: float) -> list[AlertRecord]:
+    """Alerts that last, or were over after this moment.
+
+    :param since: Unix seconds
+    """
+    query = _alerts().where(or_(Alert.over_at.is_(None), Alert.over_at >= since))
+    return [AlertRecord(*row) for row in s.execute(query.order_by(Alert.last_at.desc()).limit(_RECENT))]
+
+
+def get_alert(s: Session, alert_id: str) -> AlertRecord | None:
+    """One alert."""
+    row = s.execute(_alerts().where(Alert.id == recorded(alert_id, 32))).one_or_none()
+    return None if row is None else AlertRecord(*row)
+
+
+def acknowledge_alert(s: Session, alert_id: str, by: str, at: float) -> AlertRecord:
+    """Somebody looks after an alert; a relay that runs takes it up by the revision. The first who did stays.
+
+    :param at: Unix seconds
+    :raises NotFound: no such alert
+    :raises Invalid: it is over
+    """
+    lasts = Alert.over_at.is_(None), Alert.ack_at.is_(None)
+    known = update(Alert).where(Alert.id == recorded(alert_id, 32), *lasts)
+    values = known.values(ack_by=recorded(by), ack_at=at)
+    fresh = s.execute(values.returning(Alert.id)).first() is not None
+    found = get_alert(s, alert_id)
+    if found is None:
+        raise NotFound("there is no such alert")
+    if found.over is not None:
+        raise Invalid("this alert is over already")
+    if fresh:
+        bump(s)
+    return found
+
+
+def acknowledgements(s: Session) -> dict[str, tuple[str, float]]:
+    """Who looks after which of the alerts that last, and since when."""
+    query = select(Alert.id, Alert.ack_by, Alert.ack_at).where(
+        Alert.over_at.is_(None), Alert.ack_at.is_not(None)
+    )
+    return {row.id: (row.ack_by or "", row.ack_at) for row in s.execute(query.limit(_RECENT))}
+
+
+def purge_alerts(s: Session, before: float, most: int = ALERTS, batch: int = _PAGE) -> int:
+    """Forget one batch of the alerts that are over and too old, or too many; how many. Call again until it is 0.
+
+    :param before: Unix seconds; what was told last before that goes
+    :param most: rows that may stay, whatever their age
+    """
+    over = Alert.over_at.is_not(None)
+    old = select(Alert.id).where(over, Alert.last_at < before).limit(batch)
+    gone = len(s.scalars(delete(Alert).where(Alert.id.in_(old)).returning(Alert.id)).all())
+    surplus = (s.scalar(select(func.count()).select_from(Alert)) or 0) - most
+    if gone or surplus <= 0:
+        return gone
+    oldest = select(Alert.id).where(over).order_by(Alert.last_at).limit(min(batch, surplus))
+    return len(s.scalars(delete(Alert).where(Alert.id.in_(oldest)).returning(Alert.id)).all())
+
+
+def add_alert_rule(
+    s: Session,
+    user_id: int,
+    *,
+    name: str = "",
+    robots: str = "*",
+    kinds: Collection[str] = (),
+    level: str,
+    channel: str,
+    url: str = "",
+    secret: str = "",
+    over: bool = True,
+    group_s: float,
+    quiet: Mapping[str, str] | None = None,
+    created: float,
+) -> AlertRuleRecord:
+    """Tell a user of alerts from now on. What the words mean the relay judges before.
+
+    :param name: for people
+    :param created: Unix seconds
+    :raises Invalid: the user has too many rules, or the name is no line of text
+    :raises NotFound: no such user
+    """
+    if s.scalar(select(User.id).where(User.id == user_id).with_for_update()) is None:
+        raise NotFound("there is no such user")
+    mine = s.scalar(select(func.count()).select_from(AlertRule).where(AlertRule.user_id == user_id)) or 0
+    if mine >= RULES:
+        raise Invalid(f"a user has at most {RULES} rules for alerts; delete one first")
+    bump(s)
+    values = {
+        "user_id": user_id,
+        "label": label(name, "label of a rule"),
+        "robots": robots,
+        "kinds": list(kinds),
+        "level": level,
+        "channel": channel,
+        "url": url,
+        "secret": secret,
+        "over": over,
+        "group_s": group_s,
+        "quiet": None if quiet is None else dict(quiet),
+        "created": created,
+    }
+    number = s.scalars(insert(AlertRule).values(**values).returning(AlertRule.id)).one()
+    return next(each for each in list_alert_rules(s, user_id) if each.id == number)
+
+
+def list_alert_rules(s: Session, user_id: int | None = None) -> list[AlertRuleRecord]:
+    """The rules of a user, or of all who are not disabled, oldest first."""
+    query: Any = (
+        select(
+            AlertRule.id,
+            User.id,
+            User.name,
+            Realm.name,
+            AlertRule.label,
+            AlertRule.robots,
+            AlertRule.kinds,
+            AlertRule.level,
+            AlertRule.channel,
+            AlertRule.url,
+            AlertRule.secret,
+            AlertRule.over,
+            AlertRule.group_s,
+            AlertRule.quiet,
+            AlertRule.created,
+        )
+        .join(User, User.id == AlertRule.user_id)
+        .join(Realm, Realm.id == User.realm_id)
+        .order_by(AlertRule.id)
+    )
+    query = query.where(User.disabled.is_(False) if user_id is None else User.id == user_id)
+    rows = (AlertRuleRecord(*row) for row in s.execute(query))
+    return [row._replace(kinds=tuple(row.kinds)) for row in rows]
+
+
+def remove_alert_rule(s: Session, rule_id: int, user_id: int | None = None) -> bool:
+    """Tell nobody by this rule any more; false if there is none of that number.
+
+    :param user_id: only if it is this user's
+    """
+    gone = delete(AlertRule).where(AlertRule.id == rule_id)
+    if user_id is not None:
+        gone = gone.where(AlertRule.user_id == user_id)
+    found = s.scalar(gone.returning(AlertRule.id)) is not None
+    if found:
+        bump(s)
+    return found
+
+
+def _alerts() -> Any:
+    query: Any = select(
+        Alert.id,
+        Alert.robot_id,
+        Robot.name,
+        Alert.kind,
+        Alert.about,
+        Alert.level,
+        Alert.text,
+        Alert.first_at,
+        Alert.last_at,
+        Alert.times,
+        Alert.news,
+        Alert.over_at,
+        Alert.ack_by,
+        Alert.ack_at,
+    ).join(Robot, Robot.id == Alert.robot_id)
+    return query
