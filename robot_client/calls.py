@@ -10,15 +10,23 @@ from twisted.python.failure import Failure
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import CALL_SECONDS
+from robot_client.gate import Gate
+from robot_client.offset import Offset
 from robot_client.platforms.base import Platform
 from robot_client.wire import NotNow, Part, Wire, arguments, check_room
 
 
 class Calls(Part):
-    """The calls under way."""
+    """The calls under way.
 
-    def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
+    :param gate: judges calls that move the robot
+    :param offset: clock offset of the link they come on
+    """
+
+    def __init__(self, wire: Wire, platform: Platform, frame_limit: int, gate: Gate, offset: Offset) -> None:
         super().__init__(wire, platform, frame_limit)
+        self._gate = gate
+        self._offset = offset
         self._calls: dict[str, Deferred[None]] = {}
 
     def call(self, message: link.CallService) -> None:
@@ -30,6 +38,7 @@ class Calls(Part):
         if id in self._calls:
             raise NotNow(f"a call with the id '{id}' is under way")
         check_room(self._calls, "calls")
+        self._gate.call(message.service, message.source, message.stamp, self._offset)
         request = arguments(message.cdr, message.service)
         timeout = message.timeout if 0 < message.timeout < math.inf else CALL_SECONDS
         answer = self._platform.call(message.service, message.type, request, timeout)

@@ -6,21 +6,26 @@ Everything a channel opened ends with it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
+from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
-from relay_protocol.frames import SampleFrame
+from relay_protocol.frames import CommandFrame, SampleFrame
+from robot_client.authority import NOBODY
 from robot_client.calls import Calls
+from robot_client.gate import Gate
+from robot_client.goal_topics import GoalTopics
 from robot_client.goals import Goals, refusal
 from robot_client.motion import MOTION_QOS, MotionDesk
 from robot_client.offers import OfferedActions, OfferedServices
 from robot_client.offset import Offset
 from robot_client.platforms.base import Platform, Sink, Source
+from robot_client.pursuits import Pursuits
 from robot_client.reactors import Clock
 from robot_client.sending import Sending
 from robot_client.topics import TypedTopic
@@ -30,6 +35,8 @@ from robot_client.wire import Wire, check_room
 class _Listening(NamedTuple):
     source: Source
     request: link.Subscribe
+    topic: str
+    """Its full name."""
 
 
 class _Publishing(NamedTuple):
@@ -37,6 +44,13 @@ class _Publishing(NamedTuple):
     topic: str
     motion: str | None
     """Name of the publication at the motion desk, if it moves the robot."""
+    goal: TypedTopic | None = None
+    """What it is, if it takes goals."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it takes commands alone."""
+        return self.motion is not None or self.goal is not None
 
 
 class Channel:
@@ -44,6 +58,10 @@ class Channel:
 
     :param name: the relay's name for it
     :param offset: clock offset of this very link
+    :param gate: judges calls and goals that move the robot
+    :param silent: topics that say nothing now, and whether they say their last value instead
+    :param goal_topics: judges what is published where one message sends the robot off
+    :param pursuits: sees that goals that move the robot end with the daemon
     """
 
     def __init__(
@@ -55,9 +73,15 @@ class Channel:
         motion: MotionDesk,
         clock: Clock,
         frame_limit: int,
+        gate: Gate,
+        silent: Mapping[str, bool],
         wall: Callable[[], int] = time.time_ns,
+        goal_topics: GoalTopics | None = None,
+        pursuits: Pursuits | None = None,
     ) -> None:
         self.name = name
+        self._goal_topics = goal_topics
+        self._silent = silent
         self._wire = wire
         self._offset = offset
         self._platform = platform
@@ -66,8 +90,8 @@ class Channel:
         self.uplink = self._sending.uplink
         self._listening: dict[int, _Listening] = {}
         self._publishing: dict[int, _Publishing] = {}
-        self._calls = Calls(wire, platform, frame_limit)
-        self._goals = Goals(wire, platform, frame_limit)
+        self._calls = Calls(wire, platform, frame_limit, gate, offset)
+        self._goals = Goals(wire, platform, frame_limit, gate, offset, pursuits)
         self._services = OfferedServices(wire, platform, frame_limit)
         self._actions = OfferedActions(wire, platform, frame_limit)
         self._log = Logger("channel")
@@ -104,17 +128,45 @@ class Channel:
             self._fail(message, "the robot could not do this; its log says why")
 
     def sample(self, frame: SampleFrame) -> None:
-        """Publish one message, if it may still be published."""
+        """Publish one message, if it may still be published; what moves the robot takes commands alone."""
         publishing = self._publishing.get(frame.number)
-        if publishing is None:
-            return  # refused or unadvertised while this was on its way
+        if publishing is not None and publishing.moves:
+            self._motion.refuse()
+        elif publishing is not None:
+            self._publish(publishing, frame, NOBODY)
+
+    def command(self, frame: CommandFrame) -> None:
+        """Publish one command, if it may still be published."""
+        publishing = self._publishing.get(frame.number)
+        if publishing is not None:
+            self._publish(publishing, frame, frame.source)
+
+    def silence(self, topic: str) -> None:
+        """A topic has begun to say nothing, or says something again."""
+        for number, listening in self._listening.items():
+            if listening.topic == topic:
+                self._mute(number, topic)
+
+    def cancel_goals(self, only_moving: bool) -> None:
+        """The robot is to stop; see :meth:`robot_client.goals.Goals.cancel_all`."""
+        self._goals.cancel_all(only_moving)
+
+    def standing(self) -> Deferred[None]:
+        """Fires when it pursues no goal that moves the robot; may be cancelled."""
+        return self._goals.standing()
+
+    def _publish(self, publishing: _Publishing, frame: SampleFrame | CommandFrame, by: int) -> None:
         try:
             if publishing.motion is not None:
-                self._motion.command(publishing.motion, frame.body, frame.stamp, self._offset)
-            else:
+                self._motion.command(publishing.motion, frame.body, frame.stamp, self._offset, by)
+            elif publishing.goal is None or self._allowed(publishing.goal, frame, by):
                 publishing.sink.publish(frame.body)
         except Exception as error:
             self._log.error("could not publish on {topic}: {error}", topic=publishing.topic, error=str(error))
+
+    def _allowed(self, goal: TypedTopic, frame: SampleFrame | CommandFrame, by: int) -> bool:
+        judge = self._goal_topics
+        return judge is not None and judge.allow(goal, frame.body, frame.stamp, self._offset, by)
 
     def close(self) -> None:
         """The link is gone: stop what moves, release all."""
@@ -150,6 +202,7 @@ class Channel:
             self._sending.arm()
             return
         check_room(self._listening, "subscriptions")
+        topic = self._platform.full_name(message.topic, "topic")
         source = self._platform.subscribe(
             message.topic,
             message.type,
@@ -157,14 +210,16 @@ class Channel:
             partial(self._sending.offer, number),
             lambda: self._confirm(number),
         )
-        self._listening[number] = _Listening(source, message)
+        self._listening[number] = _Listening(source, message, topic)
         self._confirm(number)
+        if topic in self._silent:
+            self._mute(number, topic)
 
     def _confirm(self, number: int) -> None:
         listening = self._listening.get(number)
         if listening is None:
             return
-        source, request = listening
+        source, request, _ = listening
         self.uplink.open(number, request.throttle_ms / 1000, source.latched)
         self._wire.say(
             link.Subscribed(
@@ -176,6 +231,13 @@ class Channel:
                 publishers=source.publishers,
             )
         )
+
+    def _mute(self, number: int, topic: str) -> None:
+        hold = self._silent.get(topic)
+        if hold is None:
+            self._sending.unmute(number)
+        else:
+            self.uplink.mute(number, hold)
 
     def _unlisten(self, number: int) -> None:
         listening = self._listening.pop(number, None)
@@ -193,6 +255,10 @@ class Channel:
         if self._motion.concerns(on):
             self._publishing[number] = publishing = self._advertise_motion(number, on)
             self._log.info("{who} may drive by {topic}", who=message.source or "a client", topic=on.topic)
+        elif self._goal_topics is not None and self._goal_topics.concern(on):
+            # Kept for late joiners, a goal would send the robot off again.
+            sink = self._platform.advertise(*on, False, MOTION_QOS)
+            self._publishing[number] = publishing = _Publishing(sink, on.topic, None, on)
         else:
             sink = self._platform.advertise(*on, message.latch, message.qos, message.queue_size)
             self._publishing[number] = publishing = _Publishing(sink, on.topic, None)
@@ -202,7 +268,7 @@ class Channel:
                 topic=message.topic,
                 type=on.type,
                 encoding=self._platform.encoding,
-                motion=publishing.motion is not None,
+                motion=publishing.moves,
             )
         )
 

@@ -21,6 +21,7 @@ from robot_client import config, logs
 from robot_client.enrolling import enroll as hand_in
 from robot_client.helptext import examples
 from robot_client.identity import Enrolment, StateFolder
+from robot_client.lasting import DiskLatch
 from robot_client.reactors import monotonic_reactor
 from robot_client.run import Runner, agent
 from robot_client.tls import endpoint, is_loopback, split_address
@@ -145,7 +146,7 @@ def run(state: Path, config_path: Path | None, log_json: bool, use_sim_time: boo
     _warn_if_plain(split_address(enrolment.address)[0], enrolment.tls)
     logs.begin(log_json)
     reactor = monotonic_reactor()
-    runner = Runner(reactor, settings, enrolment, me)
+    runner = Runner(reactor, settings, enrolment, me, DiskLatch(state))
     runner.start()
     reactor.addSystemEventTrigger("before", "shutdown", runner.stop)
     reactor.run()

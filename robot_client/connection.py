@@ -15,6 +15,7 @@ from relay_protocol.errors import SwitchboardError
 from robot_client.backoff import Backoff
 from robot_client.link import ControlLink, Ended, Event, Registered, RelayRefused, Said, WrongRelay
 from robot_client.reactors import Clock, Endpoint, Timer
+from robot_client.safety import PROOF_EVERY
 from robot_client.tls import explain
 from robot_client.transport import LinkLost, LinkProtocol
 
@@ -61,6 +62,7 @@ class Connection:
         self._robot = robot
         self._address = address
         self._protocol: LinkProtocol | None = None
+        self._often = False
         self._registered_at: float | None = None
         self._retry: Timer | None = None
         self._attempt: Deferred[Any] | None = None
@@ -109,6 +111,23 @@ class Connection:
         measured = self._protocol.link.offset.round_trip if self._protocol else None
         return measured / 1e9 if measured is not None else None
 
+    @property
+    def answered(self) -> int | None:
+        """When the latest ping that the relay has answered was sent, nanoseconds of the link's clock."""
+        return self._protocol.link.offset.answered if self._protocol and self.registered else None
+
+    def prove(self, often: bool) -> None:
+        """Ping so often that the link is known to work both ways, or as agreed again."""
+        if often == self._often:
+            return
+        self._often = often
+        if self._protocol is not None and self.registered:
+            self._pace(self._protocol)
+
+    def _pace(self, protocol: LinkProtocol) -> None:
+        agreed = protocol.link.heartbeat
+        protocol.ping_every(min(PROOF_EVERY, agreed) if self._often else agreed)
+
     def say(self, message: link.Message) -> None:
         """Send a message, if registered; what is said meanwhile is not kept."""
         if self._protocol is not None and self.registered:
@@ -121,6 +140,8 @@ class Connection:
             self._registered_at = self._clock.seconds()
             self._last_words = ("", -LOG_SAME_EVERY)
             self._log.info("registered as {robot} at {relay}", robot=self._robot, relay=event.relay)
+            if self._often and self._protocol is not None:
+                self._pace(self._protocol)
             self.follower.on_registered(event.welcome)
         elif isinstance(event, Said):
             self.follower.on_order(event.message)

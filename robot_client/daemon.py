@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import platform as machine
 import socket
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from twisted.internet.defer import CancelledError, Deferred
+from twisted.internet.defer import CancelledError, Deferred, DeferredList
 from twisted.internet.protocol import Factory
 from twisted.internet.task import LoopingCall
 from twisted.logger import Logger
@@ -18,21 +16,32 @@ from twisted.python.failure import Failure
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
+from robot_client.alerts import MODULE, AlertMemory
+from robot_client.authority import Authority
 from robot_client.camera.desk import CameraDesk
 from robot_client.channel import Channel
 from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection, Dial
+from robot_client.gate import Gate
+from robot_client.goal_topics import GoalTopics
 from robot_client.graph_parts import parts
-from robot_client.link import ChannelLink, Ended, Event, JoinedChannel, Said, Sampled
-from robot_client.monitor import Machine
-from robot_client.motion import GuardFeed, MotionDesk
+from robot_client.guard_feed import GuardFeed
+from robot_client.hardware import Hardware
+from robot_client.helm import LOOK_EVERY, Body, Helm
+from robot_client.lasting import Latch
+from robot_client.limits import limits_told
+from robot_client.link import ChannelLink, Commanded, Ended, Event, JoinedChannel, Said, Sampled
+from robot_client.monitor import Machine, operating_system
+from robot_client.motion import MotionDesk
 from robot_client.platforms.base import GraphView, Platform, difference, whole
+from robot_client.pursuits import Pursuits
+from robot_client.rules import rules_of
+from robot_client.sweep import Sweep
 from robot_client.tls import explain
 from robot_client.transport import LinkLost, LinkProtocol
 from robot_client.wire import Wire
 
-ALERTS_KEPT = 32
 MAX_CHANNELS = 64
 
 
@@ -58,6 +67,8 @@ class ChannelEnd(Wire):
         """The relay said something."""
         if isinstance(event, Sampled):
             self.channel.sample(event.frame)
+        elif isinstance(event, Commanded):
+            self.channel.command(event.frame)
         elif isinstance(event, Said):
             self.channel.handle(event.message)
         elif isinstance(event, JoinedChannel) and event.channel != self.name:
@@ -78,9 +89,11 @@ class ChannelEnd(Wire):
         self.channel.resume()
 
 
-class Daemon:
+class Daemon(Body):
     """Everything between the relay and one platform.
 
+    :param latch: where a stop is kept
+    :param hardware: what else there is to stop
     :param dial: endpoints by address
     :param now: clock of :mod:`robot_client.clocks`, nanoseconds
     """
@@ -92,12 +105,26 @@ class Daemon:
         platform: Platform,
         guard: GuardFeed,
         cameras: CameraDesk,
+        latch: Latch,
+        hardware: Hardware,
         clock: Any,
         dial: Dial,
         agent: str,
         now: Callable[[], int] = now_ns,
     ) -> None:
-        self.motion = MotionDesk(settings.safety.policy, platform, clock, now, guard)
+        policy = settings.safety.policy
+        self.authority = Authority()
+        self.motion = MotionDesk(policy, platform, clock, now, guard, self.authority, rules_of(settings))
+        sweep = Sweep(policy, platform, clock, self.motion.commanded)
+        self.helm = Helm(self.authority, self.motion, latch, hardware, sweep, self, clock, now, time.time)
+        self.helm.limits = limits_told(settings)
+        self._pursuits = Pursuits(policy.actions, guard, sweep, latch, clock, now)
+        self.motion.proof = lambda: connection.answered or 0
+        self.motion.on_commanded = connection.prove
+        self._gate = Gate(policy, platform, self.authority, now)
+        self._goal_topics = GoalTopics(
+            settings.safety.goal_topics, platform, self.authority, self.motion, now
+        )
         self._settings = settings
         self._connection = connection
         self._platform = platform
@@ -113,11 +140,13 @@ class Daemon:
         self._heartbeat = HEARTBEAT_SECONDS
         self._frame_limit = ROBOT_FRAME
         self._told: GraphView | None = None
-        self._alerts: deque[link.Alert] = deque(maxlen=ALERTS_KEPT)
+        self._alerts = AlertMemory(connection, now)
         self._machine = Machine()
         self._troubled = False
         self._loops = [
             (LoopingCall(self._look_at_graph), 1.0 / settings.ros.graph_hz),
+            (LoopingCall(self.helm.look), LOOK_EVERY),
+            (LoopingCall(self._pursuits.look), LOOK_EVERY),
             (LoopingCall(self._tell_health), settings.monitor.health_seconds),
         ]
         self._log = Logger("daemon")
@@ -140,14 +169,10 @@ class Daemon:
         gone = self._connection.stop("the robot's daemon is leaving")
         return gone.addBoth(lambda result: self.motion.finish().addCallback(lambda _: result))
 
-    def alert(self, level: str, text: str) -> None:
-        """Tell a person, now or when the relay can be reached again."""
+    def alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+        """Tell a person, now or when the relay can be reached again; again at each registration while it lasts."""
         {"error": self._log.error, "warning": self._log.warn}.get(level, self._log.info)("{text}", text=text)
-        message = link.Alert(level=level, text=text)
-        if self._connection.registered:
-            self._connection.say(message)
-        else:
-            self._alerts.append(message)
+        self._alerts.tell(link.Alert(level=level, text=text, kind=kind, about=about, over=over))
 
     # --- control link --------------------------------------------------------------------------------------
 
@@ -156,16 +181,18 @@ class Daemon:
         self._heartbeat = welcome.heartbeat
         self._frame_limit = welcome.frame_limit
         self._connection.say(self._description())
+        self._alerts.registered()
         self._told = self._read_graph() or GraphView()
         self._tell_graph(whole(self._told))
+        self.helm.registered()
         self._cameras.look(self._told)
         self._cameras.registered(welcome.heartbeat)
         self._tell_health()
-        while self._alerts:
-            self._connection.say(self._alerts.popleft())
 
     def on_order(self, message: link.Message) -> None:
-        """The relay wants a channel or a camera opened or closed."""
+        """The relay wants a channel or a camera opened or closed, or something about motion."""
+        if self.helm.order(message):
+            return
         if isinstance(message, link.OpenChannel):
             self._open(message)
         elif isinstance(message, link.CloseChannel):
@@ -177,10 +204,41 @@ class Daemon:
 
     def on_unregistered(self, reason: str) -> None:
         """Without a control link nobody may drive; channels are joined anew."""
-        self.motion.stop_all("the control link is lost")
+        self.helm.unregistered()
+        self.motion.stop_all("the control link is lost", gently=True)
         self._told = None
         self._close_channels(reason)
         self._cameras.unregistered(reason)
+
+    # --- for the helm --------------------------------------------------------------------------------------
+
+    def say(self, message: link.Message) -> None:
+        """Tell the relay, if it is there."""
+        self._connection.say(message)
+
+    def topic(self, name: str) -> tuple[str, list[str]]:
+        """The full name of a topic, and its types."""
+        full = self._platform.full_name(name, "topic")
+        found = self._told.topics.get(full) if self._told else None
+        if found is None:  # what has just appeared is not told yet
+            view = self._read_graph()
+            found = view.topics.get(full) if view else None
+        return full, found.types if found else []
+
+    def cancel_goals(self, only_moving: bool) -> None:
+        """Cancel what the robot's actions pursue, on all channels."""
+        for end in self._ends.values():
+            end.channel.cancel_goals(only_moving)
+
+    def standing(self) -> Deferred[list[tuple[bool, None]]]:
+        """Fires when no goal that moves the robot is pursued on any channel, or with where it is when cancelled."""
+        return DeferredList([end.channel.standing() for end in self._ends.values()], consumeErrors=True)
+
+    def silence(self, topic: str) -> None:
+        """A topic is to say nothing from now on, or something again."""
+        for end in self._ends.values():
+            end.channel.silence(topic)
+        self._cameras.silence(self.helm.silent)
 
     # --- channels ------------------------------------------------------------------------------------------
 
@@ -223,6 +281,10 @@ class Daemon:
                 self.motion,
                 self._clock,
                 self._frame_limit,
+                self._gate,
+                self.helm.silent,
+                goal_topics=self._goal_topics,
+                pursuits=self._pursuits,
             )
             self._ends[message.channel] = end
             return end
@@ -259,11 +321,11 @@ class Daemon:
             host=socket.gethostname(),
             platform=facts.platform,
             distro=facts.distro,
-            os=_operating_system(),
+            os=operating_system(),
             agent=self._agent,
             started=self._started,
             sim_time=facts.sim_time,
-            motion=self.motion.policy,
+            motion=self._settings.safety.told,
             extra=facts.extra,
         )
 
@@ -294,12 +356,13 @@ class Daemon:
     def _look_for_trouble(self) -> None:
         trouble = self._platform.trouble()
         if trouble is not None and not self._troubled:
-            self.alert("error", trouble)
+            self.alert("error", trouble, MODULE, "middleware")
         elif trouble is None and self._troubled:
-            self.alert("info", "the robot's middleware serves again")
+            self.alert("info", "the robot's middleware serves again", MODULE, "middleware", over=True)
         self._troubled = trouble is not None
 
     def _tell_health(self) -> None:
+        self._alerts.look()
         try:
             health = self._health()
         except Exception:  # a figure that can't be had must end neither this loop nor a registration
@@ -314,8 +377,10 @@ class Daemon:
             cpu=self._machine.cpu(),
             memory=self._machine.memory(),
             rtt_ms=round(round_trip * 1000, 3) if round_trip is not None else None,
-            stale_commands=self.motion.stale_commands,
+            stale_commands=self.motion.stale_commands + self._gate.stale,
             unguarded_commands=self.motion.unguarded_commands,
+            refused_commands=self.authority.refused,
+            limited_commands=self.motion.limited_commands,
             watchdog_stops=self.motion.watchdog_stops,
             dropped_samples=self._platform.dropped
             + self._dropped
@@ -328,10 +393,3 @@ class Daemon:
         except Exception:
             self._log.failure("the battery's charge could not be read")
             return None
-
-
-def _operating_system() -> str:
-    try:
-        return machine.freedesktop_os_release().get("PRETTY_NAME", "")
-    except OSError:
-        return f"{machine.system()} {machine.release()}"

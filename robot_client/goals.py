@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from twisted.internet.defer import Deferred, succeed
 from twisted.python.failure import Failure
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
+from robot_client.gate import Gate
+from robot_client.offset import Offset
 from robot_client.platforms.base import ABORTED, NEVER_BEGAN, Goal, Outcome, Platform
+from robot_client.pursuits import Pursuits
 from robot_client.wire import Part, Wire, arguments, check_room
 
 
@@ -15,11 +19,30 @@ class Goals(Part):
 
     While the link takes nothing, only the newest feedback of each goal is kept: it is the one kind of JSON message
     that comes as often as somebody else likes.
+
+    :param gate: judges goals that move the robot
+    :param offset: clock offset of the link they come on
+    :param pursuits: sees that those that move the robot end with the daemon
     """
 
-    def __init__(self, wire: Wire, platform: Platform, frame_limit: int) -> None:
+    def __init__(
+        self,
+        wire: Wire,
+        platform: Platform,
+        frame_limit: int,
+        gate: Gate,
+        offset: Offset,
+        pursuits: Pursuits | None = None,
+    ) -> None:
         super().__init__(wire, platform, frame_limit)
+        self._pursuits = pursuits
+        self._gate = gate
+        self._offset = offset
         self._goals: dict[str, Goal] = {}
+        self._moving: set[str] = set()
+        """Those whose actions move the robot."""
+        self._waiting: list[Deferred[None]] = []
+        """Who wants to know when none of them is left."""
         self._paused = False
         self._held: dict[str, link.ActionFeedback] = {}
         self._closed = False
@@ -36,6 +59,11 @@ class Goals(Part):
             self._wire.say(link.Failed(what="send_action_goal", ref=id, reason=reason))
             return
         check_room(self._goals, "goals")
+        moves = self._gate.goal(message.action, message.source, message.stamp, self._offset)
+        pursuits = self._pursuits if moves else None
+        full = self._platform.full_name(message.action, "action") if pursuits is not None else ""
+        if pursuits is not None:
+            pursuits.check(full)
         goal = self._platform.pursue(
             message.action,
             message.type,
@@ -43,6 +71,10 @@ class Goals(Part):
             (lambda body: self._feedback(id, message.action, body)) if message.feedback else None,
         )
         self._goals[id] = goal
+        if moves:
+            self._moving.add(id)
+        if pursuits is not None:
+            pursuits.add(full, goal)
         goal.result.addCallbacks(
             lambda outcome: self._ended(message, outcome), lambda failure: self._failed(message, failure)
         )
@@ -52,6 +84,27 @@ class Goals(Part):
         goal = self._goals.get(message.id)
         if goal is not None:
             goal.cancel()
+
+    def cancel_all(self, only_moving: bool) -> None:
+        """The robot is to stop; the results still come.
+
+        :param only_moving: goals of actions that don't move it go on
+        """
+        for id, goal in list(self._goals.items()):
+            if only_moving and id not in self._moving:
+                continue
+            try:
+                goal.cancel()
+            except Exception:  # one that fails must not keep the next from its end
+                self._log.failure("a goal could not be cancelled")
+
+    def standing(self) -> Deferred[None]:
+        """Fires when no goal that moves the robot is left; may be cancelled."""
+        if not self._moving:
+            return succeed(None)
+        waiting: Deferred[None] = Deferred(self._waiting.remove)
+        self._waiting.append(waiting)
+        return waiting
 
     def pause(self) -> None:
         """The link takes nothing."""
@@ -71,6 +124,8 @@ class Goals(Part):
         for goal in list(self._goals.values()):
             goal.cancel()
         self._goals.clear()
+        self._moving.clear()
+        self._tell_standing()
 
     def _feedback(self, id: str, action: str, body: bytes) -> None:
         if id not in self._goals:
@@ -102,6 +157,8 @@ class Goals(Part):
 
     def _say_end(self, id: str, status: int, cdr: str | None, reason: str) -> None:
         self._goals.pop(id, None)
+        self._moving.discard(id)
+        self._tell_standing()
         feedback = self._held.pop(id, None)
         if self._closed:
             return
@@ -110,6 +167,13 @@ class Goals(Part):
         self._wire.say(
             link.ActionResult(id=id, status=status, result=cdr is not None, cdr=cdr, reason=reason)
         )
+
+    def _tell_standing(self) -> None:
+        if self._moving:
+            return
+        waiting, self._waiting = self._waiting, []
+        for each in waiting:
+            each.callback(None)
 
 
 def refusal(message: link.SendActionGoal, reason: str) -> link.ActionResult:

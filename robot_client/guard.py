@@ -1,7 +1,8 @@
 """The guard: a small process that stops the robot when the daemon can't, because it was killed or is frozen.
 
 It is started by the daemon (``python -m robot_client.guard``), has a node and publishers of its own, and
-hears of every motion command over its standard input. The end of that pipe is the end of the daemon.
+hears of every motion command over its standard input, and of goals that move the robot. The end of that pipe is the end
+of the daemon.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import msgspec
 
 from robot_client.clocks import now_ns
 from robot_client.guard_protocol import (
+    CANCEL_TYPE,
     Alive,
     Command,
     Forget,
@@ -26,6 +28,7 @@ from robot_client.guard_protocol import (
     Line,
     Probe,
     Ready,
+    Shape,
     Topic,
     decoder,
     encode,
@@ -44,7 +47,7 @@ UNHEARD = 10 * NANO
 
 
 class Outlets(Protocol):
-    """Publishers of zero."""
+    """Publishers of zero, and clients of the services that cancel goals, which is zero for an action."""
 
     def open(self, on: TypedTopic) -> None:
         """Have a publisher ready."""
@@ -52,8 +55,8 @@ class Outlets(Protocol):
     def close(self, on: TypedTopic) -> None:
         """Take the publisher away, if there is one."""
 
-    def zero(self, on: TypedTopic) -> bool:
-        """Publish zero; whether anybody listens."""
+    def zero(self, on: TypedTopic, rest: bytes) -> bool:
+        """Publish zero, of the shape that the last command had; whether anybody listens."""
 
     def heard(self, on: TypedTopic) -> bool:
         """Whether anybody listens."""
@@ -83,13 +86,18 @@ class Guard:
         self._unready: dict[TypedTopic, tuple[int, int]] = {}
         self._ready: list[TypedTopic] = []
         self._unused: set[TypedTopic] = set()
+        self._rests: dict[TypedTopic, bytes] = {}
 
     def take(self, line: Line) -> bool:
         """One line from the daemon; whether it wants an answer."""
         if isinstance(line, Topic):
             self._unused.discard(line.on)
             self._unready[line.on] = (self._now(), self._now())
+            if line.within_ms:
+                self._watchdog.within(line.topic, line.within_ms)
             self._outlets.open(line.on)
+        elif isinstance(line, Shape):
+            self._rests[line.on] = line.rest
         elif isinstance(line, Forget):
             self._unused.add(line.on)
             self._withdraw()
@@ -159,7 +167,7 @@ class Guard:
 
     def _zero(self, on: TypedTopic) -> bool:
         try:
-            return self._outlets.zero(on)
+            return self._outlets.zero(on, self._rests.get(on, b""))
         except Exception as error:  # one topic that fails must not keep the next from its stop
             _say(f"could not stop {on}: {error}")
             return False
@@ -173,11 +181,12 @@ class Guard:
             if on not in self._stops and not self._watchdog.moves(on):
                 self._unused.discard(on)
                 self._unready.pop(on, None)
+                self._rests.pop(on, None)
                 self._outlets.close(on)
 
 
 class RosOutlets:
-    """Publishers in a node of their own; nothing spins, so the node costs nothing while it waits.
+    """Publishers and clients in a node of their own; nothing spins, so the node costs nothing while it waits.
 
     :param sim_time: whether the robot's time is what ``/clock`` says. The guard does not listen to it and leaves stamps
         at 0, which controllers take for now; the machine's time would lie far in the future of a simulation
@@ -198,25 +207,36 @@ class RosOutlets:
         self._unknown = Time() if sim_time else None
         self._types = Types()
         self._publishers: dict[TypedTopic, Any] = {}
+        self._clients: dict[TypedTopic, Any] = {}
 
     def open(self, on: TypedTopic) -> None:
-        """Have a publisher ready."""
-        self._publisher(on)
+        """Have a publisher ready, or a client."""
+        if on.type == CANCEL_TYPE:
+            self._client(on)
+        else:
+            self._publisher(on)
 
     def close(self, on: TypedTopic) -> None:
-        """Take the publisher away."""
+        """Take it away."""
+        client = self._clients.pop(on, None)
+        if client is not None:
+            self._node.destroy_client(client)
         publisher = self._publishers.pop(on, None)
         if publisher is not None:
             self._node.destroy_publisher(publisher)
 
-    def zero(self, on: TypedTopic) -> bool:
-        """Publish zero."""
+    def zero(self, on: TypedTopic, rest: bytes) -> bool:
+        """Publish zero, or ask to cancel all goals; nobody waits for an answer."""
+        if on.type == CANCEL_TYPE:
+            return self._cancel(on)
         stamp = self._unknown or self._node.get_clock().now().to_msg()
-        self._publisher(on).publish(self._types.zero(on.type, stamp))
+        self._publisher(on).publish(self._types.zero(on.type, stamp, rest))
         return self.heard(on)
 
     def heard(self, on: TypedTopic) -> bool:
-        """Whether DDS has matched a subscription."""
+        """Whether DDS has matched a subscription, or the action's server."""
+        if on.type == CANCEL_TYPE:
+            return bool(self._client(on).service_is_ready())
         return bool(self._publisher(on).get_subscription_count())
 
     def _publisher(self, on: TypedTopic) -> Any:
@@ -224,6 +244,20 @@ class RosOutlets:
         if found is None:
             kind = self._types.message(on.type)
             found = self._publishers[on] = self._node.create_publisher(kind, on.topic, 10)
+        return found
+
+    def _cancel(self, on: TypedTopic) -> bool:
+        client = self._client(on)
+        if not client.service_is_ready():
+            return False
+        # No goal's id and no time: all of them.
+        client.remove_pending_request(client.call_async(self._types.service(on.type).Request()))
+        return True
+
+    def _client(self, on: TypedTopic) -> Any:
+        found = self._clients.get(on)
+        if found is None:
+            found = self._clients[on] = self._node.create_client(self._types.service(on.type), on.topic)
         return found
 
 

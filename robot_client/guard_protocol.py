@@ -6,6 +6,18 @@ import msgspec
 
 from robot_client.topics import TypedTopic
 
+CANCEL = "/_action/cancel_goal"
+CANCEL_TYPE = "action_msgs/srv/CancelGoal"
+
+GOALS_WITHIN_MS = 2000
+"""How long a daemon may say nothing of goals that move the robot: a stall that a driver hardly notices must not end
+what was to go on for an hour."""
+
+
+def cancelling(action: str) -> TypedTopic:
+    """What the guard knows an action by: its zero is the request to cancel all goals."""
+    return TypedTopic(action + CANCEL, CANCEL_TYPE)
+
 
 class _OfTopic(msgspec.Struct, array_like=True, frozen=True):
     topic: str
@@ -18,7 +30,18 @@ class _OfTopic(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Topic(_OfTopic, array_like=True, tag_field="line", tag="topic", frozen=True):
-    """Commands may come on this topic; have a publisher ready."""
+    """Commands may come on this topic; have a publisher ready. Or goals of this action, see :func:`cancelling`.
+
+    :ivar within_ms: time to stop of this topic alone, milliseconds; 0: that of the guard
+    """
+
+    within_ms: int = 0
+
+
+class Shape(_OfTopic, array_like=True, tag_field="line", tag="shape", frozen=True):
+    """What the next commands on this topic look like when they are zero, without a stamp; see ``Platform.resting``."""
+
+    rest: bytes
 
 
 class Forget(_OfTopic, array_like=True, tag_field="line", tag="forget", frozen=True):
@@ -48,7 +71,7 @@ class Ready(_OfTopic, array_like=True, tag_field="line", tag="ready", frozen=Tru
     """The guard's publisher has found who listens to this topic: from now on it could stop it."""
 
 
-Line = Topic | Forget | Command | Probe | Leave
+Line = Topic | Shape | Forget | Command | Probe | Leave
 Answer = Alive | Ready
 
 decoder: msgspec.json.Decoder[Line] = msgspec.json.Decoder(Line)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 from twisted.internet.defer import Deferred, succeed
 from twisted.logger import Logger
 
+from robot_client.alerts import MODULE, OnAlert, nobody
 from robot_client.child import Child
 from robot_client.guard_protocol import (
+    CANCEL_TYPE,
+    GOALS_WITHIN_MS,
     Command,
     Forget,
     Leave,
     Line,
     Probe,
     Ready,
+    Shape,
     Topic,
     answer_decoder,
     encode,
@@ -45,17 +49,27 @@ class GuardKeeper:
     :param node: name of the guard's node; those of later guards begin with it
     :param within_ms: time to stop, milliseconds
     :param sim_time: whether the robot's time is what ``/clock`` says
+    :param topics: times to stop of single topics, milliseconds
     """
 
-    def __init__(self, reactor: Any, node: str, within_ms: int, sim_time: bool = False) -> None:
-        self.on_alert: Callable[[str, str], None] = lambda level, text: None
+    def __init__(
+        self,
+        reactor: Any,
+        node: str,
+        within_ms: int,
+        sim_time: bool = False,
+        topics: Mapping[str, int] | None = None,
+    ) -> None:
+        self.on_alert: OnAlert = nobody
         self._reactor = reactor
         self._node = node
         self._within_ms = str(within_ms)
         self._sim_time = sim_time
+        self._within = topics or {}
         self._started = 0
         self._process: Child | None = None
         self._topics: dict[TypedTopic, Topic] = {}
+        self._shapes: dict[TypedTopic, Shape] = {}
         self._commands: dict[TypedTopic, Command] = {}
         self._ready: set[TypedTopic] = set()
         self._asked: float | None = None
@@ -73,7 +87,7 @@ class GuardKeeper:
         except OSError as error:
             self.lost(f"it can't be started: {error.strerror}")
             return
-        lines: list[Line] = [*self._topics.values(), *self._commands.values()]
+        lines: list[Line] = [*self._topics.values(), *self._shapes.values(), *self._commands.values()]
         for line in lines:
             process.tell(encode(line))
         self._heard = self._reactor.seconds()
@@ -100,13 +114,20 @@ class GuardKeeper:
     def topic(self, on: TypedTopic) -> None:
         """Commands may come on this topic."""
         if on not in self._topics:
-            self._topics[on] = line = Topic(*on)
+            within = GOALS_WITHIN_MS if on.type == CANCEL_TYPE else self._within.get(on.topic, 0)
+            self._topics[on] = line = Topic(*on, within)
             self._tell(line)
+
+    def shape(self, on: TypedTopic, rest: bytes) -> None:
+        """What commands on this topic look like when they are zero."""
+        self._shapes[on] = line = Shape(*on, rest)
+        self._tell(line)
 
     def forget(self, on: TypedTopic) -> None:
         """No more commands will come on this topic."""
         if self._topics.pop(on, None) is not None:
             self._commands.pop(on, None)
+            self._shapes.pop(on, None)
             self._ready.discard(on)
             self._tell(Forget(*on))
 
@@ -131,6 +152,8 @@ class GuardKeeper:
             return
         self._heard = self._reactor.seconds()
         self._asked = None
+        if self._failures:
+            self.on_alert("info", "the motion guard is there again", MODULE, "guard", over=True)
         self._failures = 0
         # A word about a topic that was forgotten meanwhile must not count when the topic comes back.
         if isinstance(answer, Ready) and answer.on in self._topics:
@@ -150,7 +173,8 @@ class GuardKeeper:
         least, most = RESTART
         delay = min(most, least * 2**self._failures)
         self._failures += 1
-        self.on_alert("error", f"the motion guard is gone ({why}); another one is started in {delay:.0f} s")
+        text = f"the motion guard is gone ({why}); another one is started in {delay:.0f} s"
+        self.on_alert("error", text, MODULE, "guard")
         self._timer = self._reactor.callLater(delay, self.start)
 
     def _arguments(self) -> list[str]:

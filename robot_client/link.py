@@ -75,13 +75,19 @@ class Sampled(NamedTuple):
     frame: frames.SampleFrame
 
 
+class Commanded(NamedTuple):
+    """A command from the relay, to what moves the robot."""
+
+    frame: frames.CommandFrame
+
+
 class Ended(NamedTuple):
     """The relay closes the link on purpose."""
 
     reason: str
 
 
-Event = Registered | JoinedChannel | EnrolledAt | Said | Sampled | Ended
+Event = Registered | JoinedChannel | EnrolledAt | Said | Sampled | Commanded | Ended
 
 
 class RelayRefused(Refused):
@@ -273,6 +279,11 @@ class ControlLink(Link):
         (State.REGISTERED, link.CloseChannel): _on_order,
         (State.REGISTERED, link.OpenVideo): _on_order,
         (State.REGISTERED, link.CloseVideo): _on_order,
+        (State.REGISTERED, link.Control): _on_order,
+        (State.REGISTERED, link.Stop): _on_order,
+        (State.REGISTERED, link.Resume): _on_order,
+        (State.REGISTERED, link.Suppress): _on_order,
+        (State.REGISTERED, link.Inhibit): _on_order,
     }
     _decoders: ClassVar[dict[State, msgspec.json.Decoder[Any]]] = {
         State.GREETING: link.opening_reply_decoder,
@@ -318,6 +329,8 @@ class ChannelLink(TicketLink):
     """A link for one channel."""
 
     def _sample(self, frame: frames.Frame) -> list[Event]:
+        if self.state is State.OPEN and isinstance(frame, frames.CommandFrame):
+            return [Commanded(frame)]
         if self.state is State.OPEN and isinstance(frame, frames.SampleFrame):
             return [Sampled(frame)]
         return super()._sample(frame)

@@ -1,7 +1,8 @@
-"""Load of the machine, where psutil is there to tell."""
+"""What the machine is, and its load, where psutil is there to tell."""
 
 from __future__ import annotations
 
+import platform
 from typing import Any
 
 try:
@@ -24,3 +25,11 @@ class Machine:
     def memory(self) -> float | None:
         """Memory in use."""
         return self._psutil.virtual_memory().percent / 100 if self._psutil else None
+
+
+def operating_system() -> str:
+    """Its name and version."""
+    try:
+        return platform.freedesktop_os_release().get("PRETTY_NAME", "")
+    except OSError:
+        return f"{platform.system()} {platform.release()}"

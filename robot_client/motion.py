@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
 
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_protocol.errors import Unavailable
 from relay_protocol.link import MotionPolicy, QoS
+from robot_client.authority import Authority, Verdict
+from robot_client.governor import Governor
+from robot_client.guard_feed import GuardFeed
 from robot_client.offset import Offset
 from robot_client.platforms.base import Motion, Platform, Sink
 from robot_client.reactors import Clock, Timer
+from robot_client.rules import Rules
 from robot_client.safety import (
     DAEMON_SHARE,
-    REPEAT_EVERY,
-    REPEATS,
+    MILLI,
     Freshness,
     Watchdog,
     freshness,
     is_motion,
+    void_at,
 )
+from robot_client.stilling import Stilling
 from robot_client.topics import TypedTopic
+from robot_client.tracks import Outlet, Track
 
 NANO = 1_000_000_000
 MAX_TOPICS = 64
+MAX_SHAPE = 4096
+"""Bytes that may be needed to know what zero looks like: of a joystick's axes, of an arm's joints."""
 KEPT = 30.0
 """Seconds the guard keeps its publisher after the last client left: whoever comes back need not wait for it."""
 
@@ -33,79 +40,13 @@ MOTION_QOS = QoS(history="keep_last", depth=1, reliability="reliable", durabilit
 """How motion is published: nothing old is kept for a slow or late subscriber, nothing is left to chance."""
 
 
-class GuardFeed(Protocol):
-    """Who is told of every motion command, to act when the daemon can't."""
-
-    def topic(self, on: TypedTopic) -> None:
-        """Commands may come on this topic."""
-
-    def forget(self, on: TypedTopic) -> None:
-        """No more commands will come on this topic."""
-
-    def command(self, on: TypedTopic, moving: bool, at: int) -> None:
-        """A command went out; ``at`` is the clock in nanoseconds."""
-
-    def ready(self, on: TypedTopic) -> bool:
-        """Whether it could stop this topic now."""
-
-
-class NoGuard:
-    """Nobody is told, by choice: motion does not wait for a guard."""
-
-    def topic(self, on: TypedTopic) -> None:
-        """Pass over."""
-
-    def forget(self, on: TypedTopic) -> None:
-        """Pass over."""
-
-    def command(self, on: TypedTopic, moving: bool, at: int) -> None:
-        """Pass over."""
-
-    def ready(self, on: TypedTopic) -> bool:
-        """Nothing to wait for."""
-        return True
-
-
-class _Outlet(NamedTuple):
-    on: TypedTopic
-    sink: Sink
-
-
-class _Track:
-    """One motion topic.
-
-    :attr sources: publications that may command it
-    :attr leaving: sinks to close when the last zero is said
-    :attr speaker: sink of the last command; what it says arrives after that command, what another says may not
-    :attr zeros: how often zero is still to be said
-    :attr timer: for the next zero; without sources and zeros, for being forgotten
-    """
-
-    def __init__(self) -> None:
-        self.sources: set[str] = set()
-        self.leaving: list[Sink] = []
-        self.speaker: Sink | None = None
-        self.zeros = 0
-        self.timer: Timer | None = None
-
-    @property
-    def idle(self) -> bool:
-        """Whether nobody needs it."""
-        return not self.sources and not self.zeros
-
-    def rest(self) -> None:
-        """Nothing is to come."""
-        self.zeros = 0
-        if self.timer is not None and self.timer.active():
-            self.timer.cancel()
-        self.timer = None
-
-
 class MotionDesk:
     """Passes motion commands on, or not, and stops what is left moving.
 
     :param now: clock that goes on in suspends, nanoseconds
     :param clock: schedules the watchdog
+    :param authority: knows who may move the robot
+    :param rules: what else holds for commands and stops
     """
 
     def __init__(
@@ -115,8 +56,18 @@ class MotionDesk:
         clock: Clock,
         now: Callable[[], int],
         guard: GuardFeed,
+        authority: Authority,
+        rules: Rules | None = None,
     ) -> None:
         self.policy = policy
+        self.moving = False
+        """Whether commands keep the robot moving."""
+        self.on_moving: Callable[[], None] = lambda: None
+        """Called when that changes."""
+        self.on_commanded: Callable[[bool], None] = lambda commanded: None
+        """Called when somebody may command the robot, and when nobody may any more."""
+        self.proof: Callable[[], int] = now
+        """When the latest ping that the relay has answered was sent."""
         self.stale_commands = 0
         self.invalid_commands = 0
         self.watchdog_stops = 0
@@ -125,12 +76,26 @@ class MotionDesk:
         self._clock = clock
         self._now = now
         self._guard = guard
-        self._watchdog = Watchdog(policy.stop_within_ms, DAEMON_SHARE)
-        self._outlets: dict[str, _Outlet] = {}
-        self._tracks: dict[TypedTopic, _Track] = {}
+        self._authority = authority
+        self._rules = rules or Rules()
+        self._governor = Governor(self._rules.limits, platform.encoding)
+        self._watchdog = Watchdog(policy.stop_within_ms, DAEMON_SHARE, self._rules.ramp_ms)
+        for topic, times in self._rules.topics.items():
+            self._watchdog.within(topic, times.stop_within_ms)
+        self._outlets: dict[str, Outlet] = {}
+        self._tracks: dict[TypedTopic, Track] = {}
+        self._stilling = self._make_stilling(self._rules.ramp_ms * MILLI)
         self._timer: Timer | None = None
         self._finishing: list[Deferred[None]] = []
+        self._standing: list[Deferred[list[str]]] = []
+        self._unstopped: list[str] = []
+        """Topics whose ramp could not end in zero, since somebody wanted to know."""
         self._log = Logger("motion")
+
+    @property
+    def limited_commands(self) -> int:
+        """Commands made slower."""
+        return self._governor.limited
 
     def concerns(self, on: TypedTopic) -> bool:
         """Whether commands on this topic move the robot; ``on`` as the platform resolved it."""
@@ -146,32 +111,56 @@ class MotionDesk:
                 self._forget(other)  # some middleware allows one type of a topic in a process
         if on not in self._tracks:
             self._make_room()
-            self._tracks[on] = _Track()
+            self._tracks[on] = Track()
         track = self._tracks[on]
         if track.idle:
-            track.rest()
+            track.settle()
         track.sources.add(source)
-        self._outlets[source] = _Outlet(on, sink)
+        self._outlets[source] = Outlet(on, sink)
         self._guard.topic(on)
+        self.on_commanded(True)
 
-    def command(self, source: str, body: bytes, stamp: int, offset: Offset) -> bool:
-        """Publish one command if it is fresh and sane; whether it was."""
+    def commanded(self, topic: str) -> bool:
+        """Whether clients may command a topic."""
+        return any(outlet.on.topic == topic for outlet in self._outlets.values())
+
+    def refuse(self) -> None:
+        """Count a message to what moves the robot that came without its source, which is never obeyed."""
+        self._authority.refused += 1
+
+    def command(self, source: str, body: bytes, stamp: int, offset: Offset, by: int) -> bool:
+        """Publish one command if it is allowed, fresh and sane; whether it was.
+
+        :param source: the publication it came on
+        :param by: the connection that gave it
+        """
         on = self._outlets[source].on
         now = self._now()
-        if freshness(stamp, now, offset, self.policy.deadline_ms) is not Freshness.FRESH:
+        verdict = self._platform.judge(on.type, body)
+        fresh = freshness(stamp, now, offset, self._deadline(on)) is Freshness.FRESH
+        # Zero that is too old tells nothing of what its source does now: it is no letting go.
+        moving = verdict is not Motion.STILL or not fresh
+        if self._authority.judge(by, on.topic, moving, now) is not Verdict.ALLOWED:
+            return False
+        if not fresh:
             self.stale_commands += 1
             return False
-        verdict = self._platform.judge(on.type, body)
-        if verdict is Motion.INVALID:
-            self.invalid_commands += 1
-            return False
+        void = self._void(on, stamp, now, offset)
         if verdict is Motion.STILL:
             self._stand(source, body, now)
-        elif self._guard.ready(on):
-            self._move(source, body, now)
-        else:
+        elif void <= now:
+            self.stale_commands += 1
+            return False
+        elif verdict is Motion.MOVING and not self._guard.ready(on):
             self._hold_back(on)
             return False
+        else:
+            tamed = None if verdict is Motion.INVALID else self._tame(on, body, by, now)
+            if tamed is None:
+                self.invalid_commands += 1
+                return False
+            self._tracks[on].mover = by
+            self._move(source, tamed, now, void)
         self._schedule()
         return True
 
@@ -180,18 +169,65 @@ class MotionDesk:
         outlet = self._outlets.pop(source, None)
         if outlet is None:
             return
+        if not self._outlets:
+            self.on_commanded(False)
         track = self._tracks[outlet.on]
         track.sources.discard(source)
         track.leaving.append(outlet.sink)
         if self._watchdog.release(outlet.on, source):
-            self._stop([outlet.on], "its publisher left")
-        if not track.zeros:
+            self._stilling.stop([outlet.on], "its publisher left", gently=True)
+        if not track.busy:
             self._settle(outlet.on)
         self._schedule()
 
-    def stop_all(self, why: str) -> None:
-        """Zero on everything that moves, at once."""
-        self._stop(self._watchdog.everything(), why)
+    def stop_all(self, why: str, gently: bool = False) -> list[str]:
+        """Zero on everything that moves; the topics on which it could not be said.
+
+        :param gently: by a ramp, where there are any; else at once
+        """
+        failed = self._stilling.stop(self._watchdog.everything(), why, gently)
+        self._schedule()
+        return failed
+
+    def standing(self) -> Deferred[list[str]]:
+        """Fires when no ramp is under way any more; with the topics on which zero could not be said at its end."""
+        done: Deferred[list[str]] = Deferred()
+        self._standing.append(done)
+        self._tell_finished()
+        return done
+
+    def halt(self, why: str) -> list[str]:
+        """Zero on every topic that clients may command, moving or not; those on which it could not be said."""
+        moving = set(self._watchdog.everything())
+        failed = []
+        for on, track in self._tracks.items():
+            if on not in moving and not track.sources and track.ramp is None:
+                continue
+            if track.speaker is None:
+                track.speaker = next((each.sink for each in self._outlets.values() if each.on == on), None)
+            if self._stilling.zero(on, why):
+                self._stilling.repeat(on)
+            else:
+                failed.append(on.topic)
+        self._log.info("stopped everything: {why}", why=why)
+        self._tell_finished()
+        self._schedule()
+        return failed
+
+    def yield_topic(self, topic: str, why: str) -> None:
+        """Others command a topic now: stop what those move who don't."""
+        now = self._now()
+        others = [
+            on
+            for on, track in self._tracks.items()
+            if on.topic == topic
+            and (self._watchdog.moves(on) or track.ramp is not None)
+            and not self._authority.commands(track.mover, topic, now)
+        ]
+        for on in others:
+            self._watchdog.command(on, "", False, now)
+        self._stilling.stop(others, why)
+        self._tell_finished()
         self._schedule()
 
     def finish(self) -> Deferred[None]:
@@ -203,27 +239,53 @@ class MotionDesk:
 
     # --- one command ---------------------------------------------------------------------------------------
 
-    def _move(self, source: str, body: bytes, now: int) -> None:
+    def _deadline(self, on: TypedTopic) -> int:
+        own = self._rules.topics.get(on.topic)
+        return self.policy.deadline_ms if own is None else own.deadline_ms
+
+    def _tame(self, on: TypedTopic, body: bytes, by: int, now: int) -> bytes | None:
+        """The command as it may be followed, its zero known; ``None`` where it must not be."""
+        rest = self._platform.resting(on.type, body)
+        if len(rest) > MAX_SHAPE:
+            return None
+        # Who suppresses a topic is of a level that nobody told us.
+        level = self._authority.level if by == self._authority.holder else ""
+        tamed = self._governor.tame(on, body, level, now)
+        track = self._tracks[on]
+        if tamed is not None and rest != track.rest:
+            track.rest = rest
+            self._guard.shape(on, rest)
+        return tamed
+
+    def _void(self, on: TypedTopic, stamp: int, now: int, offset: Offset) -> int:
+        deadline, within = self._deadline(on), self.policy.stop_within_ms
+        return void_at(stamp, now, offset, self.proof(), deadline, within)
+
+    def _move(self, source: str, body: bytes, now: int, void: int) -> None:
         on, sink = self._outlets[source]
         # The guard hears of a movement before it begins, and of a stop after it was sent.
         self._guard.command(on, True, now)
         sink.publish(body)
-        self._watchdog.command(on, source, True, now)
+        self._watchdog.command(on, source, True, now, void)
         track = self._tracks[on]
         track.speaker = sink
-        if track.zeros:
-            track.rest()
+        track.latest = min(void, self._watchdog.latest(on, now))
+        track.body = body if self._stilling.ramps else b""
+        if track.busy:
+            track.settle()
             self._settle(on)
 
     def _stand(self, source: str, body: bytes, now: int) -> None:
         on, sink = self._outlets[source]
         sink.publish(body)
-        moved = self._watchdog.moves(on)
-        self._watchdog.command(on, source, False, now)
         track = self._tracks[on]
+        moved = self._watchdog.moves(on) or track.ramp is not None
+        self._watchdog.command(on, source, False, now)
+        self._governor.stood(on, now)
         track.speaker = sink
         if moved:
-            self._repeat(on)
+            self._stilling.repeat(on)
+            self._tell_finished()
         elif not track.zeros:
             self._guard.command(on, False, now)
 
@@ -238,46 +300,22 @@ class MotionDesk:
         self._timer = None
         topics = self._watchdog.expired(self._now())
         self.watchdog_stops += len(topics)
-        self._stop(topics, "no fresh command came")
+        self._stilling.stop(topics, "no fresh command came", gently=True)
         self._schedule()
 
-    def _stop(self, topics: list[TypedTopic], why: str) -> None:
-        for on in topics:
-            if self._zero(on, why):
-                self._log.info("stopped {topic}: {why}", topic=on.topic, why=why)
-                self._repeat(on)
+    def _make_stilling(self, ramp: int) -> Stilling:
+        made = Stilling(self._platform, self._clock, self._now, self._guard, self._tracks, ramp)
+        made.said = lambda on: self._governor.stood(on, self._now())
+        made.slowed = lambda on, velocity: self._governor.slowed(on, velocity, self._now())
+        made.over = self._ramp_over
+        made.rested = self._settle
+        return made
 
-    def _zero(self, on: TypedTopic, why: str) -> bool:
-        speaker = self._tracks[on].speaker
-        try:
-            if speaker is None:
-                raise Unavailable("its publisher is gone")
-            speaker.publish(self._platform.zero(on.type))
-        except Exception as error:  # one topic that fails must not keep the next from its stop
-            self._log.error(
-                "could not stop {topic} ({why}): {error}", topic=on.topic, why=why, error=str(error)
-            )
-            return False  # the guard, not told, will try
-        return True
-
-    def _repeat(self, on: TypedTopic) -> None:
-        track = self._tracks[on]
-        track.rest()
-        track.zeros = REPEATS - 1
-        track.timer = self._clock.callLater(REPEAT_EVERY / NANO, self._say_again, on)
-
-    def _say_again(self, on: TypedTopic) -> None:
-        track = self._tracks[on]
-        track.zeros -= 1
-        if not self._zero(on, "once more"):
-            track.zeros = 0
-        elif not track.zeros:
-            # Not before: what the guard has begun to repeat goes on until this end is done.
-            self._guard.command(on, False, self._now())
-        if track.zeros:
-            track.timer = self._clock.callLater(REPEAT_EVERY / NANO, self._say_again, on)
-        else:
-            self._settle(on)
+    def _ramp_over(self, on: TypedTopic, stopped: bool) -> None:
+        if not stopped:
+            self._unstopped.append(on.topic)
+        self._tell_finished()
+        self._schedule()
 
     # --- coming to rest ------------------------------------------------------------------------------------
 
@@ -290,12 +328,13 @@ class MotionDesk:
                 track.speaker = None
             sink.close()
         if track.idle:
-            track.rest()
+            track.settle()
             track.timer = self._clock.callLater(KEPT, self._forget, on)
         self._tell_finished()
 
     def _forget(self, on: TypedTopic) -> None:
-        self._tracks.pop(on).rest()
+        self._tracks.pop(on).settle()
+        self._governor.forget(on)
         self._guard.forget(on)
 
     def _make_room(self) -> None:
@@ -307,6 +346,12 @@ class MotionDesk:
         self._forget(idle)
 
     def _tell_finished(self) -> None:
+        if self._stilling.under_way:
+            return
+        standing, self._standing = self._standing, []
+        unstopped, self._unstopped = self._unstopped, []
+        for each in standing:
+            each.callback(unstopped)
         if any(track.zeros for track in self._tracks.values()):
             return
         finishing, self._finishing = self._finishing, []
@@ -320,3 +365,7 @@ class MotionDesk:
         self._timer = None
         if due is not None:
             self._timer = self._clock.callLater(max(0.0, (due - self._now()) / NANO), self._expire)
+        moving = due is not None or self._stilling.under_way
+        if self.moving != moving:
+            self.moving = moving
+            self.on_moving()

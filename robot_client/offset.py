@@ -64,6 +64,11 @@ class Offset:
         """Latest round trip, nanoseconds."""
         return self._window[-1].received - self._window[-1].sent if self._window else None
 
+    @property
+    def answered(self) -> int | None:
+        """When the latest ping that was answered was sent, nanoseconds."""
+        return max(each.sent for each in self._window) if self._window else None
+
     def oldest(self, stamp: int, now: int) -> int | None:
         """How long ago the relay's clock showed ``stamp``, at most, nanoseconds.
 

@@ -19,10 +19,12 @@ from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection
 from robot_client.daemon import Daemon
+from robot_client.guard_feed import NoGuard
 from robot_client.guarding import GuardKeeper
+from robot_client.hardware import Hardware
 from robot_client.identity import Enrolment
+from robot_client.lasting import Latch
 from robot_client.link import ControlLink, Identity
-from robot_client.motion import NoGuard
 from robot_client.platforms.base import Platform
 from robot_client.reactors import Endpoint
 from robot_client.systemd import Notifier
@@ -57,6 +59,7 @@ def make_ros(reactor: Any, settings: Settings, suffix: str) -> Platform:
         executor=settings.ros.executor,
         battery=settings.ros.battery,
         sim_time=settings.ros.use_sim_time,
+        diagnostics=settings.monitor.diagnostics,
     )
 
 
@@ -64,6 +67,7 @@ class Runner:
     """One run of the daemon.
 
     :param reactor: its clock must be monotonic
+    :param latch: where a stop is kept
     """
 
     def __init__(
@@ -72,6 +76,7 @@ class Runner:
         settings: Settings,
         enrolment: Enrolment,
         me: Identity,
+        latch: Latch,
         platform: Platform | None = None,
     ) -> None:
         suffix = secrets.token_hex(3)
@@ -84,6 +89,10 @@ class Runner:
                 f"switchboard_guard_{suffix}",
                 settings.safety.stop_within_ms,
                 settings.ros.use_sim_time,
+                {
+                    each.name: settings.safety.times(each.name).stop_within_ms
+                    for each in settings.safety.topic
+                },
             )
         self.cameras = CameraKeeper(
             reactor,
@@ -112,6 +121,8 @@ class Runner:
             self.platform,
             self.keeper or NoGuard(),
             CameraDesk(settings.cameras, self.cameras, connection.say, reactor),
+            latch,
+            Hardware(settings.safety.switches, self.platform, reactor),
             reactor,
             self._dial,
             agent(),
@@ -126,7 +137,7 @@ class Runner:
         :raises Unavailable: the platform can't start
         """
         self.platform.start()
-        self.cameras.on_alert = self.daemon.alert
+        self.cameras.on_alert = self.platform.on_alert = self.daemon.alert
         if self.keeper is not None:
             self.keeper.on_alert = self.daemon.alert
             self.keeper.start()

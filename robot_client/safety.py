@@ -17,10 +17,23 @@ DAEMON_SHARE = 0.8
 GUARD_SHARE = 0.9
 """Shares of ``stop_within_ms`` after which each watchdog acts; the rest is for scheduling and delivery."""
 
+VOID_SHARE = 0.9
+"""Share of the deadline after which a command that was followed counts no more."""
+
+PROOF_EVERY = 0.1
+"""Seconds between pings that prove the link both ways, while somebody may command the robot."""
+
 
 REPEATS = 5
 REPEAT_EVERY = 40 * MILLI
 """A stop is said five times within 200 ms: the first may be lost on its way to a best-effort subscriber."""
+
+
+class Times(NamedTuple):
+    """How long the last command on a topic counts, and how old one may be, milliseconds."""
+
+    stop_within_ms: int
+    deadline_ms: int
 
 
 class Freshness(enum.Enum):
@@ -43,14 +56,27 @@ def freshness(stamp: int, now: int, offset: Offset, deadline_ms: int) -> Freshne
     return Freshness.AHEAD if oldest < 0 else Freshness.FRESH
 
 
+def void_at(stamp: int, now: int, offset: Offset, proof: int, deadline_ms: int, within_ms: int) -> int:
+    """When a command counts no more: by its age, or because the link is not known to work both ways, nanoseconds.
+
+    Whoever drives a robot that he hears nothing of any more must not go on.
+
+    :param stamp: as of :func:`freshness`, which has found the command fresh
+    :param proof: when the latest ping that the relay has answered was sent
+    """
+    age = offset.oldest(stamp, now) or 0
+    by_age = now - age + int(deadline_ms * VOID_SHARE * MILLI)
+    return min(by_age, proof + int(max(deadline_ms, within_ms) * VOID_SHARE * MILLI))
+
+
 def is_motion(policy: MotionPolicy, on: TypedTopic) -> bool:
     """Whether commands on this topic move the robot; ``on`` as the platform resolved it."""
-    return on.type in policy.types or on.topic in policy.topics
+    return policy.moves_by_topic(on.topic, on.type)
 
 
 class _Moving(NamedTuple):
     source: str
-    since: int
+    until: int
 
 
 class Watchdog:
@@ -58,20 +84,39 @@ class Watchdog:
 
     :param within_ms: time from the last command to the stop, milliseconds
     :param share: share of it after which this watchdog acts
+    :param earlier_ms: how much earlier it acts, for what the stop takes
     """
 
-    def __init__(self, within_ms: int, share: float) -> None:
-        self._patience = int(within_ms * share * MILLI)
+    def __init__(self, within_ms: int, share: float, earlier_ms: int = 0) -> None:
+        self._within_ms = within_ms
+        self._share = share
+        self._earlier = earlier_ms * MILLI
+        self._own: dict[str, int] = {}
         self._moving: dict[TypedTopic, _Moving] = {}
+
+    def within(self, topic: str, within_ms: int) -> None:
+        """A time of its own for a topic, milliseconds."""
+        self._own[topic] = within_ms
+
+    def latest(self, topic: TypedTopic, now: int) -> int:
+        """By when zero must be said on a topic that gets a command now, nanoseconds."""
+        return now + int(self._own.get(topic.topic, self._within_ms) * self._share * MILLI)
 
     def moves(self, topic: TypedTopic) -> bool:
         """Whether the last command on this topic was to move."""
         return topic in self._moving
 
-    def command(self, topic: TypedTopic, source: str, moving: bool, now: int) -> None:
-        """A valid command went out on a topic; ``now`` in nanoseconds."""
+    def command(
+        self, topic: TypedTopic, source: str, moving: bool, now: int, void: int | None = None
+    ) -> None:
+        """A valid command went out on a topic.
+
+        :param now: nanoseconds
+        :param void: when it counts no more, however soon after this; ``None``: nothing but silence ends it
+        """
         if moving:
-            self._moving[topic] = _Moving(source, now)
+            until = self.latest(topic, now) - self._earlier
+            self._moving[topic] = _Moving(source, until if void is None else min(until, void))
         else:
             self._moving.pop(topic, None)
 
@@ -79,13 +124,11 @@ class Watchdog:
         """When :meth:`expired` will next name a topic, nanoseconds; ``None`` while all stand still."""
         if not self._moving:
             return None
-        return min(each.since for each in self._moving.values()) + self._patience
+        return min(each.until for each in self._moving.values())
 
     def expired(self, now: int) -> list[TypedTopic]:
         """Topics whose commands ceased; each is named once."""
-        return self._settle(
-            [topic for topic, each in self._moving.items() if now - each.since >= self._patience]
-        )
+        return self._settle([topic for topic, each in self._moving.items() if now >= each.until])
 
     def release(self, topic: TypedTopic, source: str) -> bool:
         """A source leaves a topic; whether the topic must be stopped for it."""

@@ -50,6 +50,11 @@ class Sending:
             self._awaited = True
             self._after(self.flush)
 
+    def unmute(self, number: int) -> None:
+        """Let a subscription speak again; see :meth:`robot_client.uplink.Uplink.unmute`."""
+        if self.uplink.unmute(number):
+            self.flush()
+
     def end(self, number: int) -> None:
         """End a subscription; see :meth:`robot_client.uplink.Uplink.close`."""
         self.uplink.close(number)

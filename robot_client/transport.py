@@ -183,6 +183,13 @@ class LinkProtocol(TwistedProtocol):
         self.flush()
         self._ping = self._clock.callLater(self.link.ping_every, self._beat)
 
+    def ping_every(self, seconds: float) -> None:
+        """Ping in this rhythm from now on."""
+        self.link.ping_every = seconds
+        if self._ping is not None and self._ping.active():
+            self._ping.cancel()
+            self._beat()
+
     def _too_slow(self) -> None:
         self._deadline = None
         self.end(LinkLost(f"the relay did not answer within {UNPROVEN_SECONDS:.0f} s"))

@@ -46,6 +46,13 @@ class _Lane:
         self.begun: _Sample | None = None
         self.sent = 0
         """Bytes of :attr:`begun` that have gone."""
+        self.last: bytes | None = None
+        """What left last."""
+        self.muted = False
+        self.instead: bytes | None = None
+        """What is sent in the place of each sample while it is muted."""
+        self.missed: _Sample | None = None
+        """The newest sample of publishers that keep theirs, which came while it was muted: there may be no other."""
 
 
 class Uplink:
@@ -116,6 +123,12 @@ class Uplink:
             self.dropped += 1
             return False
         now = self._now()
+        if lane.muted:
+            if lane.latched:
+                lane.missed = _Sample(number, now, stamp, body)
+            if lane.instead is None:
+                return False
+            body = lane.instead
         sample = _Sample(number, now, stamp, body)
         if lane.throttle and now < lane.next_at:
             self.held += lane.held is None
@@ -123,6 +136,38 @@ class Uplink:
             return False
         self._admit(lane, sample, now)
         return True
+
+    def mute(self, number: int, hold: bool) -> None:
+        """Send nothing more of a subscription, also not what waits; a sample whose parts have begun is finished.
+
+        :param hold: what left last in the place of each sample, where there is that
+        """
+        lane = self._lanes.get(number)
+        if lane is None:
+            return
+        lane.muted = True
+        lane.instead = lane.last if hold else None
+        self.held -= lane.held is not None
+        lane.held = None
+        for serial in lane.waiting:
+            self._size -= len(self._pop(serial).body)
+        if lane.large and lane.begun is None:
+            self._turns.remove(number)
+        lane.waiting.clear()
+        lane.size = lane.large = 0
+
+    def unmute(self, number: int) -> bool:
+        """Send samples of a subscription again; whether there is one now."""
+        lane = self._lanes.get(number)
+        if lane is None or not lane.muted:
+            return False
+        lane.muted, lane.instead = False, None
+        self.held -= lane.held is not None
+        lane.held = None
+        missed, lane.missed = lane.missed, None
+        if missed is not None:
+            self._admit(lane, missed, self._now())
+        return missed is not None
 
     def next_due(self) -> float | None:
         """When the next sample held back by a throttle may go, on the clock given; ``None`` for none."""
@@ -152,6 +197,7 @@ class Uplink:
             lane, size = self._lanes[sample.number], len(sample.body)
             lane.waiting.remove(serial)
             lane.size -= size
+            lane.last = sample.body
             self._size -= size
             frame = frames.encode_sample(sample.number, sample.stamp, sample.body)
             taken += len(frame)
@@ -217,6 +263,7 @@ class Uplink:
         if self._begun and self._begun + size > self._limit:
             return False
         lane.begun, lane.sent = self._remove(serial), 0
+        lane.last = lane.begun.body
         self._begun += size
         return True
 

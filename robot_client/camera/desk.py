@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from relay_protocol import limits, link
 from robot_client.camera.keeper import CameraKeeper
@@ -14,9 +14,6 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 TELL_EVERY = 1.0
 """Seconds between two words of ``cameras``, at least."""
-
-_SUFFIX = "/compressed"
-"""What image_transport adds to the name of a topic for its compressed pictures."""
 
 
 class CameraDesk:
@@ -96,13 +93,18 @@ class CameraDesk:
         """Nobody watches any more."""
         self._keeper.close(message.stream, "nobody watches any more")
 
+    def silence(self, topics: Iterable[str]) -> None:
+        """Let these topics show nothing new, and all others go on."""
+        self._keeper.silence(topics)
+
     def _topic_of(self, camera: str, transport: str) -> tuple[str, str]:
         """Topic and type to subscribe to: the other one of the pair when that is asked for and there."""
         type = self._topics.get(camera, "")
-        other = {
-            ("compressed", IMAGE): camera + _SUFFIX,
-            ("raw", COMPRESSED): camera.removesuffix(_SUFFIX),
-        }.get((transport, type), camera)
+        other = camera
+        if transport == "compressed" and type != COMPRESSED:
+            other = link.compressed_of(camera)
+        elif transport == "raw" and type != IMAGE:
+            other = link.raw_of(camera)
         if other in self._topics:
             return other, self._topics[other]
         return (camera, type) if type else ("", "")
@@ -127,7 +129,7 @@ class CameraDesk:
         if cameras != self._told:
             self._told = cameras
             self._told_at = self._clock.seconds()
-            self._say(link.Cameras(cameras=cameras))
+            self._say(link.Cameras(cameras=cameras, streams=self._keeper.most))
 
     def _cameras(self) -> list[link.Camera]:
         types = {**self._topics, **dict.fromkeys(self._configured, "")}
@@ -145,4 +147,5 @@ class CameraDesk:
             width=seen.width,
             height=seen.height,
             fps=seen.fps,
+            seen=seen.at,
         )

@@ -67,8 +67,9 @@ class Feed:
             self._from_thread(self._deliver)
 
     def close(self) -> None:
-        """Nobody watches any more."""
+        """Nobody watches any more: what was seen last is told, with the time."""
         self.abandon()
+        self._tell(last=True)
         self.source.close()
 
     def abandon(self) -> None:
@@ -96,7 +97,7 @@ class Feed:
         self._timer = self._clock.callLater(LOOK_EVERY, self._look)
         self._tell()
 
-    def _tell(self) -> None:
+    def _tell(self, *, last: bool = False) -> None:
         if self._latest is None:
             return
         try:
@@ -104,9 +105,14 @@ class Feed:
         except Invalid:
             return  # the streams say why
         seen = Seen(
-            camera=self.camera, encoding=encoding[:LABEL], width=width, height=height, fps=round(self.fps, 1)
+            camera=self.camera,
+            encoding=encoding[:LABEL],
+            width=width,
+            height=height,
+            fps=round(self.fps, 1),
+            at=round(self._latest.stamp / 1e9, 3),
         )
-        if self._seen is None or _differ(self._seen, seen):
+        if last or self._seen is None or _differ(self._seen, seen):
             self._seen = seen
             self._on_seen(seen)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import msgspec
@@ -10,6 +10,7 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.logger import Logger
 
 from relay_protocol.limits import CHANNEL_TICKET_SECONDS
+from robot_client.alerts import MODULE, OnAlert, nobody
 from robot_client.camera.lines import (
     Close,
     Ended,
@@ -17,6 +18,7 @@ from robot_client.camera.lines import (
     Open,
     Seen,
     Settings,
+    Silent,
     Taken,
     answer_decoder,
     encode,
@@ -53,15 +55,18 @@ class CameraKeeper:
 
     def __init__(self, reactor: Any, settings: Settings) -> None:
         self.on_seen: Callable[[Seen], None] = _ignored
-        self.on_alert: Callable[[str, str], None] = _ignored
+        self.on_alert: OnAlert = nobody
         self._reactor = reactor
         self._settings = settings
         self._process: Child | None = None
         self._streams: dict[str, _Wanted | None] = {}
         """What the process was told; ``None`` once it has taken note."""
         self._waiting: dict[str, _Wanted] = {}
+        self._silent: list[str] = []
         self._started = 0
         self._failures = 0
+        self._missed = False
+        """Whether people were told that it is gone."""
         self._began = self._heard = 0.0
         self._look: Timer | None = None
         self._retry: Timer | None = None
@@ -104,6 +109,17 @@ class CameraKeeper:
         for stream in {*self._streams, *self._waiting}:
             self.close(stream, why)
 
+    def silence(self, topics: Iterable[str]) -> None:
+        """Let these topics say nothing, and all others speak."""
+        self._silent = sorted(topics)
+        if self._process is not None and self._leaving is None:
+            self._process.tell(encode(Silent(topics=self._silent)))
+
+    @property
+    def most(self) -> int:
+        """Streams the process makes at a time."""
+        return self._settings.streams
+
     def stop(self) -> Deferred[None]:
         """Let the process leave; fires when it has."""
         self._waiting.clear()
@@ -122,6 +138,7 @@ class CameraKeeper:
         except msgspec.MsgspecError:
             return
         self._heard = self._reactor.seconds()
+        self._missed_no_more("the camera process is there again")
         if isinstance(answer, Seen):
             self.on_seen(answer)
         elif isinstance(answer, Taken):
@@ -153,14 +170,19 @@ class CameraKeeper:
         if lost:
             steady = self._reactor.seconds() - self._began >= STEADY
             self._failures = 1 if steady else self._failures + 1
-            self.on_alert(
-                "warning", f"the camera process is gone ({why}); it is started again when it is needed"
-            )
+            self._missed = True
+            text = f"the camera process is gone ({why}); it is started again when it is needed"
+            self.on_alert("error", text, MODULE, "camera")
             least, most = RESTART
             delay = min(most, least * 2 ** min(self._failures - 1, 16))
             self._retry = self._reactor.callLater(delay, self._start_again)
         else:
             self._start()
+
+    def _missed_no_more(self, text: str) -> None:
+        if self._missed:
+            self._missed = False
+            self.on_alert("info", text, MODULE, "camera", over=True)
 
     def _start_again(self) -> None:
         self._retry = None
@@ -173,6 +195,7 @@ class CameraKeeper:
             name: each for name, each in self._waiting.items() if now - each.since < CHANNEL_TICKET_SECONDS
         }
         if not self._waiting:
+            self._missed_no_more("the camera process is not needed any more")
             return
         self._process = process = Child(self)
         try:
@@ -185,6 +208,8 @@ class CameraKeeper:
         node = f"{self._settings.node}_{self._started}" if self._started else self._settings.node
         self._started += 1
         process.tell(encode(msgspec.structs.replace(self._settings, node=node)))
+        if self._silent:
+            process.tell(encode(Silent(topics=self._silent)))
         self._look = self._reactor.callLater(LOOK_EVERY, self._watch)
         waiting, self._waiting = self._waiting, {}
         for wanted in waiting.values():

@@ -64,6 +64,12 @@ class Close(_Line, frozen=True, kw_only=True):
     why: str
 
 
+class Silent(_Line, frozen=True, kw_only=True):
+    """Topics that say nothing from now on, all there are; others do again."""
+
+    topics: list[str]
+
+
 class Alive(_Line, frozen=True, kw_only=True):
     """The process lives; said every second."""
 
@@ -80,7 +86,8 @@ class Seen(_Line, frozen=True, kw_only=True):
     :param encoding: of the last picture
     :param width: of the last picture, pixels
     :param height: of the last picture, pixels
-    :param fps: pictures per second, as they came of late
+    :param fps: pictures per second, as they came of late; 0 before that can be told
+    :param at: when the last picture came, Unix time
     """
 
     camera: str
@@ -88,6 +95,7 @@ class Seen(_Line, frozen=True, kw_only=True):
     width: int
     height: int
     fps: float
+    at: float
 
 
 class Ended(_Line, frozen=True, kw_only=True):
@@ -107,7 +115,7 @@ class Log(_Line, frozen=True, kw_only=True):
     text: str
 
 
-Line = Settings | Open | Close
+Line = Settings | Open | Close | Silent
 Answer = Alive | Taken | Seen | Ended | Log
 
 decoder: msgspec.json.Decoder[Line] = msgspec.json.Decoder(Line)

@@ -92,6 +92,8 @@ def _own_stdout() -> int:
 def main() -> None:
     """Show cameras until standard input ends."""
     os.nice(NICE)
+    # OpenCV, which reads it when it is loaded, would warn at each attempt to open a camera; Capture tells it once.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     for meant_for_the_daemon in (signal.SIGINT, signal.SIGTERM):  # it says when it is time, or its pipe ends
         signal.signal(meant_for_the_daemon, signal.SIG_IGN)
     outlet = _own_stdout()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from relay_protocol.errors import Invalid
+from relay_protocol.errors import Invalid, MalformedMessage
 from relay_protocol.limits import PICTURE_FRAME
 from relay_protocol.link import VideoSettings
+from relay_protocol.pictures import look_at
 from robot_client.camera import formats
 from robot_client.camera.editing import plan
 from robot_client.camera.encoding import Encoder, make_encoder
@@ -80,7 +81,7 @@ class Maker:
         if file is None or len(file) + _HEAD > PICTURE_FRAME:
             return None
         look = shot.look()
-        if plan(wanted, look.width, look.height).touches:
+        if plan(wanted, look.width, look.height).touches or not _goes_out(file):
             return None
         return Made(file, look.width, look.height, look.encoding)
 
@@ -94,3 +95,14 @@ class Maker:
         pixels = edits.apply(raw.pixels, shot.stamp / 1e9) if edits.touches else raw.pixels
         body, _ = self._encoder.encode(pixels, wish.quality, wish.key)
         return Made(body, *size, raw.encoding)
+
+
+def _goes_out(file: bytes) -> bool:
+    """Whether the relay would pass this JPEG on: some cameras put two into a message, or more behind the end, which
+    decoders don't mind but browsers should not get.
+    """
+    try:
+        look_at("jpeg", file)
+    except MalformedMessage:
+        return False
+    return True

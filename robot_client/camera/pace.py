@@ -3,6 +3,9 @@
 The link is taken for a pipe of one rate: a picture that leaves at once is there after the round trip and the time
 its bytes take. From each ``took`` follows that rate, from the rate how many bytes a picture may have, and from the size
 of the latest picture at its step the step at which the next one is as small as that.
+
+A link that becomes thin while a large picture is on its way is noticed by the answers to its parts: two in a row by
+which the picture would come far too late, and it is given up.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from relay_protocol.limits import KIB
 from relay_protocol.link import VideoSettings
 
 TARGET = 0.3
@@ -38,6 +42,19 @@ QUICKEST = 0.001
 
 _TELLING = 4096
 """Bytes; a smaller picture that is late says more of the processor than of the link, unless others are late too."""
+
+HOPELESS = 3
+"""Times the target; a picture that would be later is given up, if a smaller one can be made."""
+
+WINDOW = 48 * KIB
+"""Bytes without answer that may always be on their way. When a link becomes thin they must pass before the next picture
+does: at 200 kbit/s in 2 s."""
+
+PIPES = 1.5
+"""Times what fits into the link in a round trip may be on its way, so that it is never empty and more can be tried."""
+
+DAWDLE = 0.04
+"""Seconds; a link is not filled more than it takes to have a picture leave in that time."""
 
 _UNMISTAKABLE = 2
 """Times the target; what is later than that needs no second one to be believed."""
@@ -69,6 +86,9 @@ class _Sent:
     step: int
     arrived: float
     at: float
+    there: int = 0
+    """Bytes the relay has."""
+    given_up: bool = False
 
 
 def steps(settings: VideoSettings) -> list[Step]:
@@ -102,6 +122,8 @@ class Pace:
         self.rate: float | None = None
         """Bytes per second the uplink carries, as measured."""
         self._target = target
+        # Nobody looks at a stream of PNG: who asks for one picture waits for it.
+        self._gives_up = settings.codec != "png"
         self._steps = steps(settings)
         self._step = 0
         self._under_way: dict[int, _Sent] = {}
@@ -110,7 +132,11 @@ class Pace:
         self._own = 0.0
         self._unit: float | None = None
         self._due = float("-inf")
-        self._last_took = float("-inf")
+        self._last_took = self._last_answer = float("-inf")
+        self._progress = self._latest = 0.0
+        self._flowed = 0
+        """Bytes answered since the link was last empty: what shows that it is as quick as it was."""
+        self._doubts = 0
         self._late = False
         self._hold = HOLD[0]
         self._raised = self._changed = float("-inf")
@@ -135,6 +161,14 @@ class Pace:
         """How far below what was asked for: 0 as asked, 1 the least there is."""
         return self._step / (len(self._steps) - 1)
 
+    @property
+    def window(self) -> float:
+        """Bytes without answer from which on no more should leave; while in doubt they leave one part at a time."""
+        if self._doubts:
+            return 1
+        full = PIPES * self._trip * min(self._progress, self._bytes(self._step) / DAWDLE)
+        return max(WINDOW, min(full, WINDOW + self._flowed))
+
     def may_send(self, now: float) -> bool:
         """Whether a picture made now would be there in time, as far as one can tell."""
         if len(self._under_way) >= UNDER_WAY or self.wait(now) > 0:
@@ -154,11 +188,13 @@ class Pace:
         return max(0.0, self._due - now) if self.fps else 0.0
 
     def sent(self, number: int, size: int, now: float, arrived: float) -> None:
-        """A picture was written.
+        """A picture begins to leave.
 
         :param size: bytes
         :param arrived: when the camera's picture reached us
         """
+        if not self._under_way:
+            self._flowed = 0
         self._under_way[number] = _Sent(size, self._step, arrived, now)
         self._own = _smooth(self._own, now - arrived, 0.2)
         if self.fps:
@@ -178,17 +214,80 @@ class Pace:
         sent = self._under_way.pop(number, None)
         if sent is None:
             return
-        if round_trip is not None:
-            self._round_trip = round_trip if self._round_trip is None else min(self._round_trip, round_trip)
+        seconds = self._learn(sent, sent.size, now, round_trip)
         delay = now - sent.arrived
         self.delay = delay if self.delay is None else _smooth(self.delay, delay, 0.3)
+        self._measure(sent.size, seconds, delay)
+        self._passed(now)
+        self._fit(now)
+
+    def came(self, number: int, upto: int, now: float, round_trip: float | None = None) -> None:
+        """The relay has a part of a picture; what is not under way is passed over.
+
+        :param upto: bytes of the picture that are there
+        :param round_trip: as with :meth:`took`
+        """
+        sent = self._under_way.get(number)
+        if sent is None or not sent.there < upto < sent.size + sent.given_up:
+            return
+        self._learn(sent, upto, now, round_trip)
+        if sent.given_up and upto == sent.size:
+            del self._under_way[number]
+            self._passed(now)
+
+    def hopeless(self, now: float) -> set[int]:
+        """Numbers of the pictures that would come far too late, by two answers in a row."""
+        if self._doubts < 2:
+            return set()
+        return self._late_ones(now)
+
+    def gave_up(self, number: int, left: int, now: float) -> None:
+        """No more of a picture leaves.
+
+        :param left: bytes of it that have left
+        """
+        sent = self._under_way[number]
+        sent.size, sent.given_up = left, True
+        if sent.there == left:
+            del self._under_way[number]
+        self.rate = self._latest if self.rate is None else min(self.rate, self._latest)
+        coming = sum(each.size - each.there for each in self._under_way.values())
+        self._free_at = max(now, now - self._trip + coming / self.rate)
+        self._doubts = 0
+        self._fit(now)
+
+    def _learn(self, sent: _Sent, upto: int, now: float, round_trip: float | None) -> float:
+        """Take an answer: how quick this picture has been so far, and whether those under way will come in time.
+
+        :return: seconds its bytes took, at most
+        """
+        if round_trip is not None:
+            self._round_trip = round_trip if self._round_trip is None else min(self._round_trip, round_trip)
         # Behind another picture it began to go only when that one was there.
         began = max(sent.at, self._last_took - self._trip)
-        self._measure(sent.size, max(now - began - self._trip, (now - began) / 8, QUICKEST), delay)
+        seconds = max(now - began - self._trip, (now - began) / 8, QUICKEST)
+        self._progress = upto / seconds
+        self._latest = (upto - sent.there) / max(now - self._last_answer, QUICKEST)
+        self._flowed += upto - sent.there
+        sent.there, self._last_answer = upto, now
+        self._doubts = self._doubts + 1 if self._late_ones(now) else 0
+        return seconds
+
+    def _late_ones(self, now: float) -> set[int]:
+        """Pictures too late even by the better of two rates: answers a busy processor held up come at once then."""
+        rate, ahead, late = max(self._progress, self._latest), 0, set()
+        for number, each in self._under_way.items():
+            ahead += each.size - each.there
+            smaller = self._gives_up and each.step < len(self._steps) - 1
+            if smaller and not each.given_up and now - each.arrived + ahead / rate > HOPELESS * self._goal:
+                late.add(number)
+        return late
+
+    def _passed(self, now: float) -> None:
+        """All of a picture that left is there."""
         self._last_took = now
         if not self._under_way:
             self._free_at = now
-        self._fit(now)
 
     def _measure(self, size: int, seconds: float, delay: float) -> None:
         """Take one measurement: so many bytes took so long, at most; a busy processor makes it longer."""

@@ -10,8 +10,9 @@ from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from relay_protocol import frames, limits, link
+from relay_protocol import limits, link
 from relay_protocol.errors import SwitchboardError, Unavailable
+from robot_client.camera.leaving import Leaving
 from robot_client.camera.lines import Open
 from robot_client.camera.pace import Pace
 from robot_client.camera.shot import Made, Shot, Wish
@@ -68,6 +69,7 @@ class Stream:
         self.line = line
         self.pace = Pace(line.settings)
         self._protocol = protocol
+        self._leaving = Leaving(self.pace, protocol.write)
         self._watch = watch
         self._clock = clock
         self._on_gone = on_gone
@@ -89,7 +91,7 @@ class Stream:
         if isinstance(event, JoinedChannel):
             self._joined(event.channel)
         elif isinstance(event, Said) and isinstance(event.message, link.Took):
-            self._took(event.message.number)
+            self._took(event.message)
         elif isinstance(event, Said):
             self._key = True
         elif isinstance(event, Ended):
@@ -175,8 +177,7 @@ class Stream:
         self._faults = 0
         self._number += 1
         self._tell(made, wish)
-        self._protocol.write([frames.encode_video(self._number, shot.stamp, made.body)])
-        self.pace.sent(self._number, len(made.body), self._clock.seconds(), shot.arrived)
+        self._leaving.put(self._number, shot, made.body, self._clock.seconds())
         self._next()
 
     def _not_made(self, failure: Failure, wish: Wish) -> None:
@@ -196,10 +197,11 @@ class Stream:
         if self._view is not None:
             self.refuse("a picture could not be made; the robot's log says why")
 
-    def _took(self, number: int) -> None:
+    def _took(self, took: link.Took) -> None:
         measured = self._protocol.link.offset.round_trip
         round_trip = measured / 1e9 if measured is not None else None
-        self.pace.took(number, self._clock.seconds(), round_trip)
+        if self._leaving.answered(took, self._clock.seconds(), round_trip):
+            self._key = True  # what follows in H.264 must not need what was given up
         self._next()
 
     def _tell(self, made: Made, wish: Wish) -> None:

@@ -9,14 +9,13 @@ from typing import Any
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.protocol import Factory
 from twisted.internet.threads import deferToThreadPool
-from twisted.logger import Logger
 from twisted.python.failure import Failure
 from twisted.python.threadpool import ThreadPool
 
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from robot_client.camera import check_installed
 from robot_client.camera.feed import Closes, Feed
-from robot_client.camera.lines import Answer, Close, Ended, Line, Open, Settings, Taken
+from robot_client.camera.lines import Answer, Close, Ended, Line, Log, Open, Settings, Silent, Taken
 from robot_client.camera.shot import Made, Shot, Wish
 from robot_client.camera.stream import Busy, Stream
 from robot_client.clocks import now_ns
@@ -44,9 +43,9 @@ class Studio:
         self._feeds: dict[Source, Feed] = {}
         self._views: set[_View] = set()
         self._ros: Any = None
+        self._silent: frozenset[str] = frozenset()
         self._threads = ThreadPool(0, settings.streams, "pictures")
         self._threads.start()
-        self._log = Logger("camera")
 
     def take(self, line: Line) -> None:
         """One line of the daemon."""
@@ -54,6 +53,8 @@ class Studio:
             self._open(line)
         elif isinstance(line, Close):
             self._close(line.stream, line.why)
+        elif isinstance(line, Silent):
+            self._silent = frozenset(line.topics)
 
     def stop(self, why: str) -> None:
         """Close all, and leave the graph; what was written still leaves."""
@@ -126,7 +127,8 @@ class Studio:
         if not line.topic and not line.source:
             raise NotFound(f"there is no camera {line.camera} on this robot")
         check_installed()
-        source = (line.source or line.topic, line.settings.qos)
+        # Quality of service is ROS's; what is no topic may be there to be opened once.
+        source = (line.source, "") if line.source else (line.topic, line.settings.qos)
         feed = self._feeds.get(source)
         if feed is None:
             feed = self._feeds[source] = self._make_feed(line)
@@ -155,6 +157,8 @@ class Studio:
         from robot_client.camera.making import message_shot
 
         def arrived(cdr: bytes) -> None:
+            if line.topic in self._silent:
+                return
             feed.put(message_shot(time.time_ns(), self._reactor.seconds(), cdr, line.compressed))
 
         subscribed: Closes = self._in_ros().subscribe(line.topic, line.compressed, line.settings.qos, arrived)
@@ -164,13 +168,13 @@ class Studio:
         from robot_client.camera.capture import Capture
         from robot_client.camera.making import pixels_shot
 
-        def trouble(text: str) -> None:
-            self._reactor.callFromThread(self._log.warn, "{text}", text=text)
+        def tell(level: str, text: str) -> None:
+            self._reactor.callFromThread(self._tell, Log(level=level, text=f"camera {line.camera} {text}"))
 
         return Capture(
             line.source,
             lambda pixels: feed.put(pixels_shot(time.time_ns(), self._reactor.seconds(), pixels)),
-            trouble,
+            tell,
         )
 
     def _in_ros(self) -> Any:

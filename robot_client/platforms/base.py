@@ -14,6 +14,7 @@ import msgspec
 from twisted.internet.defer import Deferred
 
 from relay_protocol import link
+from robot_client.alerts import OnAlert
 from robot_client.topics import TypedTopic
 
 OnSample = Callable[[bytes], None]
@@ -141,6 +142,8 @@ class Platform(Protocol):
     """One robot's middleware."""
 
     encoding: str
+    on_alert: OnAlert
+    """Is told what a person should know."""
 
     @property
     def dropped(self) -> int:
@@ -179,6 +182,13 @@ class Platform(Protocol):
         :param type: empty to take the topic's one type from the graph
         """
 
+    def full_name(self, name: str, what: str) -> str:
+        """The absolute name that is used in the end, however it is spelled.
+
+        :param what: ``topic``, ``service`` or ``action``
+        :raises Invalid: it is no name
+        """
+
     def advertise(
         self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
     ) -> Sink:
@@ -215,8 +225,17 @@ class Platform(Protocol):
     def judge(self, type: str, body: bytes) -> Motion:
         """What this command would do."""
 
-    def zero(self, type: str) -> bytes:
-        """The message of this type that stands still, stamped now where it has a header."""
+    def resting(self, type: str, body: bytes) -> bytes:
+        """What the zero that follows this command is like: as many axes, the same joints; empty where all are alike.
+
+        :param body: a command that was judged, and found valid
+        """
+
+    def zero(self, type: str, rest: bytes = b"") -> bytes:
+        """The message of this type that stands still, stamped now where it has a header.
+
+        :param rest: what :meth:`resting` gave for the command it follows
+        """
 
     def battery(self) -> float | None:
         """Charge, 0 to 1, where known."""

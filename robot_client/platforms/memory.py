@@ -9,6 +9,7 @@ from twisted.internet.defer import Deferred, fail, succeed
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
+from robot_client.alerts import OnAlert, nobody
 from robot_client.platforms.base import (
     ABORTED,
     NEVER_BEGAN,
@@ -187,6 +188,7 @@ class MemoryPlatform(Platform):
     encoding = "cdr"
 
     def __init__(self, view: GraphView | None = None) -> None:
+        self.on_alert: OnAlert = nobody
         self.view = view or GraphView()
         self.sources: list[MemorySource] = []
         self.sinks: list[MemorySink] = []
@@ -197,6 +199,7 @@ class MemoryPlatform(Platform):
         self.offered: dict[str, MemoryService] = {}
         self.acted: dict[str, MemoryAction] = {}
         self.definitions: dict[str, str] = {}
+        self.rests: dict[str, bytes] = {}
         self.charge: float | None = None
         self.running = False
         self._after: list[Callable[[], None]] = []
@@ -258,6 +261,10 @@ class MemoryPlatform(Platform):
             raise Invalid(f"{topic} can't be advertised without a type")
         return TypedTopic(full, normalise(type) if type or known is None else known.types[0])
 
+    def full_name(self, name: str, what: str) -> str:
+        """Make a name absolute."""
+        return "/" + name.removeprefix("/")
+
     def advertise(
         self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
     ) -> MemorySink:
@@ -316,9 +323,13 @@ class MemoryPlatform(Platform):
             return Motion.INVALID
         return Motion.MOVING if any(values) else Motion.STILL
 
-    def zero(self, type: str) -> bytes:
-        """A Twist that stands still."""
-        return twist()
+    def resting(self, type: str, body: bytes) -> bytes:
+        """What :attr:`rests` says of the type."""
+        return self.rests.get(type, b"")
+
+    def zero(self, type: str, rest: bytes = b"") -> bytes:
+        """A Twist that stands still, or what was given for it."""
+        return rest or twist()
 
     def battery(self) -> float | None:
         """The charge set."""

@@ -19,6 +19,7 @@ except ImportError:  # Humble
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
+from robot_client.alerts import OnAlert, nobody
 from robot_client.platforms import ros2_facts, ros2_graph, ros2_qos
 from robot_client.platforms.base import (
     Facts,
@@ -34,6 +35,7 @@ from robot_client.platforms.base import (
 from robot_client.platforms.ros2_actions import RosAction
 from robot_client.platforms.ros2_battery import BATTERY, Battery
 from robot_client.platforms.ros2_calls import Calls
+from robot_client.platforms.ros2_diagnostics import DIAGNOSTICS, Diagnostics
 from robot_client.platforms.ros2_errors import refusals
 from robot_client.platforms.ros2_executor import Hop
 from robot_client.platforms.ros2_goals import Goals, RosGoal
@@ -63,6 +65,7 @@ class Ros2Platform(Platform):
     :param guard: how the names of guards' nodes begin; they are left out of the graph like our own
     :param executor: ``events`` or ``single``
     :param battery: whether to listen to the first battery topic there is
+    :param diagnostics: whether to tell what ``/diagnostics`` says is wrong
     :param sim_time: whether the node's clock follows ``/clock``; nothing but stamps goes by it
     """
 
@@ -80,7 +83,9 @@ class Ros2Platform(Platform):
         executor: str = "events",
         battery: bool = True,
         sim_time: bool = False,
+        diagnostics: bool = True,
     ) -> None:
+        self.on_alert: OnAlert = nobody
         self._reactor = reactor
         self._name = name
         self._guard = guard
@@ -94,6 +99,9 @@ class Ros2Platform(Platform):
         self._seen: Mapping[str, link.Topic] = {}
         self._looks = 0
         self._battery = Battery(self._types, self._gauge) if battery else None
+        self._diagnostics = (
+            Diagnostics(self._types, self._listen, self._tell, reactor.seconds) if diagnostics else None
+        )
         self._node: Any = None
 
     @property
@@ -145,6 +153,8 @@ class Ros2Platform(Platform):
         self._goals.sweep()
         if self._battery is not None:
             self._battery.look(view)
+        if self._diagnostics is not None:
+            self._diagnostics.look(view)
         return view
 
     def _follow(self, view: GraphView) -> None:
@@ -201,6 +211,12 @@ class Ros2Platform(Platform):
         types = theirs or (set() if type else ours)
         return TypedTopic(full, topic_type(full, type, sorted(types)))
 
+    def full_name(self, name: str, what: str) -> str:
+        """Expand a name."""
+        service = what == "service"
+        resolve = self._node.resolve_service_name if service else self._node.resolve_topic_name
+        return check_name(resolve, name, what)
+
     def advertise(
         self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
     ) -> RosSink:
@@ -255,9 +271,13 @@ class Ros2Platform(Platform):
         """What this command would do."""
         return self._types.judge(type, body)
 
-    def zero(self, type: str) -> bytes:
+    def resting(self, type: str, body: bytes) -> bytes:
+        """What the zero that follows this command is like."""
+        return self._types.resting(type, body)
+
+    def zero(self, type: str, rest: bytes = b"") -> bytes:
         """The message that stands still."""
-        return self._types.zero(type, self._node.get_clock().now().to_msg())
+        return self._types.zero(type, self._node.get_clock().now().to_msg(), rest)
 
     def battery(self) -> float | None:
         """Charge as the first battery topic tells it."""
@@ -266,6 +286,12 @@ class Ros2Platform(Platform):
     def trouble(self) -> str | None:
         """Whether an executor is stuck."""
         return self._nodes.trouble()
+
+    def _listen(self, topic: str, on_sample: OnSample) -> RosSource:
+        return self.subscribe(topic, DIAGNOSTICS, link.QoS(depth=50), on_sample, lambda: None)
+
+    def _tell(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+        self.on_alert(level, text, kind, about, over)
 
     def _gauge(self, topic: str, on_sample: OnSample) -> RosSource:
         return self.subscribe(topic, BATTERY, link.QoS(depth=1), on_sample, lambda: None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,10 +11,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.platforms import definitions
+from robot_client.platforms import definitions, ros2_motion
 from robot_client.platforms.base import Motion
+from robot_client.velocity import form
 
-HEADER = "std_msgs/Header"
 _OF = {"msg": "messages", "srv": "services", "action": "actions"}
 
 
@@ -101,16 +100,36 @@ class Types:
 
     def judge(self, type: str, body: bytes) -> Motion:
         """What a command of this type would do."""
+        speeds = form(type, "cdr")
+        velocity = speeds.read(body) if speeds is not None else None
+        if velocity is not None:
+            if not velocity.finite:
+                return Motion.INVALID
+            return Motion.MOVING if velocity.moves else Motion.STILL
         try:
             message = deserialize_message(body, self.message(type))
         except Exception:  # rclpy names its errors differently from release to release
             return Motion.INVALID
-        return _judge(message)
+        return ros2_motion.judge(type, message)
 
-    def zero(self, type: str, stamp: Any) -> bytes:
-        """The message that stands still, with this stamp in its header if it has one."""
-        message = self.message(type)()
-        if message.get_fields_and_field_types().get("header") == HEADER:
+    def resting(self, type: str, body: bytes) -> bytes:
+        """The command of the same shape that stands still, without a stamp; empty where all zeros are alike.
+
+        :param body: a command that was judged
+        """
+        if type not in ros2_motion.SHAPED:
+            return b""
+        kind = self.message(type)
+        return bytes(serialize_message(ros2_motion.rest(type, deserialize_message(body, kind), kind())))
+
+    def zero(self, type: str, stamp: Any, rest: bytes = b"") -> bytes:
+        """The message that stands still, with this stamp in its header if it has one.
+
+        :param rest: what :meth:`resting` gave for the last command
+        """
+        kind = self.message(type)
+        message = deserialize_message(rest, kind) if rest else kind()
+        if message.get_fields_and_field_types().get("header") == ros2_motion.HEADER:
             message.header.stamp = stamp
         return bytes(serialize_message(message))
 
@@ -153,36 +172,6 @@ def _has_interfaces(package: str, kind: str) -> bool:
         return False
     places = (spec and spec.submodule_search_locations) or ()
     return any(Path(place, kind).is_dir() for place in places)
-
-
-def _judge(value: Any) -> Motion:
-    """The worst of all numbers in a message, headers left out."""
-    verdict = Motion.STILL
-    for field, type in value.get_fields_and_field_types().items():
-        if type == HEADER:
-            continue
-        inner = _judge_value(getattr(value, field))
-        if inner is Motion.INVALID:
-            return inner
-        if inner is Motion.MOVING:
-            verdict = inner
-    return verdict
-
-
-def _judge_value(value: Any) -> Motion:
-    if isinstance(value, (bool, int, float)):
-        if not math.isfinite(value):
-            return Motion.INVALID
-        return Motion.MOVING if value else Motion.STILL
-    if hasattr(value, "get_fields_and_field_types"):
-        return _judge(value)
-    if isinstance(value, (str, bytes)):
-        return Motion.STILL
-    verdicts = {_judge_value(each.item() if hasattr(each, "item") else each) for each in value}
-    for worst in (Motion.INVALID, Motion.MOVING):
-        if worst in verdicts:
-            return worst
-    return Motion.STILL
 
 
 def introspected(found: Any, kind: str) -> str:

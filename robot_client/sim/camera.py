@@ -13,18 +13,18 @@ from robot_client.sim import paint
 from robot_client.sim.world import Hits, Pose, World
 
 WIDTH, HEIGHT = 640, 480
+"""Pixels, where no other size is asked for."""
 VIEW_ANGLE = math.radians(75)
 """Horizontal, radians."""
-FOCAL = WIDTH / 2 / math.tan(VIEW_ANGLE / 2)
-"""Pixels."""
 EYE_HEIGHT = 0.38
 """Metres over the floor."""
 WALL_HEIGHT = 1.0
 """Metres."""
 
-_HORIZON = HEIGHT // 2
 _TILE_SPAN = 4.0
 """Metres covered by the floor texture before it repeats."""
+_REPEATS = 8
+"""How often it is laid side by side: where it ends, 14 m away or more, the floor is nearly fog."""
 _FOG_LENGTH = 26.0
 """Metres after which about two thirds of a thing's colour are lost."""
 _NEAREST = 0.05
@@ -35,77 +35,89 @@ Image = npt.NDArray[np.uint8]
 
 
 class Camera:
-    """Draws what a robot sees. Keeps buffers, so one object serves one caller at a time."""
+    """Draws what a robot sees. Keeps buffers, so one object serves one caller at a time.
 
-    def __init__(self, world: World) -> None:
+    :param width: pixels
+    :param height: pixels
+    """
+
+    def __init__(self, world: World, width: int = WIDTH, height: int = HEIGHT) -> None:
         self._world = world
-        offset = np.arange(WIDTH) + 0.5 - WIDTH / 2
-        self._ray_angles = -np.arctan(offset / FOCAL)
+        self._width, self._height, self._horizon = width, height, height // 2
+        self._focal = width / 2 / math.tan(VIEW_ANGLE / 2)  # pixels
+        offset = np.arange(width) + 0.5 - width / 2
+        self._ray_angles = -np.arctan(offset / self._focal)
         self._straighten = np.cos(self._ray_angles)
-        self._tiles = paint.floor_tiles()
+        # OpenCV can repeat a texture by itself (BORDER_WRAP), but takes twice as long for it.
+        self._tiles = np.tile(paint.floor_tiles(), (_REPEATS, _REPEATS))
+        self._far_tiles = cv2.mean(self._tiles)
         self._textures = paint.wall_textures()
-        self._panorama_columns = round(math.tau / VIEW_ANGLE * WIDTH)
-        sky = paint.panorama(self._panorama_columns, _HORIZON)
-        self._panorama = np.concatenate((sky, sky[:, : WIDTH + 1]), axis=1)
+        self._panorama_columns = round(math.tau / VIEW_ANGLE * width)
+        sky = paint.panorama(self._panorama_columns, self._horizon)
+        self._panorama = np.concatenate((sky, sky[:, : width + 1]), axis=1)
         self._colours = np.array([look.colour for look in world.looks], dtype=np.float32)
         self._styles = np.array([look.texture for look in world.looks])
-        rows = np.arange(HEIGHT - _HORIZON, dtype=np.float64) + 0.5
-        self._floor_fog = np.exp(-EYE_HEIGHT * FOCAL / rows / (_FOG_LENGTH / 3))[:, None, None]
-        self._floor_gain = np.repeat(np.repeat(self._floor_fog, WIDTH, axis=1), 3, axis=2).astype(np.float32)
-        self._floor_base = (np.array(paint.FOG) * (1 - self._floor_gain)).astype(np.uint8)
-        self._columns = np.tile(np.arange(WIDTH, dtype=np.float32), (HEIGHT, 1))
-        self._rows = np.arange(HEIGHT, dtype=np.float32)[:, None] + np.float32(0.5)
+        rows = np.arange(height - self._horizon, dtype=np.float64) + 0.5
+        clear = np.exp(-EYE_HEIGHT * self._focal / rows / (_FOG_LENGTH / 3))[:, None]
+        self._floor_gain = np.repeat(clear, width, axis=1).astype(np.float32)
+        base = np.array(paint.FLOOR_TINT) * clear + np.array(paint.FOG) * (1 - clear)
+        self._floor_base = np.repeat(base[:, None, :], width, axis=1).astype(np.uint8)
+        self._columns = np.tile(np.arange(width, dtype=np.float32), (height, 1))
+        self._rows = np.arange(height, dtype=np.float32)[:, None] + np.float32(0.5)
 
     def render(self, pose: Pose, speed: float, at: float) -> Image:
-        """One picture, BGR, shape (480, 640, 3); the array is the caller's.
+        """One picture, BGR, shape (height, width, 3); the array is the caller's.
 
         :param speed: m/s, written into the picture
         :param at: seconds since the epoch, written into the picture as a UTC clock
         """
-        frame = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
+        frame = np.empty((self._height, self._width, 3), dtype=np.uint8)
         self._draw_sky(frame, pose)
         self._draw_floor(frame, pose)
         self._draw_walls(frame, pose)
-        draw_captions(frame, speed, at)
+        draw_clock(frame, at)
+        draw_speed(frame, speed)
         return frame
 
     def _draw_sky(self, frame: Image, pose: Pose) -> None:
         first = round((-pose.heading / math.tau) % 1.0 * self._panorama_columns)
-        frame[:_HORIZON] = self._panorama[:, first : first + WIDTH]
+        frame[: self._horizon] = self._panorama[:, first : first + self._width]
 
     def _draw_floor(self, frame: Image, pose: Pose) -> None:
         """The floor is a plane, so the road from pixel to tile is one homography."""
         ahead_x, ahead_y = math.cos(pose.heading), math.sin(pose.heading)
         right_x, right_y = ahead_y, -ahead_x
-        lift = EYE_HEIGHT
-        half = WIDTH / 2
+        lift, focal, half = EYE_HEIGHT, self._focal, self._width / 2
+        # Where the robot stands on the texture: near its middle.
+        x, y = (_REPEATS // 2 * _TILE_SPAN + at % _TILE_SPAN for at in (pose.x, pose.y))
         # row counted from the horizon is the homogeneous coordinate: distance = lift · focal / row
         to_floor = np.array(
             [
-                [lift * right_x, pose.x, lift * (FOCAL * ahead_x - half * right_x) + 0.5 * pose.x],
-                [lift * right_y, pose.y, lift * (FOCAL * ahead_y - half * right_y) + 0.5 * pose.y],
+                [lift * right_x, x, lift * (focal * ahead_x - half * right_x) + 0.5 * x],
+                [lift * right_y, y, lift * (focal * ahead_y - half * right_y) + 0.5 * y],
                 [0.0, 1.0, 0.5],
             ]
         )
-        scale = self._tiles.shape[0] / _TILE_SPAN
+        scale = self._tiles.shape[0] / (_REPEATS * _TILE_SPAN)
         matrix = np.diag((scale, scale, 1.0)) @ to_floor
         tiles = cv2.warpPerspective(
             self._tiles,
             matrix,
-            (WIDTH, HEIGHT - _HORIZON),
+            (self._width, self._height - self._horizon),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_WRAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=self._far_tiles,
         )
         cv2.multiply(tiles, self._floor_gain, dst=tiles, dtype=cv2.CV_8U)
-        cv2.add(tiles, self._floor_base, dst=frame[_HORIZON:])
+        cv2.add(cv2.cvtColor(tiles, cv2.COLOR_GRAY2BGR), self._floor_base, dst=frame[self._horizon :])
 
     def _draw_walls(self, frame: Image, pose: Pose) -> None:
         hits = self._world.cast(pose.x, pose.y, pose.heading + self._ray_angles)
         depth = np.maximum(hits.distance * self._straighten, _NEAREST)
-        top = _HORIZON - (WALL_HEIGHT - EYE_HEIGHT) * FOCAL / depth
+        top = self._horizon - (WALL_HEIGHT - EYE_HEIGHT) * self._focal / depth
         first = max(0, math.floor(top.min()))
-        last = min(HEIGHT, math.ceil(_HORIZON + EYE_HEIGHT * FOCAL / depth.min()))
-        texels_per_row = (paint.TEXELS * depth / (WALL_HEIGHT * FOCAL)).astype(np.float32)
+        last = min(self._height, math.ceil(self._horizon + EYE_HEIGHT * self._focal / depth.min()))
+        texels_per_row = (paint.TEXELS * depth / (WALL_HEIGHT * self._focal)).astype(np.float32)
         down = (self._rows[first:last] - top.astype(np.float32)) * texels_per_row - np.float32(0.5)
         # what is neither wall nor its edge must stay as it is: send it outside the table
         outside = (down < -0.5) | (down > paint.TEXELS - 0.5) | (hits.surface < 0)
@@ -121,7 +133,7 @@ class Camera:
         )
 
     def _wall_columns(self, hits: Hits) -> Image:
-        """The painted texture column of each picture column, shape (texels, 640, 3)."""
+        """The painted texture column of each picture column, shape (texels, width, 3)."""
         texel = (hits.along * paint.TEXELS).astype(np.int64) % paint.TEXELS
         pattern = self._textures[self._styles[hits.surface], texel].T
         clear = np.exp(-hits.distance / _FOG_LENGTH)
@@ -145,25 +157,42 @@ def to_jpeg(frame: Image, quality: int = 80) -> bytes:
     return encoded.tobytes()
 
 
-def to_rgb(frame: Image) -> bytes:
-    """The pixels of a BGR picture, row by row, as R, G, B."""
-    return bytes(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+def to_rgb(frame: Image) -> Image:
+    """The same picture, R, G, B instead of B, G, R."""
+    return cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)  # type: ignore[return-value]  # OpenCV does not say that uint8 stays uint8
 
 
-def draw_captions(frame: Image, speed: float, at: float) -> None:
-    """Write clock and speed into a picture.
+def draw_clock(frame: Image, at: float) -> None:
+    """Write the time into the lower left corner of a picture.
 
-    :param frame: BGR, shape (480, 640, 3)
-    :param speed: m/s
+    :param frame: BGR, shape (height, width, 3)
     :param at: seconds since the epoch
     """
     clock = datetime.fromtimestamp(at, tz=timezone.utc)
     _caption(frame, f"{clock:%H:%M:%S}.{clock.microsecond // 1000:03d} UTC", 12)
-    _caption(frame, f"{speed:+.2f} m/s", WIDTH - 118)
+
+
+def draw_speed(frame: Image, speed: float) -> None:
+    """Write the speed into the lower right corner of a picture.
+
+    :param frame: BGR, shape (height, width, 3)
+    :param speed: m/s
+    """
+    _caption(frame, f"{speed:+.2f} m/s", -118)
 
 
 def _caption(frame: Image, text: str, x: int) -> None:
-    (width, height), baseline = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
-    plate = frame[HEIGHT - height - baseline - 16 : HEIGHT - 8, x - 6 : x + width + 6]
+    """Write on a darker plate, as large in the picture whatever its size is.
+
+    :param x: where it begins in a picture of 640 × 480; less than zero: seen from the right edge
+    """
+    height, width = frame.shape[:2]
+    scale = min(width / WIDTH, height / HEIGHT)
+    font, stroke = scale * _FONT_SCALE, max(1, int(scale))
+    left = round(x * scale) % width
+    (long, high), below = cv2.getTextSize(text, _FONT, font, stroke)
+    edge, gap = round(8 * scale), round(6 * scale)
+    plate = frame[height - high - below - 2 * edge : height - edge, left - gap : left + long + gap]
     cv2.convertScaleAbs(plate, dst=plate, alpha=0.35)
-    cv2.putText(frame, text, (x, HEIGHT - 11 - baseline), _FONT, _FONT_SCALE, (245, 245, 245), 1, cv2.LINE_AA)
+    bottom = height - round(11 * scale) - below
+    cv2.putText(frame, text, (left, bottom), _FONT, font, (245, 245, 245), stroke, cv2.LINE_AA)

@@ -60,6 +60,7 @@ class Body:
     :ivar target: the velocity asked for, before limits
     :ivar velocity: the velocity the body really has, walls considered
     :ivar moving: the body turned or changed place in its last step, be it by sliding
+    :ivar touching: a wall turned it aside or held it back in its last step
     :ivar blocked: the body is held back by a wall while it wants to drive on
     :ivar travelled: metres driven since the beginning
     """
@@ -70,13 +71,14 @@ class Body:
     target: Twist = STANDING
     velocity: Twist = STANDING
     moving: bool = False
+    touching: bool = False
     blocked: bool = False
     travelled: float = 0.0
 
     def reset(self, pose: Pose) -> None:
         """Put the body somewhere, standing still, with nothing asked of it."""
         self.pose, self.target, self.velocity = pose, STANDING, STANDING
-        self.moving, self.blocked, self.travelled = False, False, 0.0
+        self.moving, self.touching, self.blocked, self.travelled = False, False, False, 0.0
 
     def step(self, seconds: float) -> None:
         """Let time pass."""
@@ -91,6 +93,7 @@ class Body:
         moved_x, moved_y = reached.x - self.pose.x, reached.y - self.pose.y
         moved = math.hypot(moved_x, moved_y)
         self.velocity, self.blocked = wanted_velocity, False
+        self.touching = reached is not wanted
         if reached is not wanted and wanted_velocity.speed:
             middle = self.pose.heading + wanted_velocity.turn * dt / 2
             achieved = (moved_x * math.cos(middle) + moved_y * math.sin(middle)) / dt

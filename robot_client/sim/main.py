@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -22,6 +23,23 @@ except ModuleNotFoundError as error:
 
 _LONGEST_SPIN = 0.1
 """Seconds; how long a signal may wait to be seen."""
+_SMALLEST, _LARGEST = (320, 240), (1920, 1080)
+"""Width and height of the camera's picture, pixels."""
+_RANGE = " to ".join(f"{width}x{height}" for width, height in (_SMALLEST, _LARGEST))
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height from ``1280x720``.
+
+    :raises click.BadParameter: it is something else, or too small or large
+    """
+    found = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
+    if not found:
+        raise click.BadParameter(f"'{text}' is no size: write width and height in pixels, as 1280x720")
+    size = int(found[1]), int(found[2])
+    if not all(low <= each <= high for low, each, high in zip(_SMALLEST, size, _LARGEST, strict=True)):
+        raise click.BadParameter(f"{text} is out of range: {_RANGE}")
+    return size
 
 
 @click.command(
@@ -30,6 +48,7 @@ _LONGEST_SPIN = 0.1
         "switchboard-sim",
         "switchboard-sim --world open --no-camera --seed 1",
         "switchboard-sim --namespace second --record second.jsonl",
+        "switchboard-sim --camera-size 1280x720 --camera-fps 30",
     ),
 )
 @click.option("--namespace", default="", metavar="NS", help="Put before all names, so that several can run.")
@@ -41,7 +60,26 @@ _LONGEST_SPIN = 0.1
 @click.option("--seed", type=int, help="Seed of the scanner's noise; without it every run differs.")
 @click.option("--world", type=click.Choice(sorted(WORLDS)), default="default", show_default=True)
 @click.option("--camera/--no-camera", default=True, help="Offer pictures (drawn only while somebody looks).")
-def main(namespace: str, record: Path | None, seed: int | None, world: str, camera: bool) -> None:
+@click.option(
+    "--camera-size",
+    type=_size,
+    default="640x480",
+    show_default=True,
+    metavar="WxH",
+    help=f"Of its pictures, in pixels, {_RANGE}.",
+)
+@click.option(
+    "--camera-fps", type=click.IntRange(1, 60), default=15, show_default=True, help="Pictures per second."
+)
+def main(
+    namespace: str,
+    record: Path | None,
+    seed: int | None,
+    world: str,
+    camera: bool,
+    camera_size: tuple[int, int],
+    camera_fps: int,
+) -> None:
     """Run a simulated ROS 2 robot: differential drive, scanner, camera and battery in a small world.
 
     Prints READY when its topics are there. SIGINT and SIGTERM end it.
@@ -55,7 +93,7 @@ def main(namespace: str, record: Path | None, seed: int | None, world: str, came
         ) from None
     faulthandler.enable()  # a crash in the middleware's C++ leaves a trace instead of silence
     with _opened(record) as stream, _stop_requested() as stop:
-        _run(namespace, stream, seed, world, camera, stop)
+        _run(namespace, stream, seed, world, camera_size if camera else None, camera_fps, stop)
 
 
 class _Stop:
@@ -63,7 +101,13 @@ class _Stop:
 
 
 def _run(
-    namespace: str, stream: IO[bytes] | None, seed: int | None, world: str, camera: bool, stop: _Stop
+    namespace: str,
+    stream: IO[bytes] | None,
+    seed: int | None,
+    world: str,
+    size: tuple[int, int] | None,
+    fps: int,
+    stop: _Stop,
 ) -> None:
     """Imports late: `--help` and a missing ROS must not wait for, or fall over, OpenCV and rclpy."""
     import cv2
@@ -82,7 +126,7 @@ def _run(
     ensure_log_folder()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = SimNode(robot, Camera(place) if camera else None, namespace)
+        node = SimNode(robot, Camera(place, *size) if size else None, fps, namespace)
     except InvalidNamespaceException as error:
         rclpy.try_shutdown()
         raise click.BadParameter(f"'{namespace}' is no ROS namespace: {error}") from None

@@ -16,7 +16,6 @@ from std_msgs.msg import Header
 
 from robot_client.sim import robot as scanner
 from robot_client.sim.battery import CAPACITY_AH, Battery
-from robot_client.sim.camera import HEIGHT, WIDTH
 from robot_client.sim.drive import Twist
 from robot_client.sim.health import Finding
 from robot_client.sim.world import Pose
@@ -85,12 +84,13 @@ def scan(stamp: Time, frames: Frames, ranges: npt.NDArray[np.float32], period: f
     return message
 
 
-def image(stamp: Time, frames: Frames, pixels: bytes) -> Image:
-    """:param pixels: rows of R, G, B"""
+def image(stamp: Time, frames: Frames, pixels: npt.NDArray[np.uint8]) -> Image:
+    """:param pixels: R, G, B, shape (height, width, 3)"""
     message = Image(header=Header(stamp=stamp, frame_id=frames.camera))
-    message.height, message.width, message.step = HEIGHT, WIDTH, WIDTH * 3
+    message.height, message.width = pixels.shape[:2]
+    message.step = message.width * 3
     message.encoding = "rgb8"
-    message.data = array.array("B", pixels)
+    message.data.frombytes(pixels.data)
     return message
 
 

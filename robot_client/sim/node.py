@@ -29,7 +29,6 @@ except ImportError:  # not to be had as a wheel; see scripts/build_interfaces.py
 
 STEP = LONGEST_STEP
 SCAN_PERIOD = 1 / 10
-CAMERA_PERIOD = 1 / 15
 SLOW_PERIOD = 1.0
 _CATCH_UP = 5
 """Steps made good after a hold-up; beyond 0.1 s the simulated world simply stood still."""
@@ -43,11 +42,17 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
 
     :param namespace: before every name, may be empty
     :param camera: None leaves the camera topics silent
+    :param fps: pictures per second
     :param clock: seconds, monotonic
     """
 
     def __init__(
-        self, robot: Robot, camera: Camera | None, namespace: str, clock: Callable[[], float] = time.monotonic
+        self,
+        robot: Robot,
+        camera: Camera | None,
+        fps: int,
+        namespace: str,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("switchboard_sim", namespace=namespace)
         self._robot = robot
@@ -63,7 +68,7 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
         self._schedule.every(SCAN_PERIOD, self._publish_scan)
         self._schedule.every(SLOW_PERIOD, self._publish_slow)
         if camera is not None:
-            self._schedule.every(CAMERA_PERIOD, self._publish_picture)
+            self._schedule.every(1 / fps, self._publish_picture)
 
     def run_due(self) -> float:
         """Do what is due; returns the seconds until something is due again."""

@@ -17,6 +17,9 @@ TEXELS = 64
 FOG = (214, 206, 196)
 """BGR that far things fade to."""
 
+FLOOR_TINT = (10, 6, 0)
+"""BGR that is added to the floor's brightness."""
+
 _RIDGES = (
     (5, 0.16, 0.9, (172, 160, 140)),
     (9, 0.11, 2.1, (150, 146, 112)),
@@ -46,16 +49,15 @@ def wall_textures() -> npt.NDArray[np.float32]:
 
 
 def floor_tiles(size: int = 256) -> Image:
-    """Eight by eight tiles of slightly different grey, seamless in both directions, shape (size, size, 3)."""
+    """Eight by eight tiles of slightly different brightness, seamless in both directions, shape (size, size)."""
     tile = size // 8
     random = np.random.default_rng(11)
     shade = random.uniform(-7, 7, (8, 8)) + np.where(np.indices((8, 8)).sum(axis=0) % 2 == 0, 9, -9)
-    grey = 128 + np.kron(shade, np.ones((tile, tile))) + random.normal(0, 2.5, (size, size))
+    grey = 122 + np.kron(shade, np.ones((tile, tile))) + random.normal(0, 2.5, (size, size))
     lines = np.arange(size) % tile < 2
     grey[lines, :] -= 26
     grey[:, lines] -= 26
-    tiles: Image = np.clip(grey[..., None] + np.array((4, 0, -6)), 0, 255).astype(np.uint8)
-    return tiles
+    return grey.astype(np.uint8)
 
 
 def panorama(columns: int, rows: int) -> Image:

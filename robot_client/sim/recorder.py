@@ -21,6 +21,7 @@ class Recorder:
         self._stream = stream
         self._clock = clock
         self._moving = False
+        self._touching = False
 
     def command(self, speed: float, turn: float) -> None:
         """A velocity command arrived, in m/s and rad/s; what is no number is written as null."""
@@ -31,6 +32,12 @@ class Recorder:
         if moving is not self._moving:
             self._moving = moving
             self._write({"event": "moving" if moving else "standstill"})
+
+    def touch(self, touching: bool) -> None:
+        """Tell after every step whether the body touches a wall; only that it begins to is written."""
+        if touching and not self._touching:
+            self._write({"event": "bump"})
+        self._touching = touching
 
     def reset(self) -> None:
         """The body was put back to its start."""

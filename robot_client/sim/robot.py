@@ -71,6 +71,7 @@ class Robot:
         self.body.step(seconds)
         self.battery.step(seconds, *self.body.velocity)
         self._recorder.motion(self.body.moving)
+        self._recorder.touch(self.body.touching)
 
     def reset(self) -> None:
         """Back to the start: place, velocity and charge."""

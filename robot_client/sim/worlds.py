@@ -55,4 +55,9 @@ def open_field() -> World:
     return World(box(0.0, 0.0, 80.0, 80.0, 0.0, _BRICKS), ring, Pose(0.0, 0.0, 0.0))
 
 
-WORLDS: dict[str, Callable[[], World]] = {"default": default, "open": open_field}
+def room() -> World:
+    """A bare room of 6 × 4 m."""
+    return World(box(0.0, 0.0, 6.0, 4.0, 0.0, _BRICKS), [], Pose(-1.5, 0.0, 0.0))
+
+
+WORLDS: dict[str, Callable[[], World]] = {"default": default, "open": open_field, "room": room}

@@ -1,0 +1,88 @@
+"""Which of the robot's services and actions move it, who may use those, and how old what he asks may be.
+
+SPEC 2.5: "Who moves the robot", 1, and "Clocks and deadline", 9.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from relay_protocol.errors import Refused
+from relay_protocol.link import MotionPolicy
+from robot_client.authority import Authority, Verdict
+from robot_client.offset import Offset
+from robot_client.platforms.base import Platform
+from robot_client.safety import MILLI, Freshness, freshness
+
+GOAL = "/_action/send_goal"
+"""What the service is called that takes an action's goals."""
+
+
+class Gate:
+    """Asks the authority about calls and goals, by the names the platform uses in the end, and judges their age.
+
+    :param now: clock that goes on in suspends, nanoseconds
+    """
+
+    def __init__(
+        self, policy: MotionPolicy, platform: Platform, authority: Authority, now: Callable[[], int]
+    ) -> None:
+        self.stale = 0
+        """Calls and goals that were refused for their age."""
+        self._policy = policy
+        self._platform = platform
+        self._authority = authority
+        self._now = now
+
+    def call(self, service: str, source: int, stamp: int | None, offset: Offset) -> None:
+        """See that a source may call a service.
+
+        :param stamp: the relay's monotonic nanoseconds before which the call can't have been sent, if it says so
+        :param offset: of the relay's clock, by the link on which the call came
+        :raises Refused: it moves the robot, and this source may not, or it may be too old
+        :raises Invalid: it is no name
+        """
+        if not self._policy.services and not self._policy.actions:
+            return
+        full = self._platform.full_name(service, "service")
+        moves = self._policy.moves_by_service(full)
+        if full.endswith(GOAL):
+            moves = moves or self._policy.moves_by_action(full[: -len(GOAL)])
+        if moves:
+            self._judge(f"a call of {full}", source, stamp, offset)
+
+    def goal(self, action: str, source: int, stamp: int | None, offset: Offset) -> bool:
+        """See that a source may have a goal pursued; whether that moves the robot.
+
+        :param stamp: as of :meth:`call`, like ``offset``
+        :raises Refused: it does, and this source may not, or it may be too old
+        :raises Invalid: it is no name
+        """
+        if not self._policy.actions:
+            return False
+        full = self._platform.full_name(action, "action")
+        moves = self._policy.moves_by_action(full)
+        if moves:
+            self._judge(f"a goal for {full}", source, stamp, offset)
+        return moves
+
+    def _judge(self, what: str, source: int, stamp: int | None, offset: Offset) -> None:
+        verdict = self._authority.judge_request(source)
+        if verdict is not Verdict.ALLOWED:
+            raise Refused(f"{what} moves the robot: {verdict.value}")
+        if stamp is None:
+            return
+        now, deadline = self._now(), self._policy.deadline_ms
+        if freshness(stamp, now, offset, deadline) is not Freshness.FRESH:
+            self.stale += 1
+            age = _age(offset.oldest(stamp, now))
+            raise Refused(f"{what} moves the robot: {age}; none older than {deadline} ms is obeyed")
+
+
+def _age(oldest: int | None) -> str:
+    """In words, what is wrong with the age of something; the greatest it can have, nanoseconds."""
+    if oldest is None:
+        return "how old it is can't be told yet"
+    if oldest < 0:
+        return "by its stamp it comes from the future"
+    return f"it may be {oldest / MILLI:.0f} ms old"

@@ -1,0 +1,162 @@
+"""Goals that move the robot must not outlive the daemon that had them pursued.
+
+The guard hears of them as of commands on topics: of each action by the service that cancels its goals, again and again
+as long as one is under way. When that ceases, or the daemon is gone, it has them cancelled. And a note of those actions
+lies on the disk, so that a daemon whose guard died with it finds at its next start what was left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fnmatch import fnmatchcase
+from typing import TypeVar
+
+from twisted.logger import Logger
+
+from relay_protocol.errors import Unavailable
+from robot_client.guard_feed import GuardFeed
+from robot_client.guard_protocol import cancelling
+from robot_client.lasting import Latch
+from robot_client.platforms.base import Goal
+from robot_client.reactors import Clock, Timer
+from robot_client.sweep import Sweep
+
+BEAT = 0.2
+"""Seconds between two words to the guard that the daemon is still there."""
+
+KEPT = 30.0
+"""Seconds the guard stays able to cancel an action's goals after the last one ended: another may follow."""
+
+LOOKS = 30
+"""How often to look for actions that were left goals, a second apart: nodes may be found after the daemon's start."""
+
+Ended = TypeVar("Ended")
+
+MAX_ACTIONS = 64
+"""Actions that are had pursue goals at a time."""
+
+
+class Pursuits:
+    """Knows which actions that move the robot pursue goals of this daemon, and ends those of the one before.
+
+    :param everything: patterns of all actions that move the robot, for a note that can't be read
+    :param latch: where the note is kept
+    :param now: clock of :mod:`robot_client.clocks`, nanoseconds
+    """
+
+    def __init__(
+        self,
+        everything: list[str],
+        guard: GuardFeed,
+        sweep: Sweep,
+        latch: Latch,
+        clock: Clock,
+        now: Callable[[], int],
+    ) -> None:
+        self._guard = guard
+        self._sweep = sweep
+        self._latch = latch
+        self._clock = clock
+        self._now = now
+        self._running: dict[str, int] = {}
+        """How many goals by action; none where the guard is only kept able to cancel them."""
+        self._forgetting: dict[str, Timer] = {}
+        self._beating: Timer | None = None
+        self._log = Logger("pursuits")
+        noted = latch.goals()
+        self._left = set(everything if noted is None else noted)
+        """Actions, or patterns of them, whose goals are still to be cancelled since before this start."""
+        self._swept: set[str] = set()
+        self._looks = LOOKS if self._left else 0
+        if self._left:
+            names = ", ".join(sorted(self._left))
+            self._log.warn("a daemon before this left goals of {names}; they are cancelled", names=names)
+
+    def look(self) -> None:
+        """Cancel what a daemon before this left; to be called every second."""
+        if not self._looks:
+            return
+        self._looks -= 1
+        for action in self._sweep.actions():
+            if self._is_left(action):
+                self._sweep.cancel(action).addCallback(self._answered, action)
+        if not self._looks:
+            self._left.clear()
+            self._note()
+
+    def check(self, action: str) -> None:
+        """See that a goal of an action may begin.
+
+        :param action: its full name
+        :raises Unavailable: goals of it are still being cancelled, or goals of too many are under way
+        """
+        if self._is_left(action):
+            raise Unavailable(
+                f"{action} still has goals of before the robot's daemon was started, which are being cancelled; "
+                "try again in a moment"
+            )
+        if action not in self._running and len(self._running) >= MAX_ACTIONS and not self._forgetting:
+            raise Unavailable(
+                f"{MAX_ACTIONS} actions that move the robot are in use; wait until one has ended"
+            )
+
+    def add(self, action: str, goal: Goal) -> None:
+        """A goal has begun.
+
+        :param action: its full name
+        """
+        timer = self._forgetting.pop(action, None)
+        if timer is not None:
+            timer.cancel()
+        if action not in self._running and len(self._running) >= MAX_ACTIONS:
+            self._forget(next(iter(self._forgetting)))
+        self._running[action] = self._running.get(action, 0) + 1
+        if self._running[action] == 1:
+            self._guard.topic(cancelling(action))
+            self._guard.command(cancelling(action), True, self._now())
+            self._note()
+        if self._beating is None:
+            self._beating = self._clock.callLater(BEAT, self._beat)
+        goal.result.addBoth(self._ended, action)
+
+    def _ended(self, outcome: Ended, action: str) -> Ended:
+        self._running[action] -= 1
+        if not self._running[action]:
+            self._guard.command(cancelling(action), False, self._now())
+            self._forgetting[action] = self._clock.callLater(KEPT, self._forget, action)
+            self._note()
+        return outcome
+
+    def _forget(self, action: str) -> None:
+        timer = self._forgetting.pop(action)
+        if timer.active():
+            timer.cancel()
+        del self._running[action]
+        self._guard.forget(cancelling(action))
+
+    def _beat(self) -> None:
+        self._beating = None
+        running = [action for action, goals in self._running.items() if goals]
+        for action in running:
+            self._guard.command(cancelling(action), True, self._now())
+        if running:
+            self._beating = self._clock.callLater(BEAT, self._beat)
+
+    def _is_left(self, action: str) -> bool:
+        return action not in self._swept and any(fnmatchcase(action, each) for each in self._left)
+
+    def _answered(self, words: str | None, action: str) -> None:
+        """An action was asked to cancel its goals: ``None``, it was not heard of; else what it refused, in words."""
+        if words is None:
+            return
+        self._swept.add(action)
+        if action in self._left:
+            self._left.discard(action)
+            self._note()
+
+    def _note(self) -> None:
+        running = {action for action, goals in self._running.items() if goals}
+        try:
+            self._latch.keep_goals(sorted(running | self._left))
+        except Unavailable as error:
+            self._log.warn("{why}", why=str(error))

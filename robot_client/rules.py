@@ -1,0 +1,32 @@
+"""What holds for commands and stops beside the policy that the relay is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from relay_protocol.link.moving import Limits
+from robot_client.config import Settings
+from robot_client.limits import limits_told
+from robot_client.safety import Times
+
+
+class Rules(NamedTuple):
+    """Of one robot.
+
+    :ivar topics: times of single topics
+    :ivar ramp_ms: how long it takes to a standstill where nobody said stop; 0: no time
+    :ivar limits: how fast whom may move it, by level
+    """
+
+    topics: Mapping[str, Times] = {}
+    ramp_ms: int = 0
+    limits: Mapping[str, Limits] = {}
+
+
+def rules_of(settings: Settings) -> Rules:
+    """As the settings have them."""
+    safety = settings.safety
+    return Rules(
+        {each.name: safety.times(each.name) for each in safety.topic}, safety.ramp_ms, limits_told(settings)
+    )
