@@ -18,7 +18,7 @@ from relay_protocol.rights import Grant, Operation, Rules, Verdict
 from relay_server.store import Store
 
 Changed = Callable[[], None]
-Revoked = Callable[[str], None]
+Revoked = Callable[[Refused], None]
 
 
 class BadCredentials(Refused):
@@ -56,7 +56,8 @@ class Permit:
         self.robot_id = robot_id
         self.rules = rules
         self.on_change: Changed = _ignore
-        self.on_revoke: Revoked = _ignore_reason
+        self.on_revoke: Revoked = _ignore_error
+        """Told why it is over: :class:`BadCredentials` where to log in again would help."""
 
     def judge(self, operation: Operation, resource: str) -> Verdict:
         """Yes or no with the reason, by the rights as they stand."""
@@ -67,7 +68,7 @@ def _ignore() -> None:
     """Nobody listens yet."""
 
 
-def _ignore_reason(reason: str) -> None:
+def _ignore_error(error: Refused) -> None:
     """Nobody listens yet."""
 
 
@@ -95,9 +96,9 @@ class Access:
         while seen != self._refreshed:
             seen = self._refreshed
             now = (await self._store.read(_standing, {key}, self._wall()))[key]
-        if now.ended and now.credentials:
-            raise BadCredentials(now.ended)
-        if now.ended:
+        if isinstance(now.ended, BadCredentials):
+            raise now.ended
+        if now.ended is not None:
             return None
         permit = Permit(principal, robot_id, Rules(now.grants))
         self._permits.add(permit)
@@ -123,7 +124,7 @@ class Access:
         now = self._wall()
         for permit in list(self._permits):
             if permit.principal.expires is not None and permit.principal.expires <= now:
-                self._revoke(permit, "your session has expired; log in again")
+                self._revoke(permit, BadCredentials("your session has expired; log in again"))
 
     async def refresh(self) -> None:
         """Judge all open permits anew, after something changed in the database.
@@ -142,23 +143,22 @@ class Access:
                 continue
             principal = permit.principal
             now = standing[(principal.user_id, principal.token_id, permit.robot_id)]
-            if now.ended:
+            if now.ended is not None:
                 self._revoke(permit, now.ended)
             elif tuple(now.grants) != permit.rules.grants:
                 permit.rules = Rules(now.grants)
                 permit.on_change()
 
-    def _revoke(self, permit: Permit, reason: str) -> None:
+    def _revoke(self, permit: Permit, error: Refused) -> None:
         self._permits.discard(permit)
         permit.rules = Rules()
-        permit.on_revoke(reason)
+        permit.on_revoke(error)
 
 
 @dataclass(frozen=True)
 class _Standing:
-    ended: str
+    ended: Refused | None
     grants: tuple[Grant, ...] = ()
-    credentials: bool = False
 
 
 def _standing(
@@ -168,10 +168,12 @@ def _standing(
     for key in keys:
         user_id, token_id, robot_id = key
         if not queries.token_is_live(session, token_id, now):
-            found[key] = _Standing("your session was ended; log in again", credentials=True)
+            found[key] = _Standing(BadCredentials("your session was ended; log in again"))
         elif not queries.user_is_live(session, user_id):
-            found[key] = _Standing("your account was disabled", credentials=True)
+            found[key] = _Standing(BadCredentials("your account was disabled"))
         else:
             grants = tuple(queries.grants_for(session, user_id, robot_id))
-            found[key] = _Standing("" if grants else "your right on this robot was revoked", grants)
+            found[key] = _Standing(
+                None if grants else Refused("your right on this robot was revoked"), grants
+            )
     return found

@@ -1,4 +1,4 @@
-"""Who is it? Passwords, access tokens, one-time login codes and websocket tickets become a principal."""
+"""Who is it? Passwords, access tokens, one-time login codes and tickets become a principal."""
 
 from __future__ import annotations
 
@@ -41,9 +41,26 @@ class TooManyTries(SwitchboardError):
 
 
 @dataclass(frozen=True)
+class Opening:
+    """What a ticket opens.
+
+    :param video: what shows the robot's cameras; else its websocket
+    :param camera: with ``video``, this camera alone; empty for whatever the addresses show
+    """
+
+    robot: str
+    video: bool = False
+    camera: str = ""
+
+    def covers(self, asked: Opening) -> bool:
+        """Whether it is for what somebody asks for with it."""
+        return (self.robot, self.video) == (asked.robot, asked.video) and self.camera in ("", asked.camera)
+
+
+@dataclass(frozen=True)
 class _Ticket:
     principal: Principal
-    robot: str
+    opens: Opening
     until: float
 
 
@@ -164,8 +181,8 @@ class Authenticator:
             raise BadCredentials(str(error)) from None
         return token
 
-    def issue_ticket(self, principal: Principal, robot: str) -> str:
-        """A ticket for one websocket to one robot, good once for :data:`TICKET_SECONDS`."""
+    def issue_ticket(self, principal: Principal, opens: Opening) -> str:
+        """A ticket, good once for :data:`TICKET_SECONDS`."""
         now = self._seconds()
         for key in [key for key, ticket in self._tickets.items() if ticket.until <= now]:
             del self._tickets[key]
@@ -175,18 +192,21 @@ class Authenticator:
         if len(self._tickets) >= TICKETS:
             raise Refused("too many tickets are open; use them or wait a minute")
         ticket = passwords.new_token()
-        self._tickets[passwords.token_hash(ticket)] = _Ticket(principal, robot, now + TICKET_SECONDS)
+        self._tickets[passwords.token_hash(ticket)] = _Ticket(principal, opens, now + TICKET_SECONDS)
         return ticket
 
-    async def ticket(self, ticket: str, robot: str) -> Principal:
-        """The principal of a ticket, which is spent by this.
+    async def ticket(self, ticket: str, asked: Opening, *, spend: bool = True) -> Principal:
+        """The principal of a ticket.
 
-        :raises BadCredentials: unknown, used, too old, for another robot, or its user's session has ended since
+        :param asked: what is to be opened with it
+        :param spend: the ticket is spent by this, whatever comes of it; else it is only looked at
+        :raises BadCredentials: unknown, used, too old, for something else, or its user's session has ended since
         """
-        found = self._tickets.pop(passwords.token_hash(ticket), None)
-        if found is None or found.until <= self._seconds() or found.robot != robot:
+        key = passwords.token_hash(ticket)
+        found = self._tickets.pop(key, None) if spend else self._tickets.get(key)
+        if found is None or found.until <= self._seconds() or not found.opens.covers(asked):
             raise BadCredentials(
-                "the ticket is unknown, used, expired or for another robot; ask for a new one"
+                "the ticket is unknown, used, expired or for something else; ask for a new one"
             )
         live = await self._store.read(queries.token_is_live, found.principal.token_id, self._wall())
         if not live:

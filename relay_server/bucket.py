@@ -22,12 +22,21 @@ class TokenBucket:
         self._tokens = burst
         self._at = seconds()
 
+    @property
+    def wait(self) -> float:
+        """Seconds until one more may pass; 0 when it may now."""
+        self._fill()
+        return max(0.0, (1 - self._tokens) / self._rate)
+
     def take(self) -> bool:
         """Whether one more may pass now; if so it is counted."""
-        now = self._seconds()
-        self._tokens = min(self._burst, self._tokens + max(0.0, now - self._at) * self._rate)
-        self._at = now
+        self._fill()
         if self._tokens < 1:
             return False
         self._tokens -= 1
         return True
+
+    def _fill(self) -> None:
+        now = self._seconds()
+        self._tokens = min(self._burst, self._tokens + max(0.0, now - self._at) * self._rate)
+        self._at = now

@@ -50,6 +50,22 @@ class Endpoint:
 
 
 @dataclass(frozen=True)
+class AlertSettings:
+    """What an operator can set of alerts.
+
+    :param webhook_networks: private networks that messages may go to
+    :param apprise_schemes: beginnings of apprise's URLs that users may have messages sent by
+    :param battery_low: charge, 0 to 1, at which an alert begins; 0 is never
+    :param battery_critical: charge at which it becomes worse
+    """
+
+    webhook_networks: tuple[str, ...] = ()
+    apprise_schemes: tuple[str, ...] = ()
+    battery_low: float = 0.2
+    battery_critical: float = 0.1
+
+
+@dataclass(frozen=True)
 class Settings:
     """What an operator can set.
 
@@ -63,7 +79,11 @@ class Settings:
     :param driving_ping: seconds between pings to a client that is driving
     :param stall_limit: seconds a client may take nothing before it is cut
     :param refresh: seconds between looks at the database's revision counter
+    :param explicit_control: no command takes control of a robot: it is taken by asking for it
+    :param control_grace: seconds who has control has to answer a request, before an owner may take over
+    :param control_idle: seconds without a command, after which control is free again
     :param recordings: bytes all recordings together may have
+    :param alerts: what people are told of, and where that may go
     """
 
     data: Path
@@ -82,6 +102,10 @@ class Settings:
     refresh: float = 0.25
     connections_per_address: int = 512
     recordings: int = 10 * 10**9
+    explicit_control: bool = False
+    control_grace: float = 30.0
+    control_idle: float = 600.0
+    alerts: AlertSettings = field(default_factory=AlertSettings)
 
     @property
     def tls(self) -> bool:

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from relay_server.linkmeter import LinkMeter, Reading
+
 PENDING = 64
 """Pings out at once; a client that answers none is soon cut for its silence."""
 
@@ -23,11 +25,12 @@ class Freshness:
     :param token: eight unguessable bytes at each call, so that a pong can't be sent in advance
     """
 
-    __slots__ = ("_clock", "_out", "_token", "last_pong", "not_before", "rtt")
+    __slots__ = ("_clock", "_meter", "_out", "_token", "last_pong", "not_before", "rtt")
 
     def __init__(self, clock: Callable[[], int], opened: int, token: Callable[[], bytes]) -> None:
         self._clock = clock
         self._token = token
+        self._meter = LinkMeter()
         self._out: list[tuple[bytes, int]] = []
         self.not_before = opened
         self.last_pong = opened
@@ -47,11 +50,14 @@ class Freshness:
         if place is None:
             return False
         sent = self._out[place][1]
+        self.not_before = max(self.not_before, sent)
+        self.last_pong = now = self._clock()
+        self.rtt = now - sent
+        for _, before in self._out[:place]:
+            self._meter.passed_over(now / 1e9, (now - before) / 1e9)
+        self._meter.came_back(now / 1e9, self.rtt / 1e9)
         # Pings before it were answered too, or never will be.
         del self._out[: place + 1]
-        self.not_before = max(self.not_before, sent)
-        self.last_pong = self._clock()
-        self.rtt = self.last_pong - sent
         return True
 
     def age(self) -> int:
@@ -67,6 +73,11 @@ class Freshness:
             yield
         finally:
             self.not_before = latest
+
+    def reading(self) -> Reading:
+        """How good the way to the client is."""
+        now = self._clock()
+        return self._meter.reading(now / 1e9, [(now - sent) / 1e9 for _, sent in self._out])
 
     def silence(self) -> int:
         """Nanoseconds since the client last answered a ping."""

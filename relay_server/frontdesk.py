@@ -9,31 +9,29 @@ from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
-import msgspec
-
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server import closing
 from relay_server.access import Access, Permit, Principal
-from relay_server.auth import Authenticator, BadCredentials, TooManyTries
+from relay_server.auth import Authenticator, BadCredentials, Opening, TooManyTries
 from relay_server.budget import Budgets
 from relay_server.channel import Channels
 from relay_server.clock import Clock
+from relay_server.control import Desks
 from relay_server.freshness import Freshness
 from relay_server.journal import Journal
 from relay_server.local import RelayNode
-from relay_server.local.node import milliseconds
 from relay_server.origins import Origins
+from relay_server.overview import NO_ROBOT, Overview
+from relay_server.people import People
 from relay_server.registry import Presence, Registry
 from relay_server.rounds import Rounds
 from relay_server.session import ClientTransport, Session, Timing
 from relay_server.store import Store
 from relay_server.video import Videos
 from relay_server.watching import Screen, Watching, check_view, view
-
-NO_ROBOT = "there is no such robot, or you have no right on it"
 
 
 class GoingDown(Unavailable):
@@ -68,6 +66,7 @@ class FrontDesk:
         registry: Registry,
         channels: Channels,
         videos: Videos,
+        desks: Desks,
         journal: Journal,
         origins: Origins,
         timing: Timing,
@@ -84,6 +83,7 @@ class FrontDesk:
         self._registry = registry
         self._channels = channels
         self._videos = videos
+        self._desks = desks
         self._journal = journal
         self._origins = origins
         self.timing = timing
@@ -94,7 +94,9 @@ class FrontDesk:
         self._wall = wall
         self._sessions: dict[int, dict[int, Session]] = {}
         self._watchings: set[Watching] = set()
-        self._local = RelayNode(self.sessions_of, videos)
+        people = People(self.sessions_of, desks.holder, clock.seconds)
+        self.overview = Overview(access, registry, people, self.sessions_of, desks)
+        self._local = RelayNode(self.sessions_of, videos, people)
 
     def __iter__(self) -> Iterator[Session]:
         return iter([session for each in self._sessions.values() for session in each.values()])
@@ -139,9 +141,9 @@ class FrontDesk:
 
     bearer = token
 
-    async def ticket(self, ticket: str, robot: str) -> Principal:
+    async def ticket(self, ticket: str, asked: Opening, *, spend: bool = True) -> Principal:
         """The principal of a single-use ticket."""
-        return await self._auth.ticket(ticket, robot)
+        return await self._auth.ticket(ticket, asked, spend=spend)
 
     async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
         """The principal of a session cookie in a websocket's handshake.
@@ -196,6 +198,7 @@ class FrontDesk:
             admission.permit,
             robot,
             self._channels.of(robot),
+            self._desks.of(robot),
             self._local,
             Freshness(self._clock_ns, opened_ns, lambda: secrets.token_bytes(8)),
             self.timing,
@@ -302,12 +305,14 @@ class FrontDesk:
             self.turn_away(admission)
             raise
         self._watchings.add(watching)
+        self._registry.looks_on(watching.robot, watching)
         self._tell_of_video("video.joined", watching, address=watching.address)
         return watching
 
     def _left(self, watching: Watching) -> None:
         self._access.release(watching.permit)
         self._watchings.discard(watching)
+        self._registry.looks_away(watching.robot, watching)
         self._tell_of_video("video.left", watching, pictures=watching.pictures)
 
     def _tell_of_video(self, kind: str, watching: Watching, **data: Any) -> None:
@@ -325,37 +330,19 @@ class FrontDesk:
 
     # --- what robots there are ----------------------------------------------------------------------------
 
-    async def issue_ticket(self, principal: Principal, robot: str) -> str:
-        """A ticket for one websocket to a robot.
+    async def issue_ticket(self, principal: Principal, opens: Opening) -> str:
+        """A ticket for one use of a robot.
 
         :raises NotFound: no such robot, or no right on it
         """
         for record, _ in await self._access.robots(principal):
-            if record.name == robot:
-                return self._auth.issue_ticket(principal, robot)
+            if record.name == opens.robot:
+                return self._auth.issue_ticket(principal, opens)
         raise NotFound(NO_ROBOT)
 
     async def robots(self, principal: Principal) -> list[dict[str, Any]]:
         """What the principal may see of its robots."""
-        return [
-            self._view(record, str(rules.level)) for record, rules in await self._access.robots(principal)
-        ]
-
-    def _view(self, record: queries.RobotRecord, level: str) -> dict[str, Any]:
-        robot = self._registry.find(record.id) or Presence(record.id, record.name, record.realm)
-        return {
-            "name": record.name,
-            "description": record.description,
-            "state": robot.state.value,
-            "level": level,
-            "clients": [{"user": each.name, "since": each.since} for each in self.sessions_of(record.id)],
-            "battery": robot.health.battery,
-            "rtt_ms": milliseconds(robot.rtt),
-            "host": robot.description.host,
-            "platform": robot.description.platform,
-            "distro": robot.description.distro,
-            "last_seen": robot.last_seen,
-        }
+        return await self.overview.robots(principal)
 
     async def healthy(self) -> bool:
         """Whether the database answers."""
@@ -371,33 +358,7 @@ class FrontDesk:
 
     def status(self) -> list[dict[str, Any]]:
         """Every robot the relay knows and who works with it, for the administrator's own machine."""
-        return [
-            {
-                "name": robot.name,
-                "realm": robot.realm,
-                "state": robot.state.value,
-                "address": robot.address,
-                "agent": robot.description.agent,
-                "rtt_ms": milliseconds(robot.rtt),
-                "battery": robot.health.battery,
-                "last_seen": robot.last_seen,
-                "health": msgspec.structs.asdict(robot.health),
-                "clients": [
-                    {
-                        "user": each.name,
-                        "address": each.address,
-                        "since": each.since,
-                        "rtt_ms": milliseconds(each.rtt),
-                        "drops": each.outbox.dropped,
-                        "waiting_bytes": each.outbox.waiting_bytes,
-                        "refusals": each.refusals,
-                        "stale_commands": each.stale_commands,
-                    }
-                    for each in self.sessions_of(robot.robot_id)
-                ],
-            }
-            for robot in self._registry
-        ]
+        return self.overview.status()
 
     def say_goodbye(self, reason: str) -> None:
         """Refuse newcomers and close what is open: the relay is going down."""

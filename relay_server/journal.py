@@ -26,6 +26,10 @@ WAITING = 128
 """Events that wait for the database at a time. Logins write by the same door and must find it open."""
 
 
+Listener = Callable[[str, int | None, dict[str, Any]], None]
+"""Is told the kind of an event, the robot's number if it is about one, and what belongs to it."""
+
+
 @dataclass
 class _Cause:
     bucket: TokenBucket
@@ -45,6 +49,16 @@ class Journal:
         self._wall = wall
         self._causes: OrderedDict[str, _Cause] = OrderedDict()
         self._waiting = 0
+        self._listeners: list[Listener] = []
+
+    def listen(self, listener: Listener) -> None:
+        """Have all that happens told to somebody at once, also what is not kept."""
+        self._listeners.append(listener)
+
+    def tell(self, kind: str, robot_id: int) -> None:
+        """Something happened that is not worth keeping, but listeners may act by it."""
+        for listener in self._listeners:
+            listener(kind, robot_id, {})
 
     def event(
         self,
@@ -61,6 +75,8 @@ class Journal:
         :param cause: who can make this happen at will: an address, or something like ``robot:r2-d2``
         :returns: whether it is kept. What is not is counted, and told with the next of the same cause.
         """
+        for listener in self._listeners:
+            listener(kind, robot_id, data)
         cause = network_of(cause)
         known = self._known(cause)
         if self._waiting >= WAITING or not known.bucket.take():

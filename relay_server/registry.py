@@ -10,6 +10,7 @@ from typing import Protocol
 from relay_protocol import link
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.graph import GraphMirror
+from relay_server.linkmeter import NO_LINK, Reading
 
 REPLACE_SECONDS = 3.0
 """A registration younger than this is not replaced."""
@@ -23,6 +24,9 @@ class ControlLink(Protocol):
 
     def close(self, reason: str) -> None:
         """Say ``bye`` and end the connection."""
+
+    def reading(self) -> Reading:
+        """How good the way to the robot is."""
 
 
 class State(str, enum.Enum):
@@ -49,14 +53,32 @@ class Watcher(Protocol):
         """It has told facts about itself, or which cameras it has."""
 
 
+class Onlooker(Protocol):
+    """Somebody who watches a camera."""
+
+    @property
+    def name(self) -> str:
+        """The user's."""
+
+    @property
+    def camera(self) -> str:
+        """What is watched."""
+
+    @property
+    def address(self) -> str:
+        """Where he is, for people."""
+
+
 @dataclass
 class Presence:
     """One robot as the relay sees it now.
 
     :param registered_at: monotonic seconds of the latest registration
     :param patience: seconds for which that registration is not replaced
+    :param streams: most streams of cameras it makes at a time; 0 when it did not say
     :param rtt: round trip relay–robot of the latest ping, seconds
     :param last_seen: Unix time of the latest byte, ``None`` when never seen since the start
+    :param onlookers: since when each watches, Unix time
     """
 
     robot_id: int
@@ -71,25 +93,31 @@ class Presence:
     encodings: tuple[str, ...] = ()
     description: link.Describe = field(default_factory=link.Describe)
     health: link.Health = field(default_factory=link.Health)
+    safety: link.Safety = field(default_factory=link.Safety)
     cameras: tuple[link.Camera, ...] = ()
+    streams: int = 0
     graph: GraphMirror = field(default_factory=GraphMirror)
     types: TypeRegistry = field(default_factory=TypeRegistry)
     rtt: float | None = None
     last_seen: float | None = None
     users: int = 0
+    onlookers: dict[Onlooker, float] = field(default_factory=dict)
     watchers: list[Watcher] = field(default_factory=list)
 
     @property
     def state(self) -> State:
-        """Offline, online, or online with somebody working with it."""
+        """Offline, online, or online with somebody who works with it or watches its cameras."""
         if self.control is None:
             return State.OFFLINE
-        return State.IN_USE if self.users else State.ONLINE
+        return State.IN_USE if self.users or self.onlookers else State.ONLINE
+
+    def reading(self) -> Reading:
+        """How good the way from the relay to the robot is."""
+        return NO_LINK if self.control is None else self.control.reading()
 
     def is_motion(self, topic: str, type_name: str) -> bool:
         """Whether the robot's own safety counts this topic as motion."""
-        motion = self.description.motion
-        return type_name in motion.types or topic in motion.topics
+        return self.description.motion.moves_by_topic(topic, type_name)
 
 
 class Registry:
@@ -166,8 +194,19 @@ class Registry:
     def cameras(self, robot: Presence, cameras: link.Cameras) -> None:
         """The robot told which cameras it has."""
         robot.cameras = tuple(cameras.cameras)
+        robot.streams = cameras.streams
         for watcher in list(robot.watchers):
             watcher.described()
+        self.changed()
+
+    def looks_on(self, robot: Presence, onlooker: Onlooker) -> None:
+        """Somebody begins to watch."""
+        robot.onlookers[onlooker] = self._wall()
+        self.changed()
+
+    def looks_away(self, robot: Presence, onlooker: Onlooker) -> None:
+        """Somebody watches no more."""
+        robot.onlookers.pop(onlooker, None)
         self.changed()
 
     def forget(self, robot_id: int) -> None:

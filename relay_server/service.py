@@ -24,12 +24,16 @@ import relay_server
 from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
-from relay_server import passwords
+from relay_server import invitation, passwords
 from relay_server.access import Access
+from relay_server.alerts import AlertHouse
 from relay_server.auth import Authenticator
 from relay_server.channel import Channels
 from relay_server.config import Endpoint, Settings
-from relay_server.edges import recordings
+from relay_server.console import Console
+from relay_server.control import ControlRules, DatabaseRecord, Desks
+from relay_server.edges import alerts, fleet, presence, recordings
+from relay_server.edges import control as control_edge
 from relay_server.edges.admin import AdminSocket
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
@@ -38,12 +42,13 @@ from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
 from relay_server.edges.site import Portal, RelaySite, Robots, Root
 from relay_server.edges.video import Video, VideoFactory
 from relay_server.edges.websocket import ClientFactory
+from relay_server.fleet import FleetDesk
 from relay_server.folder import DataFolder
 from relay_server.frontdesk import FrontDesk
 from relay_server.journal import Journal
 from relay_server.metrics import RelayCollector, registry_of
 from relay_server.origins import Origins
-from relay_server.recording import Library, RecordingDesk, Recordings
+from relay_server.recording import FOLDER, Library, RecordingDesk, Recordings, sweep
 from relay_server.registry import Registry
 from relay_server.rounds import Rounds
 from relay_server.session import Timing
@@ -51,7 +56,6 @@ from relay_server.store import Store
 from relay_server.tls import ServerTls
 from relay_server.video import Videos
 
-FIRST_LINK_SECONDS = 3600.0
 PURGE_SECONDS = 3600.0
 EVENT_SECONDS = 30 * 86400.0
 """Events are kept this long; the audit log is kept for ever."""
@@ -81,15 +85,27 @@ class Relay:
             reactor, linger=settings.linger, new_ticket=passwords.new_token, wall_ns=time.time_ns
         )
         self._videos = Videos(reactor, new_ticket=passwords.new_token)
-        library = Library(settings.data / "recordings", settings.recordings)
+        library = Library(settings.data / FOLDER, settings.recordings)
         self._recordings = Recordings(reactor, reactor, library, self._channels, self._videos, time.time)
         self._journal = Journal(self._store, time.time)
+        self._alerts = AlertHouse(
+            reactor, self._store, self._access, self._registry, self._channels, self._journal, settings
+        )
+        self._desks = Desks(
+            reactor,
+            DatabaseRecord(self._store, self._journal, time.time),
+            ControlRules(settings.explicit_control, settings.control_grace, settings.control_idle),
+            self._registry.changed,
+            time.time,
+        )
         self._ports: list[Any] = []
         self._revision = -1
         self._polling = LoopingCall(self._poll)
         self._purging = LoopingCall(self._purge)
         self._database_fine = True
         self._desk: FrontDesk | None = None
+        self._fleet: FleetDesk | None = None
+        self._console: Console | None = None
         self.http_port = 0
         self.robots_port = 0
         self._started = time.monotonic()
@@ -107,7 +123,11 @@ class Relay:
         self._auth.start()
         self._recordings.open()
         self._revision = await self._store.read(queries.revision)
+        self._desks.expect(await self._store.read(queries.pending_stops))
+        await sweep(self._recordings, self._store, self._journal)
+        self._recordings.recover()
         name = self.settings.name or self._folder.relay_name()
+        await self._alerts.start(name)
         http = await self._listen(self.settings.http, self._site(name))
         self.http_port = http.getHost().port
         hall = RobotHall(
@@ -116,6 +136,7 @@ class Relay:
             self._registry,
             self._channels,
             self._videos,
+            self._desks,
             self._journal,
             time.monotonic,
             time.time,
@@ -143,6 +164,7 @@ class Relay:
             self._registry,
             self._channels,
             self._videos,
+            self._desks,
             self._journal,
             origins,
             Timing(settings.client_ping, settings.driving_ping, settings.stall_limit),
@@ -153,8 +175,22 @@ class Relay:
         desk = self._desk
         metrics = registry_of(RelayCollector(self._registry, self._channels, self._videos, lambda: desk))
         keeper = RecordingDesk(desk, self._recordings, self._store, self._journal, time.time)
-        below = {"recordings": partial(recordings.below, self._reactor, keeper)}
-        api = Api(self._reactor, desk, origins, metrics, below, cookie=cookie, secure=settings.tls)
+        self._console = Console(desk, self._desks, self._registry, self._store)
+        below = {
+            "recordings": partial(recordings.below, self._reactor, keeper),
+            "people": partial(presence.below, desk.overview),
+            **{part: partial(control_edge.below, self._console, part) for part in control_edge.PARTS},
+        }
+        self._fleet = FleetDesk(
+            self._reactor, desk, self._access, self._registry, self._desks, self._store, self._journal
+        )
+        beside = {
+            "alerts": partial(alerts.beside, self._alerts.desk),
+            "fleet": partial(fleet.beside, self._reactor, self._fleet),
+        }
+        events = {"alerts": self._alerts.desk.shown}
+        served = desk, origins, metrics, below, beside
+        api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, events=events)
         cap = AddressCap(settings.connections_per_address)
         websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk, cap))
         rounds = Rounds(self._reactor)
@@ -185,7 +221,9 @@ class Relay:
         return port
 
     async def _listen_locally(self) -> None:
-        admin = AdminSocket(self.status, self.refresh)
+        assert self._fleet is not None and self._console is not None
+        order = partial(fleet.local, self._reactor, self._fleet)
+        admin = AdminSocket(self.status, self.refresh, order, self._console)
         site = Site(admin.app.resource(), reactor=self._reactor)
         site.log = lambda request: None
         self._folder.clear_socket(self.settings.socket_path)
@@ -194,34 +232,14 @@ class Relay:
 
     async def first_login(self) -> str | None:
         """A one-time login link for the administrator of a relay nobody can log in to yet."""
-        users = await self._store.read(queries.list_users)
-        if any(user.password_hash is not None or user.name != "admin" for user in users):
-            return None
-        return await self.login_link("admin", create=True)
+        return await invitation.first_login(self._store, self.url)
 
-    async def login_link(self, user: str, create: bool = False) -> str:
+    async def login_link(self, user: str) -> str:
         """A one-time login link for a user.
 
-        :param create: make the user, an administrator, when there is none
         :raises Invalid: no such user
         """
-        record = await self._store.read(queries.find_user, user)
-        if record is None:
-            if not create:
-                raise Invalid(f"there is no user '{user}'")
-            record = await self._store.write(queries.add_user, user, None, admin=True)
-        code = passwords.new_token()
-        now = time.time()
-        await self._store.write(
-            queries.create_token,
-            record.id,
-            passwords.token_hash(code),
-            kind="login",
-            label="login link",
-            expires=now + FIRST_LINK_SECONDS,
-            now=now,
-        )
-        return f"{self.url}/login#code={code}"
+        return await invitation.login_link(self._store, self.url, user)
 
     @property
     def url(self) -> str:
@@ -241,6 +259,10 @@ class Relay:
             return
         await self._access.refresh()
         await self._check_robots()
+        self._desks.expect(await self._store.read(queries.pending_stops))
+        await self._alerts.alerts.refresh()
+        # Not waited for: rights must be taken up however long a disk takes.
+        self._sweep()
         # Only now: had anything above failed, the next look would have to do it again.
         self._revision = revision
         self._registry.changed()
@@ -254,11 +276,19 @@ class Relay:
         for robot, control in links:
             if robot.robot_id not in there:
                 self._registry.forget(robot.robot_id)
+                self._desks.forget(robot.robot_id)
                 self._videos.end(robot, NotFound("this robot was removed from the relay"))
             elif control is not None and robot.control is control and (robot.robot_id, robot.key) not in live:
                 self.log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
                 control.close("the robot's key is not accepted any more")
                 self._videos.end(robot, Unavailable("the robot's key is not accepted any more"))
+
+    def _sweep(self) -> Deferred[None]:
+        return Deferred.fromCoroutine(sweep(self._recordings, self._store, self._journal)).addErrback(
+            lambda failure: self.log.error(
+                "recordings of removed robots stay for now: {reason}", reason=failure.value
+            )
+        )
 
     async def _poll_once(self) -> None:
         self._access.expire()
@@ -289,6 +319,8 @@ class Relay:
         # In small transactions: logins wait for the same writer.
         while await self._store.write(queries.purge_events, now - EVENT_SECONDS):
             pass
+        await self._alerts.alerts.purge()
+        await self._sweep()
 
     def reload_tls(self) -> None:
         """Read the certificate again (SIGHUP)."""
@@ -329,6 +361,7 @@ class Relay:
         def finish() -> None:
             self._auth.stop()
             self._recordings.close()
+            self._alerts.finish()
             self._store.stop()
             self._reactor.callFromThread(done.callback, None)
 
@@ -337,6 +370,7 @@ class Relay:
         await done
 
     async def _say_goodbye(self) -> None:
+        await self._alerts.stop()
         if self._desk is not None:
             self._desk.say_goodbye("the relay is going down")
         await self._recordings.shut("the relay is going down")

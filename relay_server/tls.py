@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from OpenSSL import SSL
+from twisted.internet.interfaces import IOpenSSLServerConnectionCreator
+from zope.interface import implementer
 
 from relay_protocol.errors import Invalid
 
 
+@implementer(IOpenSSLServerConnectionCreator)
 class ServerTls:
-    """A context factory for Twisted whose certificate can be read again while it serves.
+    """Makes TLS connections for Twisted; its certificate can be read again while it serves.
 
     :param cert: PEM file with the chain, the relay's own certificate first
     :param key: PEM file with its private key
@@ -22,9 +26,9 @@ class ServerTls:
         self._key = key
         self._context = self._read()
 
-    def getContext(self) -> SSL.Context:
-        """The context for a new connection."""
-        return self._context
+    def serverConnectionForTLS(self, protocol: Any) -> SSL.Connection:
+        """A connection with the certificate as it was last read."""
+        return SSL.Connection(self._context, None)
 
     def reload(self) -> None:
         """Read the files again; open connections keep what they have.

@@ -10,7 +10,7 @@ import msgspec
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_protocol.rights import Operation
-from relay_server.access import BadCredentials, Permit
+from relay_server.access import Permit
 from relay_server.registry import Presence
 from relay_server.video import NO_CAMERA, Picture, Stream, Videos
 
@@ -28,10 +28,6 @@ class Screen(Protocol):
         """There is nothing to see, or no more. Called once, and not after :meth:`Watching.leave`."""
 
 
-_COMPRESSED = "/compressed"
-"""What image_transport adds to the name of a topic for its compressed pictures."""
-
-
 def check_view(permit: Permit, camera: str, transport: str = "") -> None:
     """Whether this may be seen.
 
@@ -43,8 +39,7 @@ def check_view(permit: Permit, camera: str, transport: str = "") -> None:
 
 
 def _may_view(permit: Permit, camera: str, transport: str) -> bool:
-    raw = camera.removesuffix(_COMPRESSED)
-    shown = {"compressed": raw + _COMPRESSED, "raw": raw}.get(transport, camera)
+    shown = {"compressed": link.compressed_of, "raw": link.raw_of}.get(transport, str)(camera)
     return all(permit.judge(Operation.VIEW, each).allowed for each in {camera, shown})
 
 
@@ -77,12 +72,17 @@ class Watching:
         self._over = over
         self._stream: Stream | None = None
         permit.on_change = self._rights_changed
-        permit.on_revoke = self._revoked
+        permit.on_revoke = self.end
 
     @property
     def user(self) -> int:
         """Whose it is."""
         return self.permit.principal.user_id
+
+    @property
+    def name(self) -> str:
+        """The user's name."""
+        return self.permit.principal.name
 
     def begin(self, videos: Videos) -> None:
         """Watch.
@@ -136,9 +136,6 @@ class Watching:
         if not _may_view(self.permit, self.camera, self.settings.transport):
             self.end(Refused(f"your right to view {self.camera} was revoked"))
 
-    def _revoked(self, reason: str) -> None:
-        self.end(Refused(reason) if "right" in reason else BadCredentials(reason))
-
 
 def view(camera: link.Camera, streams: Iterable[Stream]) -> dict[str, Any]:
     """A camera as users see it (SPEC section 1.8)."""
@@ -149,6 +146,7 @@ def view(camera: link.Camera, streams: Iterable[Stream]) -> dict[str, Any]:
         "width": camera.width or None,
         "height": camera.height or None,
         "fps": camera.fps or None,
+        "seen": camera.seen or None,
         "streams": [_shown(stream) for stream in streams if stream.camera == camera.name],
     }
 

@@ -18,7 +18,7 @@ from relay_server.channel.interfaces import Interfaces
 from relay_server.channel.round_trips import RoundTrips
 from relay_server.channel.serving import call_seconds
 from relay_server.channel.states import State
-from relay_server.channel.wire import Member, Wire
+from relay_server.channel.wire import Commander, Sent, Wire
 from relay_server.clock import Clock, as_twisted
 
 T = TypeVar("T")
@@ -50,7 +50,14 @@ class Asking:
         self._round_trips = RoundTrips(wire)
         self._waiting: list[Deferred[None]] = []
 
-    async def call(self, service: str, type_name: str, args: bytes, timeout: float | None) -> bytes:
+    async def call(
+        self,
+        service: str,
+        type_name: str,
+        args: bytes,
+        timeout: float | None,
+        sent: Sent,
+    ) -> bytes:
         """Call a service on the robot; see :meth:`Calls.call`.
 
         :param timeout: seconds, or what is usual
@@ -60,18 +67,20 @@ class Asking:
 
         async def work() -> bytes:
             await self._open()
-            return await self._calls.call(service, type_name, args, seconds)
+            await sent.controls()
+            return await self._calls.call(service, type_name, args, seconds, sent)
 
         # One second more than the call itself has: its own words are the better ones.
         return await self.within(seconds + 2 * GRACE, work())
 
     def pursue(
         self,
-        member: Member,
+        member: Commander,
         asker: Asker,
         action: str,
         type_name: str,
         args: bytes,
+        sent: Sent,
         *,
         feedback: bool,
     ) -> ClientGoal:
@@ -83,7 +92,8 @@ class Asking:
 
         async def work() -> None:
             await self._open()
-            await self._goals.begin(goal, type_name, args)
+            await sent.controls()
+            await self._goals.begin(goal, type_name, args, sent)
 
         goal.beginning = Deferred.fromCoroutine(self.within(limits.CALL_SECONDS, work()))
         goal.beginning.addErrback(self._goals.not_begun, goal)

@@ -11,7 +11,7 @@ from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailab
 from relay_server.channel.bodies import Bodies
 from relay_server.channel.offers import Offer, Offers
 from relay_server.channel.serving import ServedCalls
-from relay_server.channel.wire import Wire
+from relay_server.channel.wire import Sent, Wire
 from relay_server.clock import Clock, cancel
 
 PENDING = 1024
@@ -36,25 +36,27 @@ class Calls:
         self._ids = itertools.count(1)
         self._pending: dict[str, Deferred[link.ServiceResponse]] = {}
 
-    async def call(self, service: str, type_name: str, args: bytes, seconds: float) -> bytes:
+    async def call(self, service: str, type_name: str, args: bytes, seconds: float, sent: Sent) -> bytes:
         """Call a service of the robot, or of a client that offers it there.
 
         :param type_name: as the client gave it; the graph's type wins
         :param args: JSON, an object or a list of the fields in order; may be empty
         :param seconds: the robot has for its answer
         :returns: the response as JSON
+        :raises Refused: it moves the robot, and may be too old when it could be sent
         :raises NotFound: no such service
         :raises Invalid: arguments that do not fit its type
         :raises Unavailable: no answer in time, the service said no, or the robot was lost
         """
         offer = self._offers.standing(service)
         if offer is not None:
-            return await self._ask_client(offer, args, seconds)
+            return await self._ask_client(offer, args, seconds, sent)
         type_name = self._known_type(service) or type_name
         if not type_name:
             raise NotFound(f"service {service} does not exist on robot {self._wire.robot.name}")
         await self._bodies.ready(type_name)
-        message = self._message(service, type_name, args, seconds)
+        sent.judge()
+        message = self._message(service, type_name, args, seconds, sent)
         response = await self._exchange(message, seconds)
         if not response.result:
             raise Unavailable(response.reason or f"service {service} failed")
@@ -68,9 +70,10 @@ class Calls:
             return "action_msgs/srv/CancelGoal"
         return graph.service_type(service) or ""
 
-    async def _ask_client(self, offer: Offer, args: bytes, seconds: float) -> bytes:
+    async def _ask_client(self, offer: Offer, args: bytes, seconds: float, sent: Sent) -> bytes:
         """What goes by the robot could come back only as a call without an answer when the client says no."""
         await self._bodies.ready(offer.type)
+        sent.judge()
         self._offers.check(offer)
         request = self._bodies.from_client(f"{offer.type}_Request", args)
         response = await self._served.ask(offer, request, seconds)
@@ -88,13 +91,17 @@ class Calls:
         for waiting in pending.values():
             waiting.errback(Unavailable(f"robot {self._wire.robot.name} lost its connection during the call"))
 
-    def _message(self, service: str, type_name: str, args: bytes, seconds: float) -> link.CallService:
+    def _message(
+        self, service: str, type_name: str, args: bytes, seconds: float, sent: Sent
+    ) -> link.CallService:
         body = self._bodies.from_client(f"{type_name}_Request", args)
         return link.CallService(
             id=str(next(self._ids)),
             service=service,
             type=type_name,
             timeout=seconds,
+            source=sent.source,
+            stamp=sent.stamp,
             **self._bodies.args(body),
         )
 

@@ -12,7 +12,7 @@ from twisted.python.failure import Failure
 from relay_protocol import jsontext, link
 from relay_protocol.errors import SwitchboardError
 from relay_server.channel.bodies import Bodies
-from relay_server.channel.wire import ChannelLink, Member
+from relay_server.channel.wire import ChannelLink, Commander
 
 
 class Status(enum.IntEnum):
@@ -124,7 +124,7 @@ class ClientGoal(Goal):
     """A goal that a client asked for."""
 
     def __init__(
-        self, member: Member, asker: Asker, bodies: Bodies, action: str, wants_feedback: bool
+        self, member: Commander, asker: Asker, bodies: Bodies, action: str, wants_feedback: bool
     ) -> None:
         super().__init__(action, wants_feedback)
         self.member = member

@@ -25,7 +25,7 @@ from relay_server.channel.goal import (
 )
 from relay_server.channel.offers import Offer, Offers, Provider
 from relay_server.channel.serving import reason_in
-from relay_server.channel.wire import Member, Wire
+from relay_server.channel.wire import Commander, Member, Sent, Wire
 
 ROBOT_GOALS = 1024
 """Goals under way on one robot, and again goals of its graph."""
@@ -87,20 +87,21 @@ class Goals:
 
     # --- clients ask --------------------------------------------------------------------------------------
 
-    def want(self, member: Member, asker: Asker, action: str, wants_feedback: bool) -> ClientGoal:
+    def want(self, member: Commander, asker: Asker, action: str, wants_feedback: bool) -> ClientGoal:
         """A client wants a goal: the record of it, to be begun with :meth:`begin`."""
         goal = ClientGoal(member, asker, self._bodies, action, wants_feedback)
         self._of_clients = {each for each in self._of_clients if not each.over}
         self._of_clients.add(goal)
         return goal
 
-    async def begin(self, goal: ClientGoal, type_name: str, args: bytes) -> None:
+    async def begin(self, goal: ClientGoal, type_name: str, args: bytes, sent: Sent) -> None:
         """Have the robot, or the client that offers the action, pursue a goal.
 
         :param type_name: as the client gave it; what the graph says wins
         :param args: JSON, an object or a list of the fields in order; may be empty
         :raises NotFound: no such action
         :raises Invalid: the arguments do not fit its type
+        :raises Refused: it moves the robot, and may be too old when it could be sent
         :raises Unavailable: the robot is lost, or whoever pursues goals has too many
         """
         offer = self._offers.standing(goal.action)
@@ -109,9 +110,10 @@ class Goals:
         if not goal.type:
             raise NotFound(f"action {goal.action} does not exist on robot {self._wire.robot.name}")
         await self._bodies.ready(goal.type)
+        sent.judge()
         body = self._bodies.from_client(f"{goal.type}_Goal", args)
         if offer is None:
-            self._robot_pursues(goal, body)
+            self._robot_pursues(goal, body, sent)
         else:
             self._client_pursues(goal, offer, body)
 
@@ -122,7 +124,7 @@ class Goals:
                 self._of_clients.discard(goal)
                 goal.abandon()
 
-    def _robot_pursues(self, goal: Goal, body: bytes) -> None:
+    def _robot_pursues(self, goal: ClientGoal, body: bytes, sent: Sent) -> None:
         if len(self._at_robot) >= ROBOT_GOALS:
             raise Unavailable(f"{ROBOT_GOALS} goals are under way on this robot already")
         if self._wire.link is None:
@@ -135,6 +137,8 @@ class Goals:
                 action=goal.action,
                 type=goal.type,
                 feedback=goal.wants_feedback,
+                source=sent.source,
+                stamp=sent.stamp,
                 **self._bodies.args(body),
             )
         )

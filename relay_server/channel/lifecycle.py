@@ -24,7 +24,7 @@ from relay_server.channel.robot_clock import RobotClock
 from relay_server.channel.serving import ServedCalls
 from relay_server.channel.states import NEXT, Event, State
 from relay_server.channel.subscriptions import Subscriptions
-from relay_server.channel.wire import ChannelLink, Member, Wire
+from relay_server.channel.wire import ChannelLink, Guest, Member, Wire
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.graph import Ends
 from relay_server.registry import Presence
@@ -67,7 +67,7 @@ class Channel:
         self._issue_ticket = issue_ticket
         self._closed = closed
         self.state = State.NEW
-        self.members: set[Member] = set()
+        self.members: set[Guest] = set()
         self._timer: Timer | None = None
         self._idle: Timer | None = None
         self.wire = Wire(clock, robot)
@@ -110,7 +110,7 @@ class Channel:
 
     # --- members ------------------------------------------------------------------------------------------
 
-    def attach(self, member: Member) -> None:
+    def attach(self, member: Guest) -> None:
         """A session begins to use the robot."""
         self.members.add(member)
         if self._idle is not None:
@@ -121,7 +121,7 @@ class Channel:
             if self.robot.control is not None:
                 self._happen(Event.ROBOT_ONLINE)
 
-    def detach(self, member: Member) -> None:
+    def detach(self, member: Guest) -> None:
         """A session has ended: what only it wanted is given back to the robot at once."""
         self.members.discard(member)
         self.subscriptions.forget(member)
@@ -160,15 +160,22 @@ class Channel:
 
     def graph_changed(self) -> None:
         """The robot told of a change in its graph."""
+        # Before anything is asked for by what is new.
+        self._judge_again()
         self.subscriptions.graph_changed()
         self.publications.graph_changed()
         self.services.graph_changed()
         self.actions.graph_changed()
 
     def described(self) -> None:
-        """The robot told facts about itself."""
+        """The robot told facts about itself, or which cameras it has."""
+        self._judge_again()
         if self.state is State.OPEN:
             self._robot_clock.follow()
+
+    def _judge_again(self) -> None:
+        for member in list(self.members):
+            member.judge_again()
 
     def ends(self) -> Ends:
         """What the robot has in its graph for our members."""

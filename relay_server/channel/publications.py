@@ -15,7 +15,7 @@ from relay_protocol.ros_types import Writer
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.topics import Held, Phase, Publication, Send
-from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire, resolve
+from relay_server.channel.wire import USER_TOPICS, Ask, ChannelLink, Commander, Member, Wire, resolve
 from relay_server.clock import Clock
 
 ADVERTISEMENTS = 1024
@@ -125,7 +125,7 @@ class Publications:
 
     def publish(
         self,
-        member: Member,
+        member: Commander,
         publication: Publication,
         body: bytes,
         stamp: int,
@@ -144,7 +144,7 @@ class Publications:
         send = publication.send or self._sender(publication)
         if send is not None:
             try:
-                send(body, stamp)
+                send(body, stamp, member.number)
             except SwitchboardError as error:
                 member.tell("error", f"publish {publication.topic}: {error}", id)
         elif publication.phase is Phase.FAILED:
@@ -166,9 +166,9 @@ class Publications:
                 # The robot said it was known: it told of a service's type, or of something else that is no message.
                 self.refused(publication.number, str(error))
                 return None
-            publication.send = _as_cdr(writer, self._now_ns, robot.sample, publication.number)
+            publication.send = _as_cdr(writer, self._now_ns, _way(robot, publication))
         else:
-            publication.send = _as_it_came(robot.sample, publication.number)
+            publication.send = _as_it_came(_way(robot, publication))
         return publication.send
 
     def _hold(self, publication: Publication, message: Held) -> None:
@@ -223,6 +223,7 @@ class Publications:
         self._wire.asks.answered(("advertise", message.number))
         publication = self._numbers.get(message.number)
         if publication is not None:
+            publication.motion = publication.motion or message.motion
             publication.enter(Phase.ACTIVE)
             for ids in publication.holders.values():
                 ids.update(dict.fromkeys(ids, ""))
@@ -285,6 +286,7 @@ class Publications:
             return
         publication.enter(Phase.WAITING)
         publication.seen = self._wire.robot.graph.topics.get(publication.topic)
+        publication.motion = self._wire.robot.is_motion(publication.topic, publication.type)
         self._definitions.want(publication.type)
         message = link.Advertise(
             number=publication.number,
@@ -339,15 +341,28 @@ def _dropped(publication: Publication, message: Held, reason: str) -> None:
     message.member.tell("error", f"publish {publication.topic}: {reason}", message.id)
 
 
-Sample = Callable[[int, int, bytes], None]
-"""Puts a sample on the robot's link; see :meth:`ChannelLink.sample`."""
+Way = Callable[[int, int, bytes], None]
+"""Puts a message on the robot's link: its stamp, its source, and what it is in the robot's encoding."""
 
 
-def _as_cdr(write: Writer, now_ns: Callable[[], int], sample: Sample, number: int) -> Send:
+def _way(robot: ChannelLink, publication: Publication) -> Way:
+    """Commands carry their source; nobody asks about that of other samples."""
+    number = publication.number
+
+    def command(stamp: int, source: int, body: bytes) -> None:
+        robot.command(number, stamp, source, body)
+
+    def sample(stamp: int, source: int, body: bytes) -> None:
+        robot.sample(number, stamp, body)
+
+    return command if publication.motion else sample
+
+
+def _as_cdr(write: Writer, now_ns: Callable[[], int], put: Way) -> Send:
     """Send messages to a robot that speaks CDR."""
 
-    def send(body: bytes, stamp: int) -> None:
-        sample(number, stamp, write(body, now_ns()))
+    def send(body: bytes, stamp: int, source: int) -> None:
+        put(stamp, source, write(body, now_ns()))
 
     return send
 
@@ -355,14 +370,14 @@ def _as_cdr(write: Writer, now_ns: Callable[[], int], sample: Sample, number: in
 _BRACE = ord("{")
 
 
-def _as_it_came(sample: Sample, number: int) -> Send:
+def _as_it_came(put: Way) -> Send:
     """Send messages to a robot that speaks JSON: in the client's own words, once any reader can take them.
 
     msgspec has skipped the body, which finds all that is not JSON except a number beyond any double; the text around
     it was checked for UTF-8 and depth.
     """
 
-    def send(body: bytes, stamp: int) -> None:
+    def send(body: bytes, stamp: int, source: int) -> None:
         if body[0] != _BRACE:
             raise Invalid("'msg' must be an object")
         if not jsontext.in_range(body):
@@ -370,6 +385,6 @@ def _as_it_came(sample: Sample, number: int) -> Send:
                 orjson.loads(body)
             except ValueError as error:
                 raise Invalid(f"the message can't be read: {error}") from None
-        sample(number, stamp, body)
+        put(stamp, source, body)
 
     return send

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from twisted.logger import Logger
 
 from relay_protocol import link
@@ -10,14 +12,32 @@ from relay_server.channel.definitions import Definitions
 from relay_server.channel.listener import Listener
 from relay_server.channel.topics import Phase, TopicUplink
 from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire
-from relay_server.clock import cancel
+from relay_server.clock import Timer, cancel
 
 RETRY_SECONDS = 0.25
 LONGEST_RETRY_SECONDS = 30.0
 """Pauses before a robot that refused a topic it has is asked again; each is twice the one before."""
 
+LOOK_SECONDS = 0.2
+"""How often it is looked whether a topic that late joiners wait for is still inhibited."""
+
 PATIENCE = 2
 """Refusals that are told to nobody when a topic has just got another type."""
+
+
+class FlowOf(NamedTuple):
+    """How a topic comes.
+
+    :param number: of the subscription; with another one counting begins anew
+    :param taken: samples that have come
+    :param regular: whether there is reason to expect any: not of latched topics, nor before the robot has subscribed
+    """
+
+    topic: str
+    type: str
+    number: int
+    taken: int
+    regular: bool
 
 
 class Subscriptions:
@@ -30,6 +50,7 @@ class Subscriptions:
         self._definitions = definitions
         self._topics: dict[str, TopicUplink] = {}
         self._numbers: dict[int, TopicUplink] = {}
+        self._looking: Timer | None = None
 
     def add(self, member: Member, listener: Listener, type_name: str | None, qos: link.QoS | None) -> None:
         """A client wants a topic, or wants it otherwise than before.
@@ -71,13 +92,40 @@ class Subscriptions:
         self._follow_throttle(uplink)
         self._tell_untypeable(uplink, member)
         if not served_before and uplink.serves(member):
-            uplink.replay(listener)
+            if self._silent(topic):
+                uplink.owed[member] = listener
+                self._look_later()
+            else:
+                uplink.replay(listener)
 
     def active(self) -> tuple[tuple[str, str], ...]:
         """Topics the robot is subscribed to for us, with their types."""
         return tuple(
             (uplink.topic, uplink.type) for uplink in self._topics.values() if uplink.phase is Phase.ACTIVE
         )
+
+    def flows(self) -> list[FlowOf]:
+        """How each topic comes that anybody listens to."""
+        return [
+            FlowOf(
+                each.topic,
+                each.type,
+                each.number,
+                each.taken,
+                each.phase is Phase.ACTIVE and each.throttle_ms == 0 and not each.latched,
+            )
+            for each in self._topics.values()
+        ]
+
+    def latched(self, topic: str) -> bool:
+        """Whether publishers of a topic keep their last messages for late joiners."""
+        uplink = self._topics.get(topic)
+        return uplink is not None and uplink.latched
+
+    def type_for(self, member: Member, topic: str) -> str:
+        """The type a topic would come in to a client, while the robot does not have it; empty when nobody says one."""
+        uplink = self._topics.get(topic)
+        return "" if uplink is None else uplink.wanted.get(member, uplink.type)
 
     def check(self, topic: str, type_name: str) -> str:
         """The type a topic has for certain, or none; see :meth:`add` for what is refused.
@@ -210,6 +258,24 @@ class Subscriptions:
         uplink = self._numbers.get(number)
         if uplink is not None:
             uplink.sample(body, stamp)
+
+    # --- late joiners of what is inhibited ----------------------------------------------------------------
+
+    def _silent(self, topic: str) -> bool:
+        """Whether nobody is to get samples of a topic now, not even its last one (SPEC section 1.7)."""
+        return any(each.resource == topic and not each.hold for each in self._wire.robot.safety.inhibited)
+
+    def _look_later(self) -> None:
+        if self._looking is None:
+            self._looking = self._wire.clock.callLater(LOOK_SECONDS, self._look)
+
+    def _look(self) -> None:
+        self._looking = None
+        for uplink in list(self._topics.values()):
+            if uplink.owed and not self._silent(uplink.topic):
+                uplink.pay()
+        if any(uplink.owed for uplink in self._topics.values()):
+            self._look_later()
 
     def _broken(self, uplink: TopicUplink, reason: str) -> None:
         self.log.warn(

@@ -12,7 +12,7 @@ from relay_protocol.link import QoS, Topic
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
-from relay_server.channel.wire import Member
+from relay_server.channel.wire import Commander, Member
 from relay_server.clock import Timer, cancel
 
 LATCHED_KEPT = 64
@@ -67,11 +67,15 @@ class TopicUplink:
         self.untypeable = ""
         """Why the type's definition is not to be had."""
         self.failures = 0
+        self.taken = 0
+        """Samples that have come."""
         self.listeners: dict[Member, Listener] = {}
         self.wanted: dict[Member, str] = {}
         """The type each client says the topic has; those who leave it to the graph are not here."""
         self.served: list[Listener] = []
         """Those who get the samples: not those who say another type."""
+        self.owed: dict[Member, Listener] = {}
+        """Late joiners that get the latched samples when the topic is inhibited no more."""
         self._types = types
         self._broken = broken
         self._converter = self._new_converter()
@@ -95,6 +99,7 @@ class TopicUplink:
     def leave(self, member: Member) -> bool:
         """A client listens no more; whether it did."""
         self.wanted.pop(member, None)
+        self.owed.pop(member, None)
         left = self.listeners.pop(member, None) is not None
         self._serve()
         return left
@@ -157,6 +162,7 @@ class TopicUplink:
             listener.mended()
 
     def _forget(self) -> None:
+        self.owed.clear()
         self._recent.clear()
         self._untyped.clear()
 
@@ -172,9 +178,11 @@ class TopicUplink:
 
     def sample(self, body: bytes, stamp: int) -> None:
         """Take a sample from the robot and hand it to the listeners."""
+        self.taken += 1
         converter = self._converter
         sample = Sample(body, stamp, converter)
         if self.latched:
+            self.pay()
             _keep(self._recent, sample)
         if converter.known or converter.knows:
             for listener in self.served:
@@ -204,6 +212,15 @@ class TopicUplink:
             for sample in list(self._recent):
                 listener.replay(sample)
 
+    def pay(self) -> None:
+        """The topic is inhibited no more: late joiners get what the others have had."""
+        if not self.owed:
+            return
+        owed, self.owed = self.owed, {}
+        for member, listener in owed.items():
+            if self.serves(member):
+                self.replay(listener)
+
 
 def _keep(samples: deque[Sample], sample: Sample) -> None:
     """The newest count, as far as they are not too large together."""
@@ -212,9 +229,10 @@ def _keep(samples: deque[Sample], sample: Sample) -> None:
         samples.popleft()
 
 
-Send = Callable[[bytes, int], None]
-"""Takes a message's JSON, part of a text that was checked, and its stamp (the relay's monotonic nanoseconds).
-Raises :class:`Invalid` when the message is not of the topic's type."""
+Send = Callable[[bytes, int, int], None]
+"""Takes a message's JSON, part of a text that was checked, its stamp (the relay's monotonic nanoseconds), and the
+number of the connection it comes from, which goes with commands. Raises :class:`Invalid` when the message is not of the
+topic's type."""
 
 
 class Held(NamedTuple):
@@ -224,7 +242,7 @@ class Held(NamedTuple):
     :param until: seconds of the relay's clock; nobody wants it sent later
     """
 
-    member: Member
+    member: Commander
     body: bytes
     stamp: int
     id: rosbridge.Id
@@ -242,6 +260,8 @@ class Publication:
         self.queue_size = 0
         self.qos: QoS | None = None
         self.phase = Phase.WAITING
+        self.motion = False
+        """Whether the robot counts it as motion: what goes there are commands, with their source."""
         self.send: Send | None = None
         """Sends a message to the robot; ``None`` while none can be sent, and until the first after a change."""
         self.holders: dict[Member, dict[rosbridge.Id, str]] = {}

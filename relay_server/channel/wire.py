@@ -38,6 +38,9 @@ class ChannelLink(Protocol):
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Queue a sample; the newest survive."""
 
+    def command(self, number: int, stamp: int, source: int, body: bytes) -> None:
+        """The same of a command, with the connection it comes from (SPEC section 2.5)."""
+
     def newest(self, key: str, message: link.Message) -> None:
         """Queue a message of which, under one key, only the newest must survive."""
 
@@ -57,6 +60,62 @@ class Member(Protocol):
 
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """Report something in words, to clients that want to hear it."""
+
+
+class Commander(Member, Protocol):
+    """A member that publishes, calls and pursues goals.
+
+    :ivar number: which connection it is, by which the robot knows who moves it
+    """
+
+    number: int
+
+
+class Movement(Protocol):
+    """A call or a goal that moves the robot."""
+
+    async def controls(self) -> None:
+        """Wait until who asks for it controls the robot.
+
+        :raises Refused: somebody else does, or it may be too old by now
+        :raises Unavailable: the robot does not agree
+        """
+
+    def judge(self) -> None:
+        """See that it is not too old by now.
+
+        :raises Refused: it may be
+        """
+
+
+class Sent(NamedTuple):
+    """What goes with a call or a goal on its way to the robot.
+
+    :param source: the connection it comes from
+    :param stamp: the relay's monotonic nanoseconds before which it can't have been sent
+    :param movement: where it moves the robot
+    """
+
+    source: int
+    stamp: int | None = None
+    movement: Movement | None = None
+
+    async def controls(self) -> None:
+        """Wait until it may move the robot, if it does; see :meth:`Movement.controls`."""
+        if self.movement is not None:
+            await self.movement.controls()
+
+    def judge(self) -> None:
+        """See that it may still be sent; see :meth:`Movement.judge`."""
+        if self.movement is not None:
+            self.movement.judge()
+
+
+class Guest(Member, Protocol):
+    """A member that has come for somebody, who may not hear everything."""
+
+    def judge_again(self) -> None:
+        """The robot's topics or cameras are others: what may be heard is judged anew."""
 
 
 Key = tuple[str, int | str]

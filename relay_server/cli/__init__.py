@@ -13,11 +13,16 @@ _COMMANDS = {
     "serve": Entry("relay_server.cli.serve", "serve", "Run the relay."),
     "demo": Entry("relay_server.cli.demo", "demo", "Run a relay with two simulated robots."),
     "status": Entry("relay_server.cli.status", "status", "Show which robots are online, and with whom."),
+    "stop": Entry("relay_server.cli.stopping", "stop", "Stop a robot, or all of them."),
+    "resume": Entry("relay_server.cli.stopping", "resume", "Let a robot that was stopped move again."),
     "user": Entry("relay_server.cli.users", "user", "Add, list, change and remove users."),
     "group": Entry("relay_server.cli.groups", "group", "Give users rights together."),
-    "robot": Entry("relay_server.cli.robots", "robot", "Add, list and remove robots and their keys."),
+    "robot": Entry(
+        "relay_server.cli.robots", "robot", "Add, list and remove robots and their keys; orders to many."
+    ),
     "right": Entry("relay_server.cli.rights", "right", "Say who may do what on which robot."),
     "token": Entry("relay_server.cli.tokens", "token", "Create, list and revoke access tokens."),
+    "alerts": Entry("relay_server.cli.alerts", "alerts", "Show alerts, and say who is told how."),
     "audit": Entry("relay_server.cli.audit", "audit", "Read and verify the audit log."),
     "db": Entry("relay_server.cli.database", "db", "Look after the database."),
 }

@@ -6,16 +6,23 @@ import http.client
 import json
 import os
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 
 SOCKET_NAME = "relay.sock"
 
 _KNOCK_SECONDS = 2.0
 _ASK_SECONDS = 5.0
 _ANSWER_BYTES = 16 * 1024 * 1024
+_LINE_SECONDS = 330.0
+"""The longest a robot may take for an order, and some more."""
+_MOTION_SECONDS = 30.0
+"""Longer than a robot has to confirm that it stands."""
+
+_NO_RELAY = "no relay runs on this data folder; start one with 'switchboard serve', or give --data"
 _PATH_BYTES = 107
 """Longest path of a Unix socket (unix(7): sun_path, less its NUL)."""
 
@@ -76,11 +83,9 @@ def ask_status(folder: Path) -> dict[str, Any]:
     try:
         status, body = _request(folder, "GET", "/status", _ASK_SECONDS)
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
-        raise Unavailable(
-            "no relay runs on this data folder; start one with 'switchboard serve', or give --data"
-        ) from None
+        raise Unavailable(_NO_RELAY) from None
     except (PermissionError, OSError, http.client.HTTPException) as error:
-        raise Unavailable(f"the relay on this data folder does not answer ({_reason(error)})") from None
+        raise _unanswered(error, _ASK_SECONDS) from None
     try:
         answer = json.loads(body)
     except ValueError:
@@ -90,7 +95,89 @@ def ask_status(folder: Path) -> dict[str, Any]:
     return answer
 
 
-def _reason(error: Exception) -> str:
+class NoRelay(Unavailable):
+    """No relay runs on this data folder."""
+
+
+def order_motion(folder: Path, what: str, order: dict[str, Any]) -> dict[str, Any]:
+    """Have the relay stop robots, or resume one.
+
+    :param what: ``stop`` or ``resume``
+    :raises NoRelay: none runs on this folder
+    :raises Unavailable: it does not answer, or a robot does not
+    :raises SwitchboardError: it says no, in its own words
+    """
+    connection = _Connection(folder, _MOTION_SECONDS)
+    try:
+        connection.request("POST", f"/{what}", json.dumps(order), {"Content-Type": "application/json"})
+        answer = connection.getresponse()
+        body = answer.read(_ANSWER_BYTES)
+    except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
+        raise NoRelay(_NO_RELAY) from None
+    except (OSError, http.client.HTTPException) as error:
+        raise _unanswered(error, _MOTION_SECONDS) from None
+    finally:
+        connection.close()
+    if answer.status != http.client.OK:
+        raise _refusal(answer.status, body)
+    return _line(body)
+
+
+def give_order(folder: Path, order: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Have the relay carry out an order to many robots; its lines as they come. Who stops reading ends the order.
+
+    :raises Unavailable: no relay runs on this folder, or it went away before the order was done
+    :raises Invalid: the order makes no sense
+    :raises NotFound: it means no robot
+    """
+    connection = _Connection(folder, _LINE_SECONDS)
+    try:
+        try:
+            headers = {"Content-Type": "application/json"}
+            connection.request("POST", "/fleet", json.dumps(order), headers)
+            answer = connection.getresponse()
+            if answer.status != http.client.OK:
+                raise _refusal(answer.status, answer.read(_ANSWER_BYTES))
+            while line := answer.readline(_ANSWER_BYTES):
+                yield _line(line)
+        except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
+            raise Unavailable(_NO_RELAY) from None
+        except (OSError, http.client.HTTPException) as error:
+            raise _unanswered(error, _LINE_SECONDS) from None
+    finally:
+        connection.close()
+
+
+def _line(line: bytes) -> dict[str, Any]:
+    try:
+        said = json.loads(line)
+    except ValueError:
+        said = None
+    if not isinstance(said, dict):
+        raise Unavailable("the relay on this data folder answered something else")
+    return said
+
+
+def _refusal(status: int, body: bytes) -> SwitchboardError:
+    """What the relay says in problem details."""
+    try:
+        said = json.loads(body)
+    except ValueError:
+        said = None
+    detail = said.get("detail") if isinstance(said, dict) else None
+    if not isinstance(detail, str):
+        return Unavailable(f"the relay on this data folder answered something else (HTTP {status})")
+    kinds: dict[int, type[SwitchboardError]] = {400: Invalid, 404: NotFound, 409: Refused}
+    return kinds.get(status, Unavailable)(detail)
+
+
+def _unanswered(error: Exception, waited: float) -> Unavailable:
+    """What is told when no answer came.
+
+    :param waited: how long it was waited for, seconds
+    """
     if isinstance(error, TimeoutError):
-        return f"nothing came within {_ASK_SECONDS:g} s"
-    return getattr(error, "strerror", None) or type(error).__name__
+        reason = f"nothing came within {waited:g} s"
+    else:
+        reason = getattr(error, "strerror", None) or type(error).__name__
+    return Unavailable(f"the relay on this data folder does not answer ({reason})")

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.queries import GroupRecord, RobotRecord, UserRecord
+from relay_protocol.errors import Unavailable
 from relay_server.cli.app import App, group_of, robot_of, sure, user_of
 from relay_server.cli.output import tell
+from relay_server.cli.text import file_size
 
 
 class _Kind(NamedTuple):
@@ -34,13 +36,43 @@ def remove_named(app: App, what: str, name: str, yes: bool, as_json: bool) -> No
     :param what: ``user``, ``group`` or ``robot``
     :param yes: don't ask
     :raises NotFound: there is none of this name
+    :raises Unavailable: what is recorded of a robot can't be told
     """
     kind = _KINDS[what]
     with app.reading() as session:
         found = kind.find(session, name)
-    sure(f"Remove {what} {found.name} with {kind.along}?", yes)
+    recordings = _recordings(app, found.id) if what == "robot" else None
+    also = f", and {recordings.words}" if recordings else ""
+    sure(f"Remove {what} {found.name} with {kind.along}{also}?", yes)
     with app.change() as change:
         found = kind.find(change.session, name)
         kind.delete(change.session, found.id)
-        change.audit(f"{what}.remove", found.name)
-    tell(as_json, {what: found.name, "removed": True}, f"Removed {what} {found.name}.")
+        change.audit(
+            f"{what}.remove", found.name, **({"recordings": recordings.number} if recordings else {})
+        )
+    answer: dict[str, Any] = {what: found.name, "removed": True}
+    sentences = [f"Removed {what} {found.name}."]
+    if recordings:
+        answer["recordings"] = recordings.number
+        sentences.append(f"The relay deletes {recordings.words}: now if it runs, else when it starts.")
+    tell(as_json, answer, *sentences)
+
+
+class _Kept(NamedTuple):
+    """What is recorded of a robot."""
+
+    number: int
+    words: str
+
+
+def _recordings(app: App, robot_id: int) -> _Kept | None:
+    # Late: what recordings need is more than other commands do.
+    from relay_server.recording import FOLDER, kept_of
+
+    try:
+        count, size = kept_of(app.data / FOLDER, robot_id)
+    except OSError as error:
+        raise Unavailable(f"the folder of recordings can't be read: {error.strerror}") from None
+    if not count:
+        return None
+    return _Kept(count, f"its {count} recording{'s' if count > 1 else ''} ({file_size(size)})")

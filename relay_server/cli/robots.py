@@ -14,6 +14,7 @@ from relay_protocol.errors import Unavailable
 from relay_protocol.limits import ENROLMENT_SECONDS
 from relay_server import passwords
 from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, yes_option
+from relay_server.cli.fleet import ORDERS
 from relay_server.cli.output import show, tell
 from relay_server.cli.relaysocket import ask_status
 from relay_server.cli.removing import remove_named
@@ -24,7 +25,11 @@ _ROBOTS_PORT = 9091
 
 @click.group()
 def robot() -> None:
-    """Add, list and remove robots and their keys."""
+    """Add, list and remove robots and their keys; give orders to many of them."""
+
+
+for _name, _order in ORDERS.items():
+    robot.add_command(_order, _name)
 
 
 @robot.command(

@@ -14,6 +14,8 @@ from relay_server.cli.app import App, examples, pass_app
 if TYPE_CHECKING:
     from relay_server.service import Relay
 
+DAY = 86400.0
+
 
 @click.command(
     epilog=examples(
@@ -51,13 +53,51 @@ if TYPE_CHECKING:
     help="Origin under which people open the portal, as https://robots.example.org:9090. May be repeated.",
 )
 @click.option("--name", default="", help="Name robots sign for; made up once when not given.")
-@click.option("--heartbeat", default=2.0, show_default=True, help="Seconds between pings on robot links.")
+@click.option("--heartbeat", default=1.25, show_default=True, help="Seconds between pings on robot links.")
 @click.option(
     "--recordings-gb",
     default=10.0,
     show_default=True,
     help="How much recordings may take in all, gigabytes. 0: nothing is recorded.",
 )
+@click.option(
+    "--explicit-control",
+    is_flag=True,
+    help="A robot nobody controls obeys nobody: control is taken by asking for it, never by a first command.",
+)
+@click.option(
+    "--control-grace",
+    default=30.0,
+    show_default=True,
+    help="Seconds who has control has to answer a request; then an owner may take over.",
+)
+@click.option(
+    "--control-idle",
+    default=600.0,
+    show_default=True,
+    help="Seconds without a command, after which control is free again.",
+)
+@click.option(
+    "--webhook-networks",
+    default="",
+    metavar="NETWORKS",
+    envvar="SWITCHBOARD_WEBHOOK_NETWORKS",
+    help="Private networks that alerts may be sent to, as 192.168.7.0/24,fd00:7::/64. None else.",
+)
+@click.option(
+    "--apprise-schemes",
+    default="",
+    metavar="SCHEMES",
+    envvar="SWITCHBOARD_APPRISE_SCHEMES",
+    help="Services that users may have alerts sent by, as mailtos,ntfys. Needs the extra 'alerts'.",
+)
+@click.option(
+    "--battery-low",
+    default=20.0,
+    show_default=True,
+    help="Percent at which a battery is an alert; 0: never.",
+)
+@click.option("--battery-critical", default=10.0, show_default=True, help="Percent at which it is worse.")
 @click.option("--log-json", is_flag=True, help="Log one JSON object a line.")
 @click.option("--debug", is_flag=True, help="Log more.")
 @pass_app
@@ -72,6 +112,13 @@ def serve(
     name: str,
     heartbeat: float,
     recordings_gb: float,
+    explicit_control: bool,
+    control_grace: float,
+    control_idle: float,
+    webhook_networks: str,
+    apprise_schemes: str,
+    battery_low: float,
+    battery_critical: float,
     log_json: bool,
     debug: bool,
 ) -> None:
@@ -81,7 +128,7 @@ def serve(
     start a one-time login link for the user 'admin' is printed.
     """
     from relay_server import logs
-    from relay_server.config import Endpoint, Settings
+    from relay_server.config import AlertSettings, Endpoint, Settings
     from relay_server.run import run
 
     if data is not None:
@@ -92,6 +139,12 @@ def serve(
         raise Invalid("--heartbeat must be more than 0 s")
     if recordings_gb < 0:
         raise Invalid("--recordings-gb must not be less than 0")
+    if not (0 <= control_grace <= DAY and 0 < control_idle <= DAY):
+        raise Invalid("--control-grace and --control-idle are seconds: more than 0, at most a day")
+    if battery_low == 0:
+        battery_critical = 0.0
+    if not 0 <= battery_critical <= battery_low <= 100:
+        raise Invalid("--battery-critical and --battery-low are percent, the first not above the second")
     app.data.mkdir(mode=0o700, parents=True, exist_ok=True)
     settings = Settings(
         data=app.data,
@@ -104,9 +157,19 @@ def serve(
         name=name,
         heartbeat=heartbeat,
         recordings=round(recordings_gb * 10**9),
+        explicit_control=explicit_control,
+        control_grace=control_grace,
+        control_idle=control_idle,
+        alerts=AlertSettings(
+            _listed(webhook_networks), _listed(apprise_schemes), battery_low / 100, battery_critical / 100
+        ),
     )
     logs.begin(log_json, debug)
     sys.exit(run(settings, _ready))
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    return tuple(each.strip() for each in text.split(",") if each.strip())
 
 
 def _ready(relay: Relay, link: str | None) -> None:

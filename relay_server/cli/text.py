@@ -1,7 +1,8 @@
-"""Moments and spans of time for people."""
+"""Moments, spans of time and sizes for people."""
 
 from __future__ import annotations
 
+import math
 import re
 from datetime import datetime, timezone
 
@@ -27,6 +28,14 @@ def duration(seconds: float) -> str:
         if count:
             parts.append(f"{count} {unit}")
     return " ".join(parts[:2]) or "0 s"
+
+
+def file_size(size: int) -> str:
+    """Bytes in the units disks are sold in, never less than there are."""
+    for unit, name in ((10**9, "GB"), (10**6, "MB")):
+        if size >= unit:
+            return f"{math.ceil(size * 10 / unit) / 10:g} {name}"
+    return f"{math.ceil(size / 1000)} kB"
 
 
 def parse_duration(text: str) -> int:

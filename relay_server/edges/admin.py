@@ -3,27 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, Protocol
 
+import msgspec
 from klein import Klein
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.web.server import Request
 
 from relay_protocol import jsontext
+from relay_protocol.errors import SwitchboardError
+from relay_server.edges.problems import problem_of
+
+
+class Stopping(Protocol):
+    """Who stops robots; see :class:`relay_server.console.Console`."""
+
+    async def stop_here(self, robot: str | None, why: str, by: str) -> list[dict[str, Any]]:
+        """Stop a robot, or all."""
+
+    async def resume_here(self, robot: str, why: str, by: str) -> None:
+        """Let one move again."""
+
+
+class StopOrder(msgspec.Struct):
+    """Body of ``POST /stop`` and ``POST /resume``; without ``robot`` all are stopped.
+
+    :param by: who is at the machine
+    """
+
+    by: str
+    robot: str | None = None
+    why: str = ""
+
+
+_order_decoder = msgspec.json.Decoder(StopOrder)
 
 
 class AdminSocket:
-    """``GET /status`` and ``POST /refresh`` for the admin command line.
+    """``GET /status``, ``POST /refresh``, ``/stop``, ``/resume`` and ``/fleet`` for the admin command line.
 
     :param status: what the relay knows now
     :param refresh: takes up changes in the database at once
+    :param order: carries out an order to many robots, and answers by itself
     """
 
     app = Klein()
 
-    def __init__(self, status: Callable[[], dict[str, Any]], refresh: Callable[[], Awaitable[None]]) -> None:
+    def __init__(
+        self,
+        status: Callable[[], dict[str, Any]],
+        refresh: Callable[[], Awaitable[None]],
+        order: Callable[[Request], Awaitable[object]],
+        stopping: Stopping,
+    ) -> None:
         self._status = status
         self._refresh = refresh
+        self._order = order
+        self._stopping = stopping
 
     @app.route("/status", methods=["GET"])
     def status(self, request: Request) -> bytes:
@@ -37,4 +73,46 @@ class AdminSocket:
     async def _take_up(self, request: Request) -> bytes:
         await self._refresh()
         request.setResponseCode(204)
+        return b""
+
+    @app.route("/stop", methods=["POST"])
+    def stop(self, request: Request) -> Deferred[bytes]:
+        return Deferred.fromCoroutine(self._told(request, self._stop(request)))
+
+    async def _stop(self, request: Request) -> Any:
+        order = jsontext.decode(_order_decoder, request.content.read())
+        return {"robots": await self._stopping.stop_here(order.robot, order.why, order.by)}
+
+    @app.route("/resume", methods=["POST"])
+    def resume(self, request: Request) -> Deferred[bytes]:
+        return Deferred.fromCoroutine(self._told(request, self._resume(request)))
+
+    async def _resume(self, request: Request) -> Any:
+        order = jsontext.decode(_order_decoder, request.content.read())
+        await self._stopping.resume_here(order.robot or "", order.why, order.by)
+        return {}
+
+    async def _told(self, request: Request, work: Awaitable[Any]) -> bytes:
+        try:
+            answer = jsontext.encode(await work)
+        except SwitchboardError as error:
+            return problem_of(request, error)
+        request.setHeader(b"content-type", b"application/json")
+        return answer
+
+    @app.route("/fleet", methods=["POST"])
+    def fleet(self, request: Request) -> Deferred[bytes]:
+        running = Deferred.fromCoroutine(self._carry_out(request))
+        # Ctrl-C at the command line ends the order.
+        request.notifyFinish().addErrback(lambda _: running.cancel())
+        return running
+
+    async def _carry_out(self, request: Request) -> bytes:
+        try:
+            await self._order(request)
+        except SwitchboardError as error:
+            return problem_of(request, error)
+        except CancelledError:
+            if not request._disconnected:
+                raise
         return b""

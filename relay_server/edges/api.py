@@ -6,10 +6,11 @@ A cookie that changes state counts only with a listed Origin. Every error is pro
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 import msgspec
 from klein import Klein
+from msgspec import Meta
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from twisted.internet.defer import Deferred
@@ -21,19 +22,15 @@ from werkzeug.exceptions import NotFound as NothingHere
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
-from relay_protocol.limits import TICKET_SECONDS
+from relay_protocol.limits import NAME, TICKET_SECONDS
 from relay_server.access import Principal
-from relay_server.auth import SESSION_SECONDS, BadCredentials
-from relay_server.clock import Clock, cancel
+from relay_server.auth import SESSION_SECONDS, BadCredentials, Opening
+from relay_server.clock import Clock
 from relay_server.edges.problems import problem, problem_of
+from relay_server.edges.stream import EventStream, Source
 from relay_server.origins import Origins
 
 T = TypeVar("T")
-
-STREAM_SECONDS = 5.0
-COALESCE_SECONDS = 0.25
-STALL_SECONDS = 5.0
-"""A client that takes nothing of its stream for so long is cut."""
 
 
 class Desk(Protocol):
@@ -54,8 +51,8 @@ class Desk(Protocol):
     async def robots(self, principal: Principal) -> list[dict[str, Any]]:
         """What the principal may see of its robots."""
 
-    async def issue_ticket(self, principal: Principal, robot: str) -> str:
-        """A websocket ticket."""
+    async def issue_ticket(self, principal: Principal, opens: Opening) -> str:
+        """A ticket for one use."""
 
     async def healthy(self) -> bool:
         """Whether the database answers."""
@@ -72,19 +69,20 @@ class Login(msgspec.Struct):
     code: str = ""
 
 
-class TicketFor(msgspec.Struct):
-    """Body of ``POST /api/v1/tickets``."""
+class TicketFor(msgspec.Struct, rename={"purpose": "for"}):
+    """Body of ``POST /api/v1/tickets``: for the robot's websocket, or for its cameras, or one of them."""
 
     robot: str
-
-
-Handler = Callable[..., Awaitable[Any]]
+    purpose: Literal["robot", "video"] = "robot"
+    camera: Annotated[str, Meta(max_length=NAME)] = ""
 
 
 class Api:
     """The HTTP API as a klein application.
 
     :param below: what serves the addresses below those of robots, by their first part
+    :param beside: the same for those beside them
+    :param events: what else is told to pages, by the name of the event
     :param cookie: name of the session cookie
     :param secure: cookies only over TLS
     """
@@ -99,15 +97,19 @@ class Api:
         origins: Origins,
         metrics: CollectorRegistry,
         below: Mapping[str, Callable[[Api, str], IResource]],
+        beside: Mapping[str, Callable[[Api], IResource]],
         *,
         cookie: str,
         secure: bool,
+        events: Mapping[str, Source] | None = None,
     ) -> None:
+        self._events = {} if events is None else events
         self._clock = clock
         self._desk = desk
         self._origins = origins
         self._metrics = metrics
         self._below = below
+        self._beside = beside
         self._cookie = cookie
         self._secure = secure
 
@@ -193,10 +195,8 @@ class Api:
 
     async def _stream(self, request: Request) -> Any:
         await self.principal(request)
-        request.setHeader(b"content-type", b"text/event-stream")
-        request.setHeader(b"cache-control", b"no-store")
-        request.setHeader(b"x-accel-buffering", b"no")
-        await _RobotStream(self._clock, self, self._desk, request).run()
+        sources = {"robots": self._desk.robots, **self._events}
+        await EventStream(self._clock, request, self.principal, sources, self._desk.on_change).run()
         return STREAMED
 
     @app.route("/api/v1/robots/<name>", methods=["GET"])
@@ -217,19 +217,26 @@ class Api:
         request.postpath = request.postpath or [b""]
         return self._below[part](self, name)
 
+    @app.route("/api/v1/<any(alerts,fleet):part>", branch=True)
+    def beside(self, request: Request, part: str) -> Any:
+        if part not in self._beside:
+            raise NothingHere
+        request.postpath = request.postpath or [b""]
+        return self._beside[part](self)
+
     @app.route("/api/v1/tickets", methods=["POST"])
     def tickets(self, request: Request) -> Any:
         return self.answer(request, self._tickets(request))
 
     async def _tickets(self, request: Request) -> Any:
         principal = await self.principal(request)
-        robot = body_of(request, TicketFor).robot
+        wanted = body_of(request, TicketFor)
+        video = wanted.purpose == "video"
+        if wanted.camera and not video:
+            raise Invalid("'camera' goes with 'for': 'video'")
+        ticket = await self._desk.issue_ticket(principal, Opening(wanted.robot, video, wanted.camera))
         request.setResponseCode(201)
-        return {
-            "ticket": await self._desk.issue_ticket(principal, robot),
-            "expires_in": TICKET_SECONDS,
-            "robot": robot,
-        }
+        return {"ticket": ticket, "expires_in": TICKET_SECONDS, **msgspec.to_builtins(wanted)}
 
     # --- operations ---------------------------------------------------------------------------------------
 
@@ -310,82 +317,3 @@ def body_of(request: Request, kind: type[T]) -> T:
 
 def _me(principal: Principal) -> dict[str, Any]:
     return {"user": principal.name, "admin": principal.admin, "realm": principal.realm}
-
-
-class _RobotStream:
-    """Server-sent events (WHATWG HTML section 9.2): the caller's robots, at every change."""
-
-    def __init__(self, clock: Clock, api: Api, desk: Desk, request: Request) -> None:
-        self._clock = clock
-        self._api = api
-        self._desk = desk
-        self._request = request
-        self._wake: Deferred[None] | None = None
-        self._paused_since: float | None = None
-
-    async def run(self) -> None:
-        """Until the client leaves, takes nothing any more, or its credentials end."""
-        stop = self._desk.on_change(self._changed)
-        self._request.registerProducer(self, True)
-        try:
-            while not self._request._disconnected:
-                if self._paused_since is None:
-                    await self._tell()
-                elif self._clock.seconds() - self._paused_since > STALL_SECONDS:
-                    self._request.transport.abortConnection()
-                    return
-                await self._sleep(COALESCE_SECONDS)
-                await self._until_change()
-        except (BadCredentials, Refused):
-            self._request.write(b"event: ended\ndata: {}\n\n")
-        finally:
-            stop()
-            self._request.unregisterProducer()
-
-    async def _tell(self) -> None:
-        try:
-            principal = await self._api.principal(self._request)
-            body = jsontext.encode({"robots": await self._desk.robots(principal)})
-        except Unavailable:
-            # What is open goes on; the next look may do better.
-            return
-        self._request.write(b"event: robots\ndata: " + body + b"\n\n")
-
-    # --- Twisted's push producer ---
-
-    def pauseProducing(self) -> None:
-        """The transport's buffer is full."""
-        self._paused_since = self._clock.seconds()
-
-    def resumeProducing(self) -> None:
-        """The transport takes bytes again."""
-        self._paused_since = None
-        self._changed()
-
-    def stopProducing(self) -> None:
-        """The client has left; the request's own end follows."""
-
-    # --- waiting ---
-
-    def _changed(self) -> None:
-        wake, self._wake = self._wake, None
-        if wake is not None:
-            wake.callback(None)
-
-    async def _until_change(self) -> None:
-        wake: Deferred[None] = Deferred()
-        self._wake = wake
-        timer = self._clock.callLater(STREAM_SECONDS, self._changed)
-        try:
-            await wake
-        finally:
-            self._wake = None
-            cancel(timer)
-
-    async def _sleep(self, seconds: float) -> None:
-        done: Deferred[None] = Deferred()
-        timer = self._clock.callLater(seconds, done.callback, None)
-        try:
-            await done
-        finally:
-            cancel(timer)

@@ -9,6 +9,7 @@ from autobahn.websocket.types import ConnectionRequest
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_server import closing
 from relay_server.access import BadCredentials, Principal
+from relay_server.auth import Opening
 from relay_server.frontdesk import Admission, GoingDown
 from relay_server.outbox import Outbox
 from relay_server.session import ClientTransport
@@ -66,7 +67,7 @@ class Gate(Protocol):
     async def bearer(self, token: str) -> Principal:
         """The principal of an access token."""
 
-    async def ticket(self, ticket: str, robot: str) -> Principal:
+    async def ticket(self, ticket: str, asked: Opening) -> Principal:
         """The principal of a single-use ticket."""
 
     async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
@@ -85,9 +86,12 @@ class Gate(Protocol):
         """Somebody who was admitted left before a session began."""
 
 
-async def identify(gate: Gate, request: ConnectionRequest, robot: str) -> tuple[Principal | None, str | None]:
+async def identify(
+    gate: Gate, request: ConnectionRequest, asked: Opening
+) -> tuple[Principal | None, str | None]:
     """The principal, if the handshake names one, and the subprotocol to answer with.
 
+    :param asked: what a ticket would have to be for
     :raises SwitchboardError: what it names proves nobody, or can't be checked
     """
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
@@ -99,7 +103,7 @@ async def identify(gate: Gate, request: ConnectionRequest, robot: str) -> tuple[
     if bearer is not None:
         return await gate.bearer(bearer.removeprefix("bearer.")), chosen
     if ticket:
-        return await gate.ticket(ticket[0], robot), chosen
+        return await gate.ticket(ticket[0], asked), chosen
     headers = request.headers
     origin = request.origin or None
     return await gate.cookie(headers.get("cookie", ""), origin, headers.get("host", "")), chosen

@@ -8,8 +8,10 @@ from twisted.web.server import Request
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, Refused, SwitchboardError, Unavailable
+from relay_server.alerts.desk import TooOften as TooManyRules
 from relay_server.auth import BadCredentials, TooManyTries
-from relay_server.video import NothingCame
+from relay_server.control import NotDone
+from relay_server.video import NothingCame, TooOften
 
 _TITLES = {
     400: "Bad request",
@@ -17,8 +19,10 @@ _TITLES = {
     403: "Refused",
     404: "Not found",
     405: "Method not allowed",
+    409: "Not done",
     413: "Too large",
     415: "Unsupported media type",
+    416: "Range not satisfiable",
     426: "Upgrade required",
     429: "Too many requests",
     500: "Internal error",
@@ -33,7 +37,10 @@ _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (Refused, 403),
     (Invalid, 400),
     (MalformedMessage, 400),
+    (NotDone, 409),
     (NothingCame, 504),
+    (TooOften, 429),
+    (TooManyRules, 429),
     (Unavailable, 503),
 ]
 
@@ -50,7 +57,7 @@ def problem(request: Request, status: int, detail: str, **more: Any) -> bytes:
 
 def problem_of(request: Request, error: SwitchboardError) -> bytes:
     """The same for an error of ours, with what its status wants to be said beside."""
-    if isinstance(error, TooManyTries):
+    if isinstance(error, (TooManyTries, TooOften, TooManyRules)):
         request.setHeader(b"retry-after", str(int(error.retry_after) + 1).encode())
     if isinstance(error, BadCredentials):
         request.setHeader(b"www-authenticate", b"Bearer")

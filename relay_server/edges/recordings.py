@@ -14,6 +14,8 @@ from relay_protocol.limits import KIB
 from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.problems import problem
+from relay_server.edges.ranges import Part, part_of
 from relay_server.recording import Ask
 
 PART_BYTES = 256 * KIB
@@ -24,10 +26,20 @@ STALL_SECONDS = 30.0
 
 
 class File(Protocol):
-    """A file on its way to somebody."""
+    """A file on its way to somebody.
+
+    :ivar tag: names this content, which never changes under it
+    """
 
     name: str
     size: int
+    tag: str
+
+    async def begin(self) -> None:
+        """It is about to be sent.
+
+        :raises Unavailable: not now
+        """
 
     def watch(self, denied: Any) -> None:
         """Call ``denied`` with the reason when it may not go on."""
@@ -44,6 +56,9 @@ class Desk(Protocol):
 
     async def start(self, principal: Principal, robot: str, ask: Ask, address: str) -> dict[str, Any]:
         """Begin one."""
+
+    async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
+        """What could be recorded now."""
 
     async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
         """Those the principal may have."""
@@ -90,6 +105,13 @@ class RobotRecordings:
         request.setHeader(b"location", f"/api/v1/robots/{robot}/recordings/{begun['id']}".encode())
         return begun
 
+    @app.route("/new", methods=["GET"])
+    def possible(self, request: Request) -> Any:
+        return self._api.answer(request, self._possible(request))
+
+    async def _possible(self, request: Request) -> Any:
+        return await self._desk.possible(*await self._asked(request))
+
     @app.route("/<id>", methods=["GET"])
     def one(self, request: Request, id: str) -> Any:
         return self._api.answer(request, self._one(request, id))
@@ -122,13 +144,31 @@ class RobotRecordings:
         principal, robot, address = await self._asked(request)
         file = await self._desk.download(principal, robot, id, address)
         try:
-            request.setHeader(b"content-type", b"application/octet-stream")
-            request.setHeader(b"content-length", str(file.size).encode())
-            request.setHeader(b"content-disposition", f'attachment; filename="{file.name}"'.encode())
-            await _Sending(self._clock, request, file).run()
+            tag = f'"{file.tag}"'
+            part = part_of(request, file.size, tag)
+            if part is None:
+                request.setHeader(b"content-range", f"bytes */{file.size}".encode())
+                request.write(problem(request, 416, f"The file has {file.size} bytes."))
+                return STREAMED
+            if request.method == b"GET":
+                await file.begin()
+            self._head(request, file, tag, part)
+            if request.method == b"GET":
+                await _Sending(self._clock, request, file, part).run()
         finally:
             file.close()
         return STREAMED
+
+    @staticmethod
+    def _head(request: Request, file: File, tag: str, part: Part) -> None:
+        if part.ranged:
+            request.setResponseCode(206)
+            request.setHeader(b"content-range", part.content_range(file.size).encode())
+        request.setHeader(b"accept-ranges", b"bytes")
+        request.setHeader(b"etag", tag.encode())
+        request.setHeader(b"content-type", b"application/octet-stream")
+        request.setHeader(b"content-length", str(part.stop - part.start).encode())
+        request.setHeader(b"content-disposition", f'attachment; filename="{file.name}"'.encode())
 
     async def _asked(self, request: Request) -> tuple[Principal, str, str]:
         """Who asks, about which robot, from where."""
@@ -144,10 +184,11 @@ class RobotRecordings:
 class _Sending:
     """A file on its way out, no faster than it is taken: Twisted's push producer."""
 
-    def __init__(self, clock: Clock, request: Request, file: File) -> None:
+    def __init__(self, clock: Clock, request: Request, file: File, part: Part) -> None:
         self._clock = clock
         self._request = request
         self._file = file
+        self._part = part
         self._paused = False
         self._wake: Deferred[None] | None = None
 
@@ -157,13 +198,13 @@ class _Sending:
         file.watch(lambda reason: self._cut())
         request.registerProducer(self, True)
         try:
-            offset = 0
-            while offset < file.size and not request._disconnected:
+            offset, stop = self._part.start, self._part.stop
+            while offset < stop and not request._disconnected:
                 if self._paused:
                     await self._room()
                     continue
                 try:
-                    part = await file.part(offset, min(PART_BYTES, file.size - offset))
+                    part = await file.part(offset, min(PART_BYTES, stop - offset))
                 except OSError:
                     part = b""
                 if not part:

@@ -22,6 +22,7 @@ from relay_protocol.errors import Invalid, MalformedMessage, Refused, Unavailabl
 from relay_protocol.frames import SampleFrame
 from relay_server import passwords
 from relay_server.channel import Channel, Channels
+from relay_server.control import Desks
 from relay_server.edges.robot_video import VideoEnd
 from relay_server.edges.robots import RobotConnection, Role
 from relay_server.journal import Journal
@@ -53,6 +54,7 @@ class RobotHall:
     registry: Registry
     channels: Channels
     videos: Videos
+    desks: Desks
     journal: Journal
     seconds: Callable[[], float]
     wall: Callable[[], float]
@@ -122,10 +124,11 @@ class Opening(Role):
                 raise Refused(
                     "this key is not accepted for this robot; enroll the robot again if it should be"
                 )
+        robot = hall.registry.presence(record.robot_id, record.robot, record.realm)
+        await hall.desks.coming(robot)
         if connection.ended:
             # It left while the database was asked; a registration now would be a ghost.
             return
-        robot = hall.registry.presence(record.robot_id, record.robot, record.realm)
         Control(hall, connection, robot, hello).begin()
         # A key that was revoked since it was read: whoever looked for robots to cut may have missed this one.
         again = await hall.store.read(queries.robot_key, hello.robot, hello.key)
@@ -263,7 +266,7 @@ class Control(Role):
         robot.encodings = tuple(self._hello.encodings)
         robot.address = connection.address
         connection.on_round_trip = self._round_trip
-        connection.proven(self, limits.CONTROL_FRAME)
+        connection.proven(self, limits.CONTROL_FRAME, measured=True)
         hall.registry.registered(robot, connection)
         self._event("robot.online", address=connection.address)
         self.log.info(
@@ -284,10 +287,10 @@ class Control(Role):
             self._event("robot.key_used_twice", address=self._connection.address, other=robot.address)
         robot.patience = min(MOST_PATIENCE, robot.patience * 2)
 
-    def _event(self, kind: str, source: str = "relay", **data: Any) -> bool:
+    def _event(self, kind: str, source: str = "relay", what: str = "robot", **data: Any) -> bool:
         robot = self._robot
         return self._hall.journal.event(
-            kind, source, cause=f"robot:{robot.realm}/{robot.name}", robot_id=robot.robot_id, **data
+            kind, source, cause=f"{what}:{robot.realm}/{robot.name}", robot_id=robot.robot_id, **data
         )
 
     def message(self, body: bytes) -> None:
@@ -303,18 +306,24 @@ class Control(Role):
             self._hall.registry.described(self._robot, message)
         elif isinstance(message, link.Cameras):
             self._hall.registry.cameras(self._robot, message)
+        elif isinstance(message, (link.Safety, link.Done)):
+            self._hall.desks.of(self._robot).told(message)
         elif isinstance(message, link.Alert):
-            self._alert(message.level[:20], message.text[:500])
+            self._alert(message)
+        elif isinstance(message, link.AlertsTold):
+            self._hall.journal.tell("robot.alerts_told", self._robot.robot_id)
         elif isinstance(message, (link.Ping, link.Pong)):
             self._connection.heartbeat(message)
         elif isinstance(message, link.Bye):
             self._connection.close("bye")
 
-    def _alert(self, level: str, text: str) -> None:
-        if self._event("robot.alert", f"robot:{self._robot.name}", level=level, text=text):
-            self.log.warn(
-                "robot {robot}: {severity}: {text}", robot=self._robot.name, severity=level, text=text
-            )
+    def _alert(self, alert: link.Alert) -> None:
+        name, level, text = self._robot.name, alert.level[:20], alert.text[:500]
+        of = {"alert_kind": alert.kind, "about": alert.about, "over": alert.over}
+        # A cause of its own: however much a robot says, that it comes and goes is kept.
+        kept = self._event("robot.alert", f"robot:{name}", "robot's words", level=level, text=text, **of)
+        if kept and not alert.over:
+            self.log.warn("robot {robot}: {severity}: {text}", robot=name, severity=level, text=text)
 
     def sample(self, frame: SampleFrame) -> None:
         """The control link never carries bulk data."""

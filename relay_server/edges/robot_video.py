@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage
-from relay_protocol.frames import SampleFrame, VideoFrame
+from relay_protocol.frames import SAMPLE_HEAD, PictureJoiner, PicturePart, SampleFrame, VideoFrame
 from relay_server.edges.robots import RobotConnection, Role
 from relay_server.video import Stream
 
@@ -15,6 +15,7 @@ class VideoEnd(Role):
     def __init__(self, stream: Stream, connection: RobotConnection) -> None:
         self._stream = stream
         self._connection = connection
+        self._parts = PictureJoiner(limits.PICTURE_FRAME - SAMPLE_HEAD)
 
     def message(self, body: bytes) -> None:
         """What it plays, or that it does not."""
@@ -32,9 +33,17 @@ class VideoEnd(Role):
         """Topics have links of their own."""
         raise MalformedMessage("samples go over the channel link, not the link of a stream")
 
-    def picture(self, frame: VideoFrame) -> None:
-        """A picture of the stream."""
-        self._stream.picture(frame)
+    def picture(self, frame: VideoFrame | PicturePart) -> None:
+        """A picture of the stream, or a part of one, which is answered too."""
+        if isinstance(frame, VideoFrame):
+            self._parts.drop()
+            self._stream.picture(frame)
+            return
+        whole = self._parts.join(frame)
+        if whole is not None:
+            self._stream.picture(whole)
+        else:
+            self._connection.send(link.Took(number=frame.number, upto=self._parts.size))
 
     def lost(self, reason: str) -> None:
         """The link has ended."""

@@ -21,15 +21,29 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
-from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, VideoFrame, encode_sample
+from relay_protocol.frames import (
+    CommandFrame,
+    Frame,
+    FrameDecoder,
+    JsonFrame,
+    PicturePart,
+    SampleFrame,
+    VideoFrame,
+    encode_command,
+    encode_sample,
+)
 from relay_server.clock import Clock, Timer, cancel, looping
 from relay_server.edges.caps import AddressCap, Place
 from relay_server.edges.fastpath import Turns, Writer, writer_for
 from relay_server.edges.flow import Flow
+from relay_server.linkmeter import LinkMeter, Reading
 from relay_server.outbox import Outbox
 
 PINGS = 256
 """Pings without an answer that are remembered."""
+
+MEASURED_SECONDS = 1.0
+"""A link whose quality is told is pinged at least so often."""
 
 
 class Role(Protocol):
@@ -47,8 +61,8 @@ class Role(Protocol):
         :raises PeerError: it has no place here
         """
 
-    def picture(self, frame: VideoFrame) -> None:
-        """A picture; few roles take any.
+    def picture(self, frame: VideoFrame | PicturePart) -> None:
+        """A picture or a part of one; few roles take any.
 
         :raises PeerError: it is none, or has no place here
         """
@@ -100,6 +114,8 @@ class RobotConnection(TwistedProtocol):
         self._beating = looping(clock, self._beat)
         self._aborting: Timer | None = None
         self._pings: OrderedDict[int, Deferred[float] | None] = OrderedDict()
+        self._meter = LinkMeter()
+        self._answered = 0
         self.on_round_trip: Callable[[float], None] = lambda seconds: None
         self._outbox = Outbox(_nowhere, clock.seconds, self._overflow)
         self.address = ""
@@ -164,6 +180,14 @@ class RobotConnection(TwistedProtocol):
         else:
             self._outbox.data(number, frame)
 
+    def command(self, number: int, stamp: int, source: int, body: bytes) -> None:
+        """The same of a command, with the connection it comes from."""
+        frame = encode_command(number, stamp, source, body)
+        if self._outbox.passing:
+            self._outbox.write(frame)
+        else:
+            self._outbox.data(number, frame)
+
     def newest(self, key: str, message: link.Message) -> None:
         """Queue a message of which, under one key, only the newest must survive."""
         self._outbox.data(key, link.frame(message), 1)
@@ -188,13 +212,17 @@ class RobotConnection(TwistedProtocol):
             self.send(refusal)
             self._hang_up(refusal.reason)
 
-    def proven(self, role: Role, frame_limit: int) -> None:
-        """The robot is known; from now on the connection has this role, heartbeats run both ways."""
+    def proven(self, role: Role, frame_limit: int, *, measured: bool = False) -> None:
+        """The robot is known; from now on the connection has this role, heartbeats run both ways.
+
+        :param measured: whether :meth:`reading` is going to be asked for
+        """
         self._role = role
         self._decoder.limit = frame_limit
         self._known()
         self._stop_deadline()
-        self._beating.start(self.timing.heartbeat, now=True)
+        often = min(self.timing.heartbeat, MEASURED_SECONDS) if measured else self.timing.heartbeat
+        self._beating.start(often, now=True)
 
     def wait_for(self, work: Deferred[None]) -> None:
         """Hold further frames until ``work`` is done."""
@@ -209,6 +237,13 @@ class RobotConnection(TwistedProtocol):
         self._ping(waiting)
         return waiting
 
+    def reading(self) -> Reading:
+        """How good the way to the robot is."""
+        now = self.clock_ns()
+        # Answers keep their order: what was asked before the latest that was answered is not waited for.
+        out = [(now - sent) / 1e9 for sent in self._pings if sent > self._answered]
+        return self._meter.reading(now / 1e9, out)
+
     # --- inside -------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
@@ -219,6 +254,8 @@ class RobotConnection(TwistedProtocol):
                 self._role.sample(frame)
             elif isinstance(frame, JsonFrame):
                 self._role.message(frame.body)
+            elif isinstance(frame, CommandFrame):
+                raise MalformedMessage("commands go from the relay to the robot only")
             else:
                 self._role.picture(frame)
 
@@ -228,7 +265,10 @@ class RobotConnection(TwistedProtocol):
             self.send(link.Pong(t=message.t, at=self.clock_ns()))
         elif message.t in self._pings:
             waiting = self._pings.pop(message.t)
-            seconds = (self.clock_ns() - message.t) / 1e9
+            now = self.clock_ns()
+            seconds = (now - message.t) / 1e9
+            self._meter.came_back(now / 1e9, seconds)
+            self._answered = max(self._answered, message.t)
             self.on_round_trip(seconds)
             if waiting is not None:
                 waiting.callback(seconds)

@@ -223,7 +223,7 @@ class Portal(Resource):
     """The built portal: its files, and its page for every address the portal itself routes."""
 
     isLeaf = True
-    PAGES = frozenset({b"", b"login", b"fleet", b"cockpit"})
+    PAGES = frozenset({b"", b"login", b"fleet", b"cockpit", b"alerts"})
 
     def __init__(self, folder: Path) -> None:
         super().__init__()

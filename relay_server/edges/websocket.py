@@ -22,6 +22,7 @@ from relay_protocol import limits, rosbridge
 from relay_protocol.errors import PeerError, SwitchboardError, Unavailable
 from relay_server import closing, wsframe
 from relay_server.access import Principal
+from relay_server.auth import Opening
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.bounded import BoundedProtocol
 from relay_server.edges.caps import AddressCap, Place
@@ -94,12 +95,13 @@ class ClientProtocol(BoundedProtocol):
     async def _connect(self, request: ConnectionRequest) -> str | None:
         chosen = None
         try:
-            self._robot = self._asked_for(request)
+            asked = self._asked_for(request)
+            self._robot = asked.robot
             if not self.factory.gate.accepting:
                 raise Unavailable("the relay is going down; connect again in a moment")
             if self._place is None:
                 raise Unavailable("too many clients connect at the same time; try again in a moment")
-            principal, chosen = await identify(self.factory.gate, request, self._robot)
+            principal, chosen = await identify(self.factory.gate, request, asked)
             if principal is not None:
                 self._admission = await self._admit(principal)
         except SwitchboardError as error:
@@ -116,12 +118,12 @@ class ClientProtocol(BoundedProtocol):
             raise ConnectionDeny(status_of(self._failure), reason)
         return chosen
 
-    def _asked_for(self, request: ConnectionRequest) -> str:
-        """The robot a handshake names.
+    def _asked_for(self, request: ConnectionRequest) -> Opening:
+        """What a handshake wants to open.
 
         :raises SwitchboardError: what it asks for makes no sense
         """
-        return unquote(request.path.removeprefix("/robots/"))
+        return Opening(unquote(request.path.removeprefix("/robots/")))
 
     async def _admit(self, principal: Principal) -> Admission:
         """Whether it may come in.

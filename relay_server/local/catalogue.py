@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from relay_protocol.link import Service, Topic
 from relay_protocol.ros_types import TypeRegistry
+from relay_server.local import control_types
 
 PACKAGES = ("rosapi_msgs/", "switchboard_msgs/")
 """How the names of these types begin."""
@@ -44,6 +45,7 @@ def _rosapi(type_name: str, text: str) -> Offered:
 
 
 SERVICES = {
+    **{name: Offered(RELAY, *type) for name, type in control_types.SERVICES.items()},
     "/relay/ping": Offered(
         RELAY, "switchboard_msgs/srv/Ping", "bool robot\n---\nint64 relay_time_ns\nfloat64 robot_rtt_ms\n"
     ),
@@ -92,6 +94,9 @@ string state
 string level
 Client[] clients
 RoundTrips rtt_ms
+Links links
+Person[] people
+uint32 more
 uint64 drops
 TopicDrops[] topic_drops
 uint64 plain_instead
@@ -101,14 +106,57 @@ Uplink uplink
 Video[] video
 Motion motion
 Health health
+Steering control
+bool stopped
+{_LINE}
+MSG: switchboard_msgs/msg/Steering
+string state
+string holder
+bool you
 {_LINE}
 MSG: switchboard_msgs/msg/Client
 string user
 float64 since
+string camera
 {_LINE}
 MSG: switchboard_msgs/msg/RoundTrips
 float64 client_relay
 float64 relay_robot
+{_LINE}
+MSG: switchboard_msgs/msg/Links
+Link client_relay
+Link relay_robot
+Link client_robot
+{_LINE}
+MSG: switchboard_msgs/msg/Link
+float64 rtt_ms
+float64 p95_ms
+float64 jitter_ms
+uint32 lost
+string quality
+{_LINE}
+MSG: switchboard_msgs/msg/Person
+string user
+bool you
+bool control
+Connection[] connections
+Watching[] watching
+{_LINE}
+MSG: switchboard_msgs/msg/Connection
+uint64 client
+float64 since
+bool you
+bool control
+float64 rtt_ms
+float64 robot_rtt_ms
+string quality
+uint64 drops
+string address
+{_LINE}
+MSG: switchboard_msgs/msg/Watching
+string camera
+float64 since
+string address
 {_LINE}
 MSG: switchboard_msgs/msg/TopicDrops
 string topic
@@ -135,6 +183,8 @@ float64 delay_ms
 MSG: switchboard_msgs/msg/Motion
 string[] types
 string[] topics
+string[] services
+string[] actions
 uint32 deadline_ms
 uint32 stop_within_ms
 {_LINE}
@@ -145,11 +195,13 @@ float64 memory
 float64 rtt_ms
 uint64 stale_commands
 uint64 unguarded_commands
+uint64 refused_commands
+uint64 limited_commands
 uint64 watchdog_stops
 uint64 dropped_samples
 """
 
-TOPICS = {"/relay/status": STATUS}
+TOPICS = {"/relay/control": control_types.CONTROL, "/relay/status": STATUS}
 
 OWN_SERVICES = {
     name: Service(types=[offered.type], providers=[offered.node]) for name, offered in SERVICES.items()
@@ -160,6 +212,7 @@ OWN_TOPICS = {name: Topic(types=[type_name], publishers=[RELAY]) for name, type_
 def _registry() -> TypeRegistry:
     types = TypeRegistry()
     types.add(STATUS, _STATUS_TEXT)
+    types.add(control_types.CONTROL, control_types.CONTROL_TEXT)
     types.add(_TYPEDEF, _TYPEDEF_TEXT)
     for offered in SERVICES.values():
         types.add(offered.type, offered.text)
@@ -169,4 +222,6 @@ def _registry() -> TypeRegistry:
 TYPES = _registry()
 """The definitions of all of these."""
 
-TYPE_NAMES = sorted({STATUS, _TYPEDEF, *(offered.type for offered in SERVICES.values())})
+TYPE_NAMES = sorted(
+    {STATUS, _TYPEDEF, control_types.CONTROL, *(offered.type for offered in SERVICES.values())}
+)

@@ -10,9 +10,14 @@ import msgspec
 
 from relay_protocol import link
 from relay_protocol.rights import Operation
-from relay_server.local import rosapi
+from relay_server.control import view
+from relay_server.linkmeter import joined, milliseconds
+from relay_server.local import control, rosapi
+from relay_server.people import Asker, People, clients
 from relay_server.session import Session
 from relay_server.video import Stream, Videos
+
+CONTROL = "/relay/control"
 
 
 async def ping(session: Session, args: Any) -> dict[str, Any]:
@@ -23,26 +28,27 @@ async def ping(session: Session, args: Any) -> dict[str, Any]:
     return {"relay_time_ns": time.time_ns(), "robot_rtt_ms": milliseconds(robot_rtt)}
 
 
-def milliseconds(seconds: float | None) -> float | None:
-    """Seconds as milliseconds with two decimals; ``None`` stays."""
-    return None if seconds is None else round(seconds * 1000, 2)
-
-
 class RelayNode:
     """Finds the relay's own services and topics by name.
 
     :param sessions: all sessions of a robot, by its id
     :param videos: all streams of cameras
+    :param people: who is at which robot
     """
 
-    def __init__(self, sessions: Callable[[int], list[Session]], videos: Videos) -> None:
+    def __init__(self, sessions: Callable[[int], list[Session]], videos: Videos, people: People) -> None:
         self._sessions = sessions
         self._videos = videos
+        self._people = people
         self._services: dict[str, Callable[[Session, Any], Awaitable[Any]]] = {
             "/relay/ping": ping,
+            **control.SERVICES,
             **rosapi.SERVICES,
         }
-        self._topics: dict[str, Callable[[Session], dict[str, Any]]] = {"/relay/status": self.status}
+        self._topics: dict[str, Callable[[Session], dict[str, Any]]] = {
+            "/relay/status": self.status,
+            CONTROL: control.told,
+        }
 
     def service(self, name: str) -> Callable[[Session, Any], Awaitable[Any]] | None:
         """The handler of a service the relay itself offers."""
@@ -52,16 +58,30 @@ class RelayNode:
         """What makes the messages of a topic the relay itself publishes."""
         return self._topics.get(name)
 
+    def pushed(self, name: str) -> bool:
+        """Whether a topic is published when it changes, and not once a second."""
+        return name == CONTROL
+
     def status(self, session: Session) -> dict[str, Any]:
         """``/relay/status``: who is here, how well the links do, what was dropped, for the one who asks."""
         robot = session.robot
         rules = session.permit.rules
+        near, far = session.reading(), robot.reading()
+        standing = session.desk.standing
+        people, more = self._people.told(robot, Asker(session.name, rules, session.number))
         return {
             "robot": robot.name,
             "state": robot.state.value,
             "level": str(rules.level or ""),
-            "clients": [{"user": each.name, "since": each.since} for each in self._sessions(robot.robot_id)],
+            "clients": clients(robot, self._sessions(robot.robot_id), rules),
             "rtt_ms": {"client_relay": milliseconds(session.rtt), "relay_robot": milliseconds(robot.rtt)},
+            "links": {
+                "client_relay": near.told(),
+                "relay_robot": far.told(),
+                "client_robot": joined(near, far).told(),
+            },
+            "people": people,
+            "more": more,
             "drops": session.outbox.dropped,
             "topic_drops": [
                 {"topic": topic, "drops": drops} for topic, drops in session.listening.drops().items()
@@ -77,6 +97,12 @@ class RelayNode:
             ],
             "motion": msgspec.structs.asdict(robot.description.motion),
             "health": msgspec.structs.asdict(robot.health),
+            "control": {
+                "state": view.state(standing),
+                "holder": view.holder(standing) or "",
+                "you": standing.lease.held_by(session),
+            },
+            "stopped": standing.stopped is not None,
         }
 
     def _uplink(self, session: Session) -> dict[str, Any]:

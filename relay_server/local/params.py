@@ -59,9 +59,18 @@ def _split(args: Any) -> tuple[str, str]:
     return absolute(node), parameter
 
 
-async def _ask(session: Session, node: str, service: str, request: Any, seconds: float = SECONDS) -> Any:
+async def _ask(
+    session: Session,
+    node: str,
+    service: str,
+    request: Any,
+    seconds: float = SECONDS,
+    stamp: int | None = None,
+) -> Any:
     """Call a parameter service of a node.
 
+    :param stamp: the relay's monotonic nanoseconds before which this can't have been asked for; as of now when it is
+        left out
     :raises Refused: the caller may not call it
     :raises NotFound: the node is not there, or has no such service
     """
@@ -72,7 +81,13 @@ async def _ask(session: Session, node: str, service: str, request: Any, seconds:
         if found is None or not found.types:
             raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
     session.share.asks_robot()
-    answer = await session.channel.asking.call(name, found.types[0], jsontext.encode(request), seconds)
+    answer = await session.channel.asking.call(
+        name,
+        found.types[0],
+        jsontext.encode(request),
+        seconds,
+        session.calling.sent(name, session.not_before if stamp is None else stamp),
+    )
     with session.share.counted():
         return jsontext.decode_any(answer)
 
@@ -137,7 +152,7 @@ async def has_param(session: Session, args: Any) -> Any:
 
 async def set_param(session: Session, args: Any) -> Any:
     """``/rosapi/set_param``"""
-    given = text(args, "value", 1)
+    given, stamp = text(args, "value", 1), session.not_before
     try:
         node, parameter = _split(args)
         try:
@@ -146,7 +161,7 @@ async def set_param(session: Session, args: Any) -> Any:
             raise Invalid(f"'value' must be JSON text: {error}") from None
         session.judge(Operation.CALL, f"{node}/set_parameters")
         has = await _type_it_has(session, node, parameter) if _ambiguous(value) else None
-        return await _set(session, node, parameter, to_parameter(value, has))
+        return await _set(session, node, parameter, to_parameter(value, has), stamp)
     except SwitchboardError as error:
         return {"successful": False, "reason": str(error)}
 
@@ -174,9 +189,11 @@ async def delete_param(session: Session, args: Any) -> Any:
         return {"successful": False, "reason": str(error)}
 
 
-async def _set(session: Session, node: str, parameter: str, value: dict[str, Any]) -> dict[str, Any]:
+async def _set(
+    session: Session, node: str, parameter: str, value: dict[str, Any], stamp: int | None = None
+) -> dict[str, Any]:
     request = {"parameters": [{"name": parameter, "value": value}]}
-    answer = await _ask(session, node, "set_parameters", request)
+    answer = await _ask(session, node, "set_parameters", request, stamp=stamp)
     try:
         (result,) = answer["results"]
         return {"successful": bool(result["successful"]), "reason": str(result["reason"])}

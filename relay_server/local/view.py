@@ -10,11 +10,13 @@ from collections.abc import Iterable
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
+from relay_protocol import link
 from relay_protocol.link import Service, Topic
 from relay_protocol.rights import Grant, Operation
 from relay_server.graph import Ends, GraphMirror
 from relay_server.local.catalogue import OWN_SERVICES, OWN_TOPICS, RELAY, ROSAPI
 from relay_server.session import Session
+from relay_server.sight import may_hear
 
 KEPT = 8
 """Views kept of one robot: callers with the same rights share one."""
@@ -32,7 +34,12 @@ class View(NamedTuple):
 class _Kept(NamedTuple):
     version: int
     ends: Ends
+    cameras: tuple[link.Camera, ...]
     view: View
+
+    def is_of(self, graph: GraphMirror, ends: Ends, cameras: tuple[link.Camera, ...]) -> bool:
+        """Whether it was made of these."""
+        return (self.version, self.ends, self.cameras) == (graph.version, ends, cameras)
 
 
 _kept: WeakKeyDictionary[GraphMirror, OrderedDict[tuple[Grant, ...], _Kept]] = WeakKeyDictionary()
@@ -40,12 +47,12 @@ _kept: WeakKeyDictionary[GraphMirror, OrderedDict[tuple[Grant, ...], _Kept]] = W
 
 def view(session: Session) -> View:
     """What the caller sees; made anew only after something has changed."""
-    graph, ends = session.robot.graph, session.channel.ends()
+    graph, ends, cameras = session.robot.graph, session.channel.ends(), session.robot.cameras
     views = _kept.setdefault(graph, OrderedDict())
     key = session.permit.rules.grants
     found = views.get(key)
-    if found is None or found.version != graph.version or found.ends != ends:
-        found = views[key] = _Kept(graph.version, ends, _made(session, graph, ends))
+    if found is None or not found.is_of(graph, ends, cameras):
+        found = views[key] = _Kept(graph.version, ends, cameras, _made(session, graph, ends))
     views.move_to_end(key)
     while len(views) > KEPT:
         views.popitem(last=False)
@@ -62,7 +69,10 @@ def _made(session: Session, graph: GraphMirror, ends: Ends) -> View:
         name: topic
         for name, topic in sorted(_topics(graph, ends).items())
         if not hidden(name)
-        and (judge(Operation.SUBSCRIBE, name).allowed or judge(Operation.PUBLISH, name).allowed)
+        and (
+            may_hear(judge, session.robot, name, topic.types).allowed
+            or judge(Operation.PUBLISH, name).allowed
+        )
     }
     services = {
         name: service

@@ -2,11 +2,12 @@
 
 ``recorder`` is one recording while it runs, a member of the robot's channel like any client; ``writer`` writes its
 file in a thread of its own, ``mcap_file`` knows the format; ``library`` has the files, ``recordings`` all of a relay's;
-``desk`` says who may have which.
+``desk`` says who may have which, ``sweeping`` deletes those of robots that were removed.
 """
 
 from relay_server.recording.desk import Download, RecordingDesk
-from relay_server.recording.library import Library
+from relay_server.recording.library import FOLDER, Library, kept_of
 from relay_server.recording.recordings import Ask, Recordings
+from relay_server.recording.sweeping import sweep
 
-__all__ = ["Ask", "Download", "Library", "RecordingDesk", "Recordings"]
+__all__ = ["FOLDER", "Ask", "Download", "Library", "RecordingDesk", "Recordings", "kept_of", "sweep"]

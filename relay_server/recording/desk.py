@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,20 @@ from relay_server.bucket import TokenBucket
 from relay_server.frontdesk import Admission, FrontDesk
 from relay_server.journal import Journal
 from relay_server.recording.library import READABLE, RUNNING, UNKNOWN, Entry
-from relay_server.recording.recorder import why_denied
+from relay_server.recording.recorder import why_denied, why_not
 from relay_server.recording.recordings import Ask, Recordings
+from relay_server.sight import may_hear
 from relay_server.store import Store
 
 RATE = 1.0
 BURST = 20
 """What one user may have put on record about recordings: so much a second, and so much at once."""
+
+FETCH_SECONDS = 3600.0
+"""A download is put on record once in so long, however many parts the one who has it takes it in."""
+
+FETCHES = 1000
+"""Downloads that are remembered for that."""
 
 
 class Download:
@@ -31,10 +39,16 @@ class Download:
 
     :ivar name: for the one who gets it
     :ivar size: bytes
+    :ivar tag: names this content; it never changes under it
     """
 
     def __init__(
-        self, recordings: Recordings, entry: Entry, permit: Permit, close: Callable[[], None]
+        self,
+        recordings: Recordings,
+        entry: Entry,
+        permit: Permit,
+        begin: Callable[[], Awaitable[None]],
+        close: Callable[[], None],
     ) -> None:
         self._recordings = recordings
         self._entry = entry
@@ -42,11 +56,20 @@ class Download:
         self._path: Path = recordings.library.path(entry)
         self.name = f"{entry.robot}-{entry.id}.mcap"
         self.size = entry.bytes
+        self.tag = entry.id
+        self._begin = begin
         self.close = close
+
+    async def begin(self) -> None:
+        """Put on record that it is sent.
+
+        :raises Unavailable: it can't be
+        """
+        await self._begin()
 
     def watch(self, denied: Callable[[str], None]) -> None:
         """Tell when it may not go on, and why."""
-        self._permit.on_revoke = denied
+        self._permit.on_revoke = lambda error: denied(str(error))
 
         def changed() -> None:
             reason = why_denied(self._permit, self._entry)
@@ -84,6 +107,7 @@ class RecordingDesk:
         self._journal = journal
         self._wall = wall
         self._buckets: dict[int, TokenBucket] = {}
+        self._fetched: OrderedDict[tuple[int, str, str], float] = OrderedDict()
 
     # --- what users ask for -------------------------------------------------------------------------------
 
@@ -108,7 +132,28 @@ class RecordingDesk:
             self._desk.turn_away(admission)
             raise
         self._event("recording.started", entry, address=address)
-        return _view(entry)
+        return self._view(entry)
+
+    async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
+        """What the principal could record of a robot now: topics, cameras, and how much.
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            there, library = admission.robot, self._recordings.library
+            topics = {name: self._why_no_topic(admission, name) for name in sorted(there.graph.topics)}
+            cameras = {
+                camera.name: why_not(admission.permit, Operation.VIEW, camera.name)
+                for camera in there.cameras
+            }
+            reasons = [*topics.values(), *cameras.values()]
+            return {
+                "topics": [name for name, reason in topics.items() if not reason],
+                "cameras": [name for name, reason in cameras.items() if not reason],
+                "denied": reasons[0] if all(reasons) and reasons else "",
+                "megabytes": library.quota / 10**6,
+                "left": library.left / 10**6,
+            }
 
     async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
         """The recordings of a robot that the principal may have, the latest first.
@@ -118,7 +163,7 @@ class RecordingDesk:
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             entries = self._recordings.library.of(admission.robot.robot_id)
             return [
-                _view(self._recordings.look(entry))
+                self._view(self._recordings.look(entry))
                 for entry in entries
                 if not why_denied(admission.permit, entry)
             ]
@@ -129,7 +174,7 @@ class RecordingDesk:
         :raises NotFound: no such robot or recording, or no right to all of it
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
-            return _view(self._recordings.look(self._find(admission, id)))
+            return self._view(self._recordings.look(self._find(admission, id)))
 
     async def stop(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
         """Finish a recording; one that is finished stays what it is.
@@ -141,7 +186,7 @@ class RecordingDesk:
             entry = self._find(admission, id)
             self._check_own(admission.permit, entry)
         await self._recordings.stop(entry, f"stopped by {principal.name}")
-        return _view(entry)
+        return self._view(entry)
 
     async def delete(self, principal: Principal, robot: str, id: str, address: str) -> None:
         """Delete a recording; one that runs is stopped before.
@@ -170,13 +215,24 @@ class RecordingDesk:
                 raise Unavailable("it is still being recorded: stop it, or wait for its end")
             if entry.state not in READABLE:
                 raise Unavailable("it broke off, and the file is not recovered yet")
-            await self._on_record("recording.download", entry, admission)
         except BaseException:
             self._desk.turn_away(admission)
             raise
-        return Download(self._recordings, entry, admission.permit, lambda: self._desk.turn_away(admission))
+        return Download(
+            self._recordings,
+            entry,
+            admission.permit,
+            lambda: self._fetch(entry, admission),
+            lambda: self._desk.turn_away(admission),
+        )
 
     # --- rights -------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _why_no_topic(admission: Admission, name: str) -> str:
+        permit, robot = admission.permit, admission.robot
+        verdict = may_hear(permit.judge, robot, name)
+        return why_not(permit, Operation.SUBSCRIBE, name) if verdict.allowed else verdict.reason
 
     @contextmanager
     def _admitted(self, admission: Admission) -> Iterator[Admission]:
@@ -199,6 +255,17 @@ class RecordingDesk:
                 if not verdict.allowed:
                     raise Refused(f"it is a recording of {entry.user}; {verdict.reason}")
 
+    def _view(self, entry: Entry) -> dict[str, Any]:
+        """What its users see of a recording."""
+        shown: dict[str, Any] = msgspec.to_builtins(entry)
+        for hidden in ("robot_id", "user_id", "pictures"):
+            del shown[hidden]
+        shown["megabytes"] = shown.pop("limit") / 10**6
+        # Told by the relay: the clocks of those who look may be wrong.
+        until = self._wall() if entry.state in RUNNING else entry.ended
+        shown["lasted"] = None if until is None else round(until - entry.begun, 1)
+        return shown
+
     # --- what is put on record ----------------------------------------------------------------------------
 
     async def _on_record(self, action: str, entry: Entry, admission: Admission) -> None:
@@ -219,6 +286,16 @@ class RecordingDesk:
             origin=admission.address,
             data={"topics": list(entry.topics), "cameras": list(entry.cameras)},
         )
+
+    async def _fetch(self, entry: Entry, admission: Admission) -> None:
+        key = (admission.permit.principal.user_id, entry.id, admission.address)
+        if self._fetched.get(key, -FETCH_SECONDS) + FETCH_SECONDS > self._wall():
+            return
+        await self._on_record("recording.download", entry, admission)
+        self._fetched[key] = self._wall()
+        self._fetched.move_to_end(key)
+        while len(self._fetched) > FETCHES:
+            self._fetched.popitem(last=False)
 
     def _ended(self, entry: Entry, admission: Admission) -> None:
         self._desk.turn_away(admission)
@@ -242,12 +319,3 @@ class RecordingDesk:
             recording=entry.id,
             **data,
         )
-
-
-def _view(entry: Entry) -> dict[str, Any]:
-    """What its users see of a recording."""
-    shown: dict[str, Any] = msgspec.to_builtins(entry)
-    for hidden in ("robot_id", "user_id"):
-        del shown[hidden]
-    shown["megabytes"] = shown.pop("limit") / 10**6
-    return shown

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -36,6 +37,7 @@ class Entry(msgspec.Struct):
     """One recording.
 
     :param robot_id: numbers of robots are never used again
+    :param pictures: those of the topics that may carry what a camera sees
     :param begun: Unix seconds
     :param ended: Unix seconds
     :param reason: why it ended
@@ -56,6 +58,7 @@ class Entry(msgspec.Struct):
     begun: float
     limit: int
     seconds: float
+    pictures: tuple[str, ...] = ()
     state: State = State.RECORDING
     ended: float | None = None
     reason: str = ""
@@ -65,7 +68,43 @@ class Entry(msgspec.Struct):
     problems: list[str] = []
 
 
+FOLDER = "recordings"
+"""Where they are, in the relay's data folder."""
+
 _decoder = msgspec.json.Decoder(Entry)
+
+
+def entries_in(folder: Path) -> Iterator[tuple[str, Entry | None]]:
+    """The recordings of a folder, which is only read: the name of each ``.json``, and what it says.
+
+    :raises OSError: it can't be read
+    """
+    for path in folder.glob("*.json"):
+        try:
+            yield path.name, _decoder.decode(path.read_bytes())
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            yield path.name, None
+        except FileNotFoundError:
+            # A relay that runs has deleted it meanwhile.
+            continue
+
+
+def kept_of(folder: Path, robot_id: int) -> tuple[int, int]:
+    """How many recordings of a robot a folder has, and the bytes of their files.
+
+    :raises OSError: it can't be read
+    """
+    count = size = 0
+    for _, entry in entries_in(folder):
+        if entry is not None and entry.robot_id == robot_id:
+            count += 1
+            with contextlib.suppress(FileNotFoundError):
+                size += _file(folder, entry.id).stat().st_size
+    return count, size
+
+
+def _file(folder: Path, id: str) -> Path:
+    return folder / f"{id}.mcap"
 
 
 class Library:
@@ -78,7 +117,7 @@ class Library:
 
     def __init__(self, folder: Path, quota: int) -> None:
         self._folder = folder
-        self._quota = quota
+        self.quota = quota
         self._entries: dict[str, Entry] = {}
 
     def open(self) -> None:
@@ -90,16 +129,14 @@ class Library:
             self._folder.mkdir(mode=0o700, exist_ok=True)
             for left in [*self._folder.glob("*.part"), *self._folder.glob("*.new")]:
                 left.unlink()
-            for path in self._folder.glob("*.json"):
-                self._read(path)
+            for name, entry in entries_in(self._folder):
+                self._read(name, entry)
         except OSError as error:
             raise Invalid(f"the folder of recordings can't be used: {error.strerror}") from None
 
-    def _read(self, path: Path) -> None:
-        try:
-            entry = _decoder.decode(path.read_bytes())
-        except (msgspec.MsgspecError, UnicodeDecodeError):
-            self.log.error("{file} in the folder of recordings is not understood", file=path.name)
+    def _read(self, name: str, entry: Entry | None) -> None:
+        if entry is None:
+            self.log.error("{file} in the folder of recordings is not understood", file=name)
             return
         if entry.state in RUNNING:
             entry.state = State.INCOMPLETE
@@ -107,6 +144,9 @@ class Library:
         self._entries[entry.id] = entry
 
     # --- what is there ------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(list(self._entries.values()))
 
     def of(self, robot_id: int) -> list[Entry]:
         """A robot's recordings, the latest first."""
@@ -136,9 +176,14 @@ class Library:
         """Bytes that are taken, with all that is being recorded may still become."""
         return sum(entry.limit if entry.state in RUNNING else entry.bytes for entry in self._entries.values())
 
+    @property
+    def left(self) -> int:
+        """Bytes that one more may take."""
+        return max(0, self.quota - self.used)
+
     def path(self, entry: Entry) -> Path:
         """The file."""
-        return self._folder / f"{entry.id}.mcap"
+        return _file(self._folder, entry.id)
 
     # --- changes; the reactor's thread --------------------------------------------------------------------
 
@@ -147,10 +192,9 @@ class Library:
 
         :raises Unavailable: it could become more than there may be
         """
-        left = self._quota - self.used
-        if entry.limit > left:
+        if entry.limit > self.left:
             raise Unavailable(
-                f"recordings may have {self._quota // 10**6} MB in all, of which {max(0, left) // 10**6} MB "
+                f"recordings may have {self.quota // 10**6} MB in all, of which {self.left // 10**6} MB "
                 f"are left: delete some, or record at most that much"
             )
         self._entries[entry.id] = entry

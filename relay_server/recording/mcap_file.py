@@ -1,6 +1,7 @@
 """One MCAP file: begun, filled up to a limit, finished; and what is left of one that was not finished.
 
-Source: the MCAP format specification and its registry (mcap.dev/spec), profile ``ros2``.
+Source: the MCAP format specification and its registry (mcap.dev/spec), profile ``ros2``; for what ``ros2 bag`` wants of
+channels, rosbag2_storage (``qos.cpp``) and rosbag2_storage_mcap (``mcap_storage.cpp``).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from mcap.records import Channel, Header, McapRecord, Message, Schema
+from mcap.records import Channel, Header, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import Writer
@@ -35,17 +36,47 @@ _END = 16 * KIB
 """Bytes of what stands once in a file; and what a chunk that can't be compressed takes more."""
 
 
+_FOREVER = "{sec: 9223372036, nsec: 854775807}"
+
+LATCHED = f"""\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {_FOREVER}
+  lifespan: {_FOREVER}
+  liveliness: 1
+  liveliness_lease_duration: {_FOREVER}
+  avoid_ros_namespace_conventions: false
+"""
+"""The offer of a publisher that is reliable and transient local, in the numbers of ``rmw/types.h``.
+
+``ros2 bag play`` must offer the same, or who waits for a map or a static transform does not get it. Numbers are read by
+all versions of rosbag2, names by later ones only.
+"""
+
+ROSBAG2 = "rosbag2"
+"""A metadata record of this name, without more in it, tells versions that read both to expect numbers."""
+
+
 class Track(NamedTuple):
     """What is the same for many messages of one topic.
 
     :param encoding: of the messages, ``cdr`` or ``json``
     :param definition: the text of the type with all it contains; empty where messages are JSON
+    :param latched: publishers keep their last messages for late joiners
     """
 
     topic: str
     type: str
     encoding: str
     definition: str = ""
+    latched: bool = False
+
+    @property
+    def offered(self) -> str:
+        """What publishers offer, as rosbag2 keeps it; nothing for what is usual, which it assumes then."""
+        return LATCHED if self.latched else ""
 
 
 class Full(Exception):
@@ -68,6 +99,7 @@ class McapFile:
         self._pending = 0
         self._summary = _END
         self._channels: dict[Track, int] = {}
+        self._numbered = False
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self.messages = 0
         self._writer.start(Profile.ROS2 if ros else "", f"switchboard {VERSION}")
@@ -86,12 +118,13 @@ class McapFile:
         :raises OSError: the file can't be written
         """
         # A new track stands twice: where it is first used, and in the summary.
-        fresh = 0 if track in self._channels else 2 * (len(str(track)) + _PER_MESSAGE)
+        fresh = 0 if track in self._channels else 2 * (len(str(track)) + len(track.offered) + _PER_MESSAGE)
         if self.size + self._summary + fresh + len(body) + _PER_MESSAGE > self._limit:
             raise Full
         self._summary += fresh
+        channel = self._channel(track)
         self._pending += len(body) + _PER_MESSAGE
-        self._writer.add_message(self._channel(track), log_time, body, publish_time, self.messages)
+        self._writer.add_message(channel, log_time, body, publish_time, self.messages)
         self.messages += 1
         self._settle()
 
@@ -124,10 +157,18 @@ class McapFile:
                 track.topic,
                 MessageEncoding.CDR if cdr else MessageEncoding.JSON,
                 self._schema(track.type, encoding, text),
-                # The profile wants it; what publishers offered is not told to the relay.
-                {"offered_qos_profiles": ""} if cdr else {},
+                {"offered_qos_profiles": track.offered} if cdr else {},
             )
+            self._say_numbers(track)
         return found
+
+    def _say_numbers(self, track: Track) -> None:
+        if track.offered and not self._numbered:
+            self._numbered = True
+            # It stands outside of chunks: the one that is begun must be out before, for the sizes to be right.
+            self.flush()
+            self._writer.add_metadata(ROSBAG2, {})
+            self._settle()
 
     def _schema(self, name: str, encoding: str, text: bytes) -> int:
         key = (name, encoding, text)
@@ -170,6 +211,8 @@ def _copy(damaged: BinaryIO, stream: BinaryIO, stopping: Callable[[], bool]) -> 
             channels[record.id] = writer.register_channel(
                 record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
             )
+        elif isinstance(record, Metadata):
+            writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Message):
             at, published = record.log_time, record.publish_time
             writer.add_message(channels[record.channel_id], at, record.data, published, record.sequence)

@@ -20,6 +20,7 @@ from relay_server.recording import compressed
 from relay_server.recording.library import Entry, State
 from relay_server.recording.mcap_file import Track
 from relay_server.recording.writer import Message, Outcome, Writer
+from relay_server.sight import carries_pictures
 from relay_server.video import Picture, Stream, Videos
 
 AGAIN_SECONDS = 5.0
@@ -49,16 +50,23 @@ NEXT: dict[tuple[State, Event], State] = {
 """An event that is not listed for a state changes nothing."""
 
 
+def why_not(permit: Permit, see: Operation, name: str) -> str:
+    """Why somebody may not record something; empty when he may.
+
+    :param see: what is needed to see it
+    """
+    for operation in (Operation.RECORD, see):
+        verdict = permit.judge(operation, name)
+        if not verdict.allowed:
+            return verdict.reason
+    return ""
+
+
 def why_denied(permit: Permit, entry: Entry) -> str:
     """Why somebody may not have all that a recording holds; empty when he may."""
     asked = [(Operation.SUBSCRIBE, topic) for topic in entry.topics]
-    asked += [(Operation.VIEW, camera) for camera in entry.cameras]
-    for see, name in asked:
-        for operation in (Operation.RECORD, see):
-            verdict = permit.judge(operation, name)
-            if not verdict.allowed:
-                return verdict.reason
-    return ""
+    asked += [(Operation.VIEW, each) for each in (*entry.cameras, *entry.pictures)]
+    return next((reason for see, name in asked if (reason := why_not(permit, see, name))), "")
 
 
 class Recorder:
@@ -129,8 +137,8 @@ class Recorder:
         except SwitchboardError:
             self._let_go()
             raise
-        self.permit.on_change = self._rights_changed
-        self.permit.on_revoke = self.stop
+        self.permit.on_change = self._judge
+        self.permit.on_revoke = lambda error: self.stop(str(error))
         self._timer = self._clock.callLater(self.entry.seconds, self.stop, "it has taken its time")
         self._writer.start()
 
@@ -168,7 +176,16 @@ class Recorder:
             eye.close()
         self._channel.detach(self)
 
-    def _rights_changed(self) -> None:
+    def judge_again(self) -> None:
+        """A topic may carry pictures that did not before."""
+        entry, robot = self.entry, self._channel.robot
+        # One that the robot does not have just now is what it was.
+        there = [topic for topic in entry.topics if topic in robot.graph.topics]
+        more = {topic for topic in there if carries_pictures(robot, topic)}
+        entry.pictures = tuple(sorted({*entry.pictures, *more}))
+        self._judge()
+
+    def _judge(self) -> None:
         reason = why_denied(self.permit, self.entry)
         if reason:
             self.stop(reason)
@@ -202,9 +219,15 @@ class Recorder:
         converter = sample.converter
         found = self._tracks.get(topic)
         if found is None or found[0] is not converter:
-            found = self._tracks[topic] = (converter, _track(topic, converter))
+            found = self._tracks[topic] = (converter, self._track(topic, converter))
         make = None if converter.cdr else _anew(converter)
         self._put(Message(found[1], log_time, sample.stamp, sample.body, make))
+
+    def _track(self, topic: str, converter: Converter) -> Track:
+        if not converter.cdr:
+            return Track(topic, converter.type, "json")
+        latched = self._channel.subscriptions.latched(topic)
+        return Track(topic, converter.type, "cdr", converter.types.full_text(converter.type), latched)
 
     def saw(self, camera: str, picture: Picture) -> None:
         """Have a picture written."""
@@ -290,12 +313,6 @@ class _Eye:
             self.open()
         except SwitchboardError as error:
             self.ended(error)
-
-
-def _track(topic: str, converter: Converter) -> Track:
-    if converter.cdr:
-        return Track(topic, converter.type, "cdr", converter.types.full_text(converter.type))
-    return Track(topic, converter.type, "json")
 
 
 def _anew(converter: Converter) -> Callable[[bytes], bytes]:

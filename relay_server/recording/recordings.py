@@ -25,6 +25,7 @@ from relay_server.recording.mcap_file import mend
 from relay_server.recording.recorder import Recorder, why_denied
 from relay_server.recording.writer import Outcome, Writer
 from relay_server.registry import Presence
+from relay_server.sight import carries_pictures
 from relay_server.store import Threads
 from relay_server.video import Videos
 
@@ -96,12 +97,15 @@ class Recordings:
     # --- life of the relay --------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Find out what is there, and begin to mend what was not finished.
+        """Find out what is there.
 
         :raises Invalid: the folder can't be used
         """
         self.library.open()
         self._threads.start()
+
+    def recover(self) -> None:
+        """Begin to mend what was not finished."""
         self.mended = Deferred.fromCoroutine(self._mend_all()).addErrback(
             lambda failure: self.log.failure("recordings could not be mended", failure)
         )
@@ -110,7 +114,8 @@ class Recordings:
         """Finish all that run."""
         self._stopping.set()
         running = list(self._running.values())
-        finishing = DeferredList([self.stop(recorder.entry, reason) for recorder in running])
+        stopping = [self.stop(recorder.entry, reason) for recorder in running]
+        finishing = DeferredList(stopping, consumeErrors=True)
         finishing.addTimeout(FINISH_SECONDS, as_twisted(self._clock))
         try:
             await finishing
@@ -134,8 +139,8 @@ class Recordings:
         cameras = tuple(dict.fromkeys(ask.cameras))
         if not topics and not cameras:
             raise Invalid("say what to record: 'topics', 'cameras' or both")
-        pictures = [compressed.topic_of(camera) for camera in cameras]
-        twice = [topic for topic in pictures if topic in topics or pictures.count(topic) > 1]
+        written = [compressed.topic_of(camera) for camera in cameras]
+        twice = [topic for topic in written if topic in topics or written.count(topic) > 1]
         if twice:
             raise Invalid(f"{twice[0]} would be recorded twice, as a camera's pictures too")
         begun = self._wall()
@@ -150,6 +155,7 @@ class Recordings:
             cameras=cameras,
             begun=begun,
             seconds=ask.seconds,
+            pictures=tuple(topic for topic in topics if carries_pictures(robot, topic)),
             limit=round(ask.megabytes * 10**6),
         )
 

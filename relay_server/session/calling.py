@@ -12,7 +12,9 @@ from relay_protocol.errors import Refused, SwitchboardError
 from relay_protocol.limits import KIB, MIB
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
+from relay_server.channel.wire import Sent
 from relay_server.forms import asked
+from relay_server.session.moving import Movement
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
@@ -22,6 +24,15 @@ if TYPE_CHECKING:
 CALLS = 256
 CALL_BYTES = 2 * MIB
 """Arguments of calls that wait, over all of them."""
+URGENT = ("/relay/stop", "/relay/release_control")
+"""Who has used up what he may ask for may still stop a robot, and let go of it."""
+
+URGENT_CALLS = 16
+"""So many calls of these may wait beyond :data:`CALLS`."""
+
+SEND_GOAL = "/_action/send_goal"
+"""How the name of the service ends that takes an action's goals (design.ros2.org, actions)."""
+
 LOCAL_BYTES = 64 * KIB
 """Arguments of one call to the relay itself: lists in lists take 30 ms to read, in which it does nothing else."""
 
@@ -53,12 +64,12 @@ class Calling:
     def call(self, ask: rosbridge.CallService) -> None:
         """Call a service of the robot, or one of the relay's own."""
         service = resolve(ask.service)
-        if len(self._calls) >= CALLS:
+        if len(self._calls) >= CALLS + (URGENT_CALLS if is_urgent(ask) else 0):
             raise Refused(f"{CALLS} calls of this connection are waiting already")
         asked(ask, self._session.tell)
         raw = bytes(ask.args or b"")
         size = len(raw)
-        if self._bytes + size > CALL_BYTES:
+        if self._bytes + size > CALL_BYTES and not is_urgent(ask):
             raise Refused(
                 "the arguments of the calls that wait already are too large together; wait for answers"
             )
@@ -67,18 +78,35 @@ class Calling:
             self._session.judge(Operation.CALL, service)
             self._session.share.asks_robot()
             answer: Awaitable[bytes] = self._session.channel.asking.call(
-                service, normal_type(ask.type, "srv"), raw, ask.timeout
+                service,
+                normal_type(ask.type, "srv"),
+                raw,
+                ask.timeout,
+                self.sent(service, self._session.not_before),
             )
         else:
             if size > LOCAL_BYTES:
                 raise Refused(f"arguments for the relay's own services may have {LOCAL_BYTES} bytes")
             args = jsontext.decode_any(raw) if raw else {}
-            answer = self._call_local(local, args)
+            answer = self._call_local(local, args, is_urgent(ask))
         running = Deferred.fromCoroutine(self._finish(ask, answer))
         self._calls[running] = ask
         self._bytes += size
         running.addErrback(self._unexpected, ask)
         running.addBoth(self._call_ended, running, size)
+
+    def sent(self, service: str, stamp: int) -> Sent:
+        """What a call of a service is sent with; where calls of it move the robot it takes control.
+
+        :param stamp: the relay's monotonic nanoseconds before which the call can't have been sent
+        :raises Refused: it may be too old, somebody else has control, or it must be taken first
+        """
+        session = self._session
+        motion = session.robot.description.motion
+        action, goal, _ = service.partition(SEND_GOAL)
+        moves = motion.moves_by_service(service) or bool(goal and motion.moves_by_action(action))
+        movement = Movement(session, f"a call of {service}", stamp) if moves else None
+        return Sent(session.number, stamp, movement)
 
     def answer(self, call: rosbridge.CallService, result: bool, values: bytes) -> None:
         """Answer one call in the form it asked for; ``values`` is JSON, a string when ``result`` is false."""
@@ -89,9 +117,12 @@ class Calling:
         self._calls.pop(running, None)
         self._bytes -= size
 
-    async def _call_local(self, local: Callable[[Session, Any], Awaitable[Any]], args: Any) -> bytes:
+    async def _call_local(
+        self, local: Callable[[Session, Any], Awaitable[Any]], args: Any, urgent: bool
+    ) -> bytes:
         answer = await local(self._session, args)
-        with self._session.share.counted():
+        share = self._session.share
+        with share.timed() if urgent else share.counted():
             return jsontext.encode(answer)
 
     async def _finish(self, ask: rosbridge.CallService, answer: Awaitable[bytes]) -> None:
@@ -108,6 +139,14 @@ class Calling:
             return
         self._session.log.failure("a call of {service} failed", failure, service=ask.service)
         self.answer(ask, False, jsontext.encode("the relay failed on this call; its log tells more"))
+
+
+def is_urgent(ask: rosbridge.ClientOp) -> bool:
+    """Whether this is done whatever else its client asks for."""
+    return isinstance(ask, rosbridge.CallService) and ask.service.lstrip("/") in _URGENT
+
+
+_URGENT = {name.lstrip("/") for name in URGENT}
 
 
 def untold(level: str, text: str, id: rosbridge.Id) -> None:

@@ -6,6 +6,7 @@ Bytes come in as whole websocket messages and go out as frames; every message is
 from __future__ import annotations
 
 import itertools
+import secrets
 from collections.abc import Callable
 
 from twisted.logger import Logger
@@ -15,15 +16,17 @@ from relay_protocol.errors import MalformedMessage, PeerError, Refused, Switchbo
 from relay_protocol.limits import KIB
 from relay_protocol.rights import Operation
 from relay_server import closing
-from relay_server.access import Permit
+from relay_server.access import BadCredentials, Permit
 from relay_server.bucket import TokenBucket
 from relay_server.budget import Allowance
 from relay_server.channel import Channel
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Sample
 from relay_server.clock import Clock
+from relay_server.control import Desk
 from relay_server.forms import PLAIN, TOO_COSTLY, Form, frames
 from relay_server.freshness import Freshness
+from relay_server.linkmeter import Reading
 from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
 from relay_server.rounds import Rounds
@@ -49,7 +52,8 @@ SMALL = 4 * KIB
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
 
-_numbers = itertools.count(1)
+_numbers = itertools.count(secrets.randbelow(1 << 31) + 1)
+"""By them robots know who has to let go. They must not take a client for one of a relay that ran before."""
 
 
 class Session:
@@ -75,6 +79,7 @@ class Session:
         permit: Permit,
         robot: Presence,
         channel: Channel,
+        desk: Desk,
         local: LocalNode,
         freshness: Freshness,
         timing: Timing,
@@ -89,6 +94,7 @@ class Session:
         self.permit = permit
         self.robot = robot
         self.channel = channel
+        self.desk = desk
         self.address = address
         self.since = since
         self.allowance = allowance
@@ -96,6 +102,7 @@ class Session:
         self.plain_instead = 0
         self.queued_bytes = 0
         self.share = Share(self)
+        self._clock = clock
         self._transport = transport
         self._freshness = freshness
         self._ended = ended
@@ -136,6 +143,15 @@ class Session:
         """Round trip to the client by websocket ping, seconds."""
         return None if self._freshness.rtt is None else self._freshness.rtt / 1e9
 
+    @property
+    def drops(self) -> int:
+        """Samples the client did not take in time."""
+        return self.outbox.dropped
+
+    def reading(self) -> Reading:
+        """How good the way to the client is."""
+        return self._freshness.reading()
+
     def start(self) -> None:
         """Begin: take a place on the channel, start pinging."""
         self.channel.attach(self)
@@ -155,6 +171,8 @@ class Session:
         self._closed = True
         self.outbox.close()
         self._pinging.end()
+        # Before what it asked for is given back: nothing of this client moves the robot any more.
+        self.desk.left(self)
         self.incoming.end()
         self.listening.end()
         self.calling.end()
@@ -304,6 +322,20 @@ class Session:
         self.tell("error", str(error), operation.id)
         answer_failed(self, operation, error)
 
+    def judge_again(self) -> None:
+        """The robot's topics or cameras are others: what is subscribed is judged anew."""
+        self.listening.judge_again()
+
+    def driving_since(self) -> float:
+        """The clock's time of its latest command; now, while something it asked for moves the robot."""
+        if self.pursuing.moving:
+            return self._clock.seconds()
+        return self._clock.seconds() - self.publishing.idle_ns / 1e9
+
+    def control_changed(self) -> None:
+        """Who moves the robot has changed."""
+        self.publishing.control_changed()
+
     def judge(self, operation: Operation, resource: str) -> None:
         """:raises Refused: the client may not do this to that resource of the robot, with the reason"""
         verdict = self.permit.judge(operation, resource)
@@ -328,12 +360,13 @@ class Session:
         self.close(closing.TOO_SLOW, "replies pile up; read faster")
 
     def _rights_changed(self) -> None:
-        self.listening.rights_changed()
+        self.listening.judge_again()
+        self.desk.rights_changed(self)
         self.calling.rights_changed()
         self.pursuing.rights_changed()
         self.channel.forget_denied(self, self.permit)
         self._pinging.rights_changed()
 
-    def _revoked(self, reason: str) -> None:
-        code = closing.FORBIDDEN if "right" in reason else closing.UNAUTHENTICATED
-        self.close(code, reason)
+    def _revoked(self, error: Refused) -> None:
+        code = closing.UNAUTHENTICATED if isinstance(error, BadCredentials) else closing.FORBIDDEN
+        self.close(code, str(error))

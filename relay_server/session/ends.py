@@ -32,6 +32,9 @@ class LocalNode(Protocol):
     def topic(self, name: str) -> Callable[[Session], dict[str, Any]] | None:
         """What makes the messages of a topic the relay itself publishes."""
 
+    def pushed(self, name: str) -> bool:
+        """Whether such a topic is published when it changes, and not once a second."""
+
 
 @dataclass(frozen=True)
 class Timing:

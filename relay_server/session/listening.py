@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Refused
-from relay_protocol.rights import Operation
+from relay_protocol.rights import Operation, Verdict
 from relay_protocol.ros_types import TypeRegistry
 from relay_server import forms
 from relay_server.channel import resolve
@@ -16,6 +16,7 @@ from relay_server.channel.sample import Converter, Sample
 from relay_server.clock import Clock
 from relay_server.rounds import Round, Rounds
 from relay_server.session.names import normal_type
+from relay_server.sight import may_hear
 
 if TYPE_CHECKING:
     from relay_server.session.core import Session
@@ -52,7 +53,10 @@ class Listening:
         """One more subscription; several of one topic are merged."""
         session = self._session
         topic = resolve(ask.topic)
-        session.judge(Operation.SUBSCRIBE, topic)
+        type_name = normal_type(ask.type)
+        verdict = self._judged(topic, type_name)
+        if not verdict.allowed:
+            raise Refused(verdict.reason)
         form = forms.asked(ask, session.tell, topic=True)
         listener = self._listeners.get(topic)
         if listener is None:
@@ -62,14 +66,17 @@ class Listening:
         if self._local.topic(topic) is not None:
             listener.add(ask, form)
             self._listeners[topic] = listener
-            if self._telling is None:
+            if self._local.pushed(topic):
+                session.desk.pushing.follow(session, self._push)
+                self._push()
+            elif self._telling is None:
                 self._telling = Round(self._publish_local, TELL_SECONDS)
                 self._rounds.start(self._telling)
             return
         subscriptions = session.channel.subscriptions
-        subscriptions.check(topic, normal_type(ask.type))
+        subscriptions.check(topic, type_name)
         listener.add(ask, form)
-        subscriptions.add(session, listener, normal_type(ask.type), ask.qos)
+        subscriptions.add(session, listener, type_name, ask.qos)
         self._listeners[topic] = listener
 
     def unsubscribe(self, ask: rosbridge.Unsubscribe) -> None:
@@ -91,13 +98,20 @@ class Listening:
             topic: counted[listener] for topic, listener in self._listeners.items() if listener in counted
         }
 
-    def rights_changed(self) -> None:
-        """What the client may not hear any more ends."""
+    def judge_again(self) -> None:
+        """What the client may not hear any more ends: its rights have changed, or what the topics are."""
         for topic in list(self._listeners):
-            verdict = self._session.permit.judge(Operation.SUBSCRIBE, topic)
+            verdict = self._judged(topic)
             if not verdict.allowed:
                 self._drop(topic)
                 self._session.tell("error", f"unsubscribed from {topic}: {verdict.reason}")
+
+    def _judged(self, topic: str, type_name: str = "") -> Verdict:
+        session = self._session
+        if self._local.topic(topic) is not None:
+            return session.permit.judge(Operation.SUBSCRIBE, topic)
+        said = type_name or session.channel.subscriptions.type_for(session, topic)
+        return may_hear(session.permit.judge, session.robot, topic, [said] if said else ())
 
     def _drop(self, topic: str) -> None:
         listener = self._listeners.pop(topic)
@@ -106,15 +120,23 @@ class Listening:
         self._session.channel.subscriptions.remove(self._session, topic)
 
     def _publish_local(self) -> None:
+        if not self._tell(pushed=False):
+            self._stop_telling()
+
+    def _push(self) -> None:
+        if not self._tell(pushed=True):
+            self._session.desk.pushing.forget(self._session)
+
+    def _tell(self, *, pushed: bool) -> bool:
+        """Publish the relay's own topics of one kind; whether any is subscribed."""
         makers: list[tuple[str, Callable[[Session], dict[str, Any]] | None]] = [
-            (name, self._local.topic(name)) for name in self._listeners
+            (name, self._local.topic(name)) for name in self._listeners if self._local.pushed(name) is pushed
         ]
         for name, make in makers:
             if make is not None:
                 body = jsontext.encode(make(self._session))
                 self._listeners[name].replay(Sample(body, 0, _OWN))
-        if not any(make for _, make in makers):
-            self._stop_telling()
+        return any(make for _, make in makers)
 
     def _stop_telling(self) -> None:
         if self._telling is not None:

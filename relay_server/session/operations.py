@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Refused
 from relay_server.channel.goal import Status
+from relay_server.session.calling import is_urgent
 
 if TYPE_CHECKING:
     from relay_server.session.core import Session
@@ -77,7 +78,7 @@ def perform(session: Session, operation: rosbridge.ClientOp) -> None:
         raise Refused(f"'{operation.__struct_config__.tag}' is not carried to robots by this relay")
     if kind in _CHANGES and not session.changes.take():
         raise Refused(f"too many changes at once; at most {CHANGES_A_SECOND:g} a second are followed")
-    if kind in _REFUSED_WHEN_BUSY:
+    if kind in _REFUSED_WHEN_BUSY and not is_urgent(operation):
         session.share.check()
     with session.share.timed():
         handler(session, operation)

@@ -15,7 +15,7 @@ from relay_server.session.ends import ClientTransport, Timing
 
 
 class Pinged(Protocol):
-    """Whose client is pinged: a session, or who watches a camera."""
+    """Whose client is pinged: a session, as far as this goes."""
 
     permit: Permit
     outbox: Outbox

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from relay_protocol import link, rosbridge
-from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_protocol.errors import Refused, SwitchboardError, Unavailable
+from relay_protocol.limits import KIB
 from relay_protocol.rights import Operation, Rules
 from relay_server.channel import resolve
 from relay_server.channel.publications import HELD_SECONDS
 from relay_server.channel.topics import Publication
+from relay_server.control import Standing
+from relay_server.control.terms import LET_GO_SECONDS
 from relay_server.freshness import Freshness
+from relay_server.session.grip import Grips, is_still
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
@@ -22,40 +26,84 @@ NO_DEADLINE = round(HELD_SECONDS * 1e9)
 ROUTES = 256
 """Topics of which one client's routes are kept."""
 
+WAITING_TOPICS = 16
+WAITING_BYTES = 64 * KIB
+"""Commands of one client that wait for control: the newest to each of so many topics, none larger than this."""
+
 
 class Route:
     """What was found out about a topic this client may publish to, and on what that was founded.
 
     :param type: as the client wrote it in ``publish``
     :param motion: whether the robot's own safety counts the topic as motion; then commands have a deadline
+    :param standing: who commands the robot
+    :param passes: whether this client does, there
     """
 
-    __slots__ = ("deadline", "description", "holders", "publication", "rules", "type")
+    __slots__ = ("deadline", "description", "holders", "passes", "publication", "rules", "standing", "type")
 
     def __init__(
-        self, type: str, rules: Rules, description: link.Describe, publication: Publication, motion: bool
+        self,
+        type: str,
+        rules: Rules,
+        description: link.Describe,
+        publication: Publication,
+        motion: bool,
+        standing: Standing,
+        passes: bool,
     ) -> None:
         self.type = type
         self.rules = rules
         self.description = description
         self.publication = publication
         self.holders = publication.holders
+        self.standing = standing
+        self.passes = passes
         self.deadline = description.motion.deadline_ms * 1_000_000 if motion else None
         """Nanoseconds; the greatest age a command may have."""
+
+
+class _Waiting(NamedTuple):
+    """A command that waits for control of the robot.
+
+    :param stamp: the relay's monotonic nanoseconds before which it can't have been sent
+    """
+
+    ask: rosbridge.Publish
+    stamp: int
 
 
 class Publishing:
     """The messages of one session on their way to the robot."""
 
-    __slots__ = ("_freshness", "_permit", "_robot", "_routes", "_session", "stale_commands")
+    __slots__ = (
+        "_desk",
+        "_freshness",
+        "_grips",
+        "_number",
+        "_permit",
+        "_robot",
+        "_routes",
+        "_session",
+        "_waiting",
+        "commanded",
+        "stale_commands",
+    )
 
     def __init__(self, session: Session, freshness: Freshness) -> None:
         self._session = session
         self._permit = session.permit
         self._robot = session.robot
+        self._desk = session.desk
+        self._number = session.number
         self._freshness = freshness
         self._routes: dict[str, Route] = {}
+        self._waiting: dict[str, _Waiting] = {}
+        """The newest command to each topic, while the robot is being told that it comes from here."""
+        self._grips = Grips()
         self.stale_commands = 0
+        self.commanded = 0
+        """The relay's monotonic nanoseconds before which the latest command can't have been sent."""
 
     def advertise(self, ask: rosbridge.Advertise) -> None:
         """The client is going to publish."""
@@ -72,9 +120,10 @@ class Publishing:
         """One message to the robot.
 
         The route found before holds while all it was founded on is the same: rights are compiled anew when they
-        change, and a robot's words about itself are replaced as a whole. So nothing has to be told of a change.
+        change, a robot's words about itself and who commands it are replaced as a whole. So nothing has to be told of a
+        change.
 
-        :raises Refused: the client may not publish there
+        :raises Refused: the client may not publish there, or somebody else commands the robot
         :raises Unavailable: the robot is offline
         :raises Invalid: no such topic, or of another type
         """
@@ -84,6 +133,7 @@ class Publishing:
             route is None
             or route.rules is not self._permit.rules
             or route.description is not robot.description
+            or route.standing is not self._desk.standing
             or session not in route.holders
             or ask.type != route.type
             or robot.control is None
@@ -95,7 +145,13 @@ class Publishing:
             # too young.
             left = deadline - freshness.age()
             if left < 0:
+                if not route.passes:
+                    # Of a zero that is so old nobody knows what the hand has done since.
+                    self._in_vain(route, still=False)
                 self._stale(route, deadline - left, ask.id)
+                return
+            self.commanded = freshness.not_before
+            if not route.passes and not self._let_by(route, ask):
                 return
         publication = route.publication
         send, body, stamp = publication.send, bytes(ask.msg), freshness.not_before
@@ -103,7 +159,7 @@ class Publishing:
             session.channel.publications.publish(session, publication, body, stamp, ask.id, left / 1e9)
             return
         try:
-            send(body, stamp)
+            send(body, stamp, self._number)
         except SwitchboardError as error:
             session.tell("error", f"publish {publication.topic}: {error}", ask.id)
 
@@ -114,20 +170,152 @@ class Publishing:
         topic = resolve(ask.topic)
         session.judge(Operation.PUBLISH, topic)
         if robot.control is None:
+            self._desk.unheard(session)
+            self._grips.in_vain(topic, self._now())
             raise Unavailable(f"robot {robot.name} is offline; the message was dropped")
         publication = session.channel.publications.get(session, ask, topic, normal_type(ask.type))
         motion = robot.is_motion(topic, publication.type)
         if len(self._routes) >= ROUTES:
             self._routes.clear()
-        route = self._routes[ask.topic] = Route(ask.type, rules, robot.description, publication, motion)
+        desk = self._desk
+        route = self._routes[ask.topic] = Route(
+            ask.type,
+            rules,
+            robot.description,
+            publication,
+            motion,
+            desk.standing,
+            not motion or (desk.passes(session, topic) and not self._must_let_go(topic)),
+        )
         return route
+
+    def _must_let_go(self, topic: str) -> bool:
+        """Whether the client went on commanding in vain until it got control (SPEC section 1.7)."""
+        desk, session = self._desk, self._session
+        if session.number in desk.standing.suppressed.get(topic, ()):
+            return False
+        return desk.lease.held_by(session) and self._grips.holds(topic, self._now())
+
+    def _let_by(self, route: Route, ask: rosbridge.Publish) -> bool:
+        """Whether a command goes to the robot though its route does not pass; else it waits.
+
+        :raises Refused: as :meth:`_claim`, or the client must let go first
+        """
+        topic = route.publication.topic
+        if not self._desk.passes(self._session, topic):
+            self._claim(route, ask)
+            return False
+        if self._must_let_go(topic):
+            self._in_vain(route, _is_still(route, ask))
+        if self._must_let_go(topic):
+            raise Refused(
+                f"let go first: you went on commanding {topic} without control of robot {self._robot.name}; "
+                f"say zero, or nothing for {LET_GO_SECONDS:g} s"
+            )
+        route.passes = True
+        return True
+
+    def _in_vain(self, route: Route, still: bool) -> None:
+        """A command was refused, held back or too old.
+
+        :param still: whether it said zero
+        """
+        topic, now = route.publication.topic, self._now()
+        if still:
+            self._grips.let_go(topic)
+        elif self._desk.in_vain(self._session) or self._grips.holds(topic, now):
+            self._grips.in_vain(topic, now)
+
+    def _now(self) -> int:
+        """The relay's monotonic nanoseconds."""
+        return self._freshness.not_before + self._freshness.age()
+
+    def _claim(self, route: Route, ask: rosbridge.Publish) -> None:
+        """A command of who does not command the robot: it waits if the robot is being told that it now does.
+
+        :raises Refused: somebody else commands the robot, or control must be taken first
+        """
+        topic = route.publication.topic
+        if len(bytes(ask.msg)) > WAITING_BYTES or (
+            topic not in self._waiting and len(self._waiting) >= WAITING_TOPICS
+        ):
+            self._ask_for_control(route, ask)
+            raise Refused(f"control is just being taken; a command to {topic} can't wait for it")
+        # Before it is asked for, since the answer may be there at once.
+        self._waiting[topic] = _Waiting(ask, self._freshness.not_before)
+        try:
+            self._ask_for_control(route, ask)
+        except SwitchboardError:
+            self._waiting.pop(topic, None)
+            raise
+
+    def _ask_for_control(self, route: Route, ask: rosbridge.Publish) -> None:
+        grips = self._grips
+        if not self._desk.lease.coming_to(self._session):
+            # A command that takes a free robot moves it: programs that know nothing of control begin so.
+            self._grips = Grips()
+        try:
+            self._desk.claim(self._session)
+        except SwitchboardError:
+            self._grips = grips
+            self._in_vain(route, _is_still(route, ask))
+            raise
+
+    def commands(self) -> None:
+        """The client moves the robot by something else than a message."""
+        self.commanded = self._freshness.not_before
+
+    def judge_age(self, what: str, stamp: int) -> None:
+        """See that something else than a message that moves the robot is not too old by now; what is, is counted.
+
+        :param stamp: the relay's monotonic nanoseconds before which it can't have been sent
+        :raises Refused: it may be too old
+        """
+        with self._freshness.as_of(stamp):
+            age = self._freshness.age()
+        deadline_ms = self._robot.description.motion.deadline_ms
+        if age > deadline_ms * 1_000_000:
+            self.stale_commands += 1
+            raise Refused(_too_old(f"{what} was refused", age, deadline_ms))
+
+    def control_changed(self) -> None:
+        """Who commands the robot is another: what waited for that goes, or is dropped."""
+        lease, session = self._desk.lease, self._session
+        if not self._waiting or lease.coming_to(session):
+            return
+        waiting, self._waiting = self._waiting, {}
+        if not lease.held_by(session):
+            # Why not, the desk has told.
+            return
+        for each in waiting.values():
+            with self._freshness.as_of(each.stamp):
+                self._again(each)
+
+    def _again(self, waiting: _Waiting) -> None:
+        """A command that waited is judged once more, as old as it is."""
+        try:
+            self.publish(waiting.ask)
+        except SwitchboardError as error:
+            self._session.refuse(waiting.ask, error)
+
+    @property
+    def idle_ns(self) -> int:
+        """Nanoseconds since the latest command."""
+        return self._freshness.not_before + self._freshness.age() - self.commanded
 
     def _stale(self, route: Route, age: int, id: rosbridge.Id) -> None:
         self.stale_commands += 1
         deadline_ms = route.description.motion.deadline_ms
-        self._session.tell(
-            "warning",
-            f"a command to {route.publication.topic} was dropped: it may be {age / 1e6:.0f} ms old, by the last ping "
-            f"answered; the robot takes none older than {deadline_ms} ms",
-            id,
-        )
+        words = _too_old(f"a command to {route.publication.topic} was dropped", age, deadline_ms)
+        self._session.tell("warning", words, id)
+
+
+def _is_still(route: Route, ask: rosbridge.Publish) -> bool:
+    return is_still(route.publication.type, bytes(ask.msg))
+
+
+def _too_old(what: str, age: int, deadline_ms: int) -> str:
+    return (
+        f"{what}: it may be {age / 1e6:.0f} ms old, by the last ping answered; "
+        f"the robot takes none older than {deadline_ms} ms"
+    )

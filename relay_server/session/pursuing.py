@@ -10,8 +10,10 @@ from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
 from relay_server.channel.goal import ClientGoal, Status
+from relay_server.channel.wire import Sent
 from relay_server.forms import Form, asked
 from relay_server.session.calling import untold
+from relay_server.session.moving import Movement
 from relay_server.session.names import normal_type
 
 if TYPE_CHECKING:
@@ -25,10 +27,14 @@ GOAL_BYTES = 2 * MIB
 
 
 class _Goal:
-    """One goal of the client, as the channel tells of it."""
+    """One goal of the client, as the channel tells of it.
 
-    def __init__(self, desk: Pursuing, ask: rosbridge.SendActionGoal, form: Form) -> None:
+    :param moves: whether the robot counts it as motion
+    """
+
+    def __init__(self, desk: Pursuing, ask: rosbridge.SendActionGoal, form: Form, moves: bool) -> None:
         self.ask = ask
+        self.moves = moves
         self.form = form
         self.size = len(bytes(ask.args or b""))
         self.pursued: ClientGoal | None = None
@@ -50,13 +56,21 @@ class Pursuing:
         self._session = session
         self._goals: list[_Goal] = []
 
+    @property
+    def moving(self) -> bool:
+        """Whether a goal that moves the robot is under way."""
+        return any(goal.moves for goal in self._goals)
+
     def send_goal(self, ask: rosbridge.SendActionGoal) -> None:
         """Have a goal pursued."""
         session, action = self._session, resolve(ask.action)
         session.judge(Operation.CALL, action)
+        moves = session.robot.description.motion.moves_by_action(action)
+        stamp = session.not_before
+        movement = Movement(session, f"a goal for {action}", stamp) if moves else None
         type_name = normal_type(ask.action_type, "action")
         self._check_room(ask)
-        goal = _Goal(self, ask, asked(ask, session.tell))
+        goal = _Goal(self, ask, asked(ask, session.tell), moves)
         self._goals.append(goal)
         pursued = session.channel.asking.pursue(
             session,
@@ -64,6 +78,7 @@ class Pursuing:
             action,
             type_name,
             bytes(ask.args or b""),
+            Sent(session.number, stamp, movement),
             feedback=ask.feedback,
         )
         goal.pursued = pursued

@@ -4,19 +4,19 @@
 ``pictures`` looks at what robots send before anybody gets it; ``ends`` says what links and viewers are.
 """
 
-from relay_server.video.ends import NO_CAMERA, NothingCame, VideoLink, Viewer
+from relay_server.video.ends import NO_CAMERA, NothingCame, TooOften, VideoLink, Viewer
 from relay_server.video.hub import Videos
-from relay_server.video.pictures import STALE_SECONDS, Picture
+from relay_server.video.pictures import Picture
 from relay_server.video.states import State
 from relay_server.video.stream import Stream
 
 __all__ = [
     "NO_CAMERA",
-    "STALE_SECONDS",
     "NothingCame",
     "Picture",
     "State",
     "Stream",
+    "TooOften",
     "VideoLink",
     "Videos",
     "Viewer",

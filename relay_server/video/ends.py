@@ -22,6 +22,18 @@ class NothingCame(Unavailable):
     code = "nothing_came"
 
 
+class TooOften(Unavailable):
+    """Somebody begins ever new streams; he may again after ``retry_after`` seconds."""
+
+    code = "too_often"
+
+    def __init__(self, robot: str, retry_after: float) -> None:
+        super().__init__(
+            f"you begin streams of robot {robot} faster than it can; try again in {int(retry_after) + 1} s"
+        )
+        self.retry_after = retry_after
+
+
 class VideoLink(Protocol):
     """The robot's end of a stream."""
 

@@ -10,10 +10,11 @@ from twisted.logger import Logger
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, SwitchboardError, Unavailable
 from relay_protocol.frames import VideoFrame
+from relay_protocol.pictures import look_at
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.registry import Presence
 from relay_server.video.ends import NO_CAMERA, NothingCame, VideoLink, Viewer
-from relay_server.video.pictures import STALE_SECONDS, Picture, look_at
+from relay_server.video.pictures import STALE_SECONDS, Lateness, Picture
 from relay_server.video.states import LINKED, NEXT, Event, State
 
 STREAM_VIEWERS = 256
@@ -80,6 +81,7 @@ class Stream:
         self.told: link.Playing | None = None
         """What the robot sends at present, once it has said so."""
         self._link: VideoLink | None = None
+        self._lateness = Lateness()
         self._patience: dict[Viewer, Timer] = {}
         """Of those who have not got any picture."""
         self._unready: set[Viewer] = set()
@@ -153,7 +155,7 @@ class Stream:
         if viewer in self.viewers and self.told is not None:
             viewer.playing(self.told)
         newest = self.newest
-        if newest is not None and newest.key and self._clock.seconds() - newest.arrived <= STALE_SECONDS:
+        if newest is not None and newest.key and self._clock.seconds() <= newest.good_until:
             self._show(newest, [viewer] if viewer in self._unready else [])
 
     def _show(self, picture: Picture, viewers: list[Viewer]) -> None:
@@ -247,10 +249,11 @@ class Stream:
             if self.told is None:
                 raise MalformedMessage("a picture came before 'playing', which tells its size")
             width, height = self.told.width, self.told.height
+        stamp, now = frame.stamp / 1e9, self._clock.seconds()
         return Picture(
             number=frame.number,
-            stamp=frame.stamp / 1e9,
-            arrived=self._clock.seconds(),
+            stamp=stamp,
+            good_until=now + STALE_SECONDS - self._lateness.of(stamp, now),
             codec=self.settings.codec,
             width=width,
             height=height,
@@ -294,7 +297,11 @@ class Stream:
             self._end(before)
 
     def _look_for_camera(self) -> None:
-        if self.robot.control is not None and any(each.name == self.camera for each in self.robot.cameras):
+        names = {self.camera}
+        if self.settings.transport == "compressed":
+            # Some cameras publish nothing else; image_transport's users name them by their raw topic all the same.
+            names.add(link.compressed_of(self.camera))
+        if self.robot.control is not None and any(each.name in names for each in self.robot.cameras):
             self._happen(Event.CAMERA_THERE)
 
     def _open_later(self, event: Event) -> None:

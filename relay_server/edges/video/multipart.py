@@ -1,4 +1,7 @@
-"""MJPEG: one answer that never ends, a JPEG a part (``multipart/x-mixed-replace``), as web_video_server has it."""
+"""MJPEG: one answer that never ends, a picture a part (``multipart/x-mixed-replace``), as web_video_server has it.
+
+The pictures are JPEG, or PNG where that was asked for.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,18 @@ from twisted.web.server import Request
 
 from relay_protocol import link
 from relay_protocol.errors import Refused, SwitchboardError
-from relay_server.clock import Clock, cancel
+from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.fastpath import Turns, Writer, writer_for
 from relay_server.edges.flow import Flow
-from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Waiting, narrow, unsent
+from relay_server.edges.video.viewing import (
+    CONTENT_TYPES,
+    LOOK_SECONDS,
+    STALL_SECONDS,
+    Made,
+    Progress,
+    Waiting,
+    narrow,
+)
 from relay_server.rounds import Round, Rounds
 from relay_server.video import Picture
 
@@ -21,6 +32,9 @@ _BOUNDARY = b"boundarydonotcross"
 _MARK = b"--" + _BOUNDARY
 _DELIMITER = _MARK + b"\r\n"
 CONTENT_TYPE = b"multipart/x-mixed-replace; boundary=" + _BOUNDARY
+
+AGAIN_SECONDS = 0.02
+"""How often it is looked whether the last picture has arrived, while another one waits for that."""
 
 LEAVING_SECONDS = 2.0
 """What was sent before the end has so long to go out; over TLS the peer, too, has to say something."""
@@ -35,7 +49,8 @@ def part(picture: Picture, reduced: float) -> bytes:
     """
     if _MARK in picture.body:
         return b""
-    head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\nX-Timestamp: %.6f\r\n%b\r\n" % (
+    head = b"Content-Type: %b\r\nContent-Length: %d\r\nX-Timestamp: %.6f\r\n%b\r\n" % (
+        CONTENT_TYPES[picture.codec],
         len(picture.body),
         picture.stamp,
         b"X-Reduced: %.3f\r\n" % reduced if reduced > 0 else b"",
@@ -59,13 +74,13 @@ class Multipart:
         self._request = request
         self._transport: Any = request.channel.transport
         self._tcp: Any = None
+        self._progress = Progress(None, clock.seconds)
         self._writer: Writer | None = None
         self._waiting = Waiting(clock.seconds)
         self._round = Round(self._look, LOOK_SECONDS)
         self._reduced = 0.0
         self._full = False
-        self._left = 0
-        self._moved = 0.0
+        self._again: Timer | None = None
 
     # --- Screen -------------------------------------------------------------------------------------------
 
@@ -88,14 +103,14 @@ class Multipart:
 
     def gone(self) -> None:
         """The client has left, or was told why there is nothing to see."""
-        self._round.stop()
+        self._rest()
 
     # --- Pausable -----------------------------------------------------------------------------------------
 
     def pause(self) -> None:
         """Something is left of what was written."""
         self._full = True
-        self._note_progress()
+        self._progress.sent()
 
     def resume(self) -> None:
         """All that was written has gone."""
@@ -105,7 +120,12 @@ class Multipart:
     # --- the connection -----------------------------------------------------------------------------------
 
     def _send(self) -> None:
-        if self._full or self.done.called:
+        if self._full or self.done.called or not self._waiting:
+            return
+        if self._progress.under_way:
+            # Twisted has nothing left of it, but the network may have seconds.
+            if self._again is None:
+                self._again = self._clock.callLater(AGAIN_SECONDS, self._look_again)
             return
         for picture in self._waiting.take():
             made = self._made.of(picture, self._reduced)
@@ -114,15 +134,20 @@ class Multipart:
             writer = self._writer or self._begin()
             # TLS takes what it is given, and says only a turn later that it has something left.
             self._full = self._tcp is not None and self._tcp is not self._transport
-            self._note_progress()
             writer.write(made)
             # Whether the socket takes it decides which picture is next, so it is tried at once.
             writer.flush()
+            self._progress.sent()
+
+    def _look_again(self) -> None:
+        self._again = None
+        self._send()
 
     def _begin(self) -> Writer:
         """The head of the answer. Not by :meth:`Request.write`, which would make a chunk of each part."""
         request, channel = self._request, self._request.channel
         self._tcp = narrow(self._transport)
+        self._progress = Progress(self._tcp, self._clock.seconds)
         if self._tcp is not None:
             # A picture is taken when nothing of it is left, so one byte is as full as many.
             self._tcp.bufferSize = 0
@@ -137,16 +162,14 @@ class Multipart:
         return writer
 
     def _look(self) -> None:
-        if not self._full or self._unsent() != self._left:
-            self._note_progress()
-        elif self._clock.seconds() - self._moved >= STALL_SECONDS:
+        stands = self._progress.stands()
+        if stands >= STALL_SECONDS and (self._full or self._progress.under_way):
             self._close(abort=True)
 
-    def _note_progress(self) -> None:
-        self._left, self._moved = self._unsent(), self._clock.seconds()
-
-    def _unsent(self) -> int:
-        return 0 if self._tcp is None else unsent(self._tcp)
+    def _rest(self) -> None:
+        self._round.stop()
+        cancel(self._again)
+        self._again = None
 
     def _close(self, abort: bool) -> None:
         """End the connection.
@@ -155,7 +178,7 @@ class Multipart:
         """
         if self.done.called:
             return
-        self._round.stop()
+        self._rest()
         self._request.unregisterProducer()
         if abort:
             self._transport.abortConnection()

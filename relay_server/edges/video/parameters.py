@@ -20,7 +20,7 @@ MOST_FPS = 1000
 Kind = Literal["stream", "snapshot", "ws"]
 
 _TYPES: dict[Kind, tuple[str, ...]] = {
-    "stream": ("mjpeg", "ros_compressed"),
+    "stream": ("mjpeg", "ros_compressed", "png"),
     "snapshot": ("mjpeg", "ros_compressed", "png"),
     "ws": ("mjpeg", "ros_compressed"),
 }
@@ -39,6 +39,7 @@ _QOS: dict[str, Literal["", "sensor_data", "default"]] = {
 _TRANSPORTS: dict[str, Literal["", "raw", "compressed"]] = {"": "", "raw": "raw", "compressed": "compressed"}
 _ANGLES: dict[str, Literal[0, 90, 180, 270]] = {"0": 0, "90": 90, "180": 180, "270": 270}
 _SWITCH = {"": True, "true": True, "1": True, "false": False, "0": False}
+_NO = frozenset({"false", "0", "no", "off"})
 
 _WHOLE = re.compile(r"[0-9]{1,9}", re.ASCII)
 _DECIMAL = re.compile(r"[0-9]{1,9}(\.[0-9]{1,9})?", re.ASCII)
@@ -70,13 +71,13 @@ def asked(query: str, kind: Kind) -> Asked:
     return Asked(
         _camera(given.text("topic", "")),
         link.VideoSettings(
-            width=given.whole("width", 0, 0, limits.PICTURE_SIDE),
-            height=given.whole("height", 0, 0, limits.PICTURE_SIDE),
+            width=given.side("width"),
+            height=given.side("height"),
             quality=given.whole("quality", 80, 1, 100),
             fps=given.decimal("fps", 0, MOST_FPS),
             crop=_crop(given.text("crop", "0,0,0,0")),
             rotate=given.one_of("rotate", _ANGLES, 0),
-            invert=given.one_of("invert", _SWITCH, False),
+            invert=given.there("invert"),
             stamp=given.one_of("stamp", _SWITCH, False),
             codec="png" if form == "png" else codec,
             qos=given.one_of("qos_profile", _QOS, ""),
@@ -112,6 +113,14 @@ class _Given:
             words = ", ".join(f"'{each}'" for each in known if each)
             raise Invalid(f"'{name}' is one of {words}{'' if '' not in known else ', or empty'}")
         return found
+
+    def there(self, name: str) -> bool:
+        """Whether a switch is there: with any value, as web_video_server takes it, but one that says no."""
+        return name in self._all and self.text(name, "").lower() not in _NO
+
+    def side(self, name: str) -> int:
+        """Pixels; those below 0, which web_video_server has for "the camera's own", are 0."""
+        return 0 if self.text(name, "0") == "-1" else self.whole(name, 0, 0, limits.PICTURE_SIDE)
 
     def whole(self, name: str, default: int, least: int, most: int) -> int:
         """A whole number."""

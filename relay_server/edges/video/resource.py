@@ -5,6 +5,7 @@ A session cookie needs no Origin here, because an ``<img>`` sends none; but othe
 
 from __future__ import annotations
 
+import html
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
@@ -17,6 +18,7 @@ from twisted.web.server import NOT_DONE_YET, Request
 from relay_protocol import jsontext, link
 from relay_protocol.errors import Refused, SwitchboardError
 from relay_server.access import Principal
+from relay_server.auth import Opening
 from relay_server.clock import Clock
 from relay_server.edges.fastpath import Turns
 from relay_server.edges.problems import problem, problem_of
@@ -24,7 +26,7 @@ from relay_server.edges.site import wants_websocket
 from relay_server.edges.video.multipart import CONTENT_TYPE, Multipart, part
 from relay_server.edges.video.parameters import asked
 from relay_server.edges.video.snapshot import Snapshot
-from relay_server.edges.video.viewing import Made
+from relay_server.edges.video.viewing import CONTENT_TYPES, Made
 from relay_server.rounds import Rounds
 from relay_server.watching import Screen, Watching
 
@@ -32,13 +34,19 @@ _METHODS = (b"GET", b"HEAD")
 _OWN_PAGES = (None, b"same-origin", b"none")
 """``Sec-Fetch-Site`` (W3C Fetch Metadata) of what is no browser's, of the relay's own pages, of the address bar."""
 
-_PICTURES = {"jpeg": b"image/jpeg", "png": b"image/png"}
+_VIEWER = """<!DOCTYPE html>
+<html lang="en">
+<head><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title></head>
+<body><img src="stream?{query}" alt="{title}"></body>
+</html>
+"""
+"""web_video_server's page around a stream, which others' pages have links to."""
 
 
 class Desk(Protocol):
     """What is asked for here; the front desk's."""
 
-    async def ticket(self, ticket: str, robot: str) -> Principal:
+    async def ticket(self, ticket: str, asked: Opening, *, spend: bool) -> Principal:
         """The principal of a single-use ticket."""
 
     async def cameras(self, principal: Principal, robot: str) -> list[dict[str, Any]]:
@@ -88,6 +96,7 @@ class Video(Resource):
         self._answers: dict[bytes, Callable[[Request, str], Awaitable[bytes | None]]] = {
             b"cameras": self._cameras,
             b"stream": self._stream,
+            b"stream_viewer": self._stream_viewer,
             b"snapshot": self._snapshot,
         }
 
@@ -118,13 +127,13 @@ class Video(Resource):
     # --- answers ------------------------------------------------------------------------------------------
 
     async def _cameras(self, request: Request, robot: str) -> bytes:
-        cameras = await self._desk.cameras(await self._principal(request, robot), robot)
+        cameras = await self._desk.cameras(await self._principal(request, Opening(robot, video=True)), robot)
         request.setHeader(b"content-type", b"application/json")
         return jsontext.encode({"cameras": cameras})
 
     async def _stream(self, request: Request, robot: str) -> bytes | None:
         wanted = asked(_query(request), "stream")
-        principal = await self._principal(request, robot)
+        principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
         if request.method == b"HEAD":
             await self._desk.may_view(principal, robot, wanted.camera, _address(request))
             request.setHeader(b"content-type", CONTENT_TYPE)
@@ -143,14 +152,21 @@ class Video(Resource):
             screen.gone()
         return None
 
+    async def _stream_viewer(self, request: Request, robot: str) -> bytes:
+        """Nothing of the robot is in it: who may see the stream is asked when the page asks for that."""
+        query = _query(request)
+        camera = asked(query, "stream").camera
+        request.setHeader(b"content-type", b"text/html; charset=utf-8")
+        return _VIEWER.format(title=html.escape(f"{camera} of {robot}"), query=html.escape(query)).encode()
+
     async def _snapshot(self, request: Request, robot: str) -> bytes:
         wanted = asked(_query(request), "snapshot")
-        principal = await self._principal(request, robot)
+        principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
         if request.method == b"HEAD":
             await self._desk.may_view(principal, robot, wanted.camera, _address(request))
-            request.setHeader(b"content-type", _PICTURES[wanted.settings.codec])
+            request.setHeader(b"content-type", CONTENT_TYPES[wanted.settings.codec])
             return b""
-        screen = Snapshot()
+        screen = Snapshot(self._clock.seconds)
         watching = await self._desk.viewing(
             principal, robot, wanted.camera, wanted.settings, screen, _address(request)
         )
@@ -158,7 +174,7 @@ class Video(Resource):
             picture = await screen.done
         finally:
             watching.leave()
-        request.setHeader(b"content-type", _PICTURES[picture.codec])
+        request.setHeader(b"content-type", CONTENT_TYPES[picture.codec])
         request.setHeader(b"x-timestamp", b"%.6f" % picture.stamp)
         if screen.reduced > 0:
             request.setHeader(b"x-reduced", b"%.3f" % screen.reduced)
@@ -166,16 +182,19 @@ class Video(Resource):
 
     # --- who asks -----------------------------------------------------------------------------------------
 
-    async def _principal(self, request: Request, robot: str) -> Principal:
+    async def _principal(self, request: Request, opens: Opening) -> Principal:
         """Who sent this, by the credentials of SPEC section 1.1, in their order.
 
+        :param opens: what a ticket would have to be for
         :raises BadCredentials: nobody that can be told
         :raises Refused: a cookie that another site's page has the browser send
         """
         if not (request.getHeader("authorization") or "").lower().startswith("bearer "):
             ticket = request.args.get(b"ticket")
             if ticket:
-                principal = await self._desk.ticket(ticket[0].decode("ascii", "replace"), robot)
+                # Who asks for the head wants the rest as well.
+                spend = request.method != b"HEAD"
+                principal = await self._desk.ticket(ticket[0].decode("ascii", "replace"), opens, spend=spend)
                 # Whoever was given a ticket may be a page of another site, with an <img>.
                 request.setHeader(b"cross-origin-resource-policy", b"cross-origin")
                 return principal

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from twisted.internet.defer import Deferred
 
 from relay_protocol import link
@@ -10,16 +12,20 @@ from relay_server.video import Picture
 
 
 class Snapshot:
-    """Waits for a picture; how long is for the stream to say."""
+    """Waits for a picture; how long is for the stream to say.
 
-    def __init__(self) -> None:
+    :param seconds: the monotonic clock pictures are dated by
+    """
+
+    def __init__(self, seconds: Callable[[], float]) -> None:
+        self._seconds = seconds
         self.done: Deferred[Picture] = Deferred()
         """The picture; fails when there is none."""
         self.reduced = 0.0
 
     def picture(self, picture: Picture) -> None:
-        """The first one is it."""
-        if not self.done.called:
+        """The first one that is not old already is it."""
+        if not self.done.called and self._seconds() <= picture.good_until:
             self.done.callback(picture)
 
     def playing(self, playing: link.Playing) -> None:

@@ -18,18 +18,18 @@ from relay_protocol.errors import MalformedMessage, SwitchboardError
 from relay_protocol.message import Message
 from relay_server import closing, wsframe
 from relay_server.access import Principal
+from relay_server.auth import Opening
 from relay_server.clock import Clock
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.gate import Gate, code_of
 from relay_server.edges.video.parameters import Asked, asked
-from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Waiting, narrow
+from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Progress, Waiting, narrow
 from relay_server.edges.websocket import ClientFactory, ClientProtocol
 from relay_server.freshness import Freshness
 from relay_server.frontdesk import Admission
 from relay_server.outbox import Outbox
 from relay_server.rounds import Round, Rounds
 from relay_server.session import ClientTransport, Timing
-from relay_server.session.pinging import Pinging
 from relay_server.video import Picture
 from relay_server.watching import Screen, Watching, check_view
 
@@ -75,6 +75,7 @@ def framed(picture: Picture, reduced: float) -> bytes:
 class VideoClient:
     """What goes on over one viewer's websocket.
 
+    :param progress: of its connection
     :param opened_ns: when its handshake was answered, monotonic nanoseconds
     """
 
@@ -84,27 +85,28 @@ class VideoClient:
         transport: ClientTransport,
         admission: Admission,
         wanted: Asked,
+        progress: Progress,
         opened_ns: int,
     ) -> None:
-        self.permit = admission.permit
         self.outbox = Outbox(transport.send, shared.clock.seconds, self._overflow)
         self._shared = shared
         self._transport = transport
+        self._progress = progress
         self._admission = admission
         self._wanted = wanted
         self._watching: Watching | None = None
         self._waiting = Waiting(shared.clock.seconds, self._start_anew)
         self._under_way: int | None = None
         """Number of the last picture that was sent and that the viewer has not taken."""
-        self._sent_at = 0.0
+        self._heard_at = shared.clock.seconds()
         self._mistakes = 0
         self._ended = False
-        timing = shared.gate.timing
         self._freshness = Freshness(shared.clock_ns, opened_ns, lambda: secrets.token_bytes(8))
         # A viewer commands nothing, whatever his rights: nobody wants to know how old what he says is.
-        only_watches = Timing(timing.client_ping, timing.client_ping, timing.stall_limit)
-        self._pinging = Pinging(self, shared.clock, transport, self._freshness, only_watches)
-        self._round = Round(self._look, LOOK_SECONDS)
+        self._rounds = (
+            Round(self._ping, shared.gate.timing.client_ping),
+            Round(self._look, LOOK_SECONDS),
+        )
 
     # --- Occupant -----------------------------------------------------------------------------------------
 
@@ -122,8 +124,8 @@ class VideoClient:
         except SwitchboardError as error:
             self.close(code_of(error), str(error))
             return
-        self._pinging.start(self._shared.rounds)
-        self._shared.rounds.start(self._round)
+        for each in self._rounds:
+            self._shared.rounds.start(each)
 
     def message(self, payload: bytes, *, since: int | None = None) -> None:
         """``took`` opens the way for the next picture."""
@@ -131,6 +133,7 @@ class VideoClient:
             number = jsontext.decode(_decoder, payload).number
         except MalformedMessage:
             number = None
+        self._heard_at = self._shared.clock.seconds()
         if number is not None and number == self._under_way:
             self._under_way = None
             self._mistakes = 0
@@ -142,6 +145,7 @@ class VideoClient:
 
     def pong(self, payload: bytes) -> None:
         """It is still there."""
+        self._heard_at = self._shared.clock.seconds()
         self._freshness.pong(payload)
 
     def pause(self) -> None:
@@ -163,8 +167,8 @@ class VideoClient:
         """The websocket is gone; give everything back."""
         self._ended = True
         self.outbox.close()
-        self._pinging.end()
-        self._round.stop()
+        for each in self._rounds:
+            each.stop()
         watching, self._watching = self._watching, None
         if watching is not None:
             watching.leave()
@@ -192,18 +196,29 @@ class VideoClient:
             return
         for picture in self._waiting.take():
             self._under_way = picture.number
-            self._sent_at = self._shared.clock.seconds()
             self.outbox.write(self._shared.frames.of(picture))
+            self._progress.sent()
 
     def _start_anew(self) -> None:
         if self._watching is not None and self._wanted.settings.codec == "h264":
             self._watching.start_anew()
 
+    def _ping(self) -> None:
+        """Keep the way open, and see whether somebody is there. A picture under way has answers wait behind it."""
+        timing = self._shared.gate.timing
+        silent = self._shared.clock.seconds() - self._heard_at
+        if self._under_way is None and silent > max(timing.client_ping * 3, timing.stall_limit):
+            self.close(closing.TOO_SLOW, f"no answer to pings for {silent:.0f} s")
+        else:
+            self._transport.ping(self._freshness.ping())
+
     def _look(self) -> None:
-        # Whose transport is full is cut by the pings.
-        waits = self._under_way is not None and self.outbox.paused_since is None
-        if waits and self._shared.clock.seconds() - self._sent_at >= STALL_SECONDS:
-            self.close(closing.TOO_SLOW, f"no 'took' for {STALL_SECONDS:g} s")
+        """A slow viewer may take his time for a picture, as long as something of it arrives."""
+        if self._progress.stands() >= STALL_SECONDS and self._under_way is not None:
+            self.close(
+                closing.TOO_SLOW,
+                f"for {STALL_SECONDS:g} s nothing was taken, and no 'took' came",
+            )
 
     def _overflow(self) -> None:
         self.close(closing.TOO_SLOW, "too much waits for you")
@@ -214,17 +229,18 @@ class VideoProtocol(ClientProtocol):
 
     factory: VideoFactory
     _wanted: Asked
+    _progress: Progress
 
     def connectionMade(self) -> None:
         """The site has handed over a connection that asked to become a websocket."""
-        narrow(self.transport)
+        self._progress = Progress(narrow(self.transport), self.factory.clock.seconds)
         super().connectionMade()
 
-    def _asked_for(self, request: ConnectionRequest) -> str:
+    def _asked_for(self, request: ConnectionRequest) -> Opening:
         # Autobahn's own look at the parameters leaves those without a value out.
         self._wanted = asked(self.http_request_uri.partition("?")[2], "ws")
         path = request.path.removeprefix("/robots/").removesuffix("/video/ws")
-        return unquote(path)
+        return Opening(unquote(path), video=True, camera=self._wanted.camera)
 
     async def _admit(self, principal: Principal) -> Admission:
         admission = await super()._admit(principal)
@@ -236,7 +252,7 @@ class VideoProtocol(ClientProtocol):
         return admission
 
     def _occupant(self, admission: Admission) -> VideoClient:
-        return VideoClient(self.factory, self, admission, self._wanted, self._opened_ns)
+        return VideoClient(self.factory, self, admission, self._wanted, self._progress, self._opened_ns)
 
 
 class VideoFactory(ClientFactory):

@@ -15,7 +15,10 @@ from collections.abc import Callable
 from typing import Any
 
 from relay_protocol.limits import KIB, MIB
-from relay_server.video import STALE_SECONDS, Picture
+from relay_server.video import Picture
+
+CONTENT_TYPES = {"jpeg": b"image/jpeg", "png": b"image/png"}
+"""Of single pictures, by their codec."""
 
 STALL_SECONDS = 5.0
 """A viewer that takes nothing for so long is cut."""
@@ -29,6 +32,9 @@ WAITING_BYTES = MIB
 SOCKET_BYTES = 256 * KIB
 UNSENT_BYTES = 16 * KIB
 """What the kernel holds for a viewer: all of it, and what has not gone over the network yet."""
+
+UNDER_WAY_BYTES = 16 * KIB
+"""With more than this not acknowledged yet, the last picture is still under way."""
 
 _PROBES = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
 """Seconds, seconds, times: while a robot is away nothing is written, and these alone notice a viewer who vanished
@@ -53,6 +59,9 @@ class Waiting:
         self._pictures: list[Picture] = []
         self._bytes = 0
 
+    def __bool__(self) -> bool:
+        return bool(self._pictures)
+
     def put(self, picture: Picture) -> None:
         """A new picture, which takes the place of all that it does not need."""
         if picture.key:
@@ -65,7 +74,7 @@ class Waiting:
 
     def take(self) -> list[Picture]:
         """What goes to the viewer now; nothing when it is too old."""
-        if self._pictures and self._seconds() - self._pictures[0].arrived > STALE_SECONDS:
+        if self._pictures and self._seconds() > self._pictures[0].good_until:
             self._leave_out()
         pictures, self._pictures, self._bytes = self._pictures, [], 0
         return pictures
@@ -74,6 +83,43 @@ class Waiting:
         self._pictures.clear()
         self._bytes = 0
         self._start_anew()
+
+
+class Progress:
+    """Whether a viewer takes what was sent: by what his end has acknowledged.
+
+    :param tcp: his connection, see :func:`narrow`; ``None`` takes everything at once
+    :param seconds: a monotonic clock
+    """
+
+    __slots__ = ("_left", "_moved", "_seconds", "_tcp")
+
+    def __init__(self, tcp: Any, seconds: Callable[[], float]) -> None:
+        self._tcp = tcp
+        self._seconds = seconds
+        self._left = 0
+        self._moved = seconds()
+
+    @property
+    def under_way(self) -> bool:
+        """Whether much of what was sent has not arrived yet."""
+        return self._tcp is not None and unsent(self._tcp) > UNDER_WAY_BYTES
+
+    def sent(self) -> None:
+        """A picture was sent just now."""
+        self._left, self._moved = self._unsent(), self._seconds()
+
+    def stands(self) -> float:
+        """Seconds since a picture was sent, or something of it acknowledged, as far as looks like this one tell."""
+        left, before = self._unsent(), self._left
+        self._left = left
+        # More than before there is by pings, which say nothing of the other end.
+        if left < before:
+            self._moved = self._seconds()
+        return self._seconds() - self._moved
+
+    def _unsent(self) -> int:
+        return 0 if self._tcp is None else unsent(self._tcp)
 
 
 class Made:

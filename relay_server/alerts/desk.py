@@ -1,0 +1,315 @@
+"""What people ask about alerts: what there is, who looks after it, by which rules they are told."""
+
+from __future__ import annotations
+
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+from sqlalchemy.orm import Session
+
+from relay_db import queries
+from relay_db.queries import AlertRecord, AlertRuleRecord
+from relay_protocol.errors import NotFound, Refused, Unavailable
+from relay_protocol.rights import Level, Rules
+from relay_server.access import Access, Principal
+from relay_server.alerts import kinds, rules
+from relay_server.alerts.hub import Alerts
+from relay_server.alerts.message import view
+from relay_server.alerts.rules import Ask
+from relay_server.alerts.ways import Ways
+from relay_server.bucket import TokenBucket
+from relay_server.journal import Journal
+from relay_server.store import Store
+
+MOST = 500
+"""Alerts one answer holds."""
+
+PAGE = 500
+PAGES = 4
+"""Rows that are looked through for alerts that somebody may know of."""
+
+TESTS = (5 / 60, 5.0)
+CHANGES = (0.2, 20.0)
+"""Tests and changes of rules by one user: a second in the long run, and at once."""
+
+REMEMBERED = 1000
+"""Users whose doings are counted, and whose pages' alerts are kept at a time."""
+
+NO_ALERT = "there is no such alert, or none for you"
+
+
+class TooOften(Unavailable):
+    """Somebody does something too often; he may again after ``retry_after`` seconds."""
+
+    code = "too_often"
+
+    def __init__(self, what: str, retry_after: float) -> None:
+        super().__init__(f"{what} too often; try again in {int(retry_after) + 1} s")
+        self.retry_after = retry_after
+
+
+class AlertDesk:
+    """Serves the HTTP API.
+
+    :param seconds: a monotonic clock
+    :param wall: Unix time in seconds
+    """
+
+    def __init__(
+        self,
+        alerts: Alerts,
+        ways: Ways,
+        store: Store,
+        access: Access,
+        journal: Journal,
+        seconds: Callable[[], float],
+        wall: Callable[[], float],
+    ) -> None:
+        self._alerts = alerts
+        self._ways = ways
+        self._store = store
+        self._access = access
+        self._journal = journal
+        self._seconds = seconds
+        self._wall = wall
+        self._buckets: OrderedDict[tuple[str, int], TokenBucket] = OrderedDict()
+        self._pages: OrderedDict[int, tuple[int, object, list[dict[str, Any]]]] = OrderedDict()
+
+    # --- alerts -------------------------------------------------------------------------------------------
+
+    async def all(
+        self, principal: Principal, robot: str = "", open: bool | None = None, limit: int = 100
+    ) -> list[dict[str, Any]]:
+        """Alerts the principal may know of, the latest first.
+
+        :param robot: of this robot only
+        :param open: only those that last, or only those that are over
+        """
+        rights = await self._rights(principal)
+        asked = [number for number, (name, _) in rights.items() if not robot or name == robot]
+        await self._alerts.flush()
+        found: list[dict[str, Any]] = []
+        for page in range(PAGES):
+            rows = await self._store.read(
+                queries.list_alerts, asked, open=open, limit=PAGE, offset=page * PAGE
+            )
+            found += [
+                self._view(principal, each, rights[each.robot_id][1])
+                for each in rows
+                if rules.visible(rights[each.robot_id][1], each.kind, each.about)
+            ]
+            if len(rows) < PAGE or len(found) >= limit:
+                break
+        return found[:limit]
+
+    async def shown(self, principal: Principal) -> list[dict[str, Any]]:
+        """What a page of the principal shows now; the same list as long as it is the same."""
+        known = await self._access.robots(principal)
+        version = self._alerts.version
+        kept = self._pages.get(principal.user_id)
+        if kept is not None and kept[0] == version and kept[1] is known:
+            return kept[2]
+        rights = {record.id: each for record, each in known}
+        now = self._wall()
+        found = [
+            each
+            for each in self._alerts.book
+            if each.robot_id in rights
+            and (each.over is None or now - each.over < kinds.SHOWN_SECONDS)
+            and rules.visible(rights[each.robot_id], each.kind, each.about)
+        ]
+        found.sort(key=lambda each: (each.over is None, each.last), reverse=True)
+        shown = [self._view(principal, each, rights[each.robot_id]) for each in found[: kinds.SHOWN]]
+        shown.sort(key=lambda each: each["last"], reverse=True)
+        if kept is not None and kept[2] == shown:
+            shown = kept[2]
+        self._pages[principal.user_id] = (version, known, shown)
+        self._pages.move_to_end(principal.user_id)
+        while len(self._pages) > REMEMBERED:
+            self._pages.popitem(last=False)
+        return shown
+
+    async def acknowledge(self, principal: Principal, alert_id: str) -> dict[str, Any]:
+        """The principal looks after it.
+
+        :raises NotFound: no such alert, or none the principal may know of
+        :raises Refused: only operators and owners may
+        """
+        rights = await self._rights(principal)
+        found = self._alerts.book.find(alert_id) or await self._store.read(queries.get_alert, alert_id)
+        if found is None or found.robot_id not in rights:
+            raise NotFound(NO_ALERT)
+        mine = rights[found.robot_id][1]
+        if not rules.visible(mine, found.kind, found.about):
+            raise NotFound(NO_ALERT)
+        if not _operates(mine):
+            raise Refused(f"to acknowledge alerts of {found.robot} takes the level operator")
+        fresh = found.over is None and found.ack_at is None
+        found = self._alerts.acknowledge(alert_id, principal.name, self._wall()) or found
+        if fresh:
+            await self._alerts.flush()
+            self._journal.event(
+                "alert.acknowledged",
+                f"user:{principal.name}",
+                cause=f"user:{principal.name}",
+                robot_id=found.robot_id,
+                user_id=principal.user_id,
+                alert=found.id,
+                alert_kind=found.kind,
+            )
+        return self._view(principal, found, mine)
+
+    async def _rights(self, principal: Principal) -> dict[int, tuple[str, Rules]]:
+        return {record.id: (record.name, each) for record, each in await self._access.robots(principal)}
+
+    def _view(self, principal: Principal, alert: AlertRecord, rights: Rules) -> dict[str, Any]:
+        return {
+            **view(alert),
+            "may_acknowledge": alert.over is None and alert.ack_at is None and _operates(rights),
+            "news": alert.news,
+            "notify": self._alerts.tellers.shown(principal.user_id, alert, self._wall()),
+        }
+
+    # --- rules --------------------------------------------------------------------------------------------
+
+    async def rules(self, principal: Principal) -> dict[str, Any]:
+        """The principal's rules, and what a rule may say here."""
+        found = await self._store.read(queries.list_alert_rules, principal.user_id)
+        return {
+            "rules": [self._rule(each) for each in found],
+            "kinds": list(kinds.KINDS),
+            "levels": list(kinds.LEVELS),
+            "channels": list(self._ways.channels),
+            "schemes": self._ways.schemes,
+        }
+
+    async def add_rule(self, principal: Principal, ask: Ask, address: str) -> dict[str, Any]:
+        """Tell the principal of alerts from now on; the rule, with the secret if the relay made one.
+
+        :param address: from where this is asked
+        :raises Invalid: the rule makes no sense, or there are too many
+        :raises TooOften: so many changes in so short a time
+        """
+        self._count("change", principal, CHANGES, "you change rules")
+        rules.check(ask, self._ways.channels)
+        await self._ways.check(ask.channel, ask.url)
+        made = ask.channel == "webhook" and not ask.secret
+        if made:
+            ask = msgspec.structs.replace(ask, secret=secrets.token_urlsafe(32))
+        record = await self._store.write(_add, principal, ask, address, self._wall())
+        await self._alerts.refresh()
+        return {**self._rule(record), **({"secret": ask.secret} if made else {})}
+
+    async def remove_rule(self, principal: Principal, number: int, address: str) -> None:
+        """Tell nobody by this rule any more.
+
+        :raises NotFound: the principal has none of this number
+        """
+        self._count("change", principal, CHANGES, "you change rules")
+        await self._store.write(_remove, principal, number, address, self._wall())
+        await self._alerts.refresh()
+
+    async def test_rule(self, principal: Principal, number: int) -> dict[str, Any]:
+        """Send a made-up alert now: whether it arrived, and why not.
+
+        :raises NotFound: the principal has no rule of this number
+        """
+        self._count("test", principal, TESTS, "you test rules")
+        mine = await self._store.read(queries.list_alert_rules, principal.user_id)
+        rule = next((each for each in mine if each.id == number), None)
+        if rule is None:
+            raise NotFound(_no_rule(number))
+        reason = await self._alerts.tellers.test(rule)
+        return {"ok": not reason, "reason": reason}
+
+    def _count(self, what: str, principal: Principal, most: tuple[float, float], words: str) -> None:
+        bucket = self._buckets.setdefault(
+            (what, principal.user_id), TokenBucket(most[0], most[1], self._seconds)
+        )
+        self._buckets.move_to_end((what, principal.user_id))
+        while len(self._buckets) > REMEMBERED:
+            self._buckets.popitem(last=False)
+        if not bucket.take():
+            raise TooOften(words, bucket.wait)
+
+    def _rule(self, record: AlertRuleRecord) -> dict[str, Any]:
+        status = self._alerts.tellers.status(record.id)
+        return {
+            "id": record.id,
+            "label": record.label,
+            "robots": record.robots,
+            "kinds": list(record.kinds),
+            "level": record.level,
+            "channel": record.channel,
+            "url": rules.shown_url(record),
+            "over": record.over,
+            "group_s": record.group_s,
+            "quiet": record.quiet,
+            "status": {
+                "sent": status.sent,
+                "failed": status.failed,
+                "reason": status.reason,
+                "last": status.last,
+            },
+        }
+
+
+def _operates(rights: Rules) -> bool:
+    return rights.level in (Level.OPERATOR, Level.OWNER)
+
+
+def _no_rule(number: int) -> str:
+    return f"you have no rule {number}"
+
+
+def keep(s: Session, user_id: int, ask: Ask, now: float) -> AlertRuleRecord:
+    """Write a rule that was checked.
+
+    :param now: Unix seconds
+    :raises Invalid: the user has too many
+    """
+    return queries.add_alert_rule(
+        s,
+        user_id,
+        name=ask.label,
+        robots=ask.robots,
+        kinds=ask.kinds,
+        level=ask.level,
+        channel=ask.channel,
+        url=ask.url,
+        secret=ask.secret,
+        over=ask.over,
+        group_s=ask.group_s,
+        quiet=None if ask.quiet is None else msgspec.to_builtins(ask.quiet),
+        created=now,
+    )
+
+
+def _add(s: Session, principal: Principal, ask: Ask, address: str, now: float) -> AlertRuleRecord:
+    record = keep(s, principal.user_id, ask, now)
+    _audit(s, "alert_rule.add", principal, record, address, now)
+    return record
+
+
+def _remove(s: Session, principal: Principal, number: int, address: str, now: float) -> None:
+    mine = {each.id: each for each in queries.list_alert_rules(s, principal.user_id)}
+    if number not in mine or not queries.remove_alert_rule(s, number, principal.user_id):
+        raise NotFound(_no_rule(number))
+    _audit(s, "alert_rule.remove", principal, mine[number], address, now)
+
+
+def _audit(
+    s: Session, action: str, principal: Principal, record: AlertRuleRecord, address: str, now: float
+) -> None:
+    queries.append_audit(
+        s,
+        at=now,
+        actor=f"user:{principal.name}",
+        action=action,
+        target=str(record.id),
+        origin=address,
+        data={"channel": record.channel, "url": rules.shown_url(record), "robots": record.robots},
+    )

@@ -1,0 +1,67 @@
+"""Alerts, put together: what looks, what remembers, what tells, and whom people ask."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from relay_protocol.limits import HEARTBEATS_MISSED
+from relay_server.access import Access
+from relay_server.alerts.desk import AlertDesk
+from relay_server.alerts.hub import Alerts
+from relay_server.alerts.senses import Thresholds
+from relay_server.alerts.ways import Ways
+from relay_server.channel import Channels
+from relay_server.config import Settings
+from relay_server.journal import Journal
+from relay_server.registry import Registry
+from relay_server.store import Store
+
+
+class AlertHouse:
+    """All that a relay has for alerts.
+
+    :param reactor: Twisted's
+    :raises Invalid: the settings make no sense
+    """
+
+    def __init__(
+        self,
+        reactor: Any,
+        store: Store,
+        access: Access,
+        registry: Registry,
+        channels: Channels,
+        journal: Journal,
+        settings: Settings,
+    ) -> None:
+        own = settings.alerts
+        self._ways = Ways(reactor, time.time, own.webhook_networks, own.apprise_schemes)
+        self.alerts = Alerts(
+            reactor,
+            time.time,
+            store,
+            access,
+            registry,
+            channels,
+            journal,
+            Thresholds(HEARTBEATS_MISSED * settings.heartbeat, own.battery_low, own.battery_critical),
+            self._ways.send,
+        )
+        self.desk = AlertDesk(self.alerts, self._ways, store, access, journal, reactor.seconds, time.time)
+
+    async def start(self, relay: str) -> None:
+        """Take up what an earlier relay kept, and begin.
+
+        :param relay: the relay's name, for those who are told
+        """
+        self._ways.start(relay)
+        await self.alerts.start()
+
+    async def stop(self) -> None:
+        """Tell nobody any more: robots go because the relay does."""
+        await self.alerts.stop()
+
+    def finish(self) -> None:
+        """End the threads; blocks for as long as that takes."""
+        self._ways.stop()

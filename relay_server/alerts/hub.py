@@ -1,0 +1,316 @@
+"""Puts alerts together: what happens to robots goes into the book, from there to the database and to people."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Collection
+from typing import Any
+
+from twisted.internet.defer import Deferred, DeferredLock
+from twisted.logger import Logger
+
+from relay_db import queries
+from relay_db.queries import AlertRecord, AlertRuleRecord
+from relay_protocol.errors import SwitchboardError
+from relay_server.access import Access, Principal
+from relay_server.alerts import kinds, rules
+from relay_server.alerts.book import Book, Change, Key
+from relay_server.alerts.delivery import Office, Send
+from relay_server.alerts.senses import LOOK_SECONDS, Senses, Thresholds, stopped_by
+from relay_server.alerts.tellers import Tellers
+from relay_server.channel import Channels
+from relay_server.clock import Clock, looping
+from relay_server.journal import Journal
+from relay_server.registry import Presence, Registry
+from relay_server.store import Store
+
+TOPICS_EVERY = 4
+"""Looks at robots from one look at their topics to the next."""
+
+TIDY_EVERY = 40
+"""Looks from one tidying of the book to the next; pages are told anew what was counted and what quiet hours changed."""
+
+ABSENT_SECONDS = 30.0
+"""A robot that was not there when the relay began has so long to come."""
+
+BATCH = 200
+"""Alerts written in one transaction."""
+
+
+class Alerts:
+    """The alerts of a relay.
+
+    :param wall: Unix time in seconds
+    :param send: sends a message by a rule's way
+    """
+
+    log = Logger()
+
+    def __init__(
+        self,
+        clock: Clock,
+        wall: Callable[[], float],
+        store: Store,
+        access: Access,
+        registry: Registry,
+        channels: Channels,
+        journal: Journal,
+        thresholds: Thresholds,
+        send: Send,
+    ) -> None:
+        self.version = 0
+        """Another number whenever there is something else to show."""
+        self.book = Book(lambda: secrets.token_hex(8))
+        self.tellers = Tellers(
+            Office(
+                clock, wall, secrets.SystemRandom().random, lambda: secrets.token_hex(8), send, self._known,
+                self._lasts,
+            )
+        )  # fmt: skip
+        self._clock = clock
+        self._wall = wall
+        self._store = store
+        self._access = access
+        self._registry = registry
+        self._senses = Senses(registry, channels, thresholds, self)
+        self._looking = looping(clock, self._look)
+        self._looks = 0
+        self._shown = self._states = 0
+        self._writing: Deferred[None] | None = None
+        self._pen = DeferredLock()
+        self._began = clock.seconds()
+        self._absent: dict[int, tuple[str, str]] = {}
+        self._came: dict[int, float] = {}
+        """Unix time of each robot's latest registration."""
+        self._daemons: dict[int, float] = {}
+        """When each robot's daemon began, as it says itself."""
+        self._untold: dict[int, set[Key]] = {}
+        """What each robot told before its latest registration and not since, where it has an end of its own."""
+        self._takers: dict[str, Callable[[Presence, dict[str, Any]], None]] = {
+            "robot.online": self._came_online,
+            "robot.stopped": self._stopped,
+            "robot.resumed": lambda robot, data: self.over(robot, kinds.STOP),
+            "robot.alert": self._robot_tells,
+            "robot.alerts_told": self._all_told,
+            "control.lost": self._control_lost,
+            "control.taken": lambda robot, data: self.over(robot, kinds.CONTROL),
+        }
+        journal.listen(self._happened)
+
+    async def start(self) -> None:
+        """Take up what an earlier relay kept, and look from now on."""
+        since = self._wall() - kinds.SHOWN_SECONDS
+        self.book.load(await self._store.read(queries.recent_alerts, since))
+        self._absent = {
+            each.id: (each.name, each.realm) for each in await self._store.read(queries.enrolled_robots)
+        }
+        self._began = self._clock.seconds()
+        await self.refresh()
+        self._looking.start(LOOK_SECONDS, now=False)
+
+    async def stop(self) -> None:
+        """Tell nobody any more, and keep what there is."""
+        if self._looking.running:
+            self._looking.stop()
+        self.tellers.close()
+        try:
+            await self.flush()
+        except SwitchboardError as error:
+            self.log.error("the latest alerts could not be kept: {reason}", reason=str(error))
+
+    async def refresh(self) -> None:
+        """Take up what somebody changed in the database: rules, acknowledgements, robots that are gone.
+
+        :raises Unavailable: the database can't be asked
+        """
+        self.tellers.take(await self._store.read(queries.list_alert_rules))
+        # First, that no acknowledgement is taken up of what has become worse since.
+        await self.flush()
+        for alert, (by, at) in (await self._store.read(queries.acknowledgements)).items():
+            self.acknowledge(alert, by, at)
+        there = {each.id for each in await self._store.read(queries.list_robots)}
+        for gone in {each.robot_id for each in self.book} - there:
+            self.book.forget(gone)
+            self._untold.pop(gone, None)
+        self.version += 1
+
+    async def purge(self) -> None:
+        """Forget what is too old or too much.
+
+        :raises Unavailable: the database can't be asked
+        """
+        while await self._store.write(queries.purge_alerts, self._wall() - kinds.KEPT_SECONDS):
+            pass
+
+    # --- what happens -------------------------------------------------------------------------------------
+
+    def tell(self, robot: Presence, kind: str, about: str, level: str, text: str) -> None:
+        """Something is wrong with a robot."""
+        told = self.book.tell(robot.robot_id, robot.name, kind, about, level, text, self._wall())
+        self._changed(told)
+
+    def over(self, robot: Presence, kind: str, about: str = "") -> None:
+        """It is well again."""
+        if self.book.lasts(robot.robot_id, kind, about) is not None:
+            self._changed(self.book.over(robot.robot_id, kind, about, self._wall()))
+
+    def lasts(self, robot: Presence, kind: str, about: str = "") -> str | None:
+        """The level of this alert while it lasts."""
+        found = self.book.lasts(robot.robot_id, kind, about)
+        return None if found is None else found.level
+
+    def lasting(self, robot: Presence, kind: str) -> list[str]:
+        """What those of a kind that last are about."""
+        return [each.about for each in self.book.open_of(robot.robot_id) if each.kind == kind]
+
+    def acknowledge(self, alert_id: str, by: str, at: float) -> AlertRecord | None:
+        """Somebody looks after an alert; the alert, if there is one."""
+        found, changes = self.book.acknowledge(alert_id, by, at)
+        self._changed(changes)
+        return found
+
+    def _changed(self, changes: Collection[Change]) -> None:
+        if self._states != self.book.states:
+            self._states = self.book.states
+            self.version += 1
+        self.tellers.offer(changes)
+
+    def _happened(self, kind: str, robot_id: int | None, data: dict[str, Any]) -> None:
+        """An event of the journal, whether it is kept there or not."""
+        take = self._takers.get(kind)
+        robot = None if robot_id is None else self._registry.find(robot_id)
+        if take is not None and robot is not None:
+            take(robot, data)
+
+    def _came_online(self, robot: Presence, data: dict[str, Any]) -> None:
+        self._came[robot.robot_id] = self._wall()
+        self._untold[robot.robot_id] = {
+            (each.kind, each.about)
+            for each in self.book.open_of(robot.robot_id)
+            if each.kind not in kinds.OURS and not kinds.endless(each.kind)
+        }
+        self.over(robot, kinds.OFFLINE)
+
+    def _stopped(self, robot: Presence, data: dict[str, Any]) -> None:
+        if self.lasts(robot, kinds.STOP) is None:
+            text = stopped_by(str(data.get("user", "")), str(data.get("why", "")))
+            self.tell(robot, kinds.STOP, "", "warning", text)
+
+    def _robot_tells(self, robot: Presence, data: dict[str, Any]) -> None:
+        kind, about = kinds.from_robot(str(data.get("alert_kind", "")), str(data.get("about", "")))
+        self._untold.get(robot.robot_id, set()).discard((kind, about))
+        if data.get("over"):
+            self.over(robot, kind, about)
+        else:
+            level = kinds.known_level(str(data.get("level", "")))
+            self.tell(robot, kind, about, level, str(data.get("text", "")))
+
+    def _all_told(self, robot: Presence, data: dict[str, Any]) -> None:
+        """What the robot has not told again is over."""
+        for kind, about in self._untold.pop(robot.robot_id, ()):
+            self.over(robot, kind, about)
+
+    def _control_lost(self, robot: Presence, data: dict[str, Any]) -> None:
+        if data.get("moving"):
+            who, why = data.get("user", "somebody"), data.get("why", "")
+            self.tell(robot, kinds.CONTROL, "", "error", f"{who} lost control while the robot moved: {why}")
+
+    # --- looking ------------------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        try:
+            self._look_once()
+        except Exception:  # a look that fails must not be the last one
+            self.log.failure("looking after alerts failed")
+
+    def _look_once(self) -> None:
+        now, wall = self._clock.seconds(), self._wall()
+        self._looks += 1
+        self._senses.look(now, wall)
+        for robot in self._registry:
+            self._end_what_is_forgotten(robot)
+        if self._looks % TOPICS_EVERY == 0:
+            self._senses.look_at_topics(now)
+        if self._looks % TIDY_EVERY == 0:
+            self._changed(self.book.sweep(wall))
+            self.version += 1
+        if self._absent and now - self._began >= ABSENT_SECONDS:
+            self._miss()
+        self._flush_later()
+        if self._shown != self.version:
+            self._shown = self.version
+            self._registry.changed()
+
+    def _end_what_is_forgotten(self, robot: Presence) -> None:
+        """A daemon that began anew does not know what it told before; it tells again what is still wrong."""
+        began = robot.description.started
+        if robot.control is None or began == self._daemons.get(robot.robot_id):
+            return
+        before = self._daemons.get(robot.robot_id)
+        self._daemons[robot.robot_id] = began
+        since = self._came.get(robot.robot_id, 0.0)
+        for each in self.book.open_of(robot.robot_id) if before else ():
+            if each.kind not in kinds.OURS and each.last < since:
+                self.over(robot, each.kind, each.about)
+
+    def _miss(self) -> None:
+        """Robots that were there before the relay began, and are not since."""
+        absent, self._absent = self._absent, {}
+        for robot_id, (name, realm) in absent.items():
+            robot = self._registry.presence(robot_id, name, realm)
+            if robot.control is None and robot.last_seen is None and self.lasts(robot, kinds.OFFLINE) is None:
+                self.tell(
+                    robot, kinds.OFFLINE, "", "error", "the robot has not come back since the relay began"
+                )
+
+    # --- writing ------------------------------------------------------------------------------------------
+
+    def _flush_later(self) -> None:
+        if self._writing is None:
+            self._writing = Deferred.fromCoroutine(self.flush())
+            self._writing.addErrback(
+                lambda failure: self.log.debug("alerts wait to be kept: {reason}", reason=failure.value)
+            )
+            self._writing.addBoth(self._flushed)
+
+    def _flushed(self, _: object) -> None:
+        self._writing = None
+
+    async def flush(self) -> None:
+        """Have the database know what the book does.
+
+        :raises Unavailable: it can't be reached; what is not written waits
+        """
+        # One at a time: a database with several writers might put an older state over a later one.
+        await self._pen.acquire()
+        try:
+            await self._write(self.book.take_changed())
+        finally:
+            self._pen.release()
+
+    async def _write(self, changed: list[AlertRecord]) -> None:
+        while changed:
+            batch, changed = changed[:BATCH], changed[BATCH:]
+            try:
+                await self._store.write(queries.save_alerts, batch)
+            except SwitchboardError:
+                self.book.put_back([*batch, *changed])
+                raise
+            changed = changed or self.book.take_changed()
+
+    # --- who may know -------------------------------------------------------------------------------------
+
+    async def _known(self, rule: AlertRuleRecord, alerts: Collection[AlertRecord]) -> set[str]:
+        """Which of these alerts the rule's user may know of now, by their ids."""
+        # Who asks is a user, by no token.
+        asks = Principal(rule.user_id, rule.user, rule.realm, False, 0, None)
+        rights = {record.id: each for record, each in await self._access.robots(asks)}
+        return {
+            each.id
+            for each in alerts
+            if each.robot_id in rights and rules.visible(rights[each.robot_id], each.kind, each.about)
+        }
+
+    def _lasts(self, alert_id: str) -> bool:
+        found = self.book.find(alert_id)
+        return found is not None and found.over is None

@@ -1,0 +1,195 @@
+"""Messages by e-mail and many other services, through apprise, in threads: it waits where it speaks to anybody.
+
+Which of its services may be used the administrator says; what their URLs may have :mod:`~relay_server.alerts.services`
+says. Where one is a server of the user's choice, that is judged like a webhook's; but apprise connects by itself, so
+nobody should be let choose it who is not trusted with the network.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+from twisted.internet.defer import Deferred, DeferredSemaphore
+from twisted.internet.defer import TimeoutError as DeferTimeout
+
+from relay_db.queries import AlertRuleRecord
+from relay_protocol.errors import Invalid, Unavailable
+from relay_server.alerts import addresses, kinds, services
+from relay_server.alerts.addresses import Network
+from relay_server.alerts.message import Message, Undelivered
+from relay_server.alerts.webhook import Resolve, parse
+from relay_server.store import Threads
+
+THREADS = 4
+DOUBTFUL = 2
+"""Threads for those whose last message did not arrive: the others shall not wait for them."""
+
+WAITING = 64
+SECONDS = 60.0
+SOCKET_SECONDS = 5.0
+"""How long apprise waits for a server to connect, and to answer; a URL that says more is not heard."""
+
+NEVER = frozenset({"file", "http", "https", "syslog", "dbus", "gnome", "macosx", "windows", "smpp"})
+"""What works on the relay's own machine, or reads further addresses from one."""
+
+
+def available() -> bool:
+    """Whether apprise is installed."""
+    return find_spec("apprise") is not None
+
+
+class Mailing:
+    """Sends messages by apprise.
+
+    :param reactor: calls results back
+    :param schemes: beginnings of apprise's URLs that the administrator allows
+    :param allowed: networks that may be reached though they are special ones
+    :raises Invalid: one of the schemes can't be allowed
+    """
+
+    def __init__(
+        self, reactor: Any, resolve: Resolve, schemes: Collection[str], allowed: Sequence[Network]
+    ) -> None:
+        services.check(schemes)
+        self._reactor = reactor
+        self._resolve = resolve
+        self.schemes = sorted(schemes)
+        self._allowed = allowed
+        self._threads = Threads(reactor, "alert-mail", THREADS, WAITING, "too many messages wait")
+        self._doubtful = DeferredSemaphore(DOUBTFUL)
+
+    def start(self) -> None:
+        """Start the first thread."""
+        self._threads.start()
+
+    def stop(self) -> None:
+        """Finish what is under way; blocks for as long as that takes."""
+        self._threads.stop()
+
+    async def check(self, url: str) -> None:
+        """Whether apprise can send by this URL.
+
+        :raises Invalid: it can't, or may not
+        """
+        scheme = _scheme(url)
+        if scheme not in self.schemes:
+            raise Invalid(
+                f"this relay does not send by '{scheme[:32]}'; it does by {', '.join(self.schemes)}"
+            )
+        if await self._threads.run(_open, url) is None:
+            raise Invalid(f"this is no URL of '{scheme}' that apprise understands")
+
+    async def send(self, rule: AlertRuleRecord, message: Message, doubtful: bool) -> None:
+        """Deliver one message.
+
+        :param doubtful: the one before did not arrive
+        :raises Undelivered: it was not taken
+        """
+        if _scheme(rule.url) not in self.schemes:
+            raise Undelivered("the relay's administrator does not allow this service any more", again=False)
+        if not doubtful:
+            await self._send(rule, message)
+            return
+        await self._doubtful.acquire()
+        try:
+            await self._send(rule, message)
+        finally:
+            self._doubtful.release()
+
+    async def _send(self, rule: AlertRuleRecord, message: Message) -> None:
+        try:
+            service = await self._threads.run(_open, rule.url)
+            if service is None:
+                raise Undelivered("apprise does not understand the URL any more", again=False)
+            if place := services.server(_scheme(rule.url), service):
+                await self._judge(*place)
+            working = Deferred.fromCoroutine(
+                self._threads.run(_notify, service, message.title, message.text, _worst(message))
+            )
+            arrived = await working.addTimeout(SECONDS, self._reactor)
+        except Invalid as error:
+            raise Undelivered(str(error), again=False) from None
+        except (Unavailable, DeferTimeout) as error:
+            words = str(error) or f"the service did not answer within {SECONDS:g} s"
+            raise Undelivered(words, again=True) from None
+        if not arrived:
+            raise Undelivered("the service did not take the message", again=True)
+
+    async def _judge(self, host: str, port: int) -> None:
+        plain = _plain(host)
+        if plain is None:
+            raise Undelivered("the URL names no server by a plain name or address", again=False)
+        found = await self._resolve(plain, port)
+        if not all(addresses.allowed(each, self._allowed) for each in found):
+            raise Undelivered(
+                f"{host} is in a network that this relay does not send to; its administrator can allow that",
+                again=False,
+            )
+
+
+def _worst(message: Message) -> str:
+    return max((each.alert.level for each in message.notices), key=kinds.severity, default="info")
+
+
+def _scheme(url: str) -> str:
+    return url.partition("://")[0].lower()
+
+
+def _plain(host: str) -> str | None:
+    """The host, if nobody can read it in two ways; without the brackets of an IPv6 address."""
+    shown = f"[{host}]" if ":" in host and not host.startswith("[") else host
+    try:
+        place = parse(f"http://{shown}/")
+    except Invalid:
+        return None
+    return place.host if (place.port, place.target) == (80, "/") else None
+
+
+def _open(url: str) -> Any:
+    """What apprise makes of a URL, or ``None``. In a thread.
+
+    :raises Invalid: the URL has a parameter that may do harm
+    """
+    import apprise
+    from apprise import plugins
+
+    read: Any = plugins.url_to_dict
+    quiet = logging.getLogger("apprise")
+    # What it logs may hold addresses with passwords.
+    quiet.propagate = False
+    quiet.disabled = True
+    try:
+        parsed = read(url)
+    except Exception:  # some of its services fail in ways of their own at what is none of their URLs
+        return None
+    if not parsed or parsed.get("schema") != _scheme(url):
+        return None
+    services.judge(_scheme(url), parsed)
+    # What was judged is what is used; and no answer leads anywhere else.
+    parsed["redirect"] = False
+    asset = apprise.AppriseAsset(app_id="Switchboard", async_mode=False, plugin_paths=[])
+    service: Any = apprise.Apprise.instantiate(parsed, asset=asset, suppress_exceptions=True)
+    if service is not None:
+        for name in ("socket_connect_timeout", "socket_read_timeout"):
+            setattr(service, name, SOCKET_SECONDS)
+    return service
+
+
+def _notify(service: Any, title: str, body: str, level: str) -> bool:
+    """Send, and wait. In a thread."""
+    import apprise
+
+    kind = {"info": apprise.NotifyType.INFO, "warning": apprise.NotifyType.WARNING}
+    sender = apprise.Apprise()
+    sender.add(service)
+    return bool(
+        sender.notify(
+            body=body,
+            title=title,
+            notify_type=kind.get(level, apprise.NotifyType.FAILURE),
+            body_format=apprise.NotifyFormat.TEXT,
+        )
+    )

@@ -1,0 +1,232 @@
+"""What is asked about control without a connection to the robot: by HTTP, and on the relay's own machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+from relay_db import queries
+from relay_protocol.errors import NotFound, Refused, SwitchboardError
+from relay_protocol.rights import Level, Operation
+from relay_server.access import Principal
+from relay_server.channel import resolve
+from relay_server.control import Actor, Answer, Client, Desk, Desks, view
+from relay_server.frontdesk import Admission, FrontDesk
+from relay_server.registry import Registry
+from relay_server.store import Store
+
+
+class Outcome(NamedTuple):
+    """What became of a stop.
+
+    :param done: whether the robot has done it; else it will as soon as it can be reached
+    :param stopped: as :func:`relay_server.control.view.stopped` tells
+    """
+
+    done: bool
+    stopped: dict[str, Any] | None
+
+
+class Console:
+    """Control of robots for users who may have no connection to them, or several."""
+
+    def __init__(self, desk: FrontDesk, desks: Desks, registry: Registry, store: Store) -> None:
+        self._desk = desk
+        self._desks = desks
+        self._registry = registry
+        self._store = store
+
+    # --- by HTTP ------------------------------------------------------------------------------------------
+
+    async def control(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
+        """Who moves a robot.
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            asker = view.Asker(admission.permit.rules, lambda client: client.user == principal.user_id)
+            desk = self._of(admission)
+            holder = desk.lease.holder
+            mine = holder is not None and asker.mine(holder.client)
+            return view.control(desk, asker, holder.client.number if holder is not None and mine else None)
+
+    async def release(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+        """Give control back, or a request for it; an owner takes control from anybody.
+
+        :raises NotFound: as :meth:`control`
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            desk, actor = self._of(admission), _actor(principal, address)
+            lease = desk.lease
+            held, request = lease.holder or lease.coming, lease.request
+            answer = Answer(False, "you have no control of this robot")
+            asks = request is not None and request.client.user == principal.user_id
+            owner = admission.permit.rules.level is Level.OWNER
+            if request is not None and asks:
+                answer = desk.release(request.client, why, actor)
+            if held is not None and (held.client.user == principal.user_id or owner):
+                answer = desk.release(held.client, why, actor)
+            return answer
+
+    async def grant(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+        """Hand control over to who asks for it.
+
+        :raises NotFound: as :meth:`control`
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            desk = self._of(admission)
+            holder = _own_holder(desk, principal)
+            return _NOT_YOURS if holder is None else desk.grant(holder, why)
+
+    async def refuse(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+        """Keep control.
+
+        :raises NotFound: as :meth:`control`
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            desk = self._of(admission)
+            holder = _own_holder(desk, principal)
+            return _NOT_YOURS if holder is None else desk.refuse(holder, why)
+
+    async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
+        """Stop a robot; everybody with any right on it may.
+
+        :raises NotFound: as :meth:`control`
+        :raises NotDone: it is stopped, but not all that belongs to it could be done
+        :raises Unavailable: it can't be reached, and the order can't be kept
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            desk = self._of(admission)
+            done = await desk.stopping.stop(_actor(principal, address), why)
+            return Outcome(done, view.stopped(desk.standing))
+
+    async def resume(self, principal: Principal, robot: str, why: str, address: str) -> None:
+        """Let a robot move again; for who controls it, and owners.
+
+        :raises NotFound: as :meth:`control`
+        :raises Refused: the principal is neither
+        :raises NotDone: the robot says that it can't
+        :raises Unavailable: it can't be reached
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            desk = self._of(admission)
+            owner = admission.permit.rules.level is Level.OWNER
+            if not owner and _own_holder(desk, principal) is None:
+                raise Refused("only who has control of the robot, and its owners, may resume it")
+            await desk.stopping.resume(_actor(principal, address), why)
+
+    async def suppress(self, principal: Principal, robot: str, resource: str, ms: int, address: str) -> None:
+        """Have a topic obey all connections of the principal and nobody else, for moments.
+
+        :raises NotFound: as :meth:`control`
+        :raises Refused: no right to
+        :raises Invalid: no such time, or no name
+        :raises SwitchboardError: the robot has not done it
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            topic = self._judged(admission, Operation.SUPPRESS, resource)
+            sources = [
+                session.number
+                for session in self._desk.sessions_of(admission.robot.robot_id)
+                if session.user == principal.user_id
+            ]
+            await self._of(admission).subsuming.suppress(_actor(principal, address), sources, topic, ms)
+
+    async def inhibit(
+        self, principal: Principal, robot: str, resource: str, ms: int, hold: bool, address: str
+    ) -> None:
+        """Have a topic say nothing, or its last value, for a time, and no longer than the principal has the right.
+
+        :raises SwitchboardError: as :meth:`suppress`
+        """
+        admission = await self._desk.admit(principal, robot, address)
+        permit, subsuming = admission.permit, self._of(admission).subsuming
+        over = partial(self._desk.turn_away, admission)
+        try:
+            topic = self._judged(admission, Operation.INHIBIT, resource)
+            inhibited = subsuming.inhibit(_actor(principal, address), topic, ms, hold, permit, over)
+        except SwitchboardError:
+            over()
+            raise
+        # The permit is kept for as long, to hear of another right or of its end.
+        permit.on_change = lambda: subsuming.ends(
+            permit, lambda topic: permit.judge(Operation.INHIBIT, topic).allowed
+        )
+        permit.on_revoke = lambda error: subsuming.ends(permit, lambda topic: False)
+        await inhibited
+
+    # --- on the relay's own machine -----------------------------------------------------------------------
+
+    async def stop_here(self, robot: str | None, why: str, by: str) -> list[dict[str, Any]]:
+        """Stop a robot, or all there are: side by side, since no robot must wait for another.
+
+        :param by: who is at the machine
+        :returns: for each ``robot``, ``done`` and, where something failed, ``reason``
+        :raises NotFound: no such robot
+        """
+        actor = _local(by)
+        desks = [self._desks.of(each) for each in await self._meant(robot)]
+        given = [(desk, desk.stopping.stop(actor, why)) for desk in desks]
+        told = []
+        for desk, waiting in given:
+            try:
+                told.append({"robot": desk.robot.name, "done": await waiting})
+            except SwitchboardError as error:
+                told.append({"robot": desk.robot.name, "done": False, "reason": str(error)})
+        return told
+
+    async def resume_here(self, robot: str, why: str, by: str) -> None:
+        """Let a robot move again.
+
+        :raises NotFound: no such robot
+        :raises SwitchboardError: it has not done it
+        """
+        for each in await self._meant(robot):
+            await self._desks.of(each).stopping.resume(_local(by), why)
+
+    async def _meant(self, robot: str | None) -> list[Any]:
+        records = await self._store.read(queries.list_robots)
+        found = [record for record in records if robot is None or record.name == robot]
+        if robot is not None and not found:
+            raise NotFound(f"there is no robot '{robot}'; see 'switchboard robot list'")
+        return [self._registry.presence(each.id, each.name, each.realm) for each in found]
+
+    # --- rights -------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _admitted(self, admission: Admission) -> Iterator[Admission]:
+        try:
+            yield admission
+        finally:
+            self._desk.turn_away(admission)
+
+    def _of(self, admission: Admission) -> Desk:
+        return self._desks.of(admission.robot)
+
+    @staticmethod
+    def _judged(admission: Admission, operation: Operation, resource: str) -> str:
+        topic = resolve(resource)
+        verdict = admission.permit.judge(operation, topic)
+        if not verdict.allowed:
+            raise Refused(verdict.reason)
+        return topic
+
+
+_NOT_YOURS = Answer(False, "you have no control of this robot")
+
+
+def _own_holder(desk: Desk, principal: Principal) -> Client | None:
+    """The connection of the principal that has control, if one has."""
+    holder = desk.lease.holder
+    mine = holder is not None and holder.client.user == principal.user_id
+    return holder.client if holder is not None and mine else None
+
+
+def _actor(principal: Principal, address: str) -> Actor:
+    return Actor(principal.name, f"user:{principal.name}", principal.user_id, address)
+
+
+def _local(by: str) -> Actor:
+    return Actor(by, f"cli:{by}", address="local")

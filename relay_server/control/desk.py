@@ -1,0 +1,304 @@
+"""Who controls one robot: takes, hands over, loses it; and whose commands pass (SPEC section 1.7)."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from relay_protocol.errors import Refused, SwitchboardError, Unavailable
+from relay_protocol.rights import Operation
+from relay_server.bucket import TokenBucket
+from relay_server.clock import Clock
+from relay_server.control.lease import Client, Request, owns
+from relay_server.control.record import WHY, Actor, Record
+from relay_server.control.steering import Steering
+from relay_server.control.terms import (
+    DESERTED_SECONDS,
+    IMPLICIT,
+    LET_GO_SECONDS,
+    ROBOT,
+    TAKES_A_SECOND,
+    TAKES_AT_ONCE,
+    USERS,
+    Answer,
+    ControlRules,
+)
+from relay_server.registry import Presence
+
+
+class Desk(Steering):
+    """Control of one robot.
+
+    :param changed: called when what the list of robots shows of it is another
+    :param wall: Unix time in seconds
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        robot: Presence,
+        record: Record,
+        rules: ControlRules,
+        changed: Callable[[], None],
+        wall: Callable[[], float],
+    ) -> None:
+        super().__init__(clock, robot, record, rules, changed, wall)
+        self._takes: OrderedDict[int, TokenBucket] = OrderedDict()
+        """By user, how often he may take control still."""
+        self._cut_off: OrderedDict[int, float] = OrderedDict()
+        """By user, the moment of the latest command of a connection that ended before he had let go."""
+
+    # --- commands -----------------------------------------------------------------------------------------
+
+    def passes(self, client: Client, topic: str) -> bool:
+        """Whether this client commands that topic now."""
+        return self.lease.held_by(client) or client.number in self.standing.suppressed.get(topic, ())
+
+    def claim(self, client: Client) -> bool:
+        """Whether a client that commands moves the robot; a free one becomes its own when the robot has agreed.
+
+        :returns: false when that is waited for
+        :raises Refused: it has no right to, somebody else moves the robot, or control must be taken first
+        """
+        lease, name = self.lease, self.robot.name
+        if lease.held_by(client):
+            return True
+        if lease.coming_to(client):
+            return False
+        self._judge(client)
+        self._see_let_go(client)
+        tenure = lease.holder or lease.coming
+        if tenure is not None and (self.rules.explicit or not self._deserted(client)):
+            raise Refused(
+                f"robot {name} is controlled by {tenure.client.name}; ask for it with /relay/take_control"
+            )
+        if not lease.settled:
+            raise Refused(f"control of robot {name} is just being given back; try again in a moment")
+        if self.rules.explicit:
+            raise Refused(
+                f"nobody controls robot {name}: take control first, with /relay/take_control or the portal"
+            )
+        self._count_take(client)
+        self._succeed(client, IMPLICIT, "taken", "the same user commands from another connection")
+        return False
+
+    def _count_take(self, client: Client) -> None:
+        """Bound how often a user takes control.
+
+        :raises Refused: he has done so too often
+        """
+        bucket = self._takes.get(client.user)
+        if bucket is None:
+            bucket = TokenBucket(TAKES_A_SECOND, TAKES_AT_ONCE, self._clock.seconds)
+            self._takes[client.user] = bucket
+        self._takes.move_to_end(client.user)
+        while len(self._takes) > USERS:
+            self._takes.popitem(last=False)
+        if not bucket.take():
+            raise Refused(
+                f"you take control of robot {self.robot.name} too often: {TAKES_A_SECOND:g} times a second at most; "
+                "try again in a moment"
+            )
+
+    def _see_let_go(self, client: Client) -> None:
+        """Who has lost control in the middle of commanding does not get it back by going on.
+
+        :raises Refused: he has not let go since
+        """
+        # By another connection he goes on as he did by that which has ended.
+        since = self._bereft.pop(client, self._cut_off.get(client.user))
+        if since is None:
+            return
+        now = self._clock.seconds()
+        if now - since < LET_GO_SECONDS:
+            self._bereft[client] = now
+            raise Refused(
+                f"you had no control of robot {self.robot.name} when you began to command: let go for "
+                f"{LET_GO_SECONDS:g} s"
+            )
+
+    def in_vain(self, client: Client) -> bool:
+        """Whether who commands without control holds on by that: somebody else has it, or he has lost it.
+
+        Who commands while nobody has it need not let go of anything (SPEC section 2.5, "Who moves the robot").
+        """
+        lease = self.lease
+        return client in self._bereft or any(
+            each is not None and each.client is not client for each in (lease.holder, lease.coming)
+        )
+
+    def unheard(self, client: Client) -> None:
+        """A client has published to the robot while that is away: it must find no hand on the stick."""
+        self._bereft[client] = self._clock.seconds()
+
+    def _succeed(self, client: Client, why: str, how: str, lost: str) -> Deferred[SwitchboardError | None]:
+        """Have the robot obey this client in the place of who has control now, if anybody has.
+
+        :param lost: what that one is told
+        """
+        former = self.lease.holder
+        if former is not None:
+            self._note_lost(former, lost)
+        waiting = self._hand_to(client, why, how)
+        if former is not None:
+            self._tell_lost(former, lost)
+        return waiting
+
+    def _deserted(self, client: Client) -> bool:
+        """Whether who has control is the same user, by a connection that he commands from no more."""
+        holder = self.lease.holder
+        if holder is None or holder.client.user != client.user or self.robot.safety.moving:
+            return False
+        return self._clock.seconds() - holder.client.driving_since() >= DESERTED_SECONDS
+
+    async def claimed(self, client: Client) -> None:
+        """Wait until a client that commands moves the robot.
+
+        :raises Refused: as :meth:`claim`
+        :raises Unavailable: the robot is offline, or does not agree
+        """
+        if not self.claim(client):
+            error = await self._settled()
+            if not self.lease.held_by(client):
+                raise error or Unavailable(f"you did not get control of {self.robot.name}")
+
+    # --- what clients ask for -----------------------------------------------------------------------------
+
+    async def take(self, client: Client, why: str) -> Answer:
+        """Take control of a free robot, or ask who has it for it.
+
+        :raises Refused: the client may not control this robot
+        :raises Unavailable: the robot is offline, or does not agree
+        """
+        self._judge(client)
+        if not self.lease.held_by(client):
+            self._count_take(client)
+        why = why[:WHY]
+        while not self.lease.settled:
+            mine = self.lease.coming_to(client)
+            error = await self._settled()
+            if mine and error is not None:
+                raise error
+        # Rights may have changed while it was waited, and the robot may have gone.
+        self._judge(client)
+        lease = self.lease
+        if lease.held_by(client):
+            return Answer(True, "you have control")
+        if lease.holder is not None and not self._may_take_over(client):
+            return self._request(client, why)
+        # Who goes on as before is held back by his session then.
+        self._bereft.pop(client, None)
+        self._cut_off.pop(client.user, None)
+        how = "taken" if lease.holder is None else "taken over"
+        error = await self._succeed(client, why, how, f"{client.name} has taken over")
+        if error is not None:
+            raise error
+        if not self.lease.held_by(client):
+            self._judge(client)
+            raise Unavailable("control has changed hands again meanwhile")
+        return Answer(True, "you have control")
+
+    def _may_take_over(self, client: Client) -> bool:
+        holder, lease = self.lease.holder, self.lease
+        if holder is not None and holder.client.user == client.user:
+            # Nobody asks himself for anything.
+            return True
+        return lease.requested_by(client) and owns(client) and self._clock.seconds() >= self._due
+
+    def _request(self, client: Client, why: str) -> Answer:
+        lease, now = self.lease, self._wall()
+        assert lease.holder is not None
+        holder, request = lease.holder.client, lease.request
+        if request is not None and request.client is client:
+            left = max(0.0, self._due - self._clock.seconds())
+            after = f"; after {left:.0f} s ask again to take over" if owns(client) else ""
+            return Answer(False, f"{holder.name} has control and was asked for it already{after}")
+        if request is not None and (owns(request.client) or not owns(client)):
+            return Answer(False, f"{holder.name} has control, and {request.client.name} asks for it already")
+        self._due = self._clock.seconds() + self.rules.grace
+        self._become(lease.requested(Request(client, now, now + self.rules.grace, why)))
+        self._note("control.requested", client, why, holder=holder.name)
+        if request is not None:
+            request.client.tell("warning", f"{client.name} asks for control of {self.robot.name} before you")
+        said = f": {why}" if why else ""
+        holder.tell("warning", f"{client.name} asks for control of {self.robot.name}{said}")
+        return Answer(False, f"{holder.name} has control and was asked for it")
+
+    def release(self, client: Client, why: str, by: Actor | None = None) -> Answer:
+        """Give control back, or a request for it.
+
+        :param by: who does it, where that is not the client
+        """
+        why = why[:WHY]
+        if self.lease.requested_by(client):
+            self._become(self.lease.withdrawn())
+            return Answer(True, "you ask for control no more")
+        if not (self.lease.held_by(client) or self.lease.coming_to(client)):
+            return Answer(False, "you have no control of this robot")
+        self._note("control.released", client, why, **({} if by is None else {"by": by.name}))
+        if by is not None:
+            self._bereft[client] = self._clock.seconds()
+        self._let_go(f"given back by {client.name if by is None else by.name}")
+        return Answer(True, "control is given back")
+
+    def grant(self, client: Client, why: str) -> Answer:
+        """The holder hands control over to who asks for it."""
+        request = self.lease.request
+        if not self.lease.held_by(client):
+            return Answer(False, "you have no control of this robot")
+        if request is None:
+            return Answer(False, "nobody asks for control")
+        self._note("control.granted", client, why[:WHY], to=request.client.name)
+        self._hand_to(request.client, f"granted by {client.name}", "granted")
+        return Answer(True, f"{request.client.name} gets control")
+
+    def refuse(self, client: Client, why: str) -> Answer:
+        """The holder keeps control."""
+        request, why = self.lease.request, why[:WHY]
+        if not self.lease.held_by(client):
+            return Answer(False, "you have no control of this robot")
+        if request is None:
+            return Answer(False, "nobody asks for control")
+        self._note("control.refused", client, why, to=request.client.name)
+        said = f": {why}" if why else ""
+        self._become(self.lease.withdrawn())
+        request.client.tell("warning", f"{client.name} keeps control of {self.robot.name}{said}")
+        return Answer(True, f"you keep control; {request.client.name} is told")
+
+    def may_resume(self, client: Client) -> bool:
+        """Whether this client may let a robot that is stopped move again: who has control, and owners."""
+        return self.lease.held_by(client) or owns(client)
+
+    # --- what ends it -------------------------------------------------------------------------------------
+
+    def left(self, client: Client) -> None:
+        """A connection has ended."""
+        self.pushing.forget(client)
+        # Not the moment at which the connection ended: who did not command any more has let go.
+        since = max(self._bereft.get(client, 0.0), client.driving_since())
+        self._lose(client, "the connection has ended")
+        if self._bereft.pop(client, None) is not None:
+            self._remember_cut_off(client.user, since)
+        self.subsuming.ends(client, lambda topic: False)
+
+    def _remember_cut_off(self, user: int, since: float) -> None:
+        self._cut_off[user] = max(since, self._cut_off.get(user, 0.0))
+        self._cut_off.move_to_end(user)
+        while len(self._cut_off) > USERS:
+            self._cut_off.popitem(last=False)
+
+    def rights_changed(self, client: Client) -> None:
+        """Whoever may not control the robot any more does not; with another level other limits count."""
+        verdict = client.permit.judge(Operation.CONTROL, ROBOT)
+        if not verdict.allowed:
+            self._lose(client, verdict.reason)
+        elif self.lease.held_by(client) or self.lease.coming_to(client):
+            self._order_control(client, "the level has changed").addErrback(self._level_unknown)
+        self.subsuming.ends(client, lambda topic: client.permit.judge(Operation.INHIBIT, topic).allowed)
+        self.pushing.push()
+
+    def _level_unknown(self, failure: Any) -> None:
+        self.log.warn("{robot} has not taken the new level: {why}", robot=self.robot.name, why=failure.value)

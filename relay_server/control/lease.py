@@ -1,0 +1,191 @@
+"""Who moves one robot: a table of states, and a value that every change replaces as a whole (SPEC section 1.7)."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+from relay_protocol.rights import Level
+from relay_server.access import Permit
+
+
+class State(enum.Enum):
+    """How far control has come."""
+
+    FREE = "free"
+    ASKING = "asking"
+    """The robot has been told who is to have it, and nobody has it before it answers."""
+    RELEASING = "releasing"
+    """The robot has been told that nobody has it any more."""
+    HELD = "held"
+    REQUESTED = "requested"
+    """Held, and somebody else asks for it."""
+
+
+class Event(enum.Enum):
+    """What may happen to it."""
+
+    GIVE = "give"
+    """Somebody is to have it."""
+    FREE = "free"
+    """Nobody is to have it any more."""
+    DONE = "done"
+    """The robot obeys."""
+    FAILED = "failed"
+    """It has not said that it does."""
+    REQUEST = "request"
+    WITHDRAW = "withdraw"
+    """Nobody asks for it any more."""
+    LOST = "lost"
+    """The robot's link is gone, and with it whoever held control."""
+
+
+NEXT = {
+    (State.FREE, Event.GIVE): State.ASKING,
+    (State.ASKING, Event.DONE): State.HELD,
+    (State.ASKING, Event.FAILED): State.FREE,
+    (State.ASKING, Event.FREE): State.RELEASING,
+    (State.HELD, Event.GIVE): State.ASKING,
+    (State.HELD, Event.FREE): State.RELEASING,
+    (State.HELD, Event.REQUEST): State.REQUESTED,
+    (State.REQUESTED, Event.REQUEST): State.REQUESTED,
+    (State.REQUESTED, Event.WITHDRAW): State.HELD,
+    (State.REQUESTED, Event.GIVE): State.ASKING,
+    (State.REQUESTED, Event.FREE): State.RELEASING,
+    (State.RELEASING, Event.DONE): State.FREE,
+    (State.RELEASING, Event.FAILED): State.FREE,
+    **{(state, Event.LOST): State.FREE for state in State},
+}
+
+
+class Client(Hashable, Protocol):
+    """One connection, as control knows it.
+
+    :ivar number: the source of its commands
+    :ivar name: its user's
+    :ivar user: that user's number
+    :ivar address: where it is, for people
+    """
+
+    number: int
+    permit: Permit
+    address: str
+
+    @property
+    def name(self) -> str:
+        """Its user's name."""
+
+    @property
+    def user(self) -> int:
+        """Whose it is."""
+
+    def tell(self, level: str, text: str) -> None:
+        """Report something in words, to clients that want to hear it."""
+
+    def driving_since(self) -> float:
+        """The relay's clock at its latest command; now, while something it asked for moves the robot."""
+
+    def control_changed(self) -> None:
+        """Who moves the robot has changed: what waited for it goes, or never will."""
+
+
+def owns(client: Client) -> bool:
+    """Whether the client is an owner of the robot, by its rights as they stand."""
+    return client.permit.rules.level is Level.OWNER
+
+
+class Tenure(NamedTuple):
+    """Somebody has control, or is to have it.
+
+    :param since: Unix time, seconds
+    """
+
+    client: Client
+    since: float
+
+
+class Request(NamedTuple):
+    """Somebody asks for it.
+
+    :param since: Unix time, seconds
+    :param until: Unix time from which an owner takes over by asking again
+    """
+
+    client: Client
+    since: float
+    until: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Lease:
+    """Who has control of a robot, who is about to get it, who asks for it.
+
+    Commands of ``holder`` pass, and of nobody else: there is none before the robot has said that it obeys him.
+
+    :param coming: who is to have it when the robot has answered
+    """
+
+    state: State = State.FREE
+    holder: Tenure | None = None
+    coming: Tenure | None = None
+    request: Request | None = None
+
+    @property
+    def settled(self) -> bool:
+        """Whether no answer of the robot is waited for."""
+        return self.state not in (State.ASKING, State.RELEASING)
+
+    def held_by(self, client: Client) -> bool:
+        """Whether this connection moves the robot."""
+        return self.holder is not None and self.holder.client is client
+
+    def requested_by(self, client: Client) -> bool:
+        """Whether this connection asks for control."""
+        return self.request is not None and self.request.client is client
+
+    def coming_to(self, client: Client) -> bool:
+        """Whether this connection is to have control when the robot has answered."""
+        return self.coming is not None and self.coming.client is client
+
+    def give(self, client: Client, now: float) -> Lease:
+        """The robot is being told that this client is to have it. Who asked for it asks no more."""
+        return Lease(self._after(Event.GIVE), coming=Tenure(client, now))
+
+    def free(self) -> Lease:
+        """The robot is being told that nobody has it."""
+        return Lease(self._after(Event.FREE))
+
+    def done(self, now: float) -> Lease:
+        """The robot obeys."""
+        state = self._after(Event.DONE)
+        coming = self.coming
+        return Lease(state, holder=None if coming is None else Tenure(coming.client, now))
+
+    def failed(self) -> Lease:
+        """It has not said that it does."""
+        return Lease(self._after(Event.FAILED))
+
+    def requested(self, request: Request) -> Lease:
+        """Somebody asks for it, in the place of who asked before."""
+        return replace(self, state=self._after(Event.REQUEST), request=request)
+
+    def withdrawn(self) -> Lease:
+        """Nobody asks for it any more."""
+        return replace(self, state=self._after(Event.WITHDRAW), request=None)
+
+    def lost(self) -> Lease:
+        """The robot's link is gone."""
+        return Lease(self._after(Event.LOST))
+
+    def _after(self, event: Event) -> State:
+        following = NEXT.get((self.state, event))
+        if following is None:
+            raise ValueError(f"'{event.value}' can't happen while control is {self.state.value}")
+        return following
+
+
+FREE = Lease()
+"""Nobody has it."""

@@ -1,0 +1,159 @@
+"""What is put on record about control: events for those who listen, entries of the audit log, orders to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+from sqlalchemy.orm import Session
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+
+from relay_db import queries
+from relay_db.queries import StopRecord
+from relay_server.journal import Journal
+from relay_server.registry import Presence
+from relay_server.store import Store
+
+WHY = 500
+"""Characters that are kept of a reason somebody gives."""
+
+WAITING = 256
+"""Audit entries that wait for the database at a time; what is not taken then is in the relay's log."""
+
+
+class Actor(NamedTuple):
+    """Who does something about control.
+
+    :param name: for people
+    :param source: for the record: ``user:ann``, ``cli:root``, ``relay``
+    :param user: the user's number, where it is one
+    :param address: from where
+    :param connection: the number of the connection it is done by, 0 for none
+    """
+
+    name: str
+    source: str
+    user: int | None = None
+    address: str = ""
+    connection: int = 0
+
+
+RELAY = Actor("the relay", "relay")
+
+
+class Record(Protocol):
+    """Where that goes: the database, or a list in tests."""
+
+    def note(
+        self, kind: str, robot: Presence, actor: Actor, why: str = "", *, audit: bool = True, **data: Any
+    ) -> None:
+        """Something has happened; nobody waits for it to be written."""
+
+    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor) -> None:
+        """Keep an order to stop until it is told, with its audit entry.
+
+        :raises SwitchboardError: it can't be kept
+        """
+
+    async def told(self, robot: Presence, at: float | None = None) -> bool:
+        """The order to stop of this moment need not be told any more; whether there was one.
+
+        :param at: Unix seconds, as it was ordered; ``None`` for whatever there is
+
+        :raises SwitchboardError: it can't be taken out
+        """
+
+    async def pending(self, robot: Presence) -> StopRecord | None:
+        """The order to stop that is still to be told.
+
+        :raises SwitchboardError: nobody can say
+        """
+
+
+class DatabaseRecord:
+    """The record of a relay in service.
+
+    :param wall: Unix time in seconds
+    """
+
+    log = Logger()
+
+    def __init__(self, store: Store, journal: Journal, wall: Callable[[], float]) -> None:
+        self._store = store
+        self._journal = journal
+        self._wall = wall
+        self._waiting = 0
+
+    def note(
+        self, kind: str, robot: Presence, actor: Actor, why: str = "", *, audit: bool = True, **data: Any
+    ) -> None:
+        """An event, as far as one user may cause them, and an entry of the audit log in any case."""
+        self._event(kind, robot, actor, why, **data)
+        if not audit:
+            return
+        if self._waiting >= WAITING:
+            self.log.error(
+                "'{kind}' of {robot} by {source} is not on record: the database does not keep up",
+                kind=kind,
+                robot=robot.name,
+                source=actor.source,
+            )
+            return
+        self._waiting += 1
+        writing = self._store.write(
+            queries.append_audit, **self._entry(kind, robot, actor, {"why": why, **data})
+        )
+        Deferred.fromCoroutine(writing).addErrback(
+            lambda failure: self.log.error(
+                "'{kind}' is not on record: {reason}", kind=kind, reason=failure.value
+            )
+        ).addBoth(self._written)
+
+    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor) -> None:
+        """The order and its audit entry, both or neither."""
+        self._event("robot.stopped", robot, actor, order.why)
+        entry = self._entry("robot.stopped", robot, actor, {"why": order.why})
+        await self._store.write(_order, order, entry)
+
+    async def told(self, robot: Presence, at: float | None = None) -> bool:
+        """See :class:`Record`."""
+        return await self._store.write(queries.stop_told, robot.robot_id, at)
+
+    async def pending(self, robot: Presence) -> StopRecord | None:
+        """See :class:`Record`."""
+        return await self._store.read(queries.pending_stop, robot.robot_id)
+
+    def _event(self, kind: str, robot: Presence, actor: Actor, why: str, **data: Any) -> None:
+        self._journal.event(
+            kind,
+            actor.source,
+            # Not that of the user's other events: who comes and goes must not hide who stops a robot.
+            cause=f"control:{actor.source}",
+            robot_id=robot.robot_id,
+            user_id=actor.user,
+            robot=robot.name,
+            user=actor.name,
+            connection=actor.connection,
+            address=actor.address,
+            why=why,
+            **data,
+        )
+
+    def _entry(self, kind: str, robot: Presence, actor: Actor, data: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "at": self._wall(),
+            "actor": actor.source,
+            "action": kind,
+            "target": robot.name,
+            "origin": actor.address,
+            "data": {"connection": actor.connection, **data},
+        }
+
+    def _written(self, _: object) -> None:
+        self._waiting -= 1
+
+
+def _order(s: Session, order: StopRecord, entry: dict[str, Any]) -> None:
+    queries.order_stop(s, order.robot_id, order.by, order.why, order.at)
+    queries.append_audit(s, **entry)

@@ -1,0 +1,248 @@
+"""Stopping one robot, and letting it move again; a robot that is away is stopped first thing when it comes back."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from msgspec import structs
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+
+from relay_db.queries import StopRecord
+from relay_protocol import link
+from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_server.control.detached import detached
+from relay_server.control.orders import NotDone, Orders
+from relay_server.control.record import WHY, Actor, Record
+from relay_server.registry import Presence
+
+STOP_SECONDS = 10.0
+"""A robot has so long to confirm that it stands: a switch in its hardware may take some seconds."""
+
+KEEPING = 8
+"""Orders to stop one robot that are being written at a time: who stops it again and again must not fill the database's
+queue. The robot is told all the same; where it can't be, whoever comes then is told that his order is not kept."""
+
+KNOWN = 256
+"""Orders to stop one robot that are remembered: a slow database may still tell of them."""
+
+AT_ONCE = 64
+"""Orders to stop one robot that are under way at a time; whoever comes then is stopping it already."""
+
+
+class Stopped(NamedTuple):
+    """That a robot is stopped.
+
+    :param since: Unix time, seconds
+    :param told: whether the robot has confirmed it
+    """
+
+    by: str
+    why: str
+    since: float
+    told: bool
+
+
+class Stopping:
+    """The stop of one robot.
+
+    :param changed: called when it is another
+    :param wall: Unix time in seconds
+    """
+
+    log = Logger()
+
+    def __init__(
+        self,
+        robot: Presence,
+        orders: Orders,
+        record: Record,
+        changed: Callable[[], None],
+        wall: Callable[[], float],
+    ) -> None:
+        self._robot = robot
+        self._orders = orders
+        self._record = record
+        self._changed = changed
+        self._wall = wall
+        self._pending: StopRecord | None = None
+        self._known: deque[float] = deque(maxlen=KNOWN)
+        """The moments that name the orders seen here, whatever has become of them. They are compared for being the
+        same only: clocks are set back."""
+        self._unsure: StopRecord | None = None
+        """An order that the robot has, but could not do all of: it may have forgotten it when it comes back."""
+        self._look = False
+        """Whether what the robot says next of itself shows if it still stands."""
+        self._under_way = 0
+        self._keeping = 0
+
+    @property
+    def stopped(self) -> Stopped | None:
+        """By whom and why the robot is stopped, as it says itself, or is going to be; ``None`` when it may move."""
+        told = self._robot.safety.stopped
+        if told is not None:
+            return Stopped(told.by, told.why, told.since, True)
+        pending = self._pending
+        return None if pending is None else Stopped(pending.by, pending.why, pending.at, False)
+
+    def stop(self, actor: Actor, why: str) -> Deferred[bool]:
+        """Stop the robot, and keep it stopped. The order is on its way when this returns.
+
+        What comes back fires with true when the robot has done it, with false when it will as soon as it is back. It
+        fails with :class:`NotDone` when the robot is stopped but could not do all that belongs to it, and with
+        :class:`Unavailable` when the order could neither be given nor be kept.
+        """
+        order = StopRecord(self._robot.robot_id, actor.name, why[:WHY], self._wall())
+        self._known.append(order.at)
+        if self._pending is None or self._keeping < KEEPING:
+            # Else those stand that are being written.
+            self._pending = order
+        self._changed()
+        return detached(self._stop(order, actor))
+
+    async def _stop(self, order: StopRecord, actor: Actor) -> bool:
+        # Before anything is written: nothing is as urgent.
+        given = self._tell(order)
+        keeping = detached(self._keep(order, actor))
+        outcome = await _outcome(given)
+        # Whoever asked is not kept waiting by a database that hangs.
+        if outcome is None:
+            self._believe(link.Stopped(by=order.by, why=order.why, since=order.at))
+            detached(self._tidy(order, keeping)).addErrback(self._failed)
+            return True
+        if isinstance(outcome, NotDone):
+            self._unsure = order
+            keeping.addErrback(self._failed)
+            raise outcome
+        kept = await _outcome(keeping)
+        if kept is not None:
+            raise Unavailable(f"{outcome}; and the order can't be kept for when it is back: {kept}")
+        return False
+
+    async def _keep(self, order: StopRecord, actor: Actor) -> None:
+        if self._keeping >= KEEPING:
+            raise Unavailable(f"{KEEPING} orders to stop {self._robot.name} are being written already")
+        self._keeping += 1
+        try:
+            await self._record.ordered(self._robot, order, actor)
+        finally:
+            self._keeping -= 1
+
+    async def _tidy(self, order: StopRecord, keeping: Deferred[None] | None = None) -> None:
+        """The robot has it: nobody need tell it again."""
+        self._over(order)
+        if keeping is not None:
+            await keeping
+        await self._record.told(self._robot, order.at)
+
+    def _believe(self, stopped: link.Stopped | None) -> None:
+        """The robot has done as it was told; how it says so of itself may come a moment later."""
+        safety = self._robot.safety
+        if (safety.stopped is None) is not (stopped is None):
+            self._robot.safety = structs.replace(safety, stopped=stopped)
+            self._changed()
+
+    def _over(self, order: StopRecord) -> None:
+        # One that was given meanwhile stands.
+        if self._pending is order:
+            self._pending = None
+            self._changed()
+
+    def _failed(self, failure: Any) -> None:
+        """A robot that is told to stop again stands all the same."""
+        robot = self._robot.name
+        self.log.error("the stop of {robot} is not well kept: {reason}", robot=robot, reason=failure.value)
+
+    def _tell(self, order: StopRecord) -> Deferred[None]:
+        if self._under_way >= AT_ONCE:
+            given: Deferred[None] = Deferred()
+            given.errback(Unavailable(f"robot {self._robot.name} has been told to stop, and does not answer"))
+            return given
+        self._under_way += 1
+        given = self._orders.give(
+            lambda id: link.Stop(id=id, by=order.by[:255], why=order.why), seconds=STOP_SECONDS, always=True
+        )
+        return given.addBoth(self._answered)
+
+    def _answered(self, result: Any) -> Any:
+        self._under_way -= 1
+        return result
+
+    def resume(self, actor: Actor, why: str) -> Deferred[None]:
+        """Let the robot move again. A stop it was not told of is taken back.
+
+        What comes back fails with :class:`NotDone` or :class:`Unavailable` when the robot has not done it. One that is
+        offline keeps what it was told, also where this relay has not seen it since it began.
+        """
+        return detached(self._resume(actor, why[:WHY], self._pending))
+
+    async def _resume(self, actor: Actor, why: str, pending: StopRecord | None) -> None:
+        robot = self._robot
+        if robot.control is not None:
+            await self._orders.give(
+                lambda id: link.Resume(id=id, by=actor.name[:255], why=why), seconds=STOP_SECONDS, always=True
+            )
+            self._believe(None)
+        elif robot.safety.stopped is not None:
+            raise Unavailable(
+                f"robot {robot.name} is offline, and stopped: it can be resumed when it is back"
+            )
+        elif pending is None or pending is self._unsure:
+            raise Unavailable(
+                f"robot {robot.name} is offline, and may be stopped: it can be resumed when it is back"
+            )
+        if pending is not None:
+            await self._record.told(robot, pending.at)
+            self._over(pending)
+        self._record.note("robot.resumed", robot, actor, why)
+
+    # --- the robot ----------------------------------------------------------------------------------------
+
+    def expect(self, order: StopRecord | None) -> bool:
+        """What the database says is still to be told; whether that is new."""
+        if order is None or order.at in self._known:
+            return False
+        self._known.append(order.at)
+        self._pending = order
+        self._changed()
+        return True
+
+    def came(self) -> None:
+        """The robot is there: what it was not told yet it is told now."""
+        pending = self._pending
+        self._look = pending is not None and pending is self._unsure
+        if not self._look:
+            self._tell_pending()
+
+    def heard(self) -> None:
+        """The robot has said of itself whether it stands: one that has forgotten its stop is told again."""
+        if self._look:
+            self._look = False
+            if self._robot.safety.stopped is None:
+                self._tell_pending()
+
+    def _tell_pending(self) -> None:
+        if self._pending is not None:
+            detached(self._catch_up(self._pending)).addErrback(self._failed)
+
+    async def _catch_up(self, order: StopRecord) -> None:
+        outcome = await _outcome(self._tell(order))
+        if outcome is not None:
+            robot = self._robot.name
+            self.log.error("robot {robot} was to be stopped: {reason}", robot=robot, reason=str(outcome))
+        if outcome is None:
+            self._believe(link.Stopped(by=order.by, why=order.why, since=order.at))
+            await self._tidy(order)
+        elif isinstance(outcome, NotDone):
+            self._unsure = order
+
+
+async def _outcome(work: Any) -> SwitchboardError | None:
+    """What went wrong, if anything did."""
+    try:
+        await work
+    except SwitchboardError as error:
+        return error
+    return None

@@ -1,0 +1,103 @@
+"""What is told of control: to each client what it may know, and which of it is its own (SPEC section 1.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import msgspec
+
+from relay_protocol.link import Inhibited, Suppressed
+from relay_protocol.rights import Level, Operation, Rules
+from relay_server.control.desk import Desk
+from relay_server.control.lease import Client, Request, State, Tenure
+from relay_server.control.terms import ROBOT, Standing
+
+
+class Asker:
+    """Who is told.
+
+    :param rules: its rights on the robot
+    :param mine: whether a connection is its own
+    """
+
+    def __init__(self, rules: Rules, mine: Callable[[Client], bool]) -> None:
+        self.rules = rules
+        self.mine = mine
+
+    def may_know(self, resource: str) -> bool:
+        """What one may not use is not shown."""
+        return any(
+            self.rules.judge(operation, resource).allowed
+            for operation in (Operation.SUBSCRIBE, Operation.PUBLISH)
+        )
+
+
+def control(desk: Desk, asker: Asker, number: int | None) -> dict[str, Any]:
+    """Who moves the robot, who asks to, and why it stands.
+
+    :param number: of the asker's connection, ``None`` when it has none or is told of all
+    """
+    lease, safety = desk.lease, desk.robot.safety
+    mine = lease.holder is not None and asker.mine(lease.holder.client)
+    return {
+        "robot": desk.robot.name,
+        "state": state(desk.standing),
+        "holder": None if lease.holder is None else _holder(lease.holder, asker),
+        "request": None if lease.request is None else _request(lease.request, asker),
+        "stopped": stopped(desk.standing),
+        "moving": safety.moving,
+        "suppressed": _known(safety.suppressed, asker),
+        "inhibited": _known(safety.inhibited, asker),
+        "limits": {level: msgspec.structs.asdict(limits) for level, limits in safety.limits.items()},
+        "you": {
+            "client": number,
+            "may_control": asker.rules.judge(Operation.CONTROL, ROBOT).allowed,
+            "may_resume": mine or asker.rules.level is Level.OWNER,
+        },
+    }
+
+
+def state(standing: Standing) -> str:
+    """``free``, ``held`` or ``requested``; while the robot is being told of somebody nobody has it."""
+    now = standing.lease.state
+    shown = now if now in (State.HELD, State.REQUESTED) else State.FREE
+    return str(shown.value)
+
+
+def holder(standing: Standing) -> str | None:
+    """The user who has control, if anybody has."""
+    tenure = standing.lease.holder
+    return None if tenure is None else tenure.client.name
+
+
+def stopped(standing: Standing) -> dict[str, Any] | None:
+    """Why the robot stands, if it was stopped."""
+    found = standing.stopped
+    return None if found is None else found._asdict()
+
+
+def _holder(tenure: Tenure, asker: Asker) -> dict[str, Any]:
+    client = tenure.client
+    return {
+        "user": client.name,
+        "client": client.number,
+        "since": tenure.since,
+        "you": asker.mine(client),
+    }
+
+
+def _request(request: Request, asker: Asker) -> dict[str, Any]:
+    client = request.client
+    return {
+        "user": client.name,
+        "client": client.number,
+        "since": request.since,
+        "why": request.why,
+        "you": asker.mine(client),
+        "until": request.until,
+    }
+
+
+def _known(told: Iterable[Suppressed | Inhibited], asker: Asker) -> list[dict[str, Any]]:
+    return [msgspec.structs.asdict(each) for each in told if asker.may_know(each.resource)]

@@ -1,0 +1,49 @@
+"""``/api/v1/robots/<robot>/people``: who is at a robot."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from klein import Klein
+from twisted.web.resource import IResource
+from twisted.web.server import Request
+from werkzeug.exceptions import HTTPException
+
+from relay_server.access import Principal
+from relay_server.edges.api import Api
+
+
+class Desk(Protocol):
+    """What is asked; see :class:`relay_server.overview.Overview`."""
+
+    async def people(self, principal: Principal, robot: str) -> dict[str, Any]:
+        """Who is at a robot."""
+
+
+class RobotPeople:
+    """The people at one robot, for one request."""
+
+    app = Klein()
+
+    def __init__(self, desk: Desk, api: Api, robot: str) -> None:
+        self._desk = desk
+        self._api = api
+        self._robot = robot
+
+    @app.route("/", methods=["GET"])
+    def people(self, request: Request) -> Any:
+        return self._api.answer(request, self._people(request))
+
+    async def _people(self, request: Request) -> Any:
+        return await self._desk.people(await self._api.principal(request), self._robot)
+
+    @app.handle_errors(HTTPException)
+    def unrouted(self, request: Request, failure: Any) -> bytes:
+        answer: bytes = self._api.unrouted(request, failure)
+        return answer
+
+
+def below(desk: Desk, api: Api, robot: str) -> IResource:
+    """What serves the address below a robot's ``people``."""
+    resource: IResource = RobotPeople(desk, api, robot).app.resource()
+    return resource

@@ -1,0 +1,303 @@
+"""What edges ask about orders to many robots: who may give them to which robots, and how they are carried out."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from relay_db import queries
+from relay_db.queries import RobotRecord
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_protocol.rights import Grant, Level, Rules
+from relay_server.access import Access, Permit, Principal
+from relay_server.clock import Clock, as_twisted
+from relay_server.control import Actor, Desks
+from relay_server.fleet.client import OrderClient
+from relay_server.fleet.errand import Errand
+from relay_server.fleet.halting import Halting
+from relay_server.fleet.matching import meant
+from relay_server.fleet.order import Order
+from relay_server.fleet.rank import side_by_side
+from relay_server.fleet.result import Outcome, Result
+from relay_server.frontdesk import Admission, FrontDesk, GoingDown
+from relay_server.journal import Journal
+from relay_server.registry import Registry
+from relay_server.store import Store
+
+ROBOTS = 1000
+"""Robots of one order, but for a stop, which may mean all there are."""
+
+ORDERS = 4
+"""Orders of one user at a time."""
+
+STOP_SECONDS = 15.0
+"""What a stop and a resume have, whatever the order says: they are given up by who carries them out before that."""
+
+LOCAL = Principal(0, "admin (local)", "default", True, 0, None)
+"""Whoever may open the relay's local socket. No user can have this name: it has a space in it."""
+
+OWNS = Rules([Grant(Level.OWNER, source=LOCAL.name)])
+"""What he may do on every robot."""
+
+
+class Meant(NamedTuple):
+    """A robot, and the asker's rights on it."""
+
+    record: RobotRecord
+    rules: Rules
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An order, and which robots it means."""
+
+    order: Order
+    asker: Principal
+    address: str
+    robots: dict[str, Meant]
+    unmatched: list[str]
+
+    @property
+    def actor(self) -> Actor:
+        """Who gives it, as the record of control knows him."""
+        if self.asker is LOCAL:
+            return Actor(LOCAL.name, "cli", address=self.address)
+        return Actor(self.asker.name, f"user:{self.asker.name}", self.asker.user_id, self.address)
+
+    def told(self) -> dict[str, Any]:
+        """The first line of the answer."""
+        return {"do": self.order.do, "robots": list(self.robots), "unmatched": self.unmatched}
+
+
+class FleetDesk:
+    """Has orders carried out.
+
+    :param clock_ns: monotonic nanoseconds
+    :param wall: Unix time in seconds
+    """
+
+    log = Logger()
+
+    def __init__(
+        self,
+        clock: Clock,
+        front: FrontDesk,
+        access: Access,
+        registry: Registry,
+        desks: Desks,
+        store: Store,
+        journal: Journal,
+        *,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self._clock = clock
+        self._front = front
+        self._access = access
+        self._registry = registry
+        self._halting = Halting(desks, registry)
+        self._store = store
+        self._journal = journal
+        self._clock_ns = clock_ns
+        self._wall = wall
+        self._orders: Counter[int] = Counter()
+
+    async def groups(self, asker: Principal) -> list[dict[str, Any]]:
+        """Groups of robots, with those the asker has a right on; the others are not told of."""
+        mine = {each.record.name for each in await self._mine(asker)}
+        groups = await self._store.read(queries.list_robot_groups, asker.realm)
+        told = (
+            {"name": each.name, "robots": [name for name in each.robots if name in mine]} for each in groups
+        )
+        return [each for each in told if each["robots"]]
+
+    async def plan(self, asker: Principal, order: Order, address: str) -> Plan:
+        """Find out which robots an order means.
+
+        :raises Invalid: the order makes no sense, or means too many
+        :raises NotFound: it means no robot the asker has a right on
+        """
+        order.check()
+        mine = {each.record.name: each for each in await self._mine(asker)}
+        groups = await self._store.read(queries.list_robot_groups, asker.realm)
+        found = meant(order.robots, mine, {each.name: each.robots for each in groups})
+        if not found.robots:
+            raise NotFound("the order means no robot that you have a right on")
+        if order.do != "stop" and len(found.robots) > ROBOTS:
+            raise Invalid(f"the order means {len(found.robots)} robots; it may mean {ROBOTS} at most")
+        return Plan(order, asker, address, {name: mine[name] for name in found.robots}, found.unmatched)
+
+    async def carry_out(
+        self, plan: Plan, begin: Callable[[], None], tell: Callable[[Result], Awaitable[None]]
+    ) -> None:
+        """Do it on all robots, some at a time. Who waits for this and gives up ends it.
+
+        :param begin: called when it begins
+        :param tell: is given each result; the next robot has its turn when it has taken that
+        :raises Unavailable: the asker has too many orders under way, or it can't be put on record
+        """
+        counted: Counter[bool] = Counter()
+
+        async def one(name: str) -> None:
+            result = await self._one(plan, plan.robots[name])
+            counted[result.outcome.ok] += 1
+            await tell(result)
+
+        async def begun(doing: Awaitable[None]) -> None:
+            try:
+                await doing
+            finally:
+                self._tell_of_end(plan, counted)
+
+        if plan.order.do == "stop":
+            begin()
+            await begun(self._stop(plan, one))
+            return
+        with self._place(plan.asker):
+            await self._record(plan)
+            begin()
+            await begun(side_by_side(plan.robots, one))
+
+    async def _stop(self, plan: Plan, one: Callable[[str], Awaitable[None]]) -> None:
+        """Nothing is as urgent: whoever can be told is told at once, and only then it is put on record."""
+        told = [name for name, each in plan.robots.items() if self._halting.online(each.record)]
+        # These by the rights of this moment, which the plan has just looked up; the others are judged in their turn.
+        stopping = Deferred.fromCoroutine(side_by_side(told, one, at_once=len(told)))
+        try:
+            await self._record(plan)
+        except SwitchboardError as error:
+            # Each stop is on record by itself, too.
+            self.log.error("an order to stop is not on record: {reason}", reason=str(error))
+        finally:
+            # Who has hung up by now has had them told all the same.
+            await stopping
+        await side_by_side([name for name in plan.robots if name not in set(told)], one)
+
+    async def _one(self, plan: Plan, robot: Meant) -> Result:
+        began = self._clock.seconds()
+        running = Deferred.fromCoroutine(self._done(plan, robot))
+        order = plan.order
+        seconds = STOP_SECONDS if order.do in ("stop", "resume") else order.timeout
+        running.addTimeout(seconds, as_twisted(self._clock), _too_late(order.do))
+        try:
+            outcome = await running
+        except SwitchboardError as error:
+            outcome = Outcome(False, str(error))
+        except CancelledError:
+            running.cancel()
+            raise
+        except Exception:
+            self.log.failure("an order failed on {robot}", robot=robot.record.name)
+            outcome = Outcome(False, "the relay failed on this order; its log tells more")
+        return Result(robot.record.name, outcome, self._clock.seconds() - began)
+
+    async def _done(self, plan: Plan, robot: Meant) -> Outcome:
+        order = plan.order
+        if order.do == "stop" and self._halting.online(robot.record):
+            return await self._halting.stop(robot.record, plan.actor, order.why)
+        if order.do in ("stop", "resume"):
+            return await self._halted(plan, robot.record)
+        return await self._errand(plan, robot.record)
+
+    async def _halted(self, plan: Plan, record: RobotRecord) -> Outcome:
+        """Stop a robot or let it move again, by the asker's rights as they stand when its turn comes."""
+        order, halting = plan.order, self._halting
+        try:
+            admission = await self._admit(plan, record)
+        except Unavailable:
+            if order.do != "stop":
+                raise
+            # Nobody can say that he may not, and the plan says that he may.
+            return await halting.stop(record, plan.actor, order.why)
+        try:
+            if order.do == "stop":
+                return await halting.stop(record, plan.actor, order.why)
+            return await halting.resume(record, admission.permit.rules, plan.asker, plan.actor, order.why)
+        finally:
+            self._front.turn_away(admission)
+
+    async def _errand(self, plan: Plan, record: RobotRecord) -> Outcome:
+        admission = await self._admit(plan, record)
+        if not self._front.accepting:
+            self._front.turn_away(admission)
+            raise GoingDown("the relay is going down")
+        client = OrderClient()
+        session = self._front.open(admission, client, self._clock_ns())
+        try:
+            client.begin(session)
+            return await Errand(self._clock, session, client, plan.order).run()
+        finally:
+            session.end()
+
+    async def _admit(self, plan: Plan, record: RobotRecord) -> Admission:
+        if plan.asker is not LOCAL:
+            return await self._front.admit(plan.asker, record.name, plan.address)
+        robot = self._registry.presence(record.id, record.name, record.realm)
+        return Admission(Permit(LOCAL, record.id, OWNS), robot, plan.address)
+
+    async def _mine(self, asker: Principal) -> list[Meant]:
+        if asker is LOCAL:
+            return [
+                Meant(record, OWNS) for record in await self._store.read(queries.list_robots, asker.realm)
+            ]
+        return [Meant(record, rules) for record, rules in await self._access.robots(asker)]
+
+    @contextmanager
+    def _place(self, asker: Principal) -> Iterator[None]:
+        if self._orders[asker.user_id] >= ORDERS:
+            raise Unavailable(f"{ORDERS} orders of yours are under way already; wait until one is done")
+        self._orders[asker.user_id] += 1
+        try:
+            yield
+        finally:
+            self._orders[asker.user_id] -= 1
+            self._orders += Counter()
+
+    async def _record(self, plan: Plan) -> None:
+        """Put on record what is ordered, before it is done; never what services are given, which may be secret."""
+        order = plan.order
+        await self._store.write(
+            queries.append_audit,
+            at=self._wall(),
+            actor=plan.asker.name if plan.asker is LOCAL else f"user:{plan.asker.name}",
+            action=f"fleet.{order.do}",
+            target=", ".join(order.robots),
+            origin=plan.address,
+            data={"robots": len(plan.robots), "what": order.subject, "why": order.why},
+        )
+
+    def _tell_of_end(self, plan: Plan, counted: Counter[bool]) -> None:
+        asker = plan.asker
+        self._journal.event(
+            "fleet.done",
+            f"user:{asker.name}",
+            cause=f"fleet:{asker.name}",
+            user_id=asker.user_id,
+            what=f"{plan.order.do} {plan.order.subject}".strip(),
+            robots=len(plan.robots),
+            ok=counted[True],
+            failed=counted[False],
+        )
+
+
+def _too_late(do: str) -> Callable[[Any, float], Any]:
+    """What is told of an order of this kind that has taken too long."""
+
+    def told(result: Any, seconds: float) -> Any:
+        if not isinstance(result, Failure):
+            return result
+        result.trap(CancelledError)
+        if do == "publish":
+            raise Unavailable(f"it was not done within {seconds:g} s")
+        # The robot may have it: nothing takes it back.
+        raise Unavailable(f"no answer within {seconds:g} s; it may still happen")
+
+    return told

@@ -1,0 +1,44 @@
+"""Which robots an order means: by names, patterns of names, and groups."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+GROUP = "group:"
+"""How the name of a group begins in an order. No robot's name can: it has no colon."""
+
+
+class Meant(NamedTuple):
+    """What an order means.
+
+    :param robots: names, each once, in their order
+    :param unmatched: what of the order means no robot
+    """
+
+    robots: list[str]
+    unmatched: list[str]
+
+
+def meant(asked: Iterable[str], robots: Collection[str], groups: Mapping[str, Collection[str]]) -> Meant:
+    """Find the robots that are meant.
+
+    :param asked: names, patterns with shell wildcards, ``group:<name>``
+    :param robots: names of those that may be meant
+    :param groups: the names of their robots by their own, which is in lower case
+    """
+    known = set(robots)
+    found: set[str] = set()
+    unmatched = []
+    for each in dict.fromkeys(asked):
+        if each.startswith(GROUP):
+            these = known & set(groups.get(each.removeprefix(GROUP).lower(), ()))
+        elif each in known:
+            these = {each}
+        else:
+            these = {name for name in known if fnmatchcase(name, each)}
+        found |= these
+        if not these:
+            unmatched.append(each)
+    return Meant(sorted(found), unmatched)

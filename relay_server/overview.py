@@ -1,0 +1,148 @@
+"""What is told of robots: to users by their rights, to the administrator on the relay's own machine all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from relay_db import queries
+from relay_protocol.errors import NotFound
+from relay_protocol.rights import Rules
+from relay_server.access import Access, Principal
+from relay_server.control import Desks, view
+from relay_server.linkmeter import Reading, joined, milliseconds
+from relay_server.people import Asker, People, clients
+from relay_server.registry import Presence, Registry
+from relay_server.session import Session
+
+NO_ROBOT = "there is no such robot, or you have no right on it"
+
+
+class Overview:
+    """Puts together what is known of robots.
+
+    :param sessions: the open sessions of a robot by its id, oldest first
+    """
+
+    def __init__(
+        self,
+        access: Access,
+        registry: Registry,
+        people: People,
+        sessions: Callable[[int], list[Session]],
+        desks: Desks,
+    ) -> None:
+        self._access = access
+        self._registry = registry
+        self._people = people
+        self._sessions = sessions
+        self._desks = desks
+
+    async def robots(self, principal: Principal) -> list[dict[str, Any]]:
+        """What the principal may see of its robots."""
+        return [self._view(record, rules) for record, rules in await self._access.robots(principal)]
+
+    async def people(self, principal: Principal, robot: str) -> dict[str, Any]:
+        """Who is at a robot, and how good its link is (SPEC section 1.7).
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        for record, rules in await self._access.robots(principal):
+            if record.name == robot:
+                there = self._of(record)
+                people, more = self._people.told(there, Asker(principal.name, rules, None))
+                return {
+                    "robot": record.name,
+                    "state": there.state.value,
+                    "link": there.reading().told(),
+                    "drops": _drops(there),
+                    "battery": there.health.battery,
+                    "people": people,
+                    "more": more,
+                }
+        raise NotFound(NO_ROBOT)
+
+    def status(self) -> list[dict[str, Any]]:
+        """Every robot the relay knows and who works with it, for the administrator's own machine."""
+        return [self._known(robot) for robot in self._registry]
+
+    def _of(self, record: queries.RobotRecord) -> Presence:
+        return self._registry.find(record.id) or Presence(record.id, record.name, record.realm)
+
+    def _view(self, record: queries.RobotRecord, rules: Rules) -> dict[str, Any]:
+        robot = self._of(record)
+        link = robot.reading()
+        standing = self._desks.standing(record.id)
+        return {
+            "name": record.name,
+            "description": record.description,
+            "state": robot.state.value,
+            "level": str(rules.level),
+            "clients": clients(robot, self._sessions(record.id), rules),
+            "people": self._people.count(robot, rules),
+            "holder": view.holder(standing),
+            "stopped": view.stopped(standing),
+            "battery": robot.health.battery,
+            "rtt_ms": milliseconds(link.rtt),
+            "quality": link.quality,
+            "host": robot.description.host,
+            "platform": robot.description.platform,
+            "distro": robot.description.distro,
+            "last_seen": robot.last_seen,
+        }
+
+    def _known(self, robot: Presence) -> dict[str, Any]:
+        return {
+            "name": robot.name,
+            "realm": robot.realm,
+            "state": robot.state.value,
+            "address": robot.address,
+            "agent": robot.description.agent,
+            "rtt_ms": milliseconds(robot.rtt),
+            "link": robot.reading().told(),
+            "drops": _drops(robot),
+            "battery": robot.health.battery,
+            "last_seen": robot.last_seen,
+            "health": msgspec.structs.asdict(robot.health),
+            "holder": self._holder(robot),
+            "stopped": view.stopped(self._desks.standing(robot.robot_id)),
+            "clients": [_client(each, robot.reading()) for each in self._sessions(robot.robot_id)],
+            "onlookers": [
+                {"user": each.name, "address": each.address, "since": since, "camera": each.camera}
+                for each, since in robot.onlookers.items()
+            ],
+        }
+
+    def _holder(self, robot: Presence) -> dict[str, Any] | None:
+        tenure = self._desks.standing(robot.robot_id).lease.holder
+        if tenure is None:
+            return None
+        client = tenure.client
+        return {"user": client.name, "address": client.address, "since": tenure.since}
+
+
+def _drops(robot: Presence) -> int | None:
+    """Samples the robot has dropped, as far as it has told."""
+    return None if robot.control is None else robot.health.dropped_samples
+
+
+def _client(session: Session, onward: Reading) -> dict[str, Any]:
+    """A connection.
+
+    :param onward: how good the way from the relay to the robot is
+    """
+    link = session.reading()
+    return {
+        "user": session.name,
+        "address": session.address,
+        "since": session.since,
+        "rtt_ms": milliseconds(session.rtt),
+        "link": link.told(),
+        "robot_rtt_ms": milliseconds(joined(link, onward).rtt),
+        "drops": session.outbox.dropped,
+        "waiting_bytes": session.outbox.waiting_bytes,
+        "refusals": session.refusals,
+        "stale_commands": session.stale_commands,
+    }
