@@ -5,8 +5,10 @@ import type { Session } from './types'
 
 export interface Toast {
   id: number
-  kind: 'info' | 'error'
+  kind: 'info' | 'warning' | 'error'
   words: string
+  /** A page of the portal that tells more, and what leads there. */
+  more: { path: string; label: string } | null
   /** How often the same was said. */
   times: number
 }
@@ -42,6 +44,13 @@ class App {
     this.follow()
   }
 
+  /** A click on a link of the portal; what opens another tab or window is left to the browser. */
+  follows(event: MouseEvent, path: string): void {
+    if (event.ctrlKey || event.metaKey || event.shiftKey || event.button !== 0) return
+    event.preventDefault()
+    this.go(path)
+  }
+
   async login(credentials: Credentials): Promise<void> {
     this.session = await login(credentials)
     this.notice = null
@@ -63,14 +72,15 @@ class App {
   toLogin(notice: string | null): void {
     this.session = null
     this.notice = notice
-    const here = parse(location.pathname).page === 'cockpit' ? `?next=${encodeURIComponent(location.pathname)}` : ''
+    const wanted = ['cockpit', 'alerts'].includes(parse(location.pathname).page)
+    const here = wanted ? `?next=${encodeURIComponent(location.pathname)}` : ''
     history.replaceState(null, '', `/login${here}`)
     this.route = { page: 'login' }
   }
 
-  tell(kind: Toast['kind'], words: string): void {
+  tell(kind: Toast['kind'], words: string, more: Toast['more'] = null): void {
     const same = this.toasts.find((toast) => toast.words === words)
-    const toast = same ?? { id: this.nextToast++, kind, words, times: 0 }
+    const toast = same ?? { id: this.nextToast++, kind, words, more, times: 0 }
     toast.times += 1
     if (!same) this.toasts = [...this.toasts, toast].slice(-TOASTS_SHOWN)
     clearTimeout(this.timers.get(toast.id))

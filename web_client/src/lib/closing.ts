@@ -44,7 +44,8 @@ const VIDEO_ENDINGS: Record<number, Ending> = {
  */
 export function videoEnding(code: number, reason: string): Ending {
   const known = VIDEO_ENDINGS[code] ?? { after: 'retry', words: 'The connection for the pictures was lost.' }
-  return known.after === 'login' ? known : withReason(known, reason)
+  // Of what is not there the relay says the same in other words.
+  return known.after === 'login' || code === 4404 ? known : withReason(known, reason)
 }
 
 function withReason(ending: Ending, reason: string): Ending {

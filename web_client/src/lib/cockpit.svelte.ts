@@ -1,24 +1,23 @@
-/** The state of the cockpit: link, latency, rights, chosen topics, driving. One instance per open cockpit. */
+/** The state of the cockpit: link, rights, chosen topics, and what there is to see. One instance per open cockpit. */
 import { cameras as fetchCameras, currentSession, robot as fetchRobot, robotSocket } from './api'
 import { app } from './app.svelte'
 import type { Ending } from './closing'
-import { Drive, type Limits, type Source, stopWords, type StopReason } from './drive'
-import { type Legs, Median, PING_DRIVING_MS, PING_IDLE_MS, PingTracker, RelayClock } from './latency'
-import { Gate } from './meter'
+import type { Control } from './control'
+import { type Bridge, Helm } from './helm.svelte'
+import { PING_IDLE_MS } from './latency'
+import { Latency } from './latency.svelte'
+import { Gate, isStale } from './meter'
 import { Link, type LinkState } from './ros'
 import { recall, remember } from './storage'
-import { fullType, MOTION, ODOMETRY, ofType, pick, SCAN } from './topics'
-import type { RelayStatus, Robot, TopicInfo, Twist } from './types'
+import { MOTION, ODOMETRY, ofType, pick, SCAN } from './topics'
+import type { RelayStatus, Robot, TopicInfo } from './types'
 import type { Camera } from './video'
 
 const TICK_MS = 33
-const ROBOT_PING_MS = 1000
 const TOPICS_MS = 5000
 const CAMERAS_MS = 5000
-/** A link without an answer for so long is dialled anew. */
-const SILENT_MS = 6000
-/** Longer than the silence above, so that a silent link is seen as one. Seconds. */
-const PING_TIMEOUT_S = 10
+/** The relay tells its status once a second. */
+const STATUS_STALE_MS = 3000
 /** A loss shorter than this is not spoken of. */
 const LOSS_SHOWN_MS = 1000
 
@@ -32,7 +31,7 @@ const USUAL: Record<Role, string[]> = {
   motion: ['cmd_vel'],
 }
 
-export class Cockpit {
+export class Cockpit implements Bridge {
   linkState = $state<LinkState>('connecting')
   ending = $state<Ending | null>(null)
   robot = $state.raw<Robot | null>(null)
@@ -41,20 +40,12 @@ export class Cockpit {
   topicsKnown = $state(false)
   /** Those the user may view; null before the relay told them. */
   cameras = $state.raw<Camera[] | null>(null)
-  legs = $state<Legs>({ clientRelay: null, relayRobot: null, clientRobot: null })
-  late = $state(false)
-  driving = $state(false)
-  /** Why driving ended the last time, in words. */
-  stopped = $state<string | null>(null)
-  /** Changes when the joystick must let go of the hand that holds it. */
-  letGo = $state(0)
-  limits = $state<Limits>({ linear: 0.5, angular: 1 })
   /** The page's clock in milliseconds, a few times a second, for marks of staleness. */
   nowMs = $state(performance.now())
   visible = $state(!document.hidden)
 
   private chosen = $state<Choice>({ scan: null, odometry: null, motion: null })
-  private answeredMs = $state<number | null>(null)
+  private statusMs = $state<number | null>(null)
   private lostMs = $state<number | null>(null)
 
   readonly level = $derived(this.status?.level ?? this.robot?.level ?? null)
@@ -66,40 +57,33 @@ export class Cockpit {
   readonly battery = $derived(this.offline ? null : (this.health?.battery ?? this.robot?.battery ?? null))
   readonly motion = $derived(this.topicFor('motion'))
   readonly lost = $derived(this.lostMs !== null && this.nowMs - this.lostMs > LOSS_SHOWN_MS)
-  readonly latencyStale = $derived(
-    this.linkState !== 'open' || this.answeredMs === null || this.nowMs - this.answeredMs > 2 * PING_IDLE_MS,
+  readonly latencyStale = $derived.by(
+    () => this.linkState !== 'open' || isStale(this.latency.answeredMs, this.nowMs, 2 * PING_IDLE_MS),
   )
-  /** Why the controls are disabled, or null. */
-  readonly blocked = $derived(this.whyBlocked())
+  /** What the relay told of robot and people is too old to count as how it is now. */
+  readonly statusStale = $derived(this.linkState !== 'open' || isStale(this.statusMs, this.nowMs, STATUS_STALE_MS))
+  /** Why nobody could drive from here, whoever has control; null when one could. */
+  readonly why = $derived(this.whyNot())
+  readonly unixS = $derived.by(() => (this.latency.clock.unixMs(this.nowMs) ?? Date.now()) / 1000)
 
   readonly link: Link
-  readonly relayClock = new RelayClock()
-  private readonly drive: Drive
-  private readonly pings = new PingTracker()
-  private readonly robotGate = new Gate(ROBOT_PING_MS)
+  readonly helm: Helm
+  readonly latency: Latency
   private readonly topicsGate = new Gate(TOPICS_MS)
   private readonly camerasGate = new Gate(CAMERAS_MS)
   private readonly nowGate = new Gate(200)
-  private readonly idleGate = new Gate(PING_IDLE_MS)
-  private readonly drivingGate = new Gate(PING_DRIVING_MS)
-  private readonly robotTrips = new Median()
-  private robotPingOut = false
   private timer: ReturnType<typeof setInterval> | undefined
 
   constructor(readonly name: string) {
     this.chosen = recall<Choice>(`topics:${name}`, { scan: null, odometry: null, motion: null })
-    this.limits = recall<Limits>(`limits:${name}`, { linear: 0.5, angular: 1 })
-    this.drive = new Drive(
-      (command) => this.send(command),
-      () => this.obstacle(),
-      this.limits,
-      (phase, reason) => this.driveChanged(phase === 'driving', reason),
-    )
     this.link = new Link(robotSocket(name, location), {
       state: (state, why) => this.linkChanged(state, why),
       told: ({ level, words }) => app.tell(level === 'error' ? 'error' : 'info', words),
     })
     this.link.subscribe<RelayStatus>('/relay/status', 'switchboard_msgs/msg/Status', (status) => this.take(status))
+    this.link.subscribe<Control>('/relay/control', 'switchboard_msgs/msg/Control', (told) => this.helm.take(told))
+    this.latency = new Latency(this.link)
+    this.helm = new Helm(this)
   }
 
   start(): void {
@@ -110,7 +94,7 @@ export class Cockpit {
 
   close(): void {
     clearInterval(this.timer)
-    this.drive.stop('link_closed')
+    this.helm.halt('link_closed')
     this.link.close()
   }
 
@@ -126,94 +110,39 @@ export class Cockpit {
     return this.topicsKnown ? `This robot publishes no ${what}.` : 'Waiting for the list of topics.'
   }
 
-  topicFor(role: Role): TopicInfo | null {
-    return pick(this.candidates(role), USUAL[role], this.chosen[role])
+  topicFor(role: Role, topics = this.topics): TopicInfo | null {
+    return pick(ofType(topics, TYPES[role]), USUAL[role], this.chosen[role])
   }
 
   choose(role: Role, name: string): void {
-    if (role === 'motion') this.drive.stop('topic_changed')
+    if (role === 'motion') this.helm.halt('topic_changed')
     this.chosen = { ...this.chosen, [role]: name }
     remember(`topics:${this.name}`, this.chosen)
     if (role === 'motion') this.advertise()
   }
 
-  // Driving
-
-  grab(source: Source): boolean {
-    this.stopped = null
-    const reason = this.drive.grab(source, performance.now())
-    if (reason !== null) this.stopped = this.blocked ?? stopWords(reason)
-    return reason === null
-  }
-
-  steer(source: Source, turn: number, ahead: number): void {
-    this.drive.steer(source, turn, ahead, performance.now())
-  }
-
-  release(source: Source): void {
-    this.drive.release(source)
-  }
-
-  stop(reason: StopReason): void {
-    this.drive.stop(reason)
-  }
-
-  pressStop(): void {
-    this.letGo += 1
-    if (this.drive.stopNow()) this.stopped = 'Stop was sent.'
-    else app.tell('error', this.blocked ?? 'The stop could not be sent: there is no connection.')
-  }
-
-  setLimits(limits: Limits): void {
-    this.limits = limits
-    this.drive.setLimits(limits)
-    remember(`limits:${this.name}`, limits)
-  }
-
   setVisible(visible: boolean): void {
     this.visible = visible
-    if (visible) {
-      // Timers slept: what was out then says nothing about the link now.
-      this.pings.reset()
-      this.relayClock.reset()
-      this.late = false
-    } else {
-      this.drive.stop('page_hidden')
-    }
+    // Timers slept: what was out then says nothing about the link now.
+    if (visible) this.latency.reset()
   }
 
-  private send(command: Twist): boolean {
-    const topic = this.motion
-    if (topic === null || this.level === 'viewer') return false
-    const stamped = fullType(topic.type) === 'geometry_msgs/msg/TwistStamped'
-    const header = { stamp: { sec: 0, nanosec: 0 }, frame_id: '' }
-    return this.link.publish(topic.name, topic.type, stamped ? { header, twist: command } : command)
+  isLate(): boolean {
+    return this.latency.isLate(performance.now()) || this.link.isStalled
   }
 
-  private obstacle(): StopReason | null {
-    if (!this.link.isOpen) return 'link_closed'
-    if (this.pings.isLate(performance.now()) || this.link.isStalled) return 'link_late'
-    return this.blocked === null ? null : 'not_allowed'
-  }
-
-  private whyBlocked(): string | null {
+  private whyNot(): string | null {
     if (this.linkState === 'ended') return this.ending?.words ?? 'The connection is closed.'
     if (this.robotState === 'offline') return 'The robot is offline.'
-    if (this.level === 'viewer') {
+    if (this.level === 'viewer' && !this.helm.mayControl) {
       return 'You watch as a viewer. To drive you need the level operator; whoever runs this relay can give it to you.'
     }
     if (this.linkState !== 'open' || this.level === null) return 'Waiting for the connection.'
+    if (!this.helm.mayControl) return 'You have no right to control this robot.'
     if (this.motion === null) {
       return this.topicsKnown ? 'This robot listens to no Twist topic.' : 'Waiting for the list of topics.'
     }
     return null
-  }
-
-  private driveChanged(driving: boolean, reason: StopReason | null): void {
-    this.driving = driving
-    if (reason === null) return
-    this.stopped = reason === 'not_allowed' ? this.blocked : stopWords(reason)
-    if (reason !== 'released') this.letGo += 1
   }
 
   private advertise(): void {
@@ -246,22 +175,15 @@ export class Cockpit {
   }
 
   private linkGone(): void {
-    this.drive.stop('link_closed')
-    this.pings.reset()
-    this.relayClock.reset()
-    this.robotPingOut = false
-    this.late = false
+    this.helm.gone()
+    this.latency.gone()
   }
 
   private take(status: RelayStatus): void {
     this.status = status
-    if (status.state === 'offline') {
-      this.legs.relayRobot = null
-      this.legs.clientRobot = null
-    } else {
-      this.legs.relayRobot = status.rtt_ms?.relay_robot ?? this.legs.relayRobot
-    }
-    if (this.driving && this.blocked !== null) this.drive.stop('not_allowed')
+    this.statusMs = performance.now()
+    this.latency.told(status.state === 'offline' ? null : status.rtt_ms.relay_robot, status.state === 'offline')
+    if (this.helm.driving && this.helm.blocked !== null) this.helm.halt('not_allowed')
   }
 
   private async fetchRobot(): Promise<void> {
@@ -284,12 +206,19 @@ export class Cockpit {
       // A robot that has just gone has no topics; what it had is what the panels wait for.
       if (this.topics.length > 0 && found.every((topic) => topic.name.startsWith('/relay/'))) return
       // The same list anew would restart every subscription that depends on it.
-      if (JSON.stringify(found) !== JSON.stringify(this.topics)) this.topics = found
+      if (JSON.stringify(found) !== JSON.stringify(this.topics)) this.takeTopics(found)
       this.topicsKnown = true
       this.advertise()
     } catch {
       // Asked again in a moment; a lost link is shown elsewhere.
     }
+  }
+
+  private takeTopics(found: TopicInfo[]): void {
+    const [before, next] = [this.motion, this.topicFor('motion', found)]
+    // The zero belongs to the topic that was driven, so it goes out while that is still the one.
+    if (before?.name !== next?.name || before?.type !== next?.type) this.helm.halt('topic_changed')
+    this.topics = found
   }
 
   private async fetchCameras(): Promise<void> {
@@ -305,45 +234,12 @@ export class Cockpit {
 
   private tick(): void {
     const now = performance.now()
-    this.late = this.linkState === 'open' && this.pings.isLate(now)
-    this.drive.tick(now)
+    this.helm.tick(now)
     if (this.nowGate.open(now)) this.nowMs = now
+    this.latency.look(now)
     if (this.linkState !== 'open' || !this.visible) return
-    if ((this.driving ? this.drivingGate : this.idleGate).open(now)) void this.pingRelay(now)
-    if (!this.robotPingOut && this.robotState !== 'offline' && this.robotGate.open(now)) void this.pingRobot(now)
+    this.latency.tick(now, this.helm.driving, !this.offline)
     if (this.topicsGate.open(now)) void this.fetchTopics()
     if (this.camerasGate.open(now)) void this.fetchCameras()
-    if (this.pings.silentFor(now) > SILENT_MS) this.link.abandon()
-  }
-
-  private async pingRelay(now: number): Promise<void> {
-    const number = this.pings.sent(now)
-    try {
-      const answer = await this.ping(false)
-      this.pings.answered(number, performance.now())
-      this.relayClock.told(now, performance.now(), answer.relay_time_ns / 1e6)
-      this.answeredMs = performance.now()
-      this.legs.clientRelay = this.pings.rtt
-    } catch {
-      this.pings.dropped(number)
-    }
-  }
-
-  private async pingRobot(now: number): Promise<void> {
-    this.robotPingOut = true
-    try {
-      const answer = await this.ping(true)
-      this.legs.clientRobot = this.robotTrips.add(performance.now() - now)
-      this.legs.relayRobot = answer.robot_rtt_ms
-    } catch {
-      this.robotTrips.reset()
-      this.legs.clientRobot = null
-    } finally {
-      this.robotPingOut = false
-    }
-  }
-
-  private ping(robot: boolean): Promise<{ relay_time_ns: number; robot_rtt_ms: number | null }> {
-    return this.link.call('/relay/ping', 'switchboard_msgs/srv/Ping', { robot }, PING_TIMEOUT_S)
   }
 }

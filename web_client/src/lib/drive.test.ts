@@ -1,10 +1,10 @@
 import { beforeEach, describe, expect, it } from 'vitest'
-import { Drive, FROZEN_MS, PUBLISH_INTERVAL_MS, type StopReason, stopWords, twist, ZERO } from './drive'
+import { Drive, FROZEN_MS, LETTING_GO, type Limits, PUBLISH_INTERVAL_MS, SOURCES, type StopReason, stopWords, twist, ZERO } from './drive'
 import type { Twist } from './types'
 
-const LIMITS = { linear: 0.5, angular: 2 }
 
 let now: number
+let limits: Limits
 let sent: Twist[]
 let open: boolean
 let obstacle: StopReason | null
@@ -13,6 +13,7 @@ let drive: Drive
 
 beforeEach(() => {
   now = 1000
+  limits = { linear: 0.5, angular: 2 }
   sent = []
   open = true
   obstacle = null
@@ -23,7 +24,7 @@ beforeEach(() => {
       return open
     },
     () => obstacle,
-    LIMITS,
+    () => limits,
     (phase, reason) => phases.push([phase, reason]),
   )
 })
@@ -49,9 +50,11 @@ describe('while held', () => {
     expect(sent.length).toBeLessThanOrEqual(40)
   })
 
-  it('publishes at once when the stick first moves', () => {
-    ahead()
-    expect(sent).toEqual([twist(0.5, 0)])
+  it('begins with a zero, and publishes at once when the stick first moves', () => {
+    drive.grab('joystick', now)
+    expect(sent).toEqual([ZERO])
+    drive.steer('joystick', 0, 1, now)
+    expect(sent).toEqual([ZERO, twist(0.5, 0)])
   })
 
   it('never publishes faster than the interval, however often the stick moves', () => {
@@ -61,15 +64,15 @@ describe('while held', () => {
       drive.steer('joystick', 0, 1, now)
       drive.tick(now)
     }
-    expect(sent.length).toBeLessThanOrEqual(Math.ceil(200 / PUBLISH_INTERVAL_MS) + 1)
+    expect(sent.length).toBeLessThanOrEqual(Math.ceil(200 / PUBLISH_INTERVAL_MS) + 2)
   })
 
   it('scales by the limits, and by new limits at once', () => {
     drive.grab('joystick', now)
     drive.steer('joystick', -0.5, 1, now)
-    drive.setLimits({ linear: 1, angular: 1 })
+    limits = { linear: 1, angular: 1 }
     pass(100)
-    expect(sent[0]).toEqual(twist(0.5, -1))
+    expect(sent[1]).toEqual(twist(0.5, -1))
     expect(sent.at(-1)).toEqual(twist(1, -0.5))
   })
 
@@ -120,15 +123,8 @@ describe('release', () => {
   })
 })
 
-const OUTSIDE: StopReason[] = [
-  'pointer_cancelled',
-  'window_left',
-  'page_hidden',
-  'link_late',
-  'link_closed',
-  'not_allowed',
-  'topic_changed',
-]
+const ALL = Object.keys(LETTING_GO) as StopReason[]
+const OUTSIDE = ALL.filter((reason) => reason !== 'released')
 
 describe.each(OUTSIDE)('a stop because of %s', (reason) => {
   it('sends exactly one zero and falls silent', () => {
@@ -151,7 +147,7 @@ describe.each(OUTSIDE)('a stop because of %s', (reason) => {
     drive.release('joystick')
     expect(sent).toEqual([])
     ahead()
-    expect(sent).toEqual([twist(0.5, 0)])
+    expect(sent).toEqual([ZERO, twist(0.5, 0)])
   })
 
   it('sends nothing when nobody drives', () => {
@@ -161,8 +157,42 @@ describe.each(OUTSIDE)('a stop because of %s', (reason) => {
   })
 })
 
+describe.each(SOURCES)('an input that fails in the hand: %s', (source) => {
+  it('ends driving with one zero when it was held', () => {
+    drive.grab(source, now)
+    drive.steer(source, 0, 1, now)
+    sent = []
+    drive.lose(source, 'capture_lost')
+    pass(1000)
+    expect(sent).toEqual([ZERO])
+    expect(phases.at(-1)).toEqual(['idle', 'capture_lost'])
+  })
+
+  it('changes nothing when another one is held', () => {
+    const other = SOURCES.find((each) => each !== source)!
+    drive.grab(other, now)
+    drive.lose(source, 'capture_lost')
+    expect(drive.phase).toBe('driving')
+    expect(drive.isHeld(other)).toBe(true)
+  })
+})
+
+it('obeys the most exact of the inputs that are held', () => {
+  const speeds = [1, 0.75, 0.5, 0.25]
+  SOURCES.forEach((source, i) => {
+    drive.grab(source, now)
+    drive.steer(source, 0, speeds[i]!, now)
+  })
+  for (const [i, source] of SOURCES.entries()) {
+    pass(100)
+    expect(sent.at(-1)).toEqual(twist(0.5 * speeds[i]!, 0))
+    drive.release(source)
+  }
+  expect(sent.at(-1)).toEqual(ZERO)
+})
+
 describe('obstacles', () => {
-  it.each<StopReason>(['link_late', 'link_closed', 'not_allowed'])('%s refuses a new hold', (reason) => {
+  it.each<StopReason>(['link_late', 'link_closed', 'not_allowed', 'control_lost', 'robot_stopped'])('%s refuses a new hold', (reason) => {
     obstacle = reason
     expect(drive.grab('joystick', now)).toBe(reason)
     drive.steer('joystick', 0, 1, now)
@@ -185,7 +215,7 @@ describe('obstacles', () => {
     pass(500)
     open = true
     pass(1000)
-    expect(sent).toEqual([twist(0.5, 0)])
+    expect(sent).toEqual([ZERO, twist(0.5, 0)])
     expect(phases.at(-1)).toEqual(['idle', 'link_closed'])
   })
 })
@@ -210,30 +240,10 @@ describe('a frozen page', () => {
   })
 })
 
-describe('the STOP button', () => {
-  it('sends one zero at once while driving, and lets go', () => {
-    ahead()
-    sent = []
-    expect(drive.stopNow()).toBe(true)
-    pass(1000)
-    expect(sent).toEqual([ZERO])
-    expect(phases.at(-1)).toEqual(['idle', 'stop_button'])
-  })
-
-  it('sends a zero when nobody drives here', () => {
-    expect(drive.stopNow()).toBe(true)
-    expect(sent).toEqual([ZERO])
-  })
-
-  it('says when it could not be sent', () => {
-    open = false
-    expect(drive.stopNow()).toBe(false)
-  })
-})
-
-it('tells the driver of stops that came from outside only', () => {
-  expect(stopWords('released')).toBeNull()
-  for (const reason of ['window_left', 'page_hidden', 'link_late', 'link_closed', 'page_frozen'] as const) {
-    expect(stopWords(reason)).toMatch(/^Stopped: .+\.$/)
+it('tells the driver of stops that came from outside, unless they are told elsewhere', () => {
+  const silent = ['released', 'stop_button', 'not_allowed', 'control_lost']
+  for (const reason of ALL) {
+    if (silent.includes(reason)) expect(stopWords(reason)).toBeNull()
+    else expect(stopWords(reason)).toMatch(/^Stopped: .+\.$/)
   }
 })

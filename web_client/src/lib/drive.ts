@@ -1,4 +1,4 @@
-/** Driving as a state machine: publish while held, one zero on release, then silence.
+/** Driving as a state machine: a zero first, publish while held, one zero on release, then silence.
  *
  * It knows no DOM, no socket and no clock; the page feeds it inputs and ticks.
  */
@@ -8,21 +8,37 @@ export const PUBLISH_INTERVAL_MS = 66
 /** A page that was frozen this long must not go on with what was held before. */
 export const FROZEN_MS = 500
 
-export type Source = 'joystick' | 'keys'
+/** The most exact one first: when several are held it is obeyed. */
+export const SOURCES = ['joystick', 'tilt', 'gamepad', 'keys'] as const
+export type Source = (typeof SOURCES)[number]
 export type Phase = 'idle' | 'driving'
 
-/** Why driving ended. All but `released` let go of every input: it has to be taken hold of again. */
-export type StopReason =
-  | 'released'
-  | 'stop_button'
-  | 'pointer_cancelled'
-  | 'window_left'
-  | 'page_hidden'
-  | 'link_late'
-  | 'link_closed'
-  | 'page_frozen'
-  | 'not_allowed'
-  | 'topic_changed'
+/** Every way driving ends, and what the driver is told of it; null when it needs no words, or others find them.
+ *
+ * All but `released` let go of every input: it has to be taken hold of again.
+ */
+export const LETTING_GO = {
+  released: null,
+  stop_button: null,
+  not_allowed: null,
+  control_lost: null,
+  robot_stopped: 'Stopped: the robot was stopped.',
+  pointer_cancelled: 'Stopped: the touch was taken over by the browser.',
+  capture_lost: 'Stopped: the browser took the pointer away.',
+  several_fingers: 'Stopped: more than one finger was on the screen.',
+  menu_opened: 'Stopped: a menu was opened.',
+  dialog_opened: 'Stopped: a dialog was opened.',
+  window_left: 'Stopped: the window lost the focus.',
+  page_hidden: 'Stopped: the page was hidden.',
+  page_frozen: 'Stopped: the page stood still for too long.',
+  gamepad_gone: 'Stopped: the gamepad is gone.',
+  tilt_silent: 'Stopped: the phone no longer tells how it is held.',
+  link_late: 'Stopped: the link is late. Take hold again when it has recovered.',
+  link_closed: 'Stopped: the connection was lost.',
+  topic_changed: 'Stopped: the command topic was changed.',
+} as const
+
+export type StopReason = keyof typeof LETTING_GO
 
 export interface Limits {
   /** Metres per second. */
@@ -53,21 +69,18 @@ export class Drive {
   /**
    * @param send publishes a command at once, or says it can't
    * @param obstacle asked before every command
+   * @param limits asked for every command
    * @param changed told of every change of phase and its reason
    */
   constructor(
     private readonly send: Sender,
     private readonly obstacle: Obstacle,
-    private limits: Limits,
+    private readonly limits: () => Limits,
     private readonly changed: (phase: Phase, reason: StopReason | null) => void = () => {},
   ) {}
 
   get phase(): Phase {
     return this.phaseNow
-  }
-
-  setLimits(limits: Limits): void {
-    this.limits = limits
   }
 
   /** Takes hold of an input; refused, with the reason, if something stands in the way. */
@@ -81,6 +94,8 @@ export class Drive {
     if (this.phaseNow === 'idle') {
       this.phaseNow = 'driving'
       this.tickedMs = nowMs
+      // The hand begins in the middle: a robot follows only who has let go before (protocol/SPEC.md 2.5).
+      this.send(ZERO)
       this.changed('driving', null)
     }
     return null
@@ -98,15 +113,18 @@ export class Drive {
     if (this.held.delete(source) && this.held.size === 0) this.end('released')
   }
 
+  /** An input failed in the hand: driving ends if it was held. */
+  lose(source: Source, reason: StopReason): void {
+    if (this.held.has(source)) this.end(reason)
+  }
+
+  isHeld(source: Source): boolean {
+    return this.held.has(source)
+  }
+
   /** Ends driving with one zero and lets go of every input. Does nothing when idle. */
   stop(reason: StopReason): void {
     if (this.phaseNow === 'driving') this.end(reason)
-  }
-
-  /** The STOP button: a zero goes out whether driving or not. Returns whether it was sent. */
-  stopNow(): boolean {
-    if (this.phaseNow === 'driving') return this.end('stop_button')
-    return this.send(ZERO)
   }
 
   /** Called often by the page; publishes when it is time to. */
@@ -125,19 +143,19 @@ export class Drive {
   }
 
   private command(): Twist {
-    // The hand on the joystick is more exact than the keys.
-    const stick = this.held.get('joystick') ?? this.held.get('keys') ?? { turn: 0, ahead: 0 }
-    return twist(stick.ahead * this.limits.linear, stick.turn * this.limits.angular)
+    const source = SOURCES.find((each) => this.held.has(each))
+    const stick = (source && this.held.get(source)) ?? { turn: 0, ahead: 0 }
+    const { linear, angular } = this.limits()
+    return twist(stick.ahead * linear, stick.turn * angular)
   }
 
-  private end(reason: StopReason): boolean {
+  private end(reason: StopReason): void {
     this.held.clear()
     this.phaseNow = 'idle'
     this.publishedMs = -Infinity
     this.tickedMs = null
-    const sent = this.send(ZERO)
+    this.send(ZERO)
     this.changed('idle', reason)
-    return sent
   }
 }
 
@@ -156,17 +174,7 @@ export function twist(ahead: number, turn: number): Twist {
 
 export const ZERO: Twist = twist(0, 0)
 
-const REASONS: Partial<Record<StopReason, string>> = {
-  pointer_cancelled: 'Stopped: the touch was taken over by the browser.',
-  window_left: 'Stopped: the window lost the focus.',
-  page_hidden: 'Stopped: the page was hidden.',
-  link_late: 'Stopped: the link is late. Take hold again when it has recovered.',
-  link_closed: 'Stopped: the connection was lost.',
-  page_frozen: 'Stopped: the page stood still for too long.',
-  topic_changed: 'Stopped: the command topic was changed.',
-}
-
 /** What to tell the driver about a stop, or null when it needs no words. */
 export function stopWords(reason: StopReason): string | null {
-  return REASONS[reason] ?? null
+  return LETTING_GO[reason]
 }

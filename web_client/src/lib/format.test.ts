@@ -1,5 +1,20 @@
 import { describe, expect, it } from 'vitest'
-import { ago, bytesPerSecond, hertz, milliseconds, number, people, percent, pretty, sentence } from './format'
+import {
+  ago,
+  bytesPerSecond,
+  count,
+  fileSize,
+  hertz,
+  lasting,
+  milliseconds,
+  moment,
+  number,
+  people,
+  percent,
+  pretty,
+  sentence,
+  stopwatch,
+} from './format'
 
 it('writes numbers with a real minus and without a negative zero', () => {
   expect(number(-1.234, 2)).toBe('−1.23')
@@ -25,6 +40,7 @@ it('says how long ago something was', () => {
     '4 days ago',
   ])
   expect(ago(null, now)).toBe('never')
+  expect([now - 2, now - 40, now - 90_000].map((t) => lasting(t, now))).toEqual(['a moment', '40 s', 'a day'])
 })
 
 it('names people once, and few of them', () => {
@@ -69,4 +85,24 @@ it('writes amounts per second in units people read', () => {
   expect(bytesPerSecond(312_400)).toBe('312 kB/s')
   expect(bytesPerSecond(1_260_000)).toBe('1.3 MB/s')
   expect(bytesPerSecond(25_000_000)).toBe('25 MB/s')
+})
+
+it('writes sizes, spans and large numbers', () => {
+  expect([0, 999, 1000, 1_234_567, 100e6, 999_960_000, 10e9].map(fileSize)).toEqual([
+    '0 B',
+    '999 B',
+    '1 kB',
+    '1.2 MB',
+    '100 MB',
+    '1 GB',
+    '10 GB',
+  ])
+  expect([0, 42.9, 725, 3723, 86_400].map(stopwatch)).toEqual(['0:00', '0:42', '12:05', '1:02:03', '24:00:00'])
+  expect([7, 1234, 1_234_567].map(count)).toEqual(['7', '1\u202f234', '1\u202f234\u202f567'])
+})
+
+it('names the year only where it is another one', () => {
+  const [then, later] = [Date.UTC(2026, 5, 15) / 1000, Date.UTC(2027, 5, 15) / 1000]
+  expect(moment(then, then)).not.toContain('2026')
+  expect(moment(then, later)).toContain('2026')
 })

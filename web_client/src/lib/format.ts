@@ -28,6 +28,41 @@ export function bytesPerSecond(value: number): string {
   return `${(value / 1e6).toFixed(value < 1e7 ? 1 : 0)} MB/s`
 }
 
+/** A size in the units disks are sold in. */
+export function fileSize(bytes: number): string {
+  const units: [number, string][] = [
+    [1e9, 'GB'],
+    [1e6, 'MB'],
+    [1e3, 'kB'],
+  ]
+  for (const [unit, name] of units) {
+    // What would be rounded to 1000 is one of the next unit.
+    if (bytes >= unit * 0.9995) return `${(bytes / unit).toFixed(bytes < unit * 99.95 ? 1 : 0).replace(/\.0$/, '')} ${name}`
+  }
+  return `${bytes} B`
+}
+
+/** A span of time as on a stopwatch: 0:42, 12:05, 1:02:03. */
+export function stopwatch(seconds: number): string {
+  const whole = Math.max(0, Math.floor(seconds))
+  const parts = [Math.floor(whole / 60) % 60, whole % 60]
+  const hours = Math.floor(whole / 3600)
+  const [first, ...rest] = hours > 0 ? [hours, ...parts] : parts
+  return [first, ...rest.map((part) => String(part).padStart(2, '0'))].join(':')
+}
+
+/** A whole number with its thousands set apart. */
+export function count(value: number): string {
+  return String(value).replace(/\B(?=(\d{3})+$)/g, '\u202f')
+}
+
+/** A moment as the calendar says it, with the year where it is another one. Both in Unix seconds. */
+export function moment(then: number, now: number): string {
+  const [at, today] = [new Date(then * 1000), new Date(now * 1000)]
+  const year = at.getFullYear() === today.getFullYear() ? undefined : 'numeric'
+  return at.toLocaleString(undefined, { year, month: 'short', day: 'numeric', hour: 'numeric', minute: '2-digit' })
+}
+
 /** How long ago a moment was, in words. Both in Unix seconds. */
 export function ago(then: number | null, now: number): string {
   if (then === null) return 'never'
@@ -38,6 +73,12 @@ export function ago(then: number | null, now: number): string {
   if (seconds < 86_400) return `${Math.floor(seconds / 3600)} h ago`
   const days = Math.floor(seconds / 86_400)
   return days === 1 ? 'a day ago' : `${days} days ago`
+}
+
+/** For how long something has lasted, in words. Both in Unix seconds. */
+export function lasting(since: number, now: number): string {
+  const words = ago(since, now)
+  return words === 'just now' ? 'a moment' : words.replace(/ ago$/, '')
 }
 
 /** Names in a sentence, each once: "ann, bob and 2 more". */

@@ -1,5 +1,5 @@
 import { expect, it } from 'vitest'
-import { grade, PingTracker, PONG_TIMEOUT_MS, RelayClock } from './latency'
+import { grade, PingTracker, PONG_TIMEOUT_MS, RelayClock, ROBOT_LATE_MS, Silence } from './latency'
 
 it('measures a round trip', () => {
   const pings = new PingTracker()
@@ -63,7 +63,7 @@ it('keeps a bounded number of unanswered pings', () => {
 })
 
 it('grades round trips', () => {
-  expect([20, 150, 400].map(grade)).toEqual(['good', 'fair', 'poor'])
+  expect([20, 99, 100, 299, 300].map(grade)).toEqual(['good', 'good', 'fair', 'fair', 'bad'])
 })
 
 it('knows the relay’s time by the quickest of its latest answers', () => {
@@ -76,4 +76,17 @@ it('knows the relay’s time by the quickest of its latest answers', () => {
   expect(clock.unixMs(6000)).toBe(66_000)
   clock.reset()
   expect(clock.unixMs(0)).toBeNull()
+})
+
+it('takes a robot for late until it answers, however many pings to it fail', () => {
+  const silence = new Silence()
+  expect(silence.isLate(1e6)).toBe(false)
+  silence.sent(1000)
+  expect(silence.isLate(1000 + ROBOT_LATE_MS)).toBe(false)
+  expect(silence.isLate(1001 + ROBOT_LATE_MS)).toBe(true)
+  silence.sent(11_000)
+  expect(silence.isLate(11_000)).toBe(true)
+  silence.over()
+  silence.sent(12_000)
+  expect(silence.isLate(12_100)).toBe(false)
 })

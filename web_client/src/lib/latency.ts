@@ -2,6 +2,9 @@
 
 export const PONG_TIMEOUT_MS = 500
 
+/** A robot from which no answer came for so long may no longer be there. */
+export const ROBOT_LATE_MS = 1500
+
 /** How often to ping while driving and otherwise. */
 export const PING_DRIVING_MS = 200
 export const PING_IDLE_MS = 1000
@@ -88,6 +91,24 @@ export class PingTracker {
   }
 }
 
+/** How long the robot has left the pings to it unanswered; a ping that fails leaves it as silent as it was. */
+export class Silence {
+  private sinceMs: number | null = null
+
+  sent(nowMs: number): void {
+    this.sinceMs ??= nowMs
+  }
+
+  /** It answered, or nobody waits for it any more. */
+  over(): void {
+    this.sinceMs = null
+  }
+
+  isLate(nowMs: number): boolean {
+    return this.sinceMs !== null && nowMs - this.sinceMs > ROBOT_LATE_MS
+  }
+}
+
 /** The relay's clock as seen from the page; of the latest exchanges the quickest is the surest. */
 export class RelayClock {
   private exchanges: { tripMs: number; aheadMs: number }[] = []
@@ -112,10 +133,10 @@ export class RelayClock {
   }
 }
 
-export type Grade = 'good' | 'fair' | 'poor'
+export type Grade = 'good' | 'fair' | 'bad'
 
-/** How a round trip feels for driving. */
+/** How a round trip feels for driving; the relay's words for links (protocol/SPEC.md 1.7) change at the same figures. */
 export function grade(rttMs: number): Grade {
   if (rttMs < 100) return 'good'
-  return rttMs < 250 ? 'fair' : 'poor'
+  return rttMs < 300 ? 'fair' : 'bad'
 }

@@ -5,6 +5,7 @@ it('reads the pages out of the address', () => {
   expect(parse('/')).toEqual({ page: 'fleet' })
   expect(parse('/fleet')).toEqual({ page: 'fleet' })
   expect(parse('/login')).toEqual({ page: 'login' })
+  expect(parse('/alerts')).toEqual({ page: 'alerts' })
   expect(parse('/cockpit/rover-1')).toEqual({ page: 'cockpit', robot: 'rover-1' })
   expect(parse('/cockpit/%E0%A4%A')).toEqual({ page: 'unknown' })
   expect(parse('/elsewhere')).toEqual({ page: 'unknown' })
@@ -18,6 +19,7 @@ it('writes robot names so that they can be read back', () => {
 
 it('goes to a page of the portal after the login, nowhere else', () => {
   expect(afterLogin('?next=%2Fcockpit%2Frover-1')).toBe('/cockpit/rover-1')
+  expect(afterLogin('?next=%2Falerts')).toBe('/alerts')
   for (const next of ['https://evil.example/', '//evil.example/x', 'javascript:alert(1)', '/api/v1/session', '']) {
     expect(afterLogin(`?next=${encodeURIComponent(next)}`)).toBe('/fleet')
   }

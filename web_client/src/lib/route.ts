@@ -3,6 +3,7 @@
 export type Route =
   | { page: 'login' }
   | { page: 'fleet' }
+  | { page: 'alerts' }
   | { page: 'cockpit'; robot: string }
   | { page: 'unknown' }
 
@@ -10,6 +11,7 @@ export function parse(path: string): Route {
   const parts = path.split('/').filter(Boolean)
   if (parts.length === 0 || (parts.length === 1 && parts[0] === 'fleet')) return { page: 'fleet' }
   if (parts.length === 1 && parts[0] === 'login') return { page: 'login' }
+  if (parts.length === 1 && parts[0] === 'alerts') return { page: 'alerts' }
   if (parts.length === 2 && parts[0] === 'cockpit') {
     const robot = decoded(parts[1]!)
     if (robot !== null) return { page: 'cockpit', robot }
@@ -25,6 +27,8 @@ function decoded(text: string): string | null {
   }
 }
 
+export const ALERTS = '/alerts'
+
 export function cockpitPath(robot: string): string {
   return `/cockpit/${encodeURIComponent(robot)}`
 }
@@ -33,6 +37,7 @@ export function cockpitPath(robot: string): string {
 export function afterLogin(search: string): string {
   const next = new URLSearchParams(search).get('next') ?? ''
   const route = parse(next)
+  if (route.page === 'alerts') return ALERTS
   return route.page === 'cockpit' ? cockpitPath(route.robot) : '/fleet'
 }
 

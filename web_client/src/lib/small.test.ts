@@ -56,7 +56,7 @@ const robot = (name: string, state: Robot['state'], description = ''): Robot => 
   description,
   state,
   level: 'viewer',
-  clients: state === 'in_use' ? [{ user: 'ann', since: 0 }] : [],
+  clients: state === 'in_use' ? [{ user: 'ann', since: 0, camera: '' }] : [],
   battery: null,
   rtt_ms: null,
   host: '',

@@ -25,6 +25,11 @@ export function isHeavy(type: string): boolean {
   return HEAVY.has(fullType(type))
 }
 
+/** Whether messages of a type are whole pictures, uncompressed. */
+export function isPicture(type: string): boolean {
+  return fullType(type) === 'sensor_msgs/msg/Image'
+}
+
 /** Topics of some types, in the order of the types, then by the shortest name. */
 export function ofType(topics: TopicInfo[], types: string[]): TopicInfo[] {
   return topics

@@ -13,6 +13,51 @@ export interface Client {
   user: string
   /** Unix seconds. */
   since: number
+  /** What is watched; empty for who works with the robot. */
+  camera: string
+}
+
+/** How good a link is, in a word: of the last seconds. */
+export type Quality = 'good' | 'fair' | 'bad' | 'lost'
+
+export interface LinkFacts {
+  rtt_ms: number | null
+  p95_ms: number | null
+  jitter_ms: number | null
+  lost: number | null
+  quality: Quality | null
+}
+
+export interface Connection {
+  client: number
+  /** Unix seconds. */
+  since: number
+  you: boolean
+  control: boolean
+  rtt_ms: number | null
+  quality: Quality | null
+  drops: number
+  /** Null for all but owners. */
+  address: string | null
+}
+
+export interface Person {
+  user: string
+  you: boolean
+  control: boolean
+  connections: Connection[]
+  watching: { camera: string; since: number }[]
+}
+
+/** A camera's stream as it is shown now. */
+export interface Stream {
+  camera: string
+  codec: string
+  viewers: number
+  width?: number | null
+  height?: number | null
+  quality?: number | null
+  fps?: number | null
 }
 
 export interface Robot {
@@ -24,6 +69,10 @@ export interface Robot {
   /** 0 to 1. */
   battery: number | null
   rtt_ms: number | null
+  quality?: Quality | null
+  /** Who has control. */
+  holder?: string | null
+  stopped?: { by: string; why: string } | null
   host: string
   platform: string
   distro: string
@@ -37,7 +86,12 @@ export interface RelayStatus {
   level: Level
   clients: Client[]
   rtt_ms: { relay_robot: number | null }
+  links?: Partial<Record<'client_relay' | 'relay_robot' | 'client_robot', LinkFacts>>
+  people?: Person[]
+  /** Connections and cameras beside those that are told. */
+  more?: number
   drops: number
+  video?: Stream[]
   motion?: { topics: string[]; types: string[]; deadline_ms: number; stop_within_ms: number }
   health?: Partial<Health>
 }
@@ -50,6 +104,49 @@ export interface Health {
   stale_commands: number
   watchdog_stops: number
   dropped_samples: number
+}
+
+export type RecordingState = 'recording' | 'finishing' | 'complete' | 'incomplete' | 'recovered'
+
+export interface Recording {
+  id: string
+  user: string
+  topics: string[]
+  cameras: string[]
+  /** Unix seconds. */
+  begun: number
+  /** Seconds it has taken; null while nobody knows. */
+  lasted: number | null
+  state: RecordingState
+  reason: string
+  /** It may take. */
+  seconds: number
+  /** The file may have. */
+  megabytes: number
+  /** Of the file. */
+  bytes: number
+  messages: number
+  drops: number
+  problems: string[]
+}
+
+/** What could be recorded of a robot now. */
+export interface Possible {
+  topics: string[]
+  cameras: string[]
+  /** Why it is nothing at all; may be empty. */
+  denied: string
+  /** What all recordings of the relay may have together. */
+  megabytes: number
+  /** How much of that is left. */
+  left: number
+}
+
+export interface RecordingAsk {
+  topics: string[]
+  cameras: string[]
+  seconds: number
+  megabytes: number
 }
 
 export interface TopicInfo {

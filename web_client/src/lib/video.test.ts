@@ -4,6 +4,7 @@ import { videoEnding } from './closing'
 import { codecName, h264Missing } from './h264'
 import {
   age,
+  type Close,
   fileName,
   missedAfter,
   MOST_PANES,
@@ -73,6 +74,7 @@ it('says in words why a camera’s pictures ended', () => {
     after: 'give_up',
     words: 'You have no right to view this camera. Revoked by admin.',
   })
+  expect(videoEnding(4404, 'there is no such camera').words).toBe('There is no camera of this name for you.')
   expect(videoEnding(4401, 'x').after).toBe('login')
   for (const code of [4400, 4404, 4429]) expect(videoEnding(code, '').after).toBe('give_up')
   for (const code of [1001, 1006, 1011, 4408, 4503, 4999]) expect(videoEnding(code, '').after).toBe('retry')
@@ -116,7 +118,7 @@ function opened(picture: (header: PictureHeader) => Promise<void> = () => Promis
   const sockets: FakeSocket[] = []
   const states: [string, number | null][] = []
   const events = {
-    state: (state: string, _why: unknown, code: number | null) => states.push([state, code]),
+    state: (state: string, _why: unknown, close: Close | null) => states.push([state, close?.code ?? null]),
     playing: vi.fn(),
     picture: vi.fn(picture),
   }

@@ -131,9 +131,11 @@ export function fileName(robot: string, camera: string, stamp: number): string {
 /** A connection on which nothing comes for so long is dialled anew; the relay ends one without pictures earlier. */
 export const SILENT_MS = 15_000
 
+export type Close = Pick<CloseEvent, 'code' | 'reason'>
+
 export interface VideoEvents {
-  /** @param code of the close, when it is one */
-  state(state: LinkState, why: Ending | null, code: number | null): void
+  /** @param close when it is one: its code, and the relay's own words */
+  state(state: LinkState, why: Ending | null, close: Close | null): void
   playing(playing: Playing): void
   /** Resolves when the picture is on the screen or given up; the next one comes after that. */
   picture(header: PictureHeader, body: ArrayBuffer): Promise<void>
@@ -208,17 +210,17 @@ export class VideoLink {
     }, SILENT_MS)
   }
 
-  private closed(socket: WebSocket, event: Pick<CloseEvent, 'code' | 'reason'>): void {
+  private closed(socket: WebSocket, close: Close): void {
     if (socket !== this.socket) return
     this.socket = null
     clearTimeout(this.silence)
-    const why = videoEnding(event.code, event.reason)
-    this.become(why.after === 'retry' ? 'waiting' : 'ended', why, event.code)
+    const why = videoEnding(close.code, close.reason)
+    this.become(why.after === 'retry' ? 'waiting' : 'ended', why, close)
     if (why.after === 'retry') this.retry = setTimeout(() => this.open(), pause(this.attempt++, Math.random()))
   }
 
-  private become(state: LinkState, why: Ending | null = null, code: number | null = null): void {
+  private become(state: LinkState, why: Ending | null = null, close: Close | null = null): void {
     this.stateNow = state
-    this.events.state(state, why, code)
+    this.events.state(state, why, close)
   }
 }

@@ -1,0 +1,130 @@
+import { describe, expect, it } from 'vitest'
+import {
+  byAnyWay,
+  type Control,
+  type Holder,
+  holderBadge,
+  isYours,
+  type Request,
+  secondsLeft,
+  sentenceOf,
+  standing,
+  topOf,
+  whoMayResume,
+  whyLost,
+  within,
+} from './control'
+
+const holder = (user: string, you = false): Holder => ({ user, client: 7, since: 1000, you })
+const request = (user: string, you = false): Request => ({ ...holder(user, you), why: '', until: 1030 })
+
+function control(more: Partial<Control> = {}): Control {
+  const you = { client: 3, may_control: true, may_resume: false }
+  const state = more.request ? 'requested' : more.holder ? 'held' : 'free'
+  return { robot: 'r', state, holder: null, request: null, stopped: null, moving: false, limits: {}, you, ...more }
+}
+
+const stands = (told: Control | null, level: 'operator' | 'owner' = 'operator', now = 1010) =>
+  standing(told, 'ann', level, now)
+
+describe('how one stands to control', () => {
+  it.each([
+    [null, 'unknown'],
+    [control(), 'free'],
+    [control({ holder: holder('ann', true) }), 'yours'],
+    [control({ holder: holder('ann', true), request: request('bob') }), 'asked'],
+    [control({ holder: holder('bob') }), 'held'],
+    [control({ holder: holder('bob'), request: request('eve') }), 'held'],
+    [control({ holder: holder('ann') }), 'elsewhere'],
+    [control({ holder: holder('bob'), request: request('ann', true) }), 'waiting'],
+  ] as const)('%#', (told, expected) => {
+    expect(stands(told)).toBe(expected)
+  })
+
+  it('an owner who got no answer may take over, an operator goes on waiting', () => {
+    const told = control({ holder: holder('bob'), request: request('ann', true) })
+    expect(stands(told, 'owner', 1029)).toBe('waiting')
+    expect(stands(told, 'owner', 1030)).toBe('ripe')
+    expect(stands(told, 'operator', 1030)).toBe('waiting')
+  })
+
+  it('only this connection’s own control counts as one’s own', () => {
+    expect(isYours(null)).toBe(false)
+    expect(isYours(control({ holder: holder('ann') }))).toBe(false)
+    expect(isYours(control({ holder: holder('ann', true) }))).toBe(true)
+  })
+})
+
+describe('the words', () => {
+  const words = (told: Control | null, now = 1010) => sentenceOf(told, stands(told, 'owner', now), now)
+
+  it('say who has control and who wants it', () => {
+    expect(words(null)).toBe('Waiting to hear who has control.')
+    expect(words(control())).toBe('Nobody has control.')
+    expect(words(control({ holder: holder('ann', true), request: request('bob') }))).toContain('bob asks for it')
+    expect(words(control({ holder: holder('bob'), request: request('eve') }))).toBe('bob has control, eve asks for it.')
+    expect(words(control({ holder: holder('ann') }))).toBe('You have control in another window.')
+  })
+
+  it('say whether the holder can still answer', () => {
+    const told = control({ holder: holder('bob'), request: request('ann', true) })
+    expect(words(told)).toBe('You have asked bob for control.')
+    expect(words(told, 1030)).toBe('bob has not answered. You may take over.')
+    expect(sentenceOf(told, 'waiting', 1031)).toBe('bob has not answered yet.')
+    expect(secondsLeft(told.request!, 1010.2)).toBe(20)
+    expect(secondsLeft(told.request!, 2000)).toBe(0)
+  })
+
+  it('say why control is gone', () => {
+    expect(whyLost(control({ holder: holder('bob') }), false)).toBe('bob has control now.')
+    expect(whyLost(control(), false)).toContain('It is free')
+    expect(whyLost(control(), true)).toContain('robot’s link')
+  })
+
+  it('say who can resume', () => {
+    expect(whoMayResume(control())).toContain('owner')
+    expect(whoMayResume(control({ holder: holder('bob') }))).toContain('bob')
+  })
+
+  it('of the top bar are short, and none when control is free', () => {
+    expect(holderBadge(null)).toBeNull()
+    expect(holderBadge(control())).toBeNull()
+    expect(holderBadge(control({ holder: holder('ann', true) }))).toBe('You have control')
+    expect(holderBadge(control({ holder: holder('bob') }))).toBe('bob has control')
+  })
+})
+
+describe('limits', () => {
+  const told = control({ limits: { operator: { linear: 0.4, angular: null }, owner: {} } })
+
+  it('are those of one’s level', () => {
+    expect(topOf(told, 'operator')).toEqual({ linear: 0.4, angular: null })
+    expect(topOf(told, 'owner')).toEqual({ linear: null, angular: null })
+    expect(topOf(told, null)).toEqual({ linear: null, angular: null })
+    expect(topOf(null, 'owner')).toEqual({ linear: null, angular: null })
+  })
+
+  it('hold what was chosen down, and leave the rest', () => {
+    expect(within({ linear: 1, angular: 2 }, topOf(told, 'operator'))).toEqual({ linear: 0.4, angular: 2 })
+  })
+
+  it('that make no sense are none', () => {
+    const odd = control({ limits: { operator: { linear: Number.NaN, angular: -1 } } })
+    expect(topOf(odd, 'operator')).toEqual({ linear: null, angular: null })
+  })
+})
+
+describe('an order that goes by several ways', () => {
+  const refused = (error: unknown) => error instanceof TypeError
+
+  it('is done when one of them does it, whatever becomes of the others', async () => {
+    const never = new Promise<string>(() => {})
+    expect(await byAnyWay([never, Promise.reject(new Error('no')), Promise.resolve('done')], refused)).toBe('done')
+  })
+
+  it('that all fail is told in the words that say most', async () => {
+    const ways = [Promise.reject(new Error('no connection')), Promise.reject(new TypeError('not yours'))]
+    await expect(byAnyWay(ways, refused)).rejects.toThrow('not yours')
+    await expect(byAnyWay([Promise.reject(new Error('no connection'))], refused)).rejects.toThrow('no connection')
+  })
+})

@@ -1,0 +1,56 @@
+/** What the browser does to a page that drives: each of these ends driving, whatever is held. */
+import type { StopReason } from './drive'
+
+type Where = 'window' | 'document'
+
+interface Sign {
+  where: Where
+  event: string
+  /** Why it ends driving; null when it does not after all. */
+  reason: (event: Event) => StopReason | null
+  /** Heard on its way down: it does not bubble, or what is below could end it. */
+  down?: true
+}
+
+const always = (reason: StopReason) => () => reason
+
+export const SIGNS: readonly Sign[] = [
+  { where: 'window', event: 'blur', reason: always('window_left') },
+  { where: 'window', event: 'pagehide', reason: always('page_hidden') },
+  { where: 'window', event: 'offline', reason: always('link_closed') },
+  { where: 'window', event: 'pointercancel', reason: always('pointer_cancelled'), down: true },
+  { where: 'window', event: 'touchstart', reason: (event) => (fingers(event) > 1 ? 'several_fingers' : null), down: true },
+  { where: 'window', event: 'beforetoggle', reason: (event) => (opens(event) ? 'dialog_opened' : null), down: true },
+  // A finger that rests on the joystick asks for a menu on some systems; the joystick declines.
+  { where: 'window', event: 'contextmenu', reason: (event) => (event.defaultPrevented ? null : 'menu_opened') },
+  { where: 'document', event: 'visibilitychange', reason: (event) => (isHidden(event) ? 'page_hidden' : null) },
+  { where: 'document', event: 'freeze', reason: always('page_frozen') },
+]
+
+function opens(event: Event): boolean {
+  return (event as ToggleEvent).newState === 'open'
+}
+
+function isHidden(event: Event): boolean {
+  return (event.target as Document | null)?.hidden === true
+}
+
+function fingers(event: Event): number {
+  return (event as TouchEvent).touches?.length ?? 0
+}
+
+/** Calls `stop` at each sign until the returned function is called. */
+export function watchLettingGo(
+  places: Record<Where, EventTarget>,
+  stop: (reason: StopReason) => void,
+): () => void {
+  const ends = SIGNS.map(({ where, event: name, reason, down = false }) => {
+    const heard = (event: Event) => {
+      const why = reason(event)
+      if (why !== null) stop(why)
+    }
+    places[where].addEventListener(name, heard, { capture: down, passive: true })
+    return () => places[where].removeEventListener(name, heard, { capture: down })
+  })
+  return () => ends.forEach((end) => end())
+}

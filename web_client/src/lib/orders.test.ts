@@ -1,0 +1,81 @@
+import { describe, expect, it } from 'vitest'
+import { after, Lines, NOTHING_YET, type Order, orderOf, stopWords, table, targets, unmatchedWords } from './orders'
+
+const ANSWER =
+  '{"do":"stop","robots":["a","b"]}\n{"robot":"b","ok":true,"message":"","values":null,"pending":true,"seconds":0.1}\n' +
+  '{"robot":"a","ok":false,"message":"no","values":null,"pending":false,"seconds":1}\n' +
+  '{"done":true,"robots":2,"ok":1,"failed":1,"seconds":1}\n'
+
+describe('the answer', () => {
+  it.each([1, 7, 1000])('is read in pieces of %d characters', (size) => {
+    const lines = new Lines()
+    let progress = NOTHING_YET
+    for (let i = 0; i < ANSWER.length; i += size) {
+      for (const line of lines.take(ANSWER.slice(i, i + size))) progress = after(progress, line)
+    }
+    expect(progress.done).toBe(true)
+    expect(progress.meant).toEqual(['a', 'b'])
+    expect(table(progress).map(({ robot, result }) => [robot, result?.ok])).toEqual([
+      ['a', false],
+      ['b', true],
+    ])
+  })
+
+  it('that breaks off is not whole, and tells of whom nothing is known', () => {
+    const lines = new Lines()
+    const progress = lines.take(ANSWER.split('\n').slice(0, 2).join('\n') + '\n{"robot":"a"').reduce(after, NOTHING_YET)
+    expect(progress.done).toBe(false)
+    expect(table(progress).map(({ result }) => result === null)).toEqual([true, false])
+  })
+
+  it('tells what of the order means no robot', () => {
+    const words = (unmatched: unknown) => unmatchedWords(after(NOTHING_YET, { do: 'stop', robots: ['a'], unmatched }))
+    expect(words(['rovr-2'])).toBe('No robot of yours is meant by rovr-2.')
+    expect(words(['b', 'group:c', 3])).toBe('No robot of yours is meant by b, group:c.')
+    expect(words([])).toBe('')
+    expect(words(undefined)).toBe('')
+  })
+
+  it('passes over what it does not know', () => {
+    const found = new Lines().take('\n[1]\nnonsense\n3\n{"new":1}\n')
+    expect(found.reduce(after, NOTHING_YET)).toEqual(NOTHING_YET)
+  })
+})
+
+it('takes names apart as people write them, each once', () => {
+  expect(targets(' a, b*  group:cleaners\na ')).toEqual(['a', 'b*', 'group:cleaners'])
+})
+
+describe('the form', () => {
+  const form = { do: 'call', name: ' /start ', type: '', body: '', why: '' } as const
+
+  it('makes an order of each kind', () => {
+    expect(orderOf(['a'], form)).toEqual({ robots: ['a'], do: 'call', service: '/start', args: {} })
+    expect(orderOf(['a'], { ...form, do: 'stop', why: ' fire ' })).toEqual({ robots: ['a'], do: 'stop', why: 'fire' })
+    expect(orderOf(['a'], { ...form, do: 'publish', type: 'std_msgs/Empty' })).toMatchObject({
+      topic: '/start',
+      type: 'std_msgs/Empty',
+      msg: {},
+    } satisfies Partial<Order>)
+    expect(orderOf(['a'], { ...form, do: 'set', body: '"fast"' })).toMatchObject({ name: '/start', value: 'fast' })
+  })
+
+  it('says what is missing', () => {
+    expect(orderOf([], form)).toContain('Choose robots')
+    expect(orderOf(Array.from({ length: 65 }, (_, i) => `r${i}`), form)).toContain('At most 64')
+    expect(orderOf(['a'], { ...form, name: ' ' })).toBe('Which service?')
+    expect(orderOf(['a'], { ...form, body: '{' })).toBe('That is no JSON.')
+    expect(orderOf(['a'], { ...form, do: 'set' })).toBe('Which value?')
+  })
+})
+
+it('says what became of a stop: who is stopped, who will be, and who may not be', () => {
+  const result = (robot: string, ok: boolean, pending = false) => ({ robot, ok, message: '', values: null, pending, seconds: 0 })
+  const words = (...results: ReturnType<typeof result>[]) => stopWords({ ...NOTHING_YET, meant: ['a', 'b'], results, done: true })
+  expect(words(result('a', true), result('b', true))).toEqual({ kind: 'info', words: '2 robots are stopped.' })
+  expect(words(result('a', true), result('b', true, true)).words).toBe(
+    '1 robot is stopped. 1 robot is away, and will be stopped when back.',
+  )
+  expect(words(result('a', true), result('b', false))).toEqual({ kind: 'error', words: 'Not confirmed to be stopped: b.' })
+  expect(words(result('a', true)).kind).toBe('error')
+})

@@ -1,0 +1,135 @@
+/** One order to many robots: what is asked, and the lines of the answer (protocol/SPEC.md 1.11). */
+import { people } from './format'
+
+export type Do = 'stop' | 'resume' | 'call' | 'publish' | 'set'
+
+export interface Order {
+  robots: string[]
+  do: Do
+  service?: string
+  topic?: string
+  type?: string
+  args?: unknown
+  msg?: unknown
+  name?: string
+  value?: unknown
+  why?: string
+}
+
+export interface Result {
+  robot: string
+  ok: boolean
+  message: string
+  values: unknown
+  pending: boolean
+  seconds: number
+}
+
+export interface Progress {
+  /** All that are meant; null before the relay told them. */
+  meant: string[] | null
+  /** What of the order means no robot. */
+  unmatched: string[]
+  results: Result[]
+  /** Whether the answer came whole. */
+  done: boolean
+}
+
+export const NOTHING_YET: Progress = { meant: null, unmatched: [], results: [], done: false }
+
+/** The lines of an answer as they come, in whatever pieces. */
+export class Lines {
+  private rest = ''
+
+  /** The whole lines that a piece completes; a line that is no object is passed over. */
+  take(text: string): object[] {
+    const parts = (this.rest + text).split('\n')
+    this.rest = parts.pop() ?? ''
+    return parts.flatMap((part) => parsed(part))
+  }
+}
+
+function parsed(text: string): object[] {
+  if (text.trim() === '') return []
+  try {
+    const value: unknown = JSON.parse(text)
+    return typeof value === 'object' && value !== null && !Array.isArray(value) ? [value] : []
+  } catch {
+    return []
+  }
+}
+
+/** What is known after one more line. */
+export function after(progress: Progress, line: object): Progress {
+  const { robots, unmatched, robot, done } = line as Record<'robots' | 'unmatched' | 'robot' | 'done', unknown>
+  if (done === true) return { ...progress, done: true }
+  if (typeof robot === 'string') return { ...progress, results: [...progress.results, line as Result] }
+  if (Array.isArray(robots)) return { ...progress, meant: words(robots), unmatched: words(unmatched) }
+  return progress
+}
+
+function words(list: unknown): string[] {
+  return Array.isArray(list) ? list.filter((each) => typeof each === 'string') : []
+}
+
+/** What of an order means no robot, in a sentence; empty where all of it means some. */
+export function unmatchedWords({ unmatched }: Progress): string {
+  return unmatched.length === 0 ? '' : `No robot of yours is meant by ${people(unmatched, 5)}.`
+}
+
+/** What became of each robot that is meant: its result, or null while there is none. */
+export function table({ meant, results }: Progress): { robot: string; result: Result | null }[] {
+  const found = new Map(results.map((result) => [result.robot, result]))
+  const names = meant ?? [...found.keys()]
+  return names.map((robot) => ({ robot, result: found.get(robot) ?? null }))
+}
+
+/** Names, patterns and groups, as people write them: apart by commas or spaces. */
+export function targets(text: string): string[] {
+  return Array.from(new Set(text.split(/[\s,]+/).filter(Boolean)))
+}
+
+export interface Form {
+  do: Do
+  /** Name of the service, topic or parameter. */
+  name: string
+  type: string
+  /** JSON. */
+  body: string
+  why: string
+}
+
+/** The order a form asks for, or what is missing in words. */
+export function orderOf(robots: string[], form: Form): Order | string {
+  if (robots.length === 0) return 'Choose robots, or write their names or a pattern.'
+  if (robots.length > 64) return 'At most 64 names and patterns go into one order.'
+  const base: Order = { robots, do: form.do, ...(form.why.trim() === '' ? {} : { why: form.why.trim() }) }
+  if (form.do === 'stop' || form.do === 'resume') return base
+  const name = form.name.trim()
+  if (name === '') return { call: 'Which service?', publish: 'Which topic?', set: 'Which parameter?' }[form.do]
+  let body: unknown
+  try {
+    body = JSON.parse(form.body.trim() || (form.do === 'set' ? 'null' : '{}'))
+  } catch {
+    return 'That is no JSON.'
+  }
+  if (form.do === 'set') return form.body.trim() === '' ? 'Which value?' : { ...base, name, value: body }
+  const type = form.type.trim()
+  const typed = { ...base, ...(type === '' ? {} : { type }) }
+  return form.do === 'call' ? { ...typed, service: name, args: body } : { ...typed, topic: name, msg: body }
+}
+
+/** What became of an order to stop, in a sentence. */
+export function stopWords(progress: Progress): { kind: 'info' | 'error'; words: string } {
+  const rows = table(progress)
+  const failed = rows.filter(({ result }) => result?.ok !== true).map(({ robot }) => robot)
+  if (failed.length > 0) return { kind: 'error', words: `Not confirmed to be stopped: ${people(failed, 5)}.` }
+  const later = rows.filter(({ result }) => result?.pending === true).length
+  const now = rows.length - later
+  const robots = (count: number) => (count === 1 ? '1 robot is' : `${count} robots are`)
+  const sentences = [
+    now > 0 || later === 0 ? `${robots(now)} stopped.` : '',
+    later > 0 ? `${robots(later)} away, and will be stopped when back.` : '',
+  ]
+  return { kind: 'info', words: sentences.filter(Boolean).join(' ') }
+}
