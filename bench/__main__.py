@@ -24,7 +24,10 @@ MEASUREMENTS = {
     "crowd": "fifty clients of mixed speed, and one that breaks every rule",
     "soak": "a minute of load: nothing is lost",
     "video": "cameras: what viewers cost, how old a picture is, slow beside fast",
+    "browser": "cameras in a browser: how old the picture on the page is",
     "standstill": "from a fault to standstill",
+    "control": "twenty clients race for control; how long it takes to hand over",
+    "stopping": "from anybody's stop to standstill, under full load",
 }
 
 
@@ -48,6 +51,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("names", nargs="*", metavar="measurement", choices=[*MEASUREMENTS, []])
     parser.add_argument("--quick", action="store_true", help="tiny counts: does it run? figures say nothing")
     parser.add_argument("--seconds", type=float, help="length of 'crowd' and 'soak'")
+    parser.add_argument("--runs", type=int, help="of each fault, of the race, of stops (50, 1000, 200)")
     parser.add_argument(
         "--json",
         type=Path,
@@ -77,7 +81,7 @@ def main() -> int:
     """Measure and tell; the code is 1 when a measurement failed, not when a bar is missed."""
     asked = arguments()
     target = asked.json or (None if asked.quick else RESULTS / "latest.json")
-    options, measured = Options(asked.quick, asked.seconds), commit()
+    options, measured = Options(asked.quick, asked.seconds, asked.runs), commit()
     rows: list[Row] = []
     missing: dict[str, str] = {}
     print(

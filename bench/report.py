@@ -28,10 +28,12 @@ class Options:
 
     :param quick: tiny counts, to see that everything works; the figures say nothing
     :param seconds: length of the long measurements, where one was asked for
+    :param runs: how often the same is done over, where that was asked for
     """
 
     quick: bool = False
     seconds: float | None = None
+    runs: int | None = None
 
     def pick(self, quick: float, full: float) -> float:
         """One of two amounts."""

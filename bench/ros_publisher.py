@@ -1,35 +1,26 @@
 """A ROS 2 node that publishes numbered messages at steady rates. Started by the measurements, as a process.
 
-Argument: JSON, a list of {"topic", "kind" ("string", "scan", "cloud" or "image"), "rate" (per second), "size" (bytes;
-of an image the width in pixels, 16 to 9)}.
+Argument: JSON, a list of {"topic", "kind" ("string", "scan" or "cloud"), "rate" (per second), "size" (bytes)}.
 Prints READY; a line on the standard input is answered by the numbers published so far, as JSON. Ends with it. Each
 message begins with ``#<number>@<monotonic nanoseconds>``, in ``data`` or in the header's ``frame_id``.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
-import math
 import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
-import cv2
 import numpy
 import rclpy
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Image, LaserScan, PointCloud2, PointField
+from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 from std_msgs.msg import String
 
-from robot_client.sim.camera import Camera
-from robot_client.sim.worlds import WORLDS
-
 BEAMS = 1080
-PICTURES = 30
-"""Different ones of a camera; then they begin anew."""
 
 
 def maker(kind: str, size: int) -> tuple[type, Callable[[str], Any]]:
@@ -42,9 +33,6 @@ def maker(kind: str, size: int) -> tuple[type, Callable[[str], Any]]:
         scan.ranges = noise.uniform(0.2, 30, BEAMS).astype("f4").tolist()
         scan.intensities = noise.uniform(0, 255, BEAMS).astype("f4").tolist()
         return LaserScan, lambda mark: marked(scan, mark)
-    if kind == "image":
-        pictures = itertools.cycle([image(each / PICTURES, size) for each in range(PICTURES)])
-        return Image, lambda mark: marked(next(pictures), mark)
     points = size // 16
     cloud = PointCloud2(height=1, width=points, point_step=16, row_step=16 * points, is_dense=True)
     cloud.fields = [
@@ -52,20 +40,6 @@ def maker(kind: str, size: int) -> tuple[type, Callable[[str], Any]]:
     ]
     cloud.data = noise.normal(scale=5, size=4 * points).astype("f4").tobytes()
     return PointCloud2, lambda mark: marked(cloud, mark)
-
-
-def image(turn: float, width: int) -> Image:
-    """What a robot sees that swings to and fro.
-
-    :param turn: 0 to 1, of one swing
-    """
-    world = WORLDS["default"]()
-    pose = world.start._replace(heading=0.3 * math.sin(math.tau * turn))
-    height = width * 9 // 16
-    pixels = cv2.resize(Camera(world).render(pose, 0.0, 0.0)[60:420], (width, height))
-    message = Image(encoding="bgr8", width=width, height=height, step=3 * width)
-    message.data.frombytes(pixels.tobytes())
-    return message
 
 
 def marked(message: Any, mark: str) -> Any:

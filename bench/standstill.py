@@ -1,94 +1,224 @@
 """How long a robot moves on after something has broken, by its own record, in milliseconds.
 
-A real relay, daemon and simulated robot, driven in circles through proxies that can be broken.
+A real relay, daemon and simulated robot, driven in circles through proxies that can be broken. Each command says when
+it was sent, so the record tells as well whether any was carried out too late. After each fault everything heals, and
+what was held up arrives: the robot must not move by it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from switchboard_drive import LIMIT_MS, SIM_STEP_MS, Drive
-from switchboard_threads import Driver
 
-from bench.report import Options, Row
+from bench.driving import DriverProcess, TimedDriver, ages_ms, connected
+from bench.report import Options, Row, Unavailable
+from bench.tab import FAULTS as tab_faults
+from bench.tab import Tab, struck
 
-Fault = Callable[[Drive, Driver], None]
-Repair = Callable[[Drive], None]
+HELD_BACK = 0.6
+"""Seconds until what is held up by a fault is older than any command may be."""
+
+Strike = Callable[[Drive, Any], None]
+Heal = Callable[[Drive], None]
 
 
 def _nothing(drive: Drive) -> None:
     """Heals by itself."""
 
 
-FAULTS: dict[str, tuple[Fault, Repair]] = {
-    "client goes silent": (lambda drive, driver: driver.stop(), _nothing),
-    "client link: black hole": (
-        lambda drive, driver: drive.client_side.black_hole(),
-        lambda drive: drive.client_side.heal(),
+def _client_heals(drive: Drive) -> None:
+    drive.client_side.heal()
+
+
+def _robot_heals(drive: Drive) -> None:
+    drive.robot_side.heal()
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that breaks.
+
+    :param strike: breaks it; takes the drive and the driver
+    :param heal: mends it
+    :param process: whether the driver must be a process of its own
+    :param goes_on: whether the driver may rightly go on when it is mended
+    """
+
+    name: str
+    strike: Strike
+    heal: Heal = _nothing
+    process: bool = False
+    goes_on: bool = False
+
+
+FAULTS = (
+    Fault("client goes silent", lambda drive, driver: driver.fall_silent()),
+    Fault("client killed (SIGKILL)", lambda drive, driver: driver.popen.kill(), process=True),
+    Fault(
+        "client frozen (SIGSTOP)",
+        lambda drive, driver: driver.popen.send_signal(signal.SIGSTOP),
+        process=True,
+        goes_on=True,
     ),
-    "client link: reset": (lambda drive, driver: drive.client_side.reset(), _nothing),
-    "robot link: black hole": (
-        lambda drive, driver: drive.robot_side.black_hole(),
-        lambda drive: drive.robot_side.heal(),
+    Fault("client link: black hole", lambda drive, driver: drive.client_side.black_hole(), _client_heals),
+    Fault(
+        "client link: client to relay only",
+        lambda drive, driver: drive.client_side.forward_up.clear(),
+        _client_heals,
     ),
-    "robot link: relay to robot only": (
+    Fault(
+        "client link: relay to client only",
+        lambda drive, driver: drive.client_side.forward_down.clear(),
+        _client_heals,
+    ),
+    Fault("client link: reset", lambda drive, driver: drive.client_side.reset()),
+    Fault("robot link: black hole", lambda drive, driver: drive.robot_side.black_hole(), _robot_heals),
+    Fault(
+        "robot link: relay to robot only",
         lambda drive, driver: drive.robot_side.forward_down.clear(),
-        lambda drive: drive.robot_side.heal(),
+        _robot_heals,
     ),
-    "robot link: reset": (lambda drive, driver: drive.robot_side.reset(), _nothing),
-    "relay frozen (SIGSTOP)": (
-        lambda drive, driver: drive.relay.freeze(),
-        lambda drive: drive.relay.thaw(),
+    Fault(
+        "robot link: robot to relay only",
+        lambda drive, driver: drive.robot_side.forward_up.clear(),
+        _robot_heals,
     ),
-    "relay killed (SIGKILL)": (lambda drive, driver: drive.relay.kill(), lambda drive: drive.relay.start()),
-    "daemon frozen (SIGSTOP)": (
+    Fault("robot link: reset", lambda drive, driver: drive.robot_side.reset()),
+    Fault(
+        "relay frozen (SIGSTOP)", lambda drive, driver: drive.relay.freeze(), lambda drive: drive.relay.thaw()
+    ),
+    Fault(
+        "relay killed (SIGKILL)", lambda drive, driver: drive.relay.kill(), lambda drive: drive.relay.start()
+    ),
+    Fault(
+        "daemon frozen (SIGSTOP)",
         lambda drive, driver: drive.robot.daemon.signal(signal.SIGSTOP),
         lambda drive: drive.robot.daemon.signal(signal.SIGCONT),
     ),
-    "daemon killed (SIGKILL)": (
+    Fault(
+        "daemon killed (SIGKILL)",
         lambda drive, driver: drive.robot.daemon.kill(),
         lambda drive: drive.robot.start_daemon(),
     ),
-}
+)
+
+
+@dataclass
+class Tally:
+    """What all runs together have shown.
+
+    :ivar ages: of all commands that were carried out, milliseconds
+    :ivar moved: runs in which the robot moved again by itself
+    """
+
+    ages: list[float]
+    moved: int = 0
 
 
 def run(options: Options) -> list[Row]:
     """All faults in turn, some times each; the worst counts."""
-    names = list(FAULTS)[: 1 if options.quick else None]
-    runs = int(options.pick(1, 4))
+    runs = options.runs or int(options.pick(1, 50))
+    faults = FAULTS[:1] if options.quick else FAULTS
+    tally = Tally([])
     rows = []
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         drive = Drive(Path(folder))
         try:
-            for name in names:
-                times = [_once(drive, *FAULTS[name]) for _ in range(runs)]
-                print(f"    {name}: {', '.join(f'{each:.0f}' for each in times)} ms", flush=True)
-                rows.append(
-                    Row(
-                        "standstill",
-                        f"standstill, worst of {runs}: {name}",
-                        "ms",
-                        max(times),
-                        bar=LIMIT_MS + SIM_STEP_MS,
-                        note=f"{name}: median {statistics.median(times):.0f} ms",
-                    )
-                )
+            for fault in faults:
+                times = [_once(drive, fault, tally) for _ in range(runs)]
+                rows.append(_row(fault.name, times))
+            if not options.quick:
+                rows += _of_tabs(drive, runs)
         finally:
             drive.stop()
-    return rows
+    return rows + _sum(tally, runs * len(faults))
 
 
-def _once(drive: Drive, fault: Fault, repair: Repair) -> float:
-    driver = drive.start_driving()
-    since = time.monotonic_ns()
-    fault(drive, driver)
-    took = drive.standstill_ms(since)
+def _row(name: str, times: list[float]) -> Row:
+    print(f"    {name}: {', '.join(f'{each:.0f}' for each in times)} ms", flush=True)
+    return Row(
+        "standstill",
+        f"standstill, worst of {len(times)}: {name}",
+        "ms",
+        max(times),
+        bar=LIMIT_MS + SIM_STEP_MS,
+        note=f"{name}: median {statistics.median(times):.0f} ms",
+    )
+
+
+def _sum(tally: Tally, runs: int) -> list[Row]:
+    late = [each for each in tally.ages if each > LIMIT_MS + SIM_STEP_MS]
+    note = (
+        f"{len(tally.ages)} commands were carried out, the oldest {max(tally.ages):.0f} ms after it was sent"
+    )
+    words = (
+        f"commands carried out more than {LIMIT_MS} ms (and one step of {SIM_STEP_MS}) after they were sent"
+    )
+    return [
+        Row("standstill", words, "commands", len(late), bar=0, note=note),
+        Row("standstill", f"of {runs} runs: moved again by itself", "runs", tally.moved, bar=0),
+    ]
+
+
+def _once(drive: Drive, fault: Fault, tally: Tally) -> float:
+    """One fault: from it to the standstill, milliseconds."""
+    port = drive.client_side.port
+    driver: Any = (
+        DriverProcess(port, "rover", drive.token)
+        if fault.process
+        else TimedDriver(connected(port, "rover", drive.token))
+    )
+    begun = time.monotonic_ns()
+    drive.start_driving(driver)
+    broken = time.monotonic_ns()
+    fault.strike(drive, driver)
+    took = drive.standstill_ms(broken)
+    driver.fall_silent()
+    time.sleep(HELD_BACK)  # what is held up is too old now, whenever it arrives
+    fault.heal(drive)
+    if fault.goes_on:
+        driver.popen.send_signal(signal.SIGCONT)
+    else:
+        _settle(drive)
+        tally.moved += bool(drive.robot.events("moving", broken))
     driver.stop()
-    repair(drive)
-    drive.robot.wait_online()
+    drive.stands()
+    tally.ages += ages_ms(drive.robot.events("command", begun))
     return took
+
+
+def _settle(drive: Drive) -> None:
+    """Wait until the robot answers, behind everything that was held up on the way to it."""
+    drive.robot.wait_online()
+    with drive.relay.connect("rover", drive.token) as client:
+        drive.answers(client)
+
+
+def _of_tabs(drive: Drive, runs: int) -> list[Row]:
+    """The portal in a browser whose tab is not looked at any more. Without a browser or portal there are no rows."""
+    found: dict[str, list[float]] = {name: [] for name in tab_faults}
+    with contextlib.ExitStack() as stack:
+        try:
+            tab = stack.enter_context(Tab.opened(drive))
+        except Unavailable as reason:
+            print(f"    not measured: tabs: {reason}", flush=True)
+            return []
+        try:
+            for name, fault in tab_faults.items():
+                for _ in range(runs):
+                    tab.drive()
+                    found[name].append(drive.standstill_ms(struck(tab, fault)))
+                    tab.recover()
+        except AssertionError as reason:
+            # What was measured before, in an hour perhaps, is not lost with it; each row says of how many runs it is.
+            print(f"    cut short: tabs: {reason}", flush=True)
+    return [_row(name, times) for name, times in found.items() if times]

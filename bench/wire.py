@@ -183,8 +183,12 @@ class WebEnd(End):
         del buffer[:start]
 
 
+_COUNTED = (1, 5)
+"""Kinds of frames: a sample, a command (SPEC section 2.1)."""
+
+
 class _LinkEnd(End):
-    """A link to the relay: counts samples, hands JSON on, answers pings."""
+    """A link to the relay: counts samples and commands, hands JSON on, answers pings."""
 
     def __init__(self, loop: Loop, port: int, told: Callable[[_LinkEnd, dict[str, Any]], None]) -> None:
         super().__init__(loop, socket.create_connection(("127.0.0.1", port), timeout=30))
@@ -204,7 +208,7 @@ class _LinkEnd(End):
             end = start + 4 + _LENGTH(buffer, start)[0]
             if end > have:
                 break
-            if buffer[start + 4] == 1:
+            if buffer[start + 4] in _COUNTED:
                 self.messages += 1
             else:
                 self._hear(bytes(buffer[start + 5 : end]))
@@ -285,6 +289,8 @@ class PlainRobot:
             self._joining = True
             self.channel = _LinkEnd(self.loop, self._port, self._channel_message)
             self.channel.tell(link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"]))
+        elif message["op"] == "control":
+            control.tell(link.Done(id=message["id"]))
         else:
             self._heard.append(message)
 
