@@ -22,8 +22,11 @@ LEAST_ROWS = {
     "endtoend": 1,
     "crowd": 10,
     "soak": 7,
-    "video": 18,
-    "standstill": 1,
+    "video": 15,
+    "browser": 6,
+    "standstill": 3,
+    "control": 6,
+    "stopping": 4,
 }
 
 

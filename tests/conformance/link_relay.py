@@ -30,13 +30,14 @@ PATIENCE_AFTER_ANOTHER_NAME = 90.0
 
 FRAME_LIMIT = 2**24
 COMMAND_FRAME = 2**22
-JSON, SAMPLE, PART = 0, 1, 3
+JSON, SAMPLE, PART, COMMAND = 0, 1, 3, 5
 RELAY = "conformance relay"
 ENROLMENT_CODE = "conformance"
 
 _HEAD = struct.Struct("!IB")
 _SAMPLE = struct.Struct("!IQ")
 _PART = struct.Struct("!IQII")
+_COMMAND = struct.Struct("!IQI")
 
 
 class Sample(NamedTuple):
@@ -62,6 +63,11 @@ def sample_frame(number: int, stamp: int, body: bytes) -> bytes:
     return frame(SAMPLE, _SAMPLE.pack(number, stamp) + body)
 
 
+def command_frame(number: int, stamp: int, source: int, body: bytes) -> bytes:
+    """The frame of a command."""
+    return frame(COMMAND, _COMMAND.pack(number, stamp, source) + body)
+
+
 class Link:
     """One connection a robot has dialled. Pings are answered at once, unless told otherwise.
 
@@ -77,6 +83,7 @@ class Link:
         self.ended = False
         self.broken = ""
         self.pings = 0
+        self._orders = 1000
         self.answers_pings = True
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         threading.Thread(target=self._read, daemon=True).start()
@@ -95,6 +102,16 @@ class Link:
     def sample(self, number: int, body: bytes, age: float = 0.0) -> None:
         """One sample that can't have been sent more than ``age`` seconds ago; below 0 it lies in the future."""
         self.raw(sample_frame(number, max(0, time.monotonic_ns() - int(age * 1e9)), body))
+
+    def command(self, number: int, body: bytes, source: int, age: float = 0.0) -> None:
+        """One command of a source; see :meth:`sample`."""
+        self.raw(command_frame(number, max(0, time.monotonic_ns() - int(age * 1e9)), source, body))
+
+    def order(self, op: str, **fields: Any) -> dict[str, Any]:
+        """One order about motion; what the robot answers."""
+        self._orders += 1
+        self.say(op, id=self._orders, **fields)
+        return self.expect("done", id=self._orders)
 
     def cut(self) -> None:
         """End the connection without a word."""

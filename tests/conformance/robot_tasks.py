@@ -16,6 +16,8 @@ TWIST = "geometry_msgs/msg/Twist"
 TRIGGER = "std_srvs/srv/Trigger"
 FIBONACCI = "example_interfaces/action/Fibonacci"
 CDR = b"\0\1\0\0"
+DRIVER = 11
+"""The source that drives, unless a case says another."""
 
 
 def sensor(relay: LinkRelay) -> tuple[str, str]:
@@ -77,14 +79,21 @@ def wheels(relay: LinkRelay) -> str:
 
 
 class Wheels:
-    """Drives the robot by one channel link, and watches by another what it was told."""
+    """Drives the robot by one channel link, and watches by another what it was told.
 
-    def __init__(self, relay: LinkRelay, driving: Link, watching: Link) -> None:
+    :param resume: whether it is resumed first, if it is stopped
+    """
+
+    def __init__(self, relay: LinkRelay, driving: Link, watching: Link, resume: bool = True) -> None:
         topic = wheels(relay)
         policy = relay.facts().get("motion", {})
         self.deadline = policy.get("deadline_ms", 500) / 1000
         self.stop_within = policy.get("stop_within_ms", 500) / 1000
         self.driving, self.watching = driving, watching
+        self.control = relay.control
+        if resume:
+            self.resume()
+        self.give(DRIVER)
         watching.say("subscribe", number=1, topic=f"{topic}/heard", type=TWIST)
         self._heard_encoding = watching.expect("subscribed", number=1)["encoding"]
         self.topic = topic
@@ -98,14 +107,33 @@ class Wheels:
         self.driving.say("advertise", number=2, topic=self.topic, type=TWIST)
         self.told = self.driving.expect("advertised", number=2)
 
-    def command(self, speed: float, age: float = 0.0) -> None:
+    def give(self, source: int) -> None:
+        """Give control to a source."""
+        done = self.control.order("control", holder=source, user="the suite", level="operator")
+        assert done.get("ok", True), done
+
+    def resume(self) -> None:
+        """Let it move again after a stop."""
+        done = self.control.order("resume", by="the suite")
+        assert done.get("ok", True), done
+
+    def streams(self, speed: float, seconds: float) -> None:
+        """Command without a pause; it does not move."""
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            self.command(speed)
+            assert self.next_speed(0.05) != speed, "it moves"
+
+    def command(self, speed: float, age: float = 0.0, source: int = DRIVER) -> None:
         """One command."""
-        if self.told["encoding"] == "json":
-            twist = {"linear": {"x": speed, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}
-            body = json.dumps(twist).encode()
-        else:
-            body = CDR + struct.pack("<6d", speed, 0, 0, 0, 0, 0)
-        self.driving.sample(2, body, age)
+        self.driving.command(2, self.twist(speed), source, age)
+
+    def twist(self, speed: float) -> bytes:
+        """A command's body."""
+        if self.told["encoding"] != "json":
+            return CDR + struct.pack("<6d", speed, 0, 0, 0, 0, 0)
+        twist = {"linear": {"x": speed, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}
+        return json.dumps(twist).encode()
 
     def not_finite(self) -> None:
         """Commands whose speed is no finite number."""
@@ -113,7 +141,7 @@ class Wheels:
             self.command(speed)
         if self.told["encoding"] == "json":
             for text in (b"null", b"1e999", b"-1e999"):
-                self.driving.sample(2, b'{"linear": {"x": ' + text + b'}, "angular": {}}')
+                self.driving.command(2, b'{"linear": {"x": ' + text + b'}, "angular": {}}', DRIVER)
 
     def speed(self, sample: Sample) -> float:
         """The forward speed of a report."""
@@ -127,12 +155,13 @@ class Wheels:
             return self.speed(self.watching.expect_sample(1, seconds))
         return None
 
-    def start(self) -> Sample:
-        """Command until it moves; the first report of it."""
+    def start(self, source: int = DRIVER) -> Sample:
+        """Command until it moves; the first report of it. Who must let go first does so by zero."""
         until = time.monotonic() + 10
+        self.command(0.0, source=source)
         while True:
             assert time.monotonic() < until, "commands, sent again and again, did not move the robot"
-            self.command(0.2)
+            self.command(0.2, source=source)
             with contextlib.suppress(AssertionError):
                 report = self.watching.expect_sample(1, 0.05)
                 if self.speed(report) == 0.2:
@@ -151,3 +180,9 @@ class Wheels:
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             assert not self.next_speed(left), "it moves"
+
+    def never_goes(self, speed: float, seconds: float = ABSENCE) -> None:
+        """No command of this speed is obeyed within this time; the last one of another speed may still be reported."""
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            assert self.next_speed(left) != speed, f"it obeys the command of {speed} m/s"

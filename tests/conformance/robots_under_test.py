@@ -53,6 +53,7 @@ class JsonRobot:
         (
             *("test_publish", "test_large_sample", "test_get_type", "test_get_interfaces"),
             *("test_offer_service", "test_offer_action", "test_goal", "test_cancel"),
+            *("test_old_goal_that_moves", "test_old_goal_that_moves_nothing"),
         )
     )
     """Cases about what it does not offer; with ``--listen`` a robot finds that out by itself."""
@@ -76,12 +77,20 @@ class SensorRobot(JsonRobot):
     program = SENSOR
     lacks = JsonRobot.lacks | frozenset(
         (
-            *("test_two_channels", "test_call", "test_get_interfaces"),
+            *("test_two_channels", "test_call", "test_old_call_that_moves_nothing", "test_get_interfaces"),
             *("test_motion_is_known", "test_fresh_commands", "test_stops_when_commands_cease"),
             *("test_says_zero_again", "test_old_commands", "test_old_commands_do_not_keep_it_moving"),
             *("test_commands_of_the_future", "test_no_number", "test_nonsense_for_a_command"),
             *("test_unadvertise_stops", "test_cut_channel_stops", "test_other_samples_are_no_commands"),
-            "test_cut_control_stops",
+            *("test_cut_control_stops", "test_only_the_holder", "test_another_holder", "test_same_holder"),
+            "test_samples_are_no_commands",
+            *(
+                "test_stop",
+                "test_stop_outlives_the_link",
+                "test_resume_moves_nothing",
+                "test_zero_is_letting_go",
+            ),
+            *("test_suppress", "test_suppression_ends_in_time"),
         )
     )
 

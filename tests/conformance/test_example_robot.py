@@ -81,7 +81,8 @@ def speed(client: Client) -> float:
 
 
 def drive(client: Client) -> None:
-    """Drive until it moves."""
+    """Drive until it moves; who has driven a moment ago need not let go of anything."""
+    assert client.call("/relay/take_control")["values"]["success"]
     client.send(op="subscribe", topic="/cmd_vel/heard")
     for _ in range(200):
         client.drive(0.2)

@@ -1,4 +1,4 @@
-"""One relay and one robot for the tests that break nothing; those that do start their own."""
+"""One relay and one robot for the tests that break nothing; those that do start their own. A browser."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import pytest
+from playwright.sync_api import Browser, expect
+from switchboard_browser import chromium
 from switchboard_client import Client
 from switchboard_relay import Relay
 from switchboard_robot import Robot
@@ -55,6 +57,14 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             robot.stop()
     finally:
         relay.stop()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """One Chromium for all tests of a module, which wait for what a page shows."""
+    expect.set_options(timeout=30_000)
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture(scope="module")

@@ -215,7 +215,8 @@ def states(stream: http.client.HTTPResponse) -> Iterator[str]:
     """The states of the rover that a stream of events tells, one after the other."""
     while line := stream.readline():
         if line.startswith(b"data: "):
-            robots = json.loads(line.removeprefix(b"data: "))["robots"]
+            # Alerts come on the same stream.
+            robots = json.loads(line.removeprefix(b"data: ")).get("robots", ())
             yield from (each["state"] for each in robots if each["name"] == "rover")
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from rosbags.interfaces import QosDurability
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from switchboard_http import Answer, ask
@@ -34,9 +35,10 @@ class Recorder:
         self._token = token
         self._path = f"/api/v1/robots/{robot}/recordings"
 
-    def ask(self, method: str, path: str = "", body: Any = None) -> Answer:
+    def ask(self, method: str, path: str = "", body: Any = None, **headers: str) -> Answer:
         """One request."""
-        return ask(self._relay.http_port, method, self._path + path, body, token=self._token)
+        given = {name.replace("_", "-"): value for name, value in headers.items()}
+        return ask(self._relay.http_port, method, self._path + path, body, headers=given, token=self._token)
 
     def start(self, *topics: str, **more: Any) -> str:
         """Begin one; its id."""
@@ -111,8 +113,8 @@ def test_what_is_recorded_is_what_a_subscriber_gets(world: Any, operator: Record
 
 
 def test_rosbags_reads_the_file(operator: Recorder, tmp_path: Path) -> None:
-    """As a rosbag2 file of MCAP, with no other knowledge of the types than the file's."""
-    id = operator.start("/odom", "/scan")
+    """As a rosbag2 file of MCAP, with no other knowledge of the types than the file's; what is latched says so."""
+    id = operator.start("/odom", "/scan", "/tf_static")
     operator.until(id, 30)
     done = operator.stop(id)
     path = operator.fetch(id, tmp_path)
@@ -132,13 +134,35 @@ def test_rosbags_reads_the_file(operator: Recorder, tmp_path: Path) -> None:
             store.deserialize_cdr(bytes(raw), connection.msgtype)
             for connection, _, raw in reader.messages(reader.connections)
         ]
+        latched = {
+            connection.topic: [each.durability for each in connection.ext.offered_qos_profiles]
+            for connection in reader.connections
+        }
     finally:
         reader.close()
     assert len(found) == done["messages"]
     assert {type(each).__name__ for each in found} == {
         "nav_msgs__msg__Odometry",
         "sensor_msgs__msg__LaserScan",
+        "tf2_msgs__msg__TFMessage",
     }
+    assert latched == {"/odom": [], "/scan": [], "/tf_static": [QosDurability.TRANSIENT_LOCAL]}
+
+
+def test_a_download_goes_on_where_it_broke_off(operator: Recorder, tmp_path: Path) -> None:
+    """As curl and browsers do it: the rest of the same file, if it still is the same."""
+    id = operator.start("/odom")
+    operator.until(id, 20)
+    operator.stop(id)
+    whole = operator.fetch(id, tmp_path).read_bytes()
+    head = operator.ask("HEAD", f"/{id}/file")
+    assert (head.status, head.headers["Content-Length"], head.body) == (200, str(len(whole)), b"")
+    begun, tag = whole[:1000], head.headers["ETag"]
+    rest = operator.ask("GET", f"/{id}/file", Range=f"bytes={len(begun)}-", If_Range=tag)
+    assert (rest.status, begun + rest.body) == (206, whole)
+    again = operator.ask("GET", f"/{id}/file", Range=f"bytes={len(begun)}-", If_Range='"another"')
+    assert (again.status, again.body) == (200, whole)
+    assert operator.ask("GET", f"/{id}/file", Range=f"bytes={len(whole)}-").status == 416
 
 
 def test_a_cameras_pictures_are_recorded(operator: Recorder, tmp_path: Path) -> None:
@@ -239,3 +263,29 @@ def test_a_recording_outlives_its_robot_and_its_relay(own: tuple[Relay, Robot, s
     relay.cli("right", "grant", "operator", "rover", "operator")
     done = wait_for("its end", lambda: (found := recorder.look(id)).get("state") == "complete" and found)
     assert "revoked" in done["reason"]
+
+
+def test_recordings_go_with_their_robot(own: tuple[Relay, Robot, str]) -> None:
+    """The one that runs is stopped; what is removed while no relay runs goes when the next starts."""
+    relay, robot, token = own
+    recorder = Recorder(relay, "rover", token)
+    wait_for("the graph", lambda: recorder.ask("POST", "", {"topics": ["/odom"], "seconds": 1}).status == 201)
+    folder = relay.data / "recordings"
+    recorder.until(recorder.start("/odom"), 10)
+    asked = relay.run_cli("robot", "remove", "rover", stdin="n\n")
+    assert "its 2 recordings (" in asked.stderr
+    assert relay.cli("robot", "remove", "rover", "--yes")["recordings"] == 2
+    wait_for("the recordings are gone", lambda: list(folder.iterdir()) == [])
+    robot.stop()
+    other = Robot(relay, "tank")
+    try:
+        relay.cli("right", "grant", "operator", "tank", "operator")
+        recorder = Recorder(relay, "tank", token)
+        wait_for("the graph", lambda: recorder.ask("POST", "", {"topics": ["/odom"]}).status == 201)
+        relay.stop()
+        relay.cli("robot", "remove", "tank", "--yes")
+        assert len(list(folder.iterdir())) == 2
+        relay.start()
+        assert list(folder.iterdir()) == []
+    finally:
+        other.stop()

@@ -3,220 +3,33 @@
 from __future__ import annotations
 
 import contextlib
-import http.client
-import json
-import re
+import itertools
 import socket
 import statistics
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from email.parser import BytesParser
-from typing import Any, NamedTuple
-from urllib.parse import urlencode
+from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
 from switchboard_browser import chromium
-from switchboard_http import Answer, ask
-from switchboard_proxy import ChaosProxy
+from switchboard_http import ask
 from switchboard_relay import Relay
-from switchboard_robot import Robot
+from switchboard_video import CAMERA, WAIT_SECONDS, Crowd, Eye, Mjpeg, decoded, get, known, path, streams
 from switchboard_waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-CAMERA = "/camera/image_raw"
-WAIT_SECONDS = 20.0
-TARGET_MS = 300
-"""The delay a robot keeps its pictures under."""
-
-
-def path(what: str, robot: str = "rover", **parameters: Any) -> str:
-    """An address below a robot's ``video``."""
-    return f"/robots/{robot}/video/{what}?{urlencode({'topic': CAMERA, **parameters})}"
-
-
-def get(relay: Relay, token: str, what: str, robot: str = "rover", **parameters: Any) -> Answer:
-    """One request."""
-    return ask(relay.http_port, "GET", path(what, robot, **parameters), token=token)
-
 
 def url(relay: Relay, token: str, what: str, **parameters: Any) -> str:
     """What a program that knows neither headers nor cookies is given."""
-    answer = ask(relay.http_port, "POST", "/api/v1/tickets", {"robot": "rover"}, token=token)
+    answer = ask(relay.http_port, "POST", "/api/v1/tickets", {"robot": "rover", "for": "video"}, token=token)
     return f"http://127.0.0.1:{relay.http_port}{path(what, **parameters, ticket=answer.json['ticket'])}"
-
-
-def streams(relay: Relay, token: str, robot: str = "rover") -> list[dict[str, Any]]:
-    """How the camera is shown now."""
-    cameras = get(relay, token, "cameras", robot).json["cameras"]
-    return next((each["streams"] for each in cameras if each["name"] == CAMERA), [])
-
-
-def known(relay: Relay, token: str, robot: str = "rover") -> None:
-    """Wait until the relay knows the robot's camera."""
-
-    def there() -> bool:
-        cameras = get(relay, token, "cameras", robot).json["cameras"]
-        return any(each["name"] == CAMERA for each in cameras)
-
-    wait_for("the camera is known", there)
-
-
-def decoded(picture: bytes) -> Any:
-    """Its pixels, height × width × 3."""
-    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
-    assert pixels is not None
-    return pixels
-
-
-class Part(NamedTuple):
-    """One part of a multipart answer."""
-
-    headers: Any
-    body: bytes
-
-
-class Mjpeg:
-    """A viewer of ``…/video/stream``, who finds the parts by their boundary as RFC 2046 has it."""
-
-    def __init__(self, relay: Relay, token: str, robot: str = "rover", **parameters: Any) -> None:
-        self.seen = 0
-        """Parts so far."""
-        self._connection = http.client.HTTPConnection("127.0.0.1", relay.http_port, timeout=WAIT_SECONDS)
-        headers = {"Authorization": f"Bearer {token}"}
-        self._connection.request("GET", path("stream", robot, **parameters), headers=headers)
-        self.answer = self._connection.getresponse()
-        boundary = re.fullmatch(
-            r"multipart/x-mixed-replace; *boundary=(\S+)", self.answer.headers["Content-Type"]
-        )
-        assert self.answer.status == 200
-        assert boundary
-        self._delimiter = b"--" + boundary[1].encode()
-        self._bytes = b""
-
-    def part(self) -> Part | None:
-        """The next; ``None`` at the end, which may be a reset."""
-        while True:
-            before, delimiter, rest = self._bytes.partition(self._delimiter)
-            if delimiter:
-                self._bytes = rest
-                head, _, body = before.removeprefix(b"\r\n").partition(b"\r\n\r\n")
-                if head:
-                    self.seen += 1
-                    return Part(BytesParser().parsebytes(head), body.removesuffix(b"\r\n"))
-                continue
-            try:
-                data = self.answer.read1(1 << 18)
-            except ConnectionResetError:
-                return None
-            if not data:
-                return None
-            self._bytes += data
-
-    def close(self) -> None:
-        """Leave."""
-        self.answer.close()
-        self._connection.close()
-
-
-class Crowd(contextlib.ExitStack):
-    """Many MJPEG viewers, each read by a thread."""
-
-    def __init__(self, relay: Relay, token: str, count: int, robot: str = "rover", **parameters: Any) -> None:
-        super().__init__()
-        self._pool = ThreadPoolExecutor(count)
-        self._left = threading.Event()
-        self.viewers = [Mjpeg(relay, token, robot, **parameters) for _ in range(count)]
-        self.callback(self._pool.shutdown)
-        self.callback(self._left.set)
-        for each in self.viewers:
-            self._pool.submit(self._read, each)
-
-    def _read(self, viewer: Mjpeg) -> None:
-        with contextlib.closing(viewer):
-            while not self._left.is_set() and viewer.part() is not None:
-                pass
-
-    def rates(self, seconds: float) -> list[float]:
-        """Pictures per second of each from now on."""
-        before, began = [each.seen for each in self.viewers], time.monotonic()
-        self._left.wait(seconds)
-        passed = time.monotonic() - began
-        return [(each.seen - seen) / passed for each, seen in zip(self.viewers, before, strict=True)]
-
-
-class Shown(NamedTuple):
-    """One picture that came by the websocket, and how old it was then."""
-
-    head: dict[str, Any]
-    body: bytes
-    delay_ms: float
-
-
-class Eye:
-    """A viewer by ``…/video/ws``."""
-
-    def __init__(self, relay: Relay, token: str, robot: str = "rover", **parameters: Any) -> None:
-        self.playing: dict[str, Any] = {}
-        """The latest word of how it is made."""
-        self._stack = contextlib.ExitStack()
-        connecting = connect(
-            f"ws://127.0.0.1:{relay.http_port}{path('ws', robot, **parameters)}",
-            additional_headers={"Authorization": f"Bearer {token}"},
-            close_timeout=1,
-        )
-        self.connection = self._stack.enter_context(connecting)
-
-    def __enter__(self) -> Eye:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def untaken(self, seconds: float = WAIT_SECONDS) -> Shown:
-        """The next picture, which is not answered."""
-        while True:
-            message = json.loads(self.connection.recv(timeout=seconds))
-            if message["op"] == "playing":
-                self.playing = message
-                continue
-            assert message["op"] == "picture"
-            body = self.connection.recv(timeout=seconds)
-            assert isinstance(body, bytes)
-            assert len(body) == message["size"]
-            return Shown(message, body, (time.time() - message["stamp"]) * 1000)
-
-    def took(self, shown: Shown) -> None:
-        """Have the next one."""
-        self.connection.send(json.dumps({"op": "took", "number": shown.head["number"]}))
-
-    def picture(self, seconds: float = WAIT_SECONDS) -> Shown:
-        """The next picture, and the word that it is here."""
-        shown = self.untaken(seconds)
-        self.took(shown)
-        return shown
-
-    def watch(self, seconds: float) -> list[Shown]:
-        """All that comes in this time."""
-        until = time.monotonic() + seconds
-        shown = []
-        while time.monotonic() < until:
-            shown.append(self.picture())
-        return shown
-
-    def watch_until(self, what: str, condition: Callable[[Shown], bool], seconds: float) -> Shown:
-        """Watch until a picture is as it should be."""
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            shown = self.picture()
-            if condition(shown):
-                return shown
-        raise AssertionError(f"not within {seconds:g} s: {what}; playing {self.playing}")
 
 
 def unread(relay: Relay, token: str, **parameters: Any) -> socket.socket:
@@ -236,28 +49,6 @@ def shown(world: Any) -> Any:
     """The world, once the relay knows its camera."""
     known(world.relay, world.viewer)
     return world
-
-
-class Thin(NamedTuple):
-    """A robot whose uplink can be made thin."""
-
-    relay: Relay
-    robot: Robot
-    proxy: ChaosProxy
-    token: str
-
-
-@pytest.fixture(scope="module")
-def thin(world: Any) -> Iterator[Thin]:
-    """Beside the others, at the same relay."""
-    proxy = ChaosProxy(world.relay.robots_port)
-    robot = Robot(world.relay, "thin", port=proxy.port, camera=True)
-    try:
-        world.relay.cli("right", "grant", "viewer", "thin", "viewer")
-        yield Thin(world.relay, robot, proxy, world.viewer)
-    finally:
-        robot.stop()
-        proxy.close()
 
 
 def test_a_snapshot_has_the_size_that_was_asked_for(shown: Any) -> None:
@@ -299,17 +90,35 @@ def test_the_stream_has_one_jpeg_a_part(shown: Any) -> None:
     assert stamps == sorted(set(stamps))
 
 
-def test_ffmpeg_reads_the_stream(shown: Any) -> None:
-    """The one that comes with OpenCV, by a ticket in the address."""
-    capture = cv2.VideoCapture(url(shown.relay, shown.viewer, "stream"), cv2.CAP_FFMPEG)
+def opencv(address: str) -> Iterator[Any]:
+    """The pictures of an address as ffmpeg in OpenCV has them."""
+    capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG)
     try:
         assert capture.isOpened()
-        for _ in range(5):
+        while True:
             there, picture = capture.read()
             assert there
-            assert picture.shape == (480, 640, 3)
+            yield picture
     finally:
         capture.release()
+
+
+def pyav(address: str) -> Iterator[Any]:
+    """The same as ffmpeg in PyAV has them."""
+    with av.open(address, timeout=WAIT_SECONDS) as container:
+        assert container.format.name == "mpjpeg"
+        for frame in container.decode(video=0):
+            yield frame.to_ndarray(format="bgr24")
+
+
+@pytest.mark.parametrize("player", [opencv, pyav])
+def test_ffmpeg_reads_the_stream(shown: Any, player: Callable[[str], Iterator[Any]]) -> None:
+    """By a ticket in the address; what it shows is what a snapshot shows."""
+    with contextlib.closing(player(url(shown.relay, shown.viewer, "stream"))) as pictures:
+        for picture in itertools.islice(pictures, 5):
+            assert picture.shape == (480, 640, 3)
+    whole = decoded(get(shown.relay, shown.viewer, "snapshot").body)
+    assert np.abs(picture.astype(int) - whole).mean() < 6
 
 
 def test_a_browser_shows_the_stream(shown: Any) -> None:
@@ -341,7 +150,6 @@ def test_the_websocket_waits_for_took(shown: Any) -> None:
 
 def test_h264_begins_with_a_key_frame_and_decodes(shown: Any) -> None:
     """Also for who comes later; fewer bytes than JPEG of the same size."""
-    av = pytest.importorskip("av")
     with Eye(shown.relay, shown.viewer, codec="h264") as early:
         early.picture()
         with Eye(shown.relay, shown.viewer, codec="h264") as late:
@@ -385,9 +193,9 @@ def test_who_may_not_view_gets_no_picture(shown: Any) -> None:
 
 def test_a_revoked_right_ends_what_runs(shown: Any) -> None:
     """Stream and websocket, within a second of the command's end."""
-    shown.relay.user("guest")
-    guest = shown.relay.token("guest")
-    shown.relay.cli("right", "grant", "guest", "rover", "viewer")
+    shown.relay.user("invited")
+    invited = shown.relay.token("invited")
+    shown.relay.cli("right", "grant", "invited", "rover", "viewer")
 
     def end_of(watch: Callable[[], Any]) -> float:
         with contextlib.suppress(ConnectionClosed):
@@ -396,38 +204,61 @@ def test_a_revoked_right_ends_what_runs(shown: Any) -> None:
         return time.monotonic()
 
     with (
-        contextlib.closing(Mjpeg(shown.relay, guest)) as viewer,
-        Eye(shown.relay, guest) as eye,
+        contextlib.closing(Mjpeg(shown.relay, invited)) as viewer,
+        Eye(shown.relay, invited) as eye,
         ThreadPoolExecutor(2) as pool,
     ):
         assert viewer.part() is not None
         eye.picture()
         ends = [pool.submit(end_of, each) for each in (viewer.part, eye.picture)]
-        shown.relay.cli("right", "revoke", "guest", "rover")
+        shown.relay.cli("right", "revoke", "invited", "rover")
         revoked = time.monotonic()
         assert max(each.result(WAIT_SECONDS) for each in ends) < revoked + 1
-    assert get(shown.relay, guest, "stream").status == 404
+    assert get(shown.relay, invited, "stream").status == 404
 
 
-def test_ten_viewers_are_one_stream_which_ends_with_the_last(thin: Thin) -> None:
-    """The robot makes it once for all, and two seconds after the last has left nothing is sent any more."""
-    known(thin.relay, thin.token, "thin")
-    with Crowd(thin.relay, thin.token, 9, "thin") as crowd, Eye(thin.relay, thin.token, "thin") as eye:
+def test_pictures_are_not_to_be_had_by_subscribing_to_them(shown: Any) -> None:
+    """Who may not view a camera gets its topic no more, once it is denied; another topic goes on."""
+    shown.relay.user("listener")
+    shown.relay.cli("right", "grant", "listener", "rover", "viewer")
+    pictures = f"{CAMERA}/compressed"
+    with shown.relay.connect("rover", shown.relay.token("listener")) as client:
+        client.send(op="set_level", level="error")
+        client.send(op="subscribe", topic="/odom", throttle_rate=200)
+        client.send(op="subscribe", topic=pictures, throttle_rate=200)
+        client.until(op="publish", topic=pictures)
+        shown.relay.cli("right", "grant", "listener", "rover", "viewer", "--deny", "view:/camera/*")
+        told = client.until(op="status")["msg"]
+        assert told.startswith(f"unsubscribed from {pictures}: view on {pictures} is denied")
+        client.until(op="publish", topic="/odom")
+        client.send(op="subscribe", topic=pictures)
+        assert client.until(op="status")["msg"].startswith(f"view on {pictures} is denied")
+        assert pictures not in client.call("/rosapi/topics")["values"]["topics"]
+
+
+def test_a_ticket_for_pictures_is_no_way_to_drive(shown: Any) -> None:
+    """Nor does one for the websocket show any."""
+    with pytest.raises(InvalidStatus, match="401"):
+        connect(f"{shown.relay.url('rover')}?{url(shown.relay, shown.operator, 'stream').partition('?')[2]}")
+    wide = ask(shown.relay.http_port, "POST", "/api/v1/tickets", {"robot": "rover"}, token=shown.operator)
+    address = path("snapshot", ticket=wide.json["ticket"])
+    assert ask(shown.relay.http_port, "GET", address).status == 401
+
+
+def test_who_watches_is_at_the_robot(shown: Any) -> None:
+    """By name, as long as he does."""
+
+    def who() -> list[dict[str, Any]]:
+        (robot,) = [each for each in shown.relay.cli("status")["robots"] if each["name"] == "rover"]
+        return [each for each in robot["onlookers"] if each["user"] == "onlooker"]
+
+    shown.relay.user("onlooker")
+    shown.relay.cli("right", "grant", "onlooker", "rover", "viewer")
+    with Eye(shown.relay, shown.relay.token("onlooker")) as eye:
         eye.picture()
-        wait_for("each has a picture", lambda: all(each.seen for each in crowd.viewers))
-        (stream,) = streams(thin.relay, thin.token, "thin")
-        assert stream["viewers"] == 10
-        before, seen = thin.proxy.up, crowd.viewers[0].seen
-        pictures = eye.watch(2)
-        sizes = statistics.median(len(each.body) for each in pictures)
-        # One after the other through one link: not more bytes than one stream has.
-        assert thin.proxy.up - before < 1.5 * sizes * (crowd.viewers[0].seen - seen + 2)
-    left = time.monotonic()
-    wait_for("the stream is closed", lambda: not streams(thin.relay, thin.token, "thin"), 2)
-    time.sleep(max(0.0, left + 2 - time.monotonic()))  # so long it may go on
-    before = thin.proxy.up
-    time.sleep(1)  # to see that nothing comes
-    assert thin.proxy.up - before < sizes / 2
+        assert [each["camera"] for each in who()] == [CAMERA]
+        assert shown.relay.state_of("rover") == "in_use"
+    wait_for("nobody watches", lambda: not who())
 
 
 def test_slow_viewers_are_nothing_to_fast_ones(shown: Any) -> None:
@@ -462,40 +293,3 @@ def test_slow_viewers_are_nothing_to_fast_ones(shown: Any) -> None:
         with contextlib.suppress(ConnectionResetError):
             while stopped.recv(1 << 16):
                 pass
-
-
-@pytest.mark.parametrize("kilobits", [1000, 200])
-def test_a_thin_uplink_makes_pictures_smaller_not_late(thin: Thin, kilobits: int) -> None:
-    """After 5 s the delay is under the target; when the uplink is as before, so are the pictures."""
-    known(thin.relay, thin.token, "thin")
-    with Eye(thin.relay, thin.token, "thin") as eye:
-        whole = eye.watch_until("pictures are as asked for", lambda _: eye.playing["reduced"] == 0, 30)
-        thin.proxy.squeeze(kilobits * 1000)
-        try:
-            eye.watch(5)
-            pictures = eye.watch(4)
-            playing = eye.playing
-        finally:
-            thin.proxy.squeeze(None)
-        delays = sorted(each.delay_ms for each in pictures)
-        assert statistics.median(delays) < TARGET_MS, (delays, playing)
-        assert playing["delay_ms"] < TARGET_MS, (delays, playing)
-        assert playing["reduced"] > 0
-        assert statistics.median(len(each.body) for each in pictures) < len(whole.body) / 2
-        eye.watch_until("pictures are as before", lambda _: eye.playing["reduced"] == 0, 60)
-        after = eye.picture()
-        assert decoded(after.body).shape == (480, 640, 3)
-
-
-def test_pictures_go_on_when_the_daemon_is_started_again(thin: Thin) -> None:
-    """On the same websocket, by themselves."""
-    known(thin.relay, thin.token, "thin")
-    with Eye(thin.relay, thin.token, "thin") as eye:
-        before = eye.picture()
-        thin.robot.daemon.kill()
-        thin.robot.start_daemon()
-        again = eye.watch_until(
-            "a picture taken after that", lambda each: each.head["stamp"] > before.head["stamp"] + 1, 30
-        )
-        assert decoded(again.body).shape == (480, 640, 3)
-        assert len(eye.watch(1)) > 3

@@ -51,6 +51,15 @@ def run(*command: str) -> dict[str, Any]:
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
+def assert_throttled(said: list[int]) -> None:
+    """Four samples of a counter of milliseconds, asked for every 200 ms: all of them would be 20 ms apart.
+
+    Together, because a busy machine may delay one of them until the next.
+    """
+    assert len(said) >= 4
+    assert said[3] - said[0] >= 300, said
+
+
 def test_everything_roslib_js_can_do(world: Any, owner: str) -> None:
     """Lists, types, topics in every form, services and actions both ways, parameters, status, closing."""
     node = [str(TESTS.parent / "scripts" / "with-node.sh"), "node"]
@@ -77,8 +86,7 @@ def test_everything_roslib_js_can_do(world: Any, owner: str) -> None:
     assert (raw["secs"], raw["nsecs"]) == ("number", "number")
     assert bytes(raw["bytes"])[4:19] == b"\x0b\x00\x00\x00still here\x00"
     assert seen["echoed"] == {"data": "said by roslib.js"}
-    gaps = [after - before for before, after in zip(seen["throttled"], seen["throttled"][1:], strict=False)]
-    assert all(gap >= 100 for gap in gaps), gaps
+    assert_throttled(seen["throttled"])
     assert seen["publishers"] == ["/conformance/fixture"]
     assert seen["inverted"] == {"success": False, "message": "inverted"}
     assert "did not answer within 0.2 s" in seen["tooSlow"]
@@ -125,8 +133,7 @@ def test_everything_roslibpy_can_do(world: Any, owner: str) -> None:
     assert "/conformance/fixture:conformance.number" in seen["params"]
     assert seen["time"]
     assert seen["latched"] == [{"data": "still here"}]
-    steps = [after - before for before, after in zip(seen["throttled"], seen["throttled"][1:], strict=False)]
-    assert all(step >= 100 for step in steps), steps
+    assert_throttled(seen["throttled"])
     assert seen["echoed"] == {"data": "said by roslibpy"}
     assert seen["inverted"] == {"success": False, "message": "inverted"}
     assert seen["inverted later"] == {"success": True, "message": "inverted"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
 import relay_server
 
@@ -64,3 +65,55 @@ def sound_pages(browser: Browser, url: str, seconds: float) -> Iterator[Callable
     for context in contexts:
         context.close()
     assert faults == []
+
+
+# --- the cockpit ------------------------------------------------------------------------------------------
+
+
+def seen(page: Page, testid: str) -> Locator:
+    """An element of the page by its name for tests."""
+    return page.get_by_test_id(testid)
+
+
+def stands(page: Page, how: str) -> None:
+    """Wait until the page stands so to control: ``free``, ``yours``, ``asked``, ``held``, ``waiting``, …
+
+    :param how: a regular expression
+    """
+    expect(seen(page, "control")).to_have_attribute("data-standing", re.compile(f"^({how})$"))
+
+
+def take_control(page: Page) -> None:
+    """Have control of a robot that is free, or is the page's already."""
+    stands(page, "free|yours")
+    if seen(page, "control").get_attribute("data-standing") == "free":
+        seen(page, "control-take").click()
+    stands(page, "yours")
+
+
+def ready_to_drive(page: Page) -> None:
+    """The cockpit is connected, has control, and its joystick is on."""
+    expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+    take_control(page)
+    expect(seen(page, "drive-blocked")).to_have_count(0)
+    expect(seen(page, "joystick").locator(".back")).to_be_visible()
+
+
+def hold_joystick(page: Page, dx: float = 0, dy: float = -60) -> None:
+    """Press the joystick with the mouse and pull it away from its middle (pixels)."""
+    box = seen(page, "joystick").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + dx, y + dy, steps=4)
+
+
+def hold_resume(page: Page) -> None:
+    """Keep the button pressed by which a stopped robot may move again."""
+    box = seen(page, "resume").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    expect(seen(page, "stopped")).to_have_count(0)
+    page.mouse.up()

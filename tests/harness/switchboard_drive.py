@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from typing import Any
 
+from switchboard_client import Client
 from switchboard_proxy import ChaosProxy
 from switchboard_relay import Relay
 from switchboard_robot import Robot
@@ -12,6 +15,8 @@ from switchboard_waiting import wait_for
 
 LIMIT_MS = 500
 SIM_STEP_MS = 20
+LET_GO_SECONDS = 0.6
+"""Silence of half a second is letting go."""
 
 
 class Drive:
@@ -24,11 +29,15 @@ class Drive:
         self.robot = Robot(self.relay, "rover", port=self.robot_side.port)
         self.token = self.relay.user("driver")
         self.relay.cli("right", "grant", "driver", "rover", "operator")
-        self._drivers: list[Driver] = []
+        self._drivers: list[Any] = []
 
-    def start_driving(self) -> Driver:
-        """Drive in circles until the robot moves by its own record."""
-        driver = Driver(self.relay.connect_by(self.client_side.port, "rover", self.token))
+    def start_driving(self, driver: Any = None) -> Any:
+        """Drive in circles until the robot moves by its own record.
+
+        :param driver: who drives, from its ``start`` to its ``stop``; a :class:`Driver` where there is none
+        """
+        if driver is None:
+            driver = Driver(self.relay.connect_by(self.client_side.port, "rover", self.token))
         driver.start()
         self._drivers.append(driver)
         wait_for("the robot moves", self.robot.moving)
@@ -39,8 +48,16 @@ class Drive:
 
     def standstill_ms(self, since: int) -> float:
         """Milliseconds from a fault at ``since`` (monotonic ns) to the standstill, by the robot's own record."""
-        wait_for("the robot stands", lambda: not self.robot.moving(), 10)
+        self.stands()
         return float(self.robot.events("standstill")[-1]["t"] - since) / 1e6
+
+    def stands(self) -> None:
+        """Wait until the robot stands."""
+        wait_for("the robot stands", lambda: not self.robot.moving(), 10)
+
+    def answers(self, client: Client) -> None:
+        """Wait until the robot answers, behind everything that was held up on the way to it."""
+        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
 
     def stands_within_limit(self, since: int) -> None:
         """The robot came to a standstill soon enough after a fault."""
@@ -48,10 +65,11 @@ class Drive:
         assert took_ms <= LIMIT_MS + SIM_STEP_MS, f"it took {took_ms:.0f} ms"
 
     def again(self) -> None:
-        """All is back by itself: somebody new can drive, and lets go."""
+        """All is back by itself: who has let go can drive by a new connection, and lets go."""
         self.robot.wait_online()
+        time.sleep(LET_GO_SECONDS)
         self.start_driving().stop()
-        wait_for("the robot stands", lambda: not self.robot.moving(), 5)
+        self.stands()
 
     def stop(self) -> None:
         """End everything."""

@@ -11,9 +11,14 @@ from typing import Any
 from relay_protocol import PROTOCOL_VERSION, identity, limits, link
 from relay_protocol.frames import FrameDecoder, JsonFrame
 
+ORDERS = frozenset({"control", "stop", "resume", "suppress", "inhibit"})
+
 
 class FakeRobot:
-    """One end of a robot link, spoken by hand: for what no honest robot says."""
+    """One end of a robot link, spoken by hand: for what no honest robot says.
+
+    Orders about motion it answers by itself, as if they were done.
+    """
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=10)
@@ -46,7 +51,11 @@ class FakeRobot:
             if not data:
                 return None
             frames = self._decoder.feed(data)
-            self._heard += [json.loads(each.body) for each in frames if isinstance(each, JsonFrame)]
+            heard = [json.loads(each.body) for each in frames if isinstance(each, JsonFrame)]
+            for each in heard:
+                if each["op"] in ORDERS:
+                    self.send(link.Done(id=each["id"]))
+            self._heard += [each for each in heard if each["op"] not in ORDERS]
         return self._heard.pop(0)
 
     def until(self, op: str, seconds: float = 10.0) -> dict[str, Any]:

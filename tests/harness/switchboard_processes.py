@@ -26,8 +26,10 @@ def ros_environment(domain: int) -> dict[str, str]:
 def mortal(command: list[str]) -> list[str]:
     """The same command, ended by SIGTERM as soon as the thread that starts it is gone, however that went.
 
-    So a test run that is killed leaves no robots and relays behind.
+    So a test run that is killed leaves no robots and relays behind. Ctrl-C ends it also where the run itself was
+    started in the background of a script, which has it ignored.
     """
+    command = ["env", "--default-signal=INT", *command]
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM", "--", *command] if setpriv else command
 

@@ -12,7 +12,7 @@ PACKET_BYTES = 1460
 
 
 class ChaosProxy:
-    """A TCP proxy on loopback that can swallow bytes in either direction, be thin upwards, or reset everything.
+    """A TCP proxy on loopback that can swallow bytes in either direction, be thin upwards, be far, or reset everything.
 
     :param target: port it leads to
     """
@@ -21,6 +21,8 @@ class ChaosProxy:
         self.up = 0
         """Bytes that went to the target, of all connections."""
         self._target = target
+        self.seconds_away = 0.0
+        """By so much later what comes leaves, each way."""
         self._up_rate: float | None = None
         self._up_free_at = 0.0
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -86,6 +88,8 @@ class ChaosProxy:
         try:
             while data := source.recv(65536):
                 gate.wait()
+                # What comes meanwhile goes together with what comes next.
+                time.sleep(self.seconds_away)
                 if gate is self.forward_up:
                     self._send_up(sink, data)
                 else:

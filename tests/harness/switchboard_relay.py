@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from switchboard_client import Client
+from switchboard_commands import run_command
 from switchboard_processes import BIN, Process
 from websockets.sync.client import connect
+
+from relay_server.cli.relaysocket import ask_status
 
 
 class Relay:
@@ -49,15 +52,7 @@ class Relay:
 
     def run_cli(self, *arguments: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
         """Run an admin command as it is."""
-        return subprocess.run(
-            [str(BIN / "switchboard"), "--data", str(self.data), *arguments],
-            input=stdin,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            env=self._environment,
-            check=False,
-        )
+        return run_command(["--data", str(self.data), *arguments], env=self._environment, stdin=stdin)
 
     def user(self, name: str, password: str = "correct horse", *, admin: bool = False) -> str:
         """Add a user and return an access token."""
@@ -72,10 +67,8 @@ class Relay:
 
     def state_of(self, robot: str) -> str:
         """``online``, ``in_use`` or ``offline``."""
-        for each in self.cli("status")["robots"]:
-            if each["name"] == robot:
-                return str(each["state"])
-        return "offline"
+        states = {each["name"]: str(each["state"]) for each in ask_status(self.data)["robots"]}
+        return states.get(robot, "offline")
 
     def url(self, robot: str) -> str:
         """The websocket of a robot."""

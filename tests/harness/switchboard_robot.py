@@ -16,6 +16,7 @@ class Robot:
     """A simulated robot in a ROS domain of its own, with its daemon, enrolled at a relay.
 
     :param port: where the daemon dials; a proxy's port, or the relay's
+    :param sim_options: further ones of ``switchboard-sim``, such as ``--camera-size``, ``1280x720``
     """
 
     def __init__(
@@ -27,6 +28,7 @@ class Robot:
         camera: bool = False,
         daemon_env: dict[str, str] | None = None,
         enroll_options: tuple[str, ...] = (),
+        sim_options: tuple[str, ...] = (),
     ) -> None:
         self.relay = relay
         self.name = name
@@ -35,9 +37,12 @@ class Robot:
         self.record_file = self.folder / "record.jsonl"
         self.state = self.folder / "state"
         self._daemon_env = daemon_env or {}
+        self._record: list[dict[str, Any]] = []
+        self._recorded = 0
+        """Bytes of the file that are read."""
         self.folder.mkdir(parents=True)
         command = [str(BIN / "switchboard-sim"), "--record", str(self.record_file), "--seed", "1"]
-        command += ["--camera" if camera else "--no-camera"]
+        command += ["--camera" if camera else "--no-camera", *sim_options]
         self.sim = Process(command, self.folder, "sim", ros_environment(self.domain))
         code = relay.cli("robot", "add", name)["enrolment_code"]
         self.enroll(code, port or relay.robots_port, *enroll_options).check_returncode()
@@ -72,10 +77,13 @@ class Robot:
 
     def record(self) -> list[dict[str, Any]]:
         """What the simulated body was told and did: dicts with ``t`` (monotonic ns) and ``event``."""
-        if not self.record_file.exists():
-            return []
-        lines = self.record_file.read_text().splitlines()
-        return [json.loads(line) for line in lines if line.endswith("}")]
+        if self.record_file.exists():
+            with self.record_file.open("rb") as file:
+                file.seek(self._recorded)
+                whole, _, _ = file.read().rpartition(b"\n")
+            self._recorded += len(whole) + bool(whole)
+            self._record += [json.loads(line) for line in whole.splitlines()]
+        return self._record
 
     def events(self, kind: str, since: int = 0) -> list[dict[str, Any]]:
         """Events of one kind after a moment."""
@@ -83,8 +91,8 @@ class Robot:
 
     def moving(self) -> bool:
         """Whether it moves, by its own record."""
-        changes = [each["event"] for each in self.record() if each["event"] in ("moving", "standstill")]
-        return bool(changes) and changes[-1] == "moving"
+        changes = (each["event"] for each in reversed(self.record()))
+        return next((each for each in changes if each in ("moving", "standstill")), "") == "moving"
 
     def stop(self) -> None:
         """End daemon and simulator."""

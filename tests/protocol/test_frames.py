@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 
 from relay_protocol import frames
 from relay_protocol.errors import FrameTooLarge, MalformedMessage, PeerError
-from relay_protocol.frames import Frame, FrameDecoder, JsonFrame, SampleFrame, VideoFrame
+from relay_protocol.frames import (
+    Frame,
+    FrameDecoder,
+    JsonFrame,
+    PictureJoiner,
+    PicturePart,
+    SampleFrame,
+    VideoFrame,
+)
 
 U32 = st.integers(0, frames.MAX_U32)
 U64 = st.integers(0, frames.MAX_U64)
@@ -21,6 +29,7 @@ FRAMES = st.one_of(
     st.builds(JsonFrame, BODIES),
     st.builds(SampleFrame, U32, U64, BODIES),
     st.builds(VideoFrame, U32, U64, BODIES),
+    st.builds(PicturePart, U32, U64, U32, U32, st.binary(min_size=1, max_size=60)),
 )
 
 
@@ -30,6 +39,8 @@ def encode(frame: Frame) -> bytes:
         return frames.encode_json(frame.body)
     if isinstance(frame, SampleFrame):
         return frames.encode_sample(frame.number, frame.stamp, frame.body)
+    if isinstance(frame, PicturePart):
+        return frames.encode_picture_part(frame.number, frame.stamp, frame.total, frame.offset, frame.body)
     return frames.encode_video(frame.number, frame.stamp, frame.body)
 
 
@@ -100,10 +111,19 @@ def test_the_limit_can_be_raised_between_frames() -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [b"\0\0\0\0", b"\0\0\0\x01\x04", b"\0\0\0\x0c\x01" + bytes(11), b"\0\0\0\x01\x02"]
+    "data",
+    [
+        b"\0\0\0\0",
+        b"\0\0\0\x01\x05",
+        b"\0\0\0\x0c\x01" + bytes(11),
+        b"\0\0\0\x01\x02",
+        b"\0\0\0\x15\x04" + bytes(20),
+    ],
 )
 def test_malformed_frames_are_refused(data: bytes) -> None:
-    """No kind, an unknown kind, and a sample or picture without number and stamp are faults of the peer."""
+    """No kind, an unknown kind, a sample or picture without number and stamp, and a part without a byte are faults of
+    the peer.
+    """
     with pytest.raises(MalformedMessage):
         FrameDecoder(limit=1000).feed(data)
 
@@ -187,3 +207,61 @@ def test_finished_samples_make_room() -> None:
         for part in in_parts(number, 0, bytes(900), 800):
             decoder.feed(part)
     assert decoder.buffered == 0
+
+
+@given(st.lists(PARTED, max_size=6), st.integers(1, 70), st.data())
+def test_parts_make_the_pictures_they_came_from(
+    sent: list[tuple[int, int, bytes]], size: int, data: st.DataObject
+) -> None:
+    """A picture that breaks off is forgotten as soon as another begins; the others come out whole."""
+    joiner = PictureJoiner(limit=60)
+    for number, stamp, body in sent:
+        starts = range(0, len(body), size)
+        parts = [PicturePart(number, stamp, len(body), at, body[at : at + size]) for at in starts]
+        kept = data.draw(st.integers(1, len(parts)))
+        joined = [joiner.join(part) for part in parts[:kept]]
+        assert joined[:-1] == [None] * (kept - 1)
+        whole = kept == len(parts)
+        assert joined[-1] == (VideoFrame(number, stamp, body) if whole else None)
+        assert joiner.size == (0 if whole else kept * size)
+
+
+@pytest.mark.parametrize(
+    ("part", "error"),
+    [
+        (PicturePart(1, 2, 9, 4, b"x"), "does not follow"),
+        (PicturePart(1, 2, 9, 2, b"x"), "does not follow"),
+        (PicturePart(1, 3, 9, 3, b"x"), "does not follow"),
+        (PicturePart(1, 2, 8, 3, b"x"), "does not follow"),
+        (PicturePart(2, 2, 9, 3, b"x"), "does not follow"),
+        (PicturePart(1, 2, 9, 3, bytes(7)), "longer than its 9 bytes"),
+        (PicturePart(2, 2, 0, 0, b"x"), "longer than its 0 bytes"),
+        (PicturePart(2, 2, 101, 0, b"x"), "at most 100 are taken"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(part: PicturePart, error: str) -> None:
+    """A gap, a repetition, another head, more than was announced, more than is taken."""
+    joiner = PictureJoiner(limit=100)
+    assert joiner.join(PicturePart(1, 2, 9, 0, b"abc")) is None
+    with pytest.raises(PeerError, match=error):
+        joiner.join(part)
+
+
+def test_what_was_given_up_is_forgotten() -> None:
+    """Its next part follows nothing."""
+    joiner = PictureJoiner(limit=100)
+    joiner.join(PicturePart(1, 2, 9, 0, b"abc"))
+    joiner.drop()
+    assert joiner.size == 0
+    with pytest.raises(MalformedMessage, match="does not follow"):
+        joiner.join(PicturePart(1, 2, 9, 3, b"def"))
+
+
+def test_a_picture_takes_memory_as_it_comes() -> None:
+    """Not as it was announced."""
+    joiner = PictureJoiner(limit=2**24)
+    tracemalloc.start()
+    joiner.join(PicturePart(1, 0, 2**23, 0, b"a"))
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert used < 100_000

@@ -82,7 +82,7 @@ def test_the_version_and_the_words_of_rights_are_the_codes() -> None:
         (f"type or node | {limits.NAME} characters", 255),
         (f"name of a robot | {limits.ROBOT_NAME} characters", 63),
         (f"enrolment code | one use, {limits.ENROLMENT_SECONDS // 60} min", 15),
-        (f"ticket for a websocket | one use, {limits.TICKET_SECONDS} s", 60),
+        (f"ticket in an address | one use, {limits.TICKET_SECONDS} s", 60),
         (f"ticket for a channel | one use, {limits.CHANNEL_TICKET_SECONDS} s", 30),
         (f"heartbeat | {limits.HEARTBEAT_SECONDS:g} s; three missed", limits.HEARTBEATS_MISSED),
         (f"age of a motion command | {limits.COMMAND_DEADLINE_MS} ms", 500),

@@ -44,8 +44,12 @@ def as_vector(frame: frames.Frame) -> dict[str, Any]:
     """A frame as the vectors write it."""
     if isinstance(frame, frames.JsonFrame):
         return {"kind": frames.JSON, "body": frame.body.hex()}
-    kind = frames.SAMPLE if isinstance(frame, frames.SampleFrame) else frames.VIDEO
-    return {"kind": kind, "number": frame.number, "stamp": str(frame.stamp), "body": frame.body.hex()}
+    numbered = {"number": frame.number, "stamp": str(frame.stamp), "body": frame.body.hex()}
+    if isinstance(frame, frames.PicturePart):
+        return {"kind": frames.PICTURE_PART, "total": frame.total, "offset": frame.offset, **numbered}
+    if isinstance(frame, frames.CommandFrame):
+        return {"kind": frames.COMMAND, "source": frame.source, **numbered}
+    return {"kind": frames.SAMPLE if isinstance(frame, frames.SampleFrame) else frames.VIDEO, **numbered}
 
 
 def test_every_file_is_run() -> None:

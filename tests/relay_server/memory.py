@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import msgspec
@@ -13,16 +13,21 @@ from twisted.internet.task import Clock
 
 from relay_protocol import link
 from relay_protocol.errors import Unavailable
+from relay_protocol.link.moving import Order
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
 from relay_server.budget import Budgets
 from relay_server.channel import Channel, Channels
+from relay_server.control import ControlRules, Desks
 from relay_server.freshness import Freshness
+from relay_server.linkmeter import UNKNOWN, Reading
 from relay_server.local import RelayNode
+from relay_server.people import People
 from relay_server.registry import Presence, Registry
 from relay_server.rounds import Rounds
 from relay_server.session import Session, Timing
 from relay_server.video import Videos
+from tests.relay_server.control_record import MemoryRecord
 
 M = TypeVar("M", bound=link.Message)
 
@@ -97,17 +102,27 @@ class MemoryLink:
     def __init__(self) -> None:
         self.said: list[link.Message] = []
         self.samples: list[tuple[int, int, bytes]] = []
+        self.commands: list[tuple[int, int, int, bytes]] = []
         self.closed: str | None = None
         self.pings: list[Deferred[float]] = []
+        self.obeys: Callable[[Order], None] | None = None
+        """Carries out orders about motion."""
 
     def send(self, message: link.Message) -> None:
         """Keep it, once it has proved to be JSON that a robot can read."""
         msgspec.json.decode(msgspec.json.encode(message))
         self.said.append(message)
+        if self.obeys is not None and isinstance(message, Order):
+            self.obeys(message)
 
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Keep it."""
         self.samples.append((number, stamp, body))
+
+    def command(self, number: int, stamp: int, source: int, body: bytes) -> None:
+        """Keep it, as a sample and with where it comes from."""
+        self.commands.append((number, stamp, source, body))
+        self.sample(number, stamp, body)
 
     def newest(self, key: str, message: link.Message) -> None:
         """Keep it; no link in memory is slow."""
@@ -116,6 +131,10 @@ class MemoryLink:
     def close(self, reason: str) -> None:
         """The relay hangs up."""
         self.closed = self.closed or reason
+
+    def reading(self) -> Reading:
+        """Nobody has measured it."""
+        return UNKNOWN
 
     def round_trip(self) -> Deferred[float]:
         """A ping the test answers."""
@@ -207,14 +226,29 @@ class World:
         )
         self.videos = Videos(self.clock, new_ticket=lambda: f"ticket-{next(tickets)}")
         self.robot = self.registry.presence(1, "rover", "main")
-        self.control = MemoryLink()
+        self.record = MemoryRecord()
+        self.desks = Desks(
+            self.clock,
+            self.record,
+            ControlRules(),
+            self.registry.changed,
+            lambda: 1.7e9 + self.clock.seconds(),
+        )
+        self.control = self.control_link()
         self.link = MemoryLink()
         self.people: list[Session] = []
+        self.presence = People(lambda robot_id: self.people, lambda robot: 0, self.clock.seconds)
         self._tokens = itertools.count(1)
 
     def now_ns(self) -> int:
         """The clock in nanoseconds."""
         return round(self.clock.seconds() * 1e9)
+
+    def control_link(self) -> MemoryLink:
+        """A control link of a robot that does at once what it is told about motion."""
+        made = MemoryLink()
+        made.obeys = lambda order: self.desks.of(self.robot).told(link.Done(id=order.id))
+        return made
 
     @property
     def channel(self) -> Channel:
@@ -224,7 +258,7 @@ class World:
     def robot_comes(self, encodings: Iterable[str] = ("cdr", "json"), graph: link.Graph = GRAPH) -> None:
         """The robot registers and tells of its graph."""
         self.robot.encodings = tuple(encodings)
-        self.control = MemoryLink()
+        self.control = self.control_link()
         self.registry.registered(self.robot, self.control)
         self.robot.description = MOTION
         self.registry.graph(self.robot, graph)
@@ -268,9 +302,10 @@ class World:
         allow: tuple[str, ...] = (),
         deny: tuple[str, ...] = (),
         user: int = 7,
+        name: str = "ann",
     ) -> Person:
         """A client with a right on the robot, its session begun."""
-        principal = Principal(user, "ann", "main", False, next(self._tokens), None)
+        principal = Principal(user, name, "main", False, next(self._tokens), None)
         permit = Permit(principal, 1, Rules([Grant(level, allow, deny)]))
         client = MemoryClient()
         session = Session(
@@ -279,7 +314,8 @@ class World:
             permit,
             self.robot,
             self.channel,
-            RelayNode(lambda robot_id: self.people, self.videos),
+            self.desks.of(self.robot),
+            RelayNode(lambda robot_id: self.people, self.videos, self.presence),
             Freshness(self.now_ns, self.now_ns(), lambda: next(self._tokens).to_bytes(8, "big")),
             Timing(client_ping=2.0, driving_ping=0.1, stall_limit=5.0),
             self.rounds,

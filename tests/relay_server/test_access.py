@@ -49,7 +49,7 @@ class Hall:
         permit = await self.access.permit(self.principal, self.robot.id)
         assert permit is not None
         permit.on_change = lambda: self.told.append("changed")
-        permit.on_revoke = self.told.append
+        permit.on_revoke = lambda error: self.told.append(f"{type(error).__name__}: {error}")
         return permit
 
 
@@ -99,9 +99,9 @@ async def test_changed_rights_reach_what_is_open(store: Store) -> None:
 @pytest.mark.parametrize(
     ("what", "words"),
     [
-        ("right", "your right on this robot was revoked"),
-        ("token", "your session was ended; log in again"),
-        ("user", "your session was ended; log in again"),
+        ("right", "Refused: your right on this robot was revoked"),
+        ("token", "BadCredentials: your session was ended; log in again"),
+        ("user", "BadCredentials: your session was ended; log in again"),
     ],
 )
 @pytest_twisted.ensureDeferred
@@ -134,7 +134,7 @@ async def test_a_token_that_runs_out_ends_what_is_open(store: Store) -> None:
     hall.now = 5000.0
     hall.access.expire()
     hall.access.expire()
-    assert hall.told == ["your session has expired; log in again"]
+    assert hall.told == ["BadCredentials: your session has expired; log in again"]
 
 
 @pytest_twisted.ensureDeferred

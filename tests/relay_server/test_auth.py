@@ -17,13 +17,14 @@ from relay_protocol.limits import TICKET_SECONDS
 from relay_server import auth as module
 from relay_server import limiter, passwords
 from relay_server.access import Principal
-from relay_server.auth import Authenticator, BadCredentials, TooManyTries
+from relay_server.auth import Authenticator, BadCredentials, Opening, TooManyTries
 from relay_server.store import Store
 from tests.relay_server.memory import Time
 
 PASSWORD = "correct horse"
 HASHED = passwords.hash_password(PASSWORD)
 HERE = "192.0.2.1"
+ROVER = Opening("rover")
 
 
 @pytest.fixture
@@ -220,16 +221,35 @@ async def test_guessing_login_links_is_limited(
 async def test_a_ticket_is_good_once_for_one_robot_and_a_minute(
     auth: Authenticator, store: Store, ann: UserRecord, time: Time
 ) -> None:
-    """Every other use is told the same, and spends it."""
+    """Every other use is told the same, and spends it; to look at it does not."""
     principal = await auth.token(await token(store, ann))
-    good, other, late = (auth.issue_ticket(principal, "rover") for _ in range(3))
-    assert (await auth.ticket(good, "rover")) == principal
-    told = {await words(auth.ticket(good, "rover")), await words(auth.ticket("unknown", "rover"))}
-    told.add(await words(auth.ticket(other, "tank")))
-    told.add(await words(auth.ticket(other, "rover")))
+    good, other, late = (auth.issue_ticket(principal, ROVER) for _ in range(3))
+    assert (await auth.ticket(good, ROVER, spend=False)) == principal
+    assert (await auth.ticket(good, ROVER)) == principal
+    told = {await words(auth.ticket(good, ROVER)), await words(auth.ticket("unknown", ROVER))}
+    told.add(await words(auth.ticket(other, Opening("tank"))))
+    told.add(await words(auth.ticket(other, ROVER)))
     time.now += TICKET_SECONDS
-    told.add(await words(auth.ticket(late, "rover")))
-    assert told == {"the ticket is unknown, used, expired or for another robot; ask for a new one"}
+    told.add(await words(auth.ticket(late, ROVER)))
+    assert told == {"the ticket is unknown, used, expired or for something else; ask for a new one"}
+
+
+@pytest.mark.parametrize(
+    ("opens", "asked", "good"),
+    [
+        (ROVER, Opening("rover", video=True, camera="/eye"), False),
+        (Opening("rover", video=True), ROVER, False),
+        (Opening("rover", video=True), Opening("rover", video=True), True),
+        (Opening("rover", video=True), Opening("rover", video=True, camera="/eye"), True),
+        (Opening("rover", video=True, camera="/eye"), Opening("rover", video=True, camera="/eye"), True),
+        (Opening("rover", video=True, camera="/eye"), Opening("rover", video=True, camera="/eyes"), False),
+        (Opening("rover", video=True, camera="/eye"), Opening("rover", video=True), False),
+        (Opening("rover", video=True, camera="/eye"), Opening("tank", video=True, camera="/eye"), False),
+    ],
+)
+def test_a_ticket_opens_what_it_is_for(opens: Opening, asked: Opening, good: bool) -> None:
+    """A picture's is no way to drive, and one camera's shows no other."""
+    assert opens.covers(asked) is good
 
 
 @pytest_twisted.ensureDeferred
@@ -238,9 +258,9 @@ async def test_a_ticket_dies_with_the_session_that_asked_for_it(
 ) -> None:
     """Logging out in between leaves no way in."""
     principal = await auth.token(await token(store, ann))
-    ticket = auth.issue_ticket(principal, "rover")
+    ticket = auth.issue_ticket(principal, ROVER)
     await store.write(queries.revoke_token, principal.token_id)
-    assert "has ended" in await words(auth.ticket(ticket, "rover"))
+    assert "has ended" in await words(auth.ticket(ticket, ROVER))
 
 
 def test_tickets_are_bounded_and_nobody_takes_them_all(
@@ -251,11 +271,11 @@ def test_tickets_are_bounded_and_nobody_takes_them_all(
     greedy = Principal(1, "greedy", "main", False, 1, None)
     others = [Principal(number, "x", "main", False, number, None) for number in range(2, 60)]
     for _ in range(1000):
-        auth.issue_ticket(greedy, "rover")
+        auth.issue_ticket(greedy, ROVER)
     assert len(auth._tickets) == module.TICKETS_OF_ONE
     with pytest.raises(Refused, match="too many tickets"):
         for other in others:
-            auth.issue_ticket(other, "rover")
+            auth.issue_ticket(other, ROVER)
     time.now += TICKET_SECONDS
-    auth.issue_ticket(others[0], "rover")
+    auth.issue_ticket(others[0], ROVER)
     assert len(auth._tickets) == 1

@@ -10,15 +10,17 @@ import pytest_twisted
 from twisted.internet import reactor
 
 from relay_db import queries
-from relay_protocol.errors import NotFound, Refused
+from relay_protocol import link
+from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_server import closing, limiter, passwords
 from relay_server.access import Access, BadCredentials, Principal
-from relay_server.auth import Authenticator, TooManyTries
+from relay_server.auth import Authenticator, Opening, TooManyTries
 from relay_server.frontdesk import NO_ROBOT, FrontDesk
 from relay_server.journal import Journal
 from relay_server.origins import Origins
 from relay_server.session import Session, Timing
 from relay_server.store import Store
+from relay_server.video import Picture
 from tests.relay_server.memory import MemoryClient, World
 
 PASSWORD = "correct horse"
@@ -43,6 +45,7 @@ class Desk:
             self.world.registry,
             self.world.channels,
             self.world.videos,
+            self.world.desks,
             Journal(store, self.wall),
             Origins("http"),
             Timing(2.0, 0.1, 5.0),
@@ -135,7 +138,10 @@ async def test_a_robot_without_rights_is_like_no_robot(front: Desk) -> None:
     """For websockets and for tickets: one and the same answer."""
     principal, _ = await front.logged_in()
     for robot in ("hidden", "nothing", "", "x" * 10_000, "\x00"):
-        for asking in (front.desk.admit(principal, robot, HERE), front.desk.issue_ticket(principal, robot)):
+        for asking in (
+            front.desk.admit(principal, robot, HERE),
+            front.desk.issue_ticket(principal, Opening(robot)),
+        ):
             with pytest.raises(NotFound) as told:
                 await asking
             assert str(told.value) == NO_ROBOT
@@ -172,6 +178,45 @@ async def test_open_sessions_are_counted_shown_and_recorded(front: Desk) -> None
     assert not front.access._permits
     assert not list(front.desk)
     assert len(await front.events("client.joined")) == len(await front.events("client.left")) == 2
+
+
+class Wall:
+    """A screen nobody looks at."""
+
+    def picture(self, picture: Picture) -> None:
+        """None comes."""
+
+    def playing(self, playing: link.Playing) -> None:
+        """Nor this."""
+
+    def ended(self, error: SwitchboardError) -> None:
+        """Nor this."""
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_watches_a_camera_is_at_the_robot(front: Desk) -> None:
+    """It is in use, and users and the administrator see by whom; afterwards nothing is left of it."""
+    front.world.robot = front.desk._registry.presence(front.rover.id, "rover", "default")
+    front.world.robot_comes()
+    principal, _ = await front.logged_in()
+    changes: list[None] = []
+    stop = front.desk.on_change(lambda: changes.append(None))
+    watching = await front.desk.viewing(principal, "rover", "/eye", link.VideoSettings(), Wall(), HERE)
+    (view,) = await front.desk.robots(principal)
+    since = front.world.registry._wall()
+    assert (view["state"], view["clients"]) == (
+        "in_use",
+        [{"user": "ann", "since": since, "camera": "/eye"}],
+    )
+    (shown,) = [each for each in front.desk.status() if each["state"] == "in_use"]
+    assert shown["clients"] == []
+    assert shown["onlookers"] == [{"user": "ann", "address": HERE, "since": since, "camera": "/eye"}]
+    watching.leave()
+    assert len(changes) == 2
+    stop()
+    (view,) = await front.desk.robots(principal)
+    assert (view["state"], view["clients"]) == ("online", [])
+    assert not front.access._permits
 
 
 @pytest_twisted.ensureDeferred

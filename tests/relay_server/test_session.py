@@ -8,9 +8,10 @@ import msgspec
 import pytest
 
 from relay_protocol import link
-from relay_protocol.errors import Invalid
+from relay_protocol.errors import Invalid, Refused
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server import closing
+from relay_server.access import BadCredentials
 from relay_server.channel import subscriptions
 from relay_server.session import calling, listening, normal_type, operations
 from relay_server.session import core as module
@@ -331,19 +332,17 @@ def test_rights_taken_away_while_open_take_back_what_they_gave(world: World) -> 
 
 
 @pytest.mark.parametrize(
-    ("reason", "code"),
+    ("error", "code"),
     [
-        ("your right on this robot was revoked", closing.FORBIDDEN),
-        ("your session was ended; log in again", closing.UNAUTHENTICATED),
-        ("your account was disabled", closing.UNAUTHENTICATED),
-        ("your session has expired; log in again", closing.UNAUTHENTICATED),
+        (Refused("your right on this robot was revoked"), closing.FORBIDDEN),
+        (BadCredentials("your account was disabled"), closing.UNAUTHENTICATED),
     ],
 )
-def test_a_revoked_client_is_cut_with_the_reason(world: World, reason: str, code: int) -> None:
+def test_a_revoked_client_is_cut_with_the_reason(world: World, error: Refused, code: int) -> None:
     """The code tells whether logging in again helps."""
     person = world.person()
-    person.session.permit.on_revoke(reason)
-    assert person.client.closed == (code, reason)
+    person.session.permit.on_revoke(error)
+    assert person.client.closed == (code, str(error))
     assert not world.channel.members
 
 

@@ -15,6 +15,7 @@ import msgspec
 
 from relay_protocol import frames, identity, link
 from relay_protocol.errors import PeerError
+from relay_protocol.link.moving import Order
 
 T = TypeVar("T", bound=link.Message | frames.SampleFrame | frames.VideoFrame)
 PATIENCE = 20.0
@@ -26,6 +27,7 @@ class Peer:
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
         self._decoder = frames.FrameDecoder(2**25)
+        self._pictures = frames.PictureJoiner(2**25)
         self._inbox: queue.Queue[Any] = queue.Queue()
         self.read = link.opening_decoder
         self.skipped: list[Any] = []
@@ -43,6 +45,13 @@ class Peer:
         self._inbox.put(None)
 
     def _take(self, frame: frames.Frame) -> None:
+        if isinstance(frame, frames.PicturePart):
+            whole = self._pictures.join(frame)
+            if whole is None:
+                if self.takes:
+                    self.say(link.Took(number=frame.number, upto=self._pictures.size))
+                return
+            frame = whole
         if not isinstance(frame, frames.JsonFrame):
             if isinstance(frame, frames.VideoFrame) and self.takes:
                 self.say(link.Took(number=frame.number))
@@ -64,6 +73,16 @@ class Peer:
     def sample(self, number: int, body: bytes, age: float = 0.0) -> None:
         self.raw(frames.encode_sample(number, time.monotonic_ns() - int(age * 1e9), body))
 
+    def command(self, number: int, body: bytes, age: float = 0.0, source: int = 1) -> None:
+        self.raw(frames.encode_command(number, time.monotonic_ns() - int(age * 1e9), source, body))
+
+    def order(self, message: Order) -> link.Done:
+        """Give an order; what the robot answers."""
+        self.say(message)
+        while (done := self.expect(link.Done)).id != message.id:
+            self.skipped.append(done)
+        return done
+
     def raw(self, data: bytes) -> None:
         with contextlib.suppress(OSError):
             self._connection.sendall(data)
@@ -73,7 +92,9 @@ class Peer:
         deadline = time.monotonic() + timeout
         while True:
             message = self._inbox.get(timeout=max(0.01, deadline - time.monotonic()))
-            assert message is not None, f"the robot hung up before it said {kind.__name__}"
+            assert message is not None, (
+                f"the robot hung up before it said {kind.__name__}; it said {self.skipped[-5:]}"
+            )
             if isinstance(message, kind):
                 return message
             self.skipped.append(message)

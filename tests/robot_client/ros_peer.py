@@ -18,7 +18,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import BatteryState
+from sensor_msgs.msg import BatteryState, Joy
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -76,12 +76,16 @@ def listen(topic: str, kind: str) -> None:
     def stamped(message: TwistStamped) -> None:
         tell(topic=topic, x=message.twist.linear.x, stamp=message.header.stamp.sec)
 
+    def joy(message: Joy) -> None:
+        tell(topic=topic, axes=list(message.axes), buttons=list(message.buttons))
+
     def string(message: String) -> None:
         tell(topic=topic, text=message.data)
 
     type, function = {
         "twist": (Twist, twist),
         "stamped": (TwistStamped, stamped),
+        "joy": (Joy, joy),
         "string": (String, string),
     }[kind]
     ends["<" + topic] = node.create_subscription(type, topic, function, 10)

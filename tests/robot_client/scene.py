@@ -7,16 +7,21 @@ from typing import Any, cast
 from twisted.internet.task import Clock
 
 from relay_protocol import link
-from relay_protocol.frames import FrameDecoder, SampleFrame
+from relay_protocol.frames import CommandFrame, FrameDecoder, SampleFrame
 from relay_protocol.link import MotionPolicy
+from robot_client.authority import Authority
 from robot_client.channel import Channel
-from robot_client.motion import MotionDesk, NoGuard
+from robot_client.gate import Gate
+from robot_client.guard_feed import NoGuard
+from robot_client.motion import MotionDesk
 from robot_client.offset import Offset
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, MemoryPlatform
 from robot_client.wire import Wire
 
 STRING = "std_msgs/msg/String"
+DRIVER = 7
+"""The source that holds control."""
 
 
 class Recorder(Wire):
@@ -39,10 +44,23 @@ class Scene:
         self.wire = Recorder()
         self.offset = Offset()
         self.offset.add(self.now(), self.now(), self.now())
-        policy = MotionPolicy(types=[TWIST])
-        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, NoGuard())
+        policy = MotionPolicy(types=[TWIST], services=["/arm/*"], actions=["/navigate_to_pose"])
+        self.authority = Authority()
+        self.authority.hold(DRIVER, "ann", "operator", 0)
+        self.silent: dict[str, bool] = {}
+        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, NoGuard(), self.authority)
+        self.gate = Gate(policy, self.platform, self.authority, self.now)
         self.channel = Channel(
-            "c1", self.wire, self.offset, self.platform, self.desk, self.clock, 2**24, wall=lambda: 777
+            "c1",
+            self.wire,
+            self.offset,
+            self.platform,
+            self.desk,
+            self.clock,
+            2**24,
+            self.gate,
+            self.silent,
+            wall=lambda: 777,
         )
 
     def now(self) -> int:
@@ -60,5 +78,5 @@ class Scene:
         for _ in range(round(seconds * 100)):
             self.clock.advance(0.01)
 
-    def drive(self, body: bytes) -> None:
-        self.channel.sample(SampleFrame(5, self.now(), body))
+    def drive(self, body: bytes, source: int = DRIVER) -> None:
+        self.channel.command(CommandFrame(5, self.now(), source, body))

@@ -11,9 +11,9 @@ from relay_protocol import link
 from relay_protocol.frames import SampleFrame
 from relay_protocol.link import MotionPolicy
 from robot_client.motion import KEPT, MAX_TOPICS, MOTION_QOS
-from robot_client.platforms.base import GraphView
+from robot_client.platforms.base import CANCELED, GraphView, Outcome
 from robot_client.platforms.memory import TWIST, twist
-from tests.robot_client.scene import STRING, Scene
+from tests.robot_client.scene import DRIVER, STRING, Scene
 
 
 @pytest.fixture
@@ -249,3 +249,76 @@ def test_every_request_of_the_contract_is_known(scene: Scene) -> None:
     """The channel has a handler for all that the relay may ask."""
     told = {link.Ping, link.Pong, link.Bye}
     assert set(scene.channel._handlers) == set(get_args(link.RelayChannel)) - told
+
+
+@pytest.mark.parametrize("source", [0, DRIVER + 1])
+def test_calls_and_goals_that_move_the_robot_are_for_the_holder(scene: Scene, source: int) -> None:
+    """Also by a name spelled otherwise, and by the hidden service of an action; everything else is for everybody."""
+    echo = {
+        "/arm/move",
+        "/lamp",
+        "/navigate_to_pose/_action/send_goal",
+        "/navigate_to_pose/_action/cancel_goal",
+    }
+    for service in echo:
+        scene.platform.services[service] = lambda request: request
+    scene.platform.actions = {"/navigate_to_pose", "/dock"}
+    cdr = link.to_base64(b"abc")
+
+    def call(service: str, by: int) -> bool:
+        answer = scene.ask(link.CallService(id="c", service=service, type="t", source=by, cdr=cdr))
+        return bool(answer.result)
+
+    def goal(action: str, by: int) -> bool:
+        before = len(scene.platform.goals)
+        scene.ask(link.SendActionGoal(id=f"{action}{by}", action=action, type="t", source=by, cdr=cdr))
+        return len(scene.platform.goals) > before
+
+    for name in ("/arm/move", "arm/move", "/navigate_to_pose/_action/send_goal"):
+        assert not call(name, source)
+    assert call("/arm/move", DRIVER)
+    assert call("/navigate_to_pose/_action/send_goal", DRIVER)
+    assert call("/lamp", source)
+    assert call("/navigate_to_pose/_action/cancel_goal", source)
+    for name in ("/navigate_to_pose", "navigate_to_pose"):
+        assert not goal(name, source)
+    assert goal("/navigate_to_pose", DRIVER)
+    assert goal("/dock", source)
+    assert scene.authority.refused == 5
+
+
+def test_only_the_holders_commands_are_obeyed(scene: Scene) -> None:
+    """What another source says on the same publication goes nowhere."""
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    scene.drive(twist(0.5), DRIVER + 1)
+    scene.drive(twist(1.0))
+    assert scene.platform.published == [("/cmd_vel", twist(1.0))]
+
+
+def test_goals_are_cancelled_in_order_whatever_one_does(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A goal whose end fails does not keep the next from its own; its result is still told."""
+    scene.platform.actions = {"/a", "/navigate_to_pose"}
+    for action in ("/a", "/navigate_to_pose"):
+        scene.ask(link.SendActionGoal(id=action, action=action, type="t", source=DRIVER, cdr=""))
+
+    def broken() -> None:
+        raise RuntimeError("gone")
+
+    first, second = scene.platform.goals
+    monkeypatch.setattr(first, "cancel", broken)
+    scene.channel.cancel_goals(only_moving=False)
+    assert second.cancelled
+    second.result.callback(Outcome(CANCELED, None, "stopped"))
+    assert scene.wire.said[-1] == link.ActionResult(
+        id="/navigate_to_pose", status=CANCELED, result=False, reason="stopped"
+    )
+
+
+def test_samples_to_what_moves_the_robot_are_dropped_and_counted(scene: Scene) -> None:
+    """They don't say whose they are."""
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    scene.channel.sample(SampleFrame(5, scene.now(), twist(1.0)))
+    assert scene.platform.published == []
+    assert scene.authority.refused == 1

@@ -11,6 +11,7 @@ from relay_protocol import identity
 from robot_client.clocks import now_ns
 from robot_client.config import Safety, Settings
 from robot_client.identity import Enrolment
+from robot_client.lasting import MemoryLatch
 from robot_client.link import Identity
 from robot_client.platforms.memory import MemoryPlatform
 from robot_client.run import Runner
@@ -42,6 +43,8 @@ def test_the_daemon_judges_commands_by_it() -> None:
     """The daemon, and with it every link's estimate and the watchdog, reads this clock."""
     me = Identity("r1", "relay-1", identity.generate_key())
     enrolment = Enrolment(relay="relay-1", robot="r1", address="127.0.0.1:1", tls=False)
-    runner = Runner(Clock(), Settings(safety=Safety(guard=False)), enrolment, me, MemoryPlatform())
+    runner = Runner(
+        Clock(), Settings(safety=Safety(guard=False)), enrolment, me, MemoryLatch(), MemoryPlatform()
+    )
     assert runner.daemon._now is now_ns
     assert runner.daemon.motion._now is now_ns

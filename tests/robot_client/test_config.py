@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from relay_protocol.errors import Invalid
 from robot_client.config import Settings, load
+from robot_client.safety import Times
+
+POSE = "geometry_msgs/msg/PoseStamped"
 
 
 def test_without_anything_the_defaults_hold() -> None:
-    """No file and no variables give the defaults: stop within 500 ms, Twist and TwistStamped are motion."""
+    """No file, no variables: stop within 500 ms, no ramp; velocities, joints and joysticks are motion."""
     settings = load(None, {})
     assert settings == Settings()
     assert settings.safety.policy.stop_within_ms == 500
-    assert settings.safety.policy.types == ["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
+    assert settings.safety.ramp_ms == 0
+    assert settings.safety.policy.types == [
+        "geometry_msgs/msg/Twist",
+        "geometry_msgs/msg/TwistStamped",
+        "sensor_msgs/msg/Joy",
+        "trajectory_msgs/msg/JointTrajectory",
+        "control_msgs/msg/JointJog",
+    ]
 
 
 def test_environment_beats_file(tmp_path: Path) -> None:
@@ -46,6 +57,16 @@ def test_lists_in_variables_have_commas() -> None:
         ('[cameras]\n"a b" = "/film.mp4"\n', "a b"),
         ('[cameras]\nusb = "video0"\n', "v4l2:/dev/video0"),
         ("[video]\nstreams = 0\n", "streams"),
+        ("[limits]\nlinear = 0\n", "linear"),
+        ("[limits]\nviewer = { linear = 1 }\n", "viewer"),
+        ("[limits.owner]\nlinar = 1\n", "linar"),
+        ("[safety]\nstop_within_ms = 9000\nramp_ms = 2001\n", r"<= 2000.*safety\.ramp_ms"),
+        ("[safety]\nramp_ms = 251\n", "at most half of stop_within_ms, which is 500"),
+        ('[safety]\nramp_ms = 101\ntopic = [{name="a", stop_within_ms=200}]\n', "which is 200"),
+        ('[[safety.topic]]\nname = "/arm"\nstop_within_ms = 501\n', "longer than the robot's"),
+        ('[[safety.topic]]\nname = "/arm"\ndeadline_ms = 501\n', "longer than the robot's"),
+        ('[[safety.topic]]\nname = "/arm"\n[[safety.topic]]\nname = "arm"\n', "twice"),
+        ('[[safety.topic]]\nname = "a b"\n', "a b"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
@@ -65,6 +86,15 @@ def test_cameras_are_named_like_topics(tmp_path: Path) -> None:
     settings = load(file, {})
     assert settings.cameras == {"/usb": "v4l2:/dev/video0", "/gate/left": "rtsp://gate/1"}
     assert settings.video.streams == 3
+
+
+def test_address_of_a_camera_is_not_told(tmp_path: Path) -> None:
+    """It may hold a password, also where it is wrong."""
+    file = tmp_path / "robot.toml"
+    file.write_text('[cameras]\ngate = "RTSP://ann:s3cret@gate/1"\n')
+    with pytest.raises(Invalid, match="what gate") as caught:
+        load(file, {})
+    assert "s3cret" not in str(caught.value)
 
 
 def test_unknown_variable_is_named() -> None:
@@ -99,7 +129,11 @@ def test_short_spellings_of_motion_are_made_full() -> None:
         ("motion_types", "std_srvs/srv/Trigger"),
         ("motion_topics", "cmd vel"),
         ("motion_topics", "/cmd_vel/"),
-        ("motion_topics", "*"),
+        ("motion_topics", "//arm"),
+        ("motion_services", "/arm/*/"),
+        ("motion_services", "/arm/[xy"),
+        ("motion_actions", "go there"),
+        ("goal_topics", "/goal_pose/"),
     ],
 )
 def test_motion_that_could_match_nothing_is_refused(tmp_path: Path, key: str, value: str) -> None:
@@ -117,3 +151,116 @@ def test_simulated_time_is_a_setting(tmp_path: Path) -> None:
     assert not load(None, {}).ros.use_sim_time
     assert load(file, {}).ros.use_sim_time
     assert load(None, {"SWITCHBOARD_ROBOT_ROS_USE_SIM_TIME": "true"}).ros.use_sim_time
+
+
+def test_a_topic_with_times_of_its_own_moves_the_robot(tmp_path: Path) -> None:
+    """What is left out is as for the robot; the topic is told as motion, once."""
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        '[safety]\nmotion_topics = ["/arm"]\n'
+        '[[safety.topic]]\nname = "arm"\nstop_within_ms = 200\n'
+        '[[safety.topic]]\nname = "/gripper"\ndeadline_ms = 100\n'
+    )
+    safety = load(file, {}).safety
+    assert safety.policy.topics == ["/arm", "/gripper"]
+    assert safety.times("/arm") == Times(200, 500)
+    assert safety.times("/gripper") == Times(500, 100)
+    assert safety.times("/cmd_vel") == Times(500, 500)
+
+
+def test_limits_of_a_level_have_variables_too(tmp_path: Path) -> None:
+    """They beat the file, and a table that is none is named."""
+    file = tmp_path / "robot.toml"
+    file.write_text("[limits]\nlinear = 1\n[limits.operator]\nlinear = 0.5\nangular = 1.5\n")
+    limits = load(file, {"SWITCHBOARD_ROBOT_LIMITS_OPERATOR_LINEAR": "0.25"}).limits
+    assert (limits.linear, limits.operator.linear, limits.operator.angular) == (1.0, 0.25, 1.5)
+    file.write_text("[limits]\noperator = 3\n")
+    with pytest.raises(Invalid, match="operator"):
+        load(file, {"SWITCHBOARD_ROBOT_LIMITS_OPERATOR_LINEAR": "0.25"})
+
+
+def test_tables_have_no_variables() -> None:
+    """A list of tables can't be written into one."""
+    with pytest.raises(Invalid, match="SAFETY_TOPIC is no setting"):
+        load(None, {"SWITCHBOARD_ROBOT_SAFETY_TOPIC": "/arm"})
+
+
+def test_motion_may_be_named_by_patterns(tmp_path: Path) -> None:
+    """Topics, services and actions that move the robot, by name or by pattern; without settings the usual actions."""
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        '[safety]\nmotion_topics = ["arm/*", "*/cmd_vel"]\nmotion_services = ["/gripper/[oc]*"]\n'
+    )
+    policy = load(file, {}).safety.policy
+    assert policy.moves_by_topic("/arm/left", "std_msgs/msg/String")
+    assert policy.moves_by_topic("/base/cmd_vel", "x/msg/Y")
+    assert policy.moves_by_service("/gripper/open")
+    assert not policy.moves_by_service("/gripper/state")
+    assert policy.moves_by_action("/navigate_to_pose")
+    assert policy.moves_by_action("/left/follow_joint_trajectory")
+    assert not policy.moves_by_action("/dock_is_free")
+
+
+@pytest.mark.parametrize("namespace", ["", "/robot1", "/fleet/robot1"])
+def test_actions_of_nav2_move_the_robot_in_every_namespace(namespace: str) -> None:
+    """Those that drive it, without any settings; those that only compute or wait do not."""
+    policy = load(None, {}).safety.policy
+    for name in [
+        "navigate_to_pose",
+        "navigate_through_poses",
+        "navigate_complete_coverage",
+        "follow_waypoints",
+        "follow_gps_waypoints",
+        "follow_path",
+        "follow_object",
+        "drive_on_heading",
+        "spin",
+        "backup",
+        "assisted_teleop",
+        "dock_robot",
+        "undock_robot",
+        "follow_joint_trajectory",
+    ]:
+        assert policy.moves_by_action(f"{namespace}/{name}")
+    for name in ("compute_path_to_pose", "compute_route", "smooth_path", "wait", "my_spin", "spin/state"):
+        assert not policy.moves_by_action(f"{namespace}/{name}")
+
+
+def test_goal_topics_are_told_as_motion_but_not_stopped_by_zero(tmp_path: Path) -> None:
+    """The relay asks for control; what says zero does not know of them. They are a setting of their own."""
+    safety = load(None, {}).safety
+    for name in ("/goal_pose", "/robot1/goal_pose"):
+        assert safety.told.moves_by_topic(name, POSE)
+        assert not safety.policy.moves_by_topic(name, POSE)
+    assert not safety.told.moves_by_topic("/initialpose", POSE)
+    assert (safety.told.actions, safety.told.types) == (safety.policy.actions, safety.policy.types)
+    file = tmp_path / "robot.toml"
+    file.write_text('[safety]\nmotion_topics = ["/arm"]\ngoal_topics = ["arm", "target"]\n')
+    assert load(file, {}).safety.told.topics == ["/arm", "/target"]
+
+
+def test_settings_of_the_readme_lose_no_default(tmp_path: Path) -> None:
+    """Whoever copies the example as it stands has all that moves by default."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    example = next(each for each in re.findall(r"```toml\n(.*?)```", text, re.DOTALL) if "[safety]" in each)
+    file = tmp_path / "robot.toml"
+    file.write_text(example)
+    shown, default = load(file, {}).safety, load(None, {}).safety
+    for key in ("motion_types", "motion_actions", "goal_topics"):
+        assert getattr(shown, key) == getattr(default, key)
+
+
+def test_switches_of_the_hardware_are_settings() -> None:
+    """The service and the programs that stop the hardware; a program is named by its whole path."""
+    settings = load(
+        None,
+        {
+            "SWITCHBOARD_ROBOT_SAFETY_STOP_CALL": "estop",
+            "SWITCHBOARD_ROBOT_SAFETY_STOP_COMMAND": "/usr/bin/relay, off",
+        },
+    )
+    assert tuple(settings.safety.switches) == ("/estop", ["/usr/bin/relay", "off"], [])
+    with pytest.raises(Invalid, match="stop_command"):
+        load(None, {"SWITCHBOARD_ROBOT_SAFETY_STOP_COMMAND": "relay,off"})
+    with pytest.raises(Invalid, match="stop_call"):
+        load(None, {"SWITCHBOARD_ROBOT_SAFETY_STOP_CALL": "e stop"})

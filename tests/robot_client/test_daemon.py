@@ -2,137 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
-from twisted.internet.address import IPv4Address
-from twisted.internet.defer import Deferred, fail, succeed
-from twisted.internet.error import ConnectionLost, ConnectionRefusedError
-from twisted.internet.protocol import Factory
-from twisted.internet.task import Clock
-from twisted.internet.testing import StringTransportWithDisconnection
-from twisted.python.failure import Failure
 
-from relay_protocol import frames, identity, link
-from robot_client.backoff import Backoff
-from robot_client.camera.desk import CameraDesk
-from robot_client.camera.keeper import CameraKeeper
-from robot_client.camera.lines import Settings as CameraSettings
-from robot_client.config import Settings
-from robot_client.connection import Connection
-from robot_client.daemon import Daemon
-from robot_client.link import ControlLink, Identity
-from robot_client.motion import NoGuard
+from relay_protocol import frames, link
 from robot_client.platforms.base import GraphView
-from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
-
-ME = Identity("r1", "relay-1", identity.generate_key())
-
-
-class Line:
-    """The relay's end of one connection in memory."""
-
-    def __init__(self, protocol: Any, address: str) -> None:
-        self.address = address
-        self.protocol = protocol
-        self.transport = StringTransportWithDisconnection(peerAddress=IPv4Address("TCP", "127.0.0.1", 1))
-        self.transport.protocol = protocol
-        self.transport.abortConnection = self.transport.loseConnection
-        self.closed = False
-        protocol.makeConnection(self.transport)
-
-    def say(self, *messages: link.Message) -> None:
-        self.protocol.dataReceived(b"".join(map(link.frame, messages)))
-
-    def heard(self) -> list[Any]:
-        data = self.transport.value()
-        self.transport.clear()
-        return [
-            json.loads(each.body) if isinstance(each, frames.JsonFrame) else each
-            for each in frames.FrameDecoder(2**25).feed(data)
-        ]
-
-    def ops(self) -> list[str]:
-        return [each["op"] for each in self.heard() if isinstance(each, dict)]
-
-    def lose(self) -> None:
-        self.transport.connected = False
-        self.protocol.connectionLost(Failure(ConnectionLost()))
-
-
-class Endpoint:
-    def __init__(self, scene: Scene, address: str) -> None:
-        self.scene = scene
-        self.address = address
-
-    def connect(self, factory: Factory[Any]) -> Deferred[Any]:
-        self.scene.dialled.append((self.scene.clock.seconds(), self.address))
-        if not self.scene.listening:
-            return fail(ConnectionRefusedError())
-        protocol = factory.buildProtocol(IPv4Address("TCP", "127.0.0.1", 1))
-        self.scene.lines.append(Line(protocol, self.address))
-        return succeed(protocol)
-
-
-class Scene:
-    def __init__(self) -> None:
-        self.clock = Clock()
-        self.clock.advance(1000)
-        self.listening = True
-        self.dialled: list[tuple[float, str]] = []
-        self.lines: list[Line] = []
-        self.platform = MemoryPlatform(GraphView(nodes=frozenset({"/talker"})))
-        self.connection = Connection(
-            self.dial,
-            lambda: ControlLink(ME, "test", self.now),
-            self.clock,
-            Backoff(lambda: 0.5),
-            "r1",
-            "relay:1",
-        )
-        self.cameras = CameraKeeper(self.clock, CameraSettings(address="relay:1", node="camera", streams=8))
-        self.daemon = Daemon(
-            Settings(),
-            self.connection,
-            self.platform,
-            NoGuard(),
-            CameraDesk({}, self.cameras, self.connection.say, self.clock),
-            self.clock,
-            self.dial,
-            "test",
-            self.now,
-        )
-        self.daemon.start()
-
-    def now(self) -> int:
-        return round(self.clock.seconds() * 1e9)
-
-    def dial(self, address: str) -> Endpoint:
-        return Endpoint(self, address)
-
-    def register(self) -> Line:
-        line = self.lines[-1]
-        line.say(link.Challenge(nonce=link.to_base64(bytes(32)), relay="relay-1"))
-        line.say(link.Welcome(session="s", heartbeat=2.0, frame_limit=2**24))
-        return line
-
-    def channel(self, control: Line, name: str = "c1", address: str = "") -> Line:
-        control.say(link.OpenChannel(channel=name, ticket="t-" + name, address=address))
-        line = self.lines[-1]
-        line.say(link.Joined(channel=name, at=self.now()))
-        return line
-
-    def driving(self, control: Line) -> Line:
-        line = self.channel(control)
-        line.say(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
-        line.protocol.dataReceived(frames.encode_sample(5, self.now(), twist(1.0)))
-        assert self.platform.published[-1] == ("/cmd_vel", twist(1.0))
-        return line
-
-    def run(self, seconds: float) -> None:
-        for _ in range(round(seconds * 10)):
-            self.clock.advance(0.1)
+from robot_client.platforms.memory import TWIST, twist
+from tests.robot_client.daemon_scene import DRIVER, Scene
 
 
 @pytest.fixture
@@ -159,7 +36,7 @@ def test_cameras_are_told_and_shown(scene: Scene, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(scene.cameras, "close_all", lambda why: done.append("all"))
     image = link.Topic(types=["sensor_msgs/msg/Image"], publishers=["/driver"])
     line = scene.register()
-    assert [each for each in line.heard() if each["op"] == "cameras"] == [{"op": "cameras"}]
+    assert [each for each in line.heard() if each["op"] == "cameras"] == [{"op": "cameras", "streams": 8}]
     scene.platform.view = GraphView(topics={"/front": image})
     scene.run(1.5)
     (told,) = [each for each in line.heard() if each["op"] == "cameras"]
@@ -303,24 +180,30 @@ def test_every_loss_stops_the_robot_at_once(scene: Scene, how: str) -> None:
 def test_nothing_behind_a_goodbye_is_done(scene: Scene) -> None:
     """A command that follows the relay's goodbye in the same bytes is not executed."""
     line = scene.driving(scene.register())
-    late = frames.encode_sample(5, scene.now(), twist(0.5))
+    late = frames.encode_command(5, scene.now(), DRIVER, twist(0.5))
     line.protocol.dataReceived(link.frame(link.Bye(reason="done")) + late)
     assert ("/cmd_vel", twist(0.5)) not in scene.platform.published
     assert scene.platform.published[-1] == ("/cmd_vel", twist())
 
 
 def test_reconnecting_resumes_nothing(scene: Scene) -> None:
-    """After a loss nothing is published until a client advertises and commands anew."""
+    """Who drives on through a loss moves nothing, though he has control again, until he has let go."""
     control = scene.register()
     scene.driving(control)
     control.lose()
     sent = len(scene.platform.published)
     scene.run(1)
     control = scene.register()
+    control.say(link.Control(id=2, holder=DRIVER, user="ann", level="operator"))
     line = scene.channel(control)
-    line.protocol.dataReceived(frames.encode_sample(5, scene.now(), twist(1.0)))
-    scene.run(1)
+    line.say(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    for _ in range(20):
+        scene.command(line, twist(1.0))
+        scene.clock.advance(0.05)
     assert {body for _, body in scene.platform.published[sent:]} == {twist()}
+    scene.command(line, twist())
+    scene.command(line, twist(1.0))
+    assert scene.platform.published[-1] == ("/cmd_vel", twist(1.0))
 
 
 def test_alert_waits_for_the_relay(scene: Scene) -> None:
@@ -328,6 +211,19 @@ def test_alert_waits_for_the_relay(scene: Scene) -> None:
     scene.daemon.alert("error", "look here")
     (told,) = [each for each in scene.register().heard() if each["op"] == "alert"]
     assert told["text"] == "look here"
+
+
+def test_alert_said_into_a_dead_link_is_told_by_the_next(scene: Scene) -> None:
+    """And that there is no other; what lasts is told by each link after it."""
+    scene.register().heard()
+    scene.daemon.alert("error", "the motor is hot", "diagnostics", "motor")
+    for _ in range(2):
+        scene.lines[-1].lose()
+        scene.run(0.5)
+        heard = scene.register().heard()
+        (told,) = [each for each in heard if each["op"] == "alert"]
+        assert (told["kind"], told["about"], told["text"]) == ("diagnostics", "motor", "the motor is hot")
+        assert [each["op"] for each in heard if "alert" in each["op"]] == ["alert", "alerts_told"]
 
 
 def test_stop_says_goodbye(scene: Scene) -> None:

@@ -8,7 +8,19 @@ import sys
 import pytest
 
 from robot_client.guard import Guard
-from robot_client.guard_protocol import Alive, Command, Forget, Leave, Probe, Topic, decoder, encode
+from robot_client.guard_protocol import (
+    GOALS_WITHIN_MS,
+    Alive,
+    Command,
+    Forget,
+    Leave,
+    Probe,
+    Shape,
+    Topic,
+    cancelling,
+    decoder,
+    encode,
+)
 from robot_client.topics import TypedTopic
 
 MS = 1_000_000
@@ -21,6 +33,7 @@ class Outlets:
     def __init__(self) -> None:
         self.open_now: set[TypedTopic] = set()
         self.zeros: list[tuple[int, TypedTopic]] = []
+        self.rests: list[bytes] = []
         self.listened = True
         self.scene: Scene
 
@@ -30,8 +43,9 @@ class Outlets:
     def close(self, on: TypedTopic) -> None:
         self.open_now.discard(on)
 
-    def zero(self, on: TypedTopic) -> bool:
+    def zero(self, on: TypedTopic, rest: bytes) -> bool:
         self.zeros.append((self.scene.now // MS, on))
+        self.rests.append(rest)
         return self.listened
 
     def heard(self, on: TypedTopic) -> bool:
@@ -191,10 +205,10 @@ def test_topic_that_can_not_be_stopped_does_not_keep_the_next_from_it(scene: Sce
     scene.move()
     honest = scene.outlets.zero
 
-    def broken(on: TypedTopic) -> bool:
+    def broken(on: TypedTopic, rest: bytes) -> bool:
         if on == STAMPED:
             raise RuntimeError("no publisher")
-        return honest(on)
+        return honest(on, rest)
 
     scene.outlets.zero = broken  # type: ignore[method-assign]
     scene.guard.orphaned()
@@ -211,3 +225,56 @@ def test_answers_have_their_output_for_themselves() -> None:
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
     assert found.stdout == encode(Alive())
     assert b"noise" in found.stderr
+
+
+def test_zero_has_the_shape_of_the_last_command(scene: Scene) -> None:
+    """As the daemon told it, until the topic is forgotten."""
+    line = decoder.decode(encode(Shape(*CMD, b"\0two axes")))
+    scene.guard.take(line)
+    scene.move()
+    scene.guard.orphaned()
+    assert scene.outlets.rests == [b"\0two axes"]
+    other = Scene()
+    other.guard.take(Shape(*CMD, b"shape"))
+    other.guard.take(Forget(*CMD))
+    other.guard.take(Topic(*CMD))
+    other.move()
+    other.guard.orphaned()
+    assert other.outlets.rests == [b""]
+
+
+def test_a_topic_with_a_shorter_time_is_stopped_earlier(scene: Scene) -> None:
+    """The daemon says it with the topic."""
+    arm = TypedTopic("/arm", TWIST)
+    scene.guard.take(Topic(*arm, 200))
+    scene.guard.take(Command(*arm, True, scene.now))
+    scene.move()
+    scene.run(300)
+    assert scene.outlets.zeros[0] == (1180, arm)
+    assert {on for _, on in scene.outlets.zeros} == {arm}
+
+
+SPIN = cancelling("/spin")
+
+
+def test_goals_of_a_dead_daemon_are_cancelled_at_once(scene: Scene) -> None:
+    """Several times, as topics are stopped; not those of an action whose goals have ended."""
+    for on in (SPIN, cancelling("/dock_robot")):
+        scene.guard.take(Topic(*on, GOALS_WITHIN_MS))
+        scene.guard.take(Command(*on, True, scene.now))
+    scene.guard.take(Command(*cancelling("/dock_robot"), False, scene.now))
+    scene.guard.orphaned()
+    scene.run(1000)
+    assert [on for _, on in scene.outlets.zeros] == [SPIN] * 5
+    assert scene.guard.done
+
+
+def test_goals_have_longer_than_commands(scene: Scene) -> None:
+    """A daemon that stands still for a moment loses its commands, and its goals 1.8 s after its last word of them."""
+    scene.guard.take(Topic(*SPIN, GOALS_WITHIN_MS))
+    scene.guard.take(Command(*SPIN, True, scene.now))
+    scene.move()
+    scene.run(1799)
+    assert {on for _, on in scene.outlets.zeros} == {CMD}
+    scene.run(2)
+    assert scene.outlets.zeros[-1] == (2800, SPIN)

@@ -6,7 +6,20 @@ from typing import Any
 
 import pytest
 
-from robot_client.guard_protocol import Alive, Command, Forget, Leave, Probe, Ready, Topic, decoder, encode
+from robot_client.guard_protocol import (
+    GOALS_WITHIN_MS,
+    Alive,
+    Command,
+    Forget,
+    Leave,
+    Probe,
+    Ready,
+    Shape,
+    Topic,
+    cancelling,
+    decoder,
+    encode,
+)
 from robot_client.guarding import DOUBTFUL, PROBE_EVERY, PROBE_MOVING, SILENT, GuardKeeper
 from robot_client.topics import TypedTopic
 from tests.robot_client.processes import Process, Reactor
@@ -19,8 +32,11 @@ class Scene:
         self.reactor = Reactor(decoder.decode)
         self.alerts: list[str] = []
         self.keeper = GuardKeeper(self.reactor, "guard", 500)
-        self.keeper.on_alert = lambda level, text: self.alerts.append(text)
+        self.keeper.on_alert = self._told
         self.keeper.start()
+
+    def _told(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+        self.alerts.append(f"{kind} {about} {'over' if over else level}")
 
     @property
     def process(self) -> Process:
@@ -45,10 +61,27 @@ def test_dead_guard_is_replaced_and_brought_up_to_date(scene: Scene) -> None:
     scene.keeper.topic(CMD)
     scene.keeper.command(CMD, True, 5)
     scene.process.end()
-    assert len(scene.alerts) == 1
+    assert scene.alerts == ["module guard error"]
     scene.reactor.advance(1.0)
     assert len(scene.reactor.processes) == 2
     assert scene.process.lines == [Topic(*CMD), Command(*CMD, True, 5)]
+
+
+def test_guard_is_told_what_a_zero_looks_like_and_how_long_a_topic_has(scene: Scene) -> None:
+    """The next guard as well, until the topic is forgotten."""
+    keeper = GuardKeeper(scene.reactor, "guard", 500, topics={"/cmd_vel": 200})
+    keeper.start()
+    keeper.topic(CMD)
+    keeper.shape(CMD, b"one")
+    keeper.shape(CMD, b"two")
+    assert scene.process.lines == [Topic(*CMD, 200), Shape(*CMD, b"one"), Shape(*CMD, b"two")]
+    scene.process.end()
+    scene.reactor.advance(1.0)
+    assert scene.process.lines == [Topic(*CMD, 200), Shape(*CMD, b"two")]
+    keeper.forget(CMD)
+    scene.process.end()
+    scene.reactor.advance(2.0)
+    assert scene.process.lines == []
 
 
 def test_guard_that_can_not_live_is_not_started_all_the_time(scene: Scene) -> None:
@@ -168,3 +201,27 @@ def test_frozen_guard_is_not_relied_on_while_anything_moves(scene: Scene) -> Non
     assert not scene.keeper.ready(CMD)
     answer(scene, Alive())
     assert scene.keeper.ready(CMD)
+
+
+def test_a_guard_that_answers_again_is_told(scene: Scene) -> None:
+    """Once."""
+    scene.process.end()
+    scene.reactor.advance(1.0)
+    scene.keeper.topic(CMD)
+    for _ in range(2):
+        answer(scene, Alive())
+    assert scene.alerts == ["module guard error", "module guard over"]
+
+
+def test_guard_is_told_of_goals_with_a_time_of_their_own(scene: Scene) -> None:
+    """Whatever the topics of the robot have; the next guard as well."""
+    on = cancelling("/cmd_vel")
+    keeper = GuardKeeper(scene.reactor, "guard", 500, topics={"/cmd_vel": 200, on.topic: 200})
+    keeper.start()
+    keeper.topic(on)
+    keeper.command(on, True, 5)
+    told = [Topic(*on, GOALS_WITHIN_MS), Command(*on, True, 5)]
+    assert scene.process.lines[:2] == told
+    scene.process.end()
+    scene.reactor.advance(1.0)
+    assert scene.process.lines == told

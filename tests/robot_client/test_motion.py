@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
+import struct
+
 import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import Unavailable
-from relay_protocol.link import MotionPolicy
-from robot_client.motion import KEPT, MAX_TOPICS, MotionDesk
+from relay_protocol.link import Limits, MotionPolicy, Stopped
+from robot_client.authority import Authority, Suppression
+from robot_client.motion import KEPT, MAX_SHAPE, MAX_TOPICS, MotionDesk
 from robot_client.offset import Offset
 from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
-from robot_client.safety import REPEATS
+from robot_client.rules import Rules
+from robot_client.safety import DAEMON_SHARE, REPEATS, Times
 from robot_client.topics import TypedTopic
 
 GO = twist(1.0)
 ZERO = twist()
+DRIVER = 7
+"""The source that holds control."""
 STAMPED = "geometry_msgs/msg/TwistStamped"
 
 
@@ -33,6 +40,9 @@ class Feed:
     def forget(self, on: TypedTopic) -> None:
         self.topics.discard(on)
 
+    def shape(self, on: TypedTopic, rest: bytes) -> None:
+        self.lines.append((on.topic, rest))
+
     def command(self, on: TypedTopic, moving: bool, at: int) -> None:
         self.lines.append((on.topic, moving))
 
@@ -41,12 +51,15 @@ class Feed:
 
 
 class Scene:
-    def __init__(self) -> None:
+    def __init__(self, rules: Rules | None = None, deadline_ms: int = 500) -> None:
         self.clock = Clock()
         self.clock.advance(100)
         self.platform = MemoryPlatform()
         self.feed = Feed()
-        self.desk = MotionDesk(MotionPolicy(types=[TWIST]), self.platform, self.clock, self.now, self.feed)
+        self.authority = Authority()
+        self.authority.hold(DRIVER, "ann", "operator", 0)
+        policy = MotionPolicy(types=[TWIST], deadline_ms=deadline_ms)
+        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, self.feed, self.authority, rules)
         self.offset = Offset()
         self.offset.add(self.now(), self.now(), self.now())
         self.open("a")
@@ -57,8 +70,8 @@ class Scene:
     def open(self, source: str, topic: str = "/cmd_vel", type: str = TWIST) -> None:
         self.desk.open(source, TypedTopic(topic, type), self.platform.advertise(topic, type, False, None))
 
-    def command(self, body: bytes, source: str = "a", age: float = 0.0) -> bool:
-        return self.desk.command(source, body, self.now() - int(age * 1e9), self.offset)
+    def command(self, body: bytes, source: str = "a", age: float = 0.0, by: int = DRIVER) -> bool:
+        return self.desk.command(source, body, self.now() - int(age * 1e9), self.offset, by)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds * 100)):
@@ -67,6 +80,11 @@ class Scene:
     @property
     def sent(self) -> list[bytes]:
         return [body for _, body in self.platform.published]
+
+
+def speeds(scene: Scene) -> list[float]:
+    """Of everything that was published."""
+    return [struct.unpack_from("<d", body, 4)[0] for body in scene.sent]
 
 
 @pytest.fixture
@@ -106,6 +124,18 @@ def test_stale_commands_do_not_feed_it(scene: Scene) -> None:
     assert GO not in scene.sent[1:]
     assert ZERO in scene.sent
     assert scene.desk.stale_commands == 10
+
+
+def test_stale_zero_is_no_letting_go(scene: Scene) -> None:
+    """One that a stalled link delivers after a resume does not let the stream go on that was there before."""
+    scene.command(GO)
+    scene.authority.stop(Stopped(by="eve", since=1.0), scene.now())
+    scene.authority.resume(scene.now())
+    assert not scene.command(ZERO, age=3.0)
+    assert not scene.command(GO)
+    assert scene.sent == [GO]
+    assert scene.command(ZERO)
+    assert scene.command(GO)
 
 
 def test_zero_needs_no_stop(scene: Scene) -> None:
@@ -243,9 +273,9 @@ def test_zero_has_the_type_of_the_command(scene: Scene, monkeypatch: pytest.Monk
     asked: list[str] = []
     honest = scene.platform.zero
 
-    def noted(type: str) -> bytes:
+    def noted(type: str, rest: bytes = b"") -> bytes:
         asked.append(type)
-        return honest(type)
+        return honest(type, rest)
 
     monkeypatch.setattr(scene.platform, "zero", noted)
     scene.open("stamped", "/base", STAMPED)
@@ -298,3 +328,270 @@ def test_cycling_topics_cost_no_more_than_the_limit(scene: Scene) -> None:
         scene.open("more", "/more")
     scene.desk.close("0")
     scene.open("more", "/more")
+
+
+# --- limits, shapes, times of single topics ----------------------------------------------------------------
+
+
+def test_commands_are_held_to_the_limits_of_who_holds_control() -> None:
+    """An operator's here; whoever suppresses is of no level that is known, and has the strictest."""
+    scene = Scene(Rules(limits={"operator": Limits(linear=0.5), "owner": Limits(linear=0.8)}))
+    scene.command(GO)
+    scene.authority.hold(DRIVER, "ann", "owner", scene.now())
+    scene.command(GO)
+    scene.authority.suppress("/cmd_vel", Suppression(frozenset({8}), scene.now() + 10**9, "eve"))
+    scene.command(GO, by=8)
+    assert scene.sent == [twist(0.5), twist(0.8), twist(0.5)]
+    assert scene.desk.limited_commands == 3
+
+
+def test_after_zero_speed_grows_from_there() -> None:
+    """Whoever said it: the driver, or the watchdog."""
+    scene = Scene(Rules(limits={"operator": Limits(linear_acceleration=2.0)}))
+    for _ in range(10):
+        scene.command(GO)
+        scene.run(0.1)
+    assert scene.sent[-1] == GO
+    scene.run(1)
+    assert scene.sent[-1] == ZERO
+    scene.command(GO)
+    assert speeds(scene)[-1] == pytest.approx(2.0 * 0.1)
+    scene.command(ZERO)
+    scene.run(0.01)
+    scene.command(GO)
+    assert speeds(scene)[-1] == pytest.approx(2.0 * 0.01)
+
+
+def test_what_can_not_be_limited_is_not_followed() -> None:
+    """A command whose speeds can't be found counts as no command."""
+    scene = Scene(Rules(limits={"operator": Limits(linear=0.5)}))
+    assert scene.command(b"\0\7" + GO[2:]) is False
+    assert scene.sent == []
+    assert scene.desk.invalid_commands == 1
+
+
+def test_zero_has_the_shape_of_the_command(scene: Scene) -> None:
+    """The guard hears of the shape before the command, and again only when it changes."""
+    scene.platform.rests[TWIST] = b"two axes"
+    scene.command(GO)
+    scene.command(GO)
+    assert scene.feed.lines[1:] == [("/cmd_vel", b"two axes"), ("/cmd_vel", True), ("/cmd_vel", True)]
+    scene.desk.stop_all("test")
+    assert scene.sent[-1] == b"two axes"
+
+
+def test_a_shape_without_measure_is_no_command(scene: Scene) -> None:
+    """What the guard would have to keep is bounded."""
+    scene.platform.rests[TWIST] = bytes(MAX_SHAPE + 1)
+    assert scene.command(GO) is False
+    assert (scene.sent, scene.desk.invalid_commands) == ([], 1)
+
+
+def test_a_topic_may_have_shorter_times() -> None:
+    """Its commands grow old sooner, and it is stopped sooner; other topics have the robot's."""
+    scene = Scene(Rules(topics={"/arm": Times(200, 100)}))
+    scene.open("arm", "/arm")
+    assert scene.command(GO, "arm", age=0.15) is False
+    assert scene.command(GO, "a", age=0.15)
+    scene.command(GO, "arm")
+    scene.run(0.2 * DAEMON_SHARE + 0.01)
+    assert scene.platform.published[-1] == ("/arm", ZERO)
+    assert ("/cmd_vel", ZERO) not in scene.platform.published
+
+
+# --- links that work one way only --------------------------------------------------------------------------
+
+
+def test_a_command_ends_when_it_has_grown_too_old(scene: Scene) -> None:
+    """One that was old when it came is over sooner: its driver may hear nothing any more."""
+    assert scene.command(GO, age=0.3)
+    scene.run(0.14)
+    assert scene.sent == [GO]
+    scene.run(0.02)
+    assert scene.sent[-1] == ZERO
+    assert scene.desk.watchdog_stops == 1
+
+
+def test_a_driver_who_is_not_heard_by_the_relay_does_not_go_on(scene: Scene) -> None:
+    """Commands that come all the time count no longer than the proof that the robot's own word arrives."""
+    proof = scene.now()
+    scene.desk.proof = lambda: proof
+    passed = []
+    for _ in range(60):
+        passed.append(scene.command(GO))
+        scene.run(0.01)
+    assert passed == [True] * 45 + [False] * 15
+    assert scene.sent[45:47] == [ZERO, ZERO]
+    assert scene.desk.stale_commands == 15
+    scene.desk.proof = scene.now
+    assert scene.command(GO)
+
+
+def test_a_longer_deadline_leaves_more_time_for_the_proof() -> None:
+    """Else nobody far away could drive at all."""
+    scene = Scene(deadline_ms=1000)
+    proof = scene.now()
+    scene.desk.proof = lambda: proof
+    scene.run(0.8)
+    assert scene.command(GO)
+    scene.run(0.11)
+    assert scene.sent[-1] == ZERO
+
+
+def test_whether_somebody_may_command_is_told(scene: Scene) -> None:
+    """With the first publication and after the last."""
+    told: list[bool] = []
+    scene.desk.on_commanded = told.append
+    scene.open("b")
+    scene.desk.close("a")
+    scene.desk.close("b")
+    scene.desk.close("b")
+    assert told == [True, False]
+
+
+# --- ramps -------------------------------------------------------------------------------------------------
+
+
+def ramping() -> Scene:
+    return Scene(Rules(ramp_ms=200))
+
+
+def test_silence_ends_in_a_ramp_that_is_over_in_time() -> None:
+    """It begins earlier by its length; the last zero is said when a watchdog without a ramp would say its first."""
+    scene = ramping()
+    scene.command(GO)
+    scene.run(0.2)
+    assert speeds(scene) == [1.0]
+    assert scene.desk.moving
+    scene.run(0.19)
+    slowing = speeds(scene)[1:]
+    assert len(slowing) >= 5
+    assert all(earlier > later > 0 for earlier, later in itertools.pairwise(slowing))
+    assert scene.desk.moving
+    scene.run(0.02)
+    assert scene.sent[-1] == ZERO
+    assert not scene.desk.moving
+    scene.run(1)
+    assert speeds(scene).count(0.0) == REPEATS
+    assert scene.desk.watchdog_stops == 1
+    assert scene.feed.lines[-1] == ("/cmd_vel", False)
+
+
+def test_a_new_command_ends_a_ramp() -> None:
+    """To move or to stand: it counts, and not the rest of the ramp."""
+    scene = ramping()
+    scene.command(GO)
+    scene.run(0.3)
+    scene.command(twist(0.7))
+    assert speeds(scene)[-1] == 0.7
+    scene.run(0.3)
+    assert 0.0 < speeds(scene)[-1] < 0.7
+    scene.command(ZERO)
+    scene.run(1)
+    assert speeds(scene)[-REPEATS:] == [0.0] * REPEATS
+    assert speeds(scene).count(0.0) == REPEATS
+
+
+def test_who_ends_a_ramp_goes_on_from_its_speed() -> None:
+    """Not from the one before it: the most that his acceleration allows is counted from what was said last."""
+    scene = Scene(Rules(limits={"operator": Limits(linear_acceleration=1.0)}, ramp_ms=200))
+    for _ in range(20):
+        scene.command(GO)
+        scene.run(0.1)
+    assert scene.sent[-1] == GO
+    while speeds(scene)[-1] > 0.15:
+        scene.run(0.01)
+    slow = speeds(scene)[-1]
+    assert slow > 0.0
+    scene.clock.advance(0.005)
+    scene.command(GO)
+    assert speeds(scene)[-1] == pytest.approx(slow + 1.0 * 0.005)
+
+
+def test_stop_is_never_a_ramp() -> None:
+    """Neither one that begins nor one that is under way; zero is said at once."""
+    scene = ramping()
+    scene.command(GO)
+    scene.desk.halt("test")
+    assert scene.sent == [GO, ZERO]
+    scene.run(1)
+    scene.command(GO)
+    scene.run(0.3)
+    scene.desk.close("a")
+    before = len(scene.sent)
+    assert speeds(scene)[-1] > 0
+    scene.desk.halt("test")
+    assert scene.sent[before:] == [ZERO]
+    scene.run(1)
+    assert scene.sent[before:] == [ZERO] * REPEATS
+    assert scene.platform.sinks == []
+
+
+def test_a_ramp_ends_in_time_however_late_it_begins() -> None:
+    """A publisher that leaves long after its last command leaves less of it, or none."""
+    scene = ramping()
+    scene.command(GO)
+    scene.run(0.15)
+    scene.desk.close("a")
+    scene.run(0.19)
+    assert 0.0 < speeds(scene)[-1] < 1.0
+    scene.run(0.02)
+    assert scene.sent[-1] == ZERO
+    scene.run(1)
+    assert scene.platform.sinks == []
+    late = Scene(Rules(ramp_ms=200))
+    late.command(GO)
+    late.clock.pump([0.0])
+    late.clock.rightNow += 0.39  # the process was held up: its watchdog has not had its turn
+    late.desk.close("a")
+    assert late.sent == [GO, ZERO]
+
+
+def test_who_waits_for_a_standstill_waits_for_its_ramp() -> None:
+    """Control is another's only then; a failure at its end is told."""
+    scene, stood = ramping(), []
+    scene.desk.standing().addCallback(stood.append)
+    assert stood == [[]]
+    scene.command(GO)
+    scene.desk.stop_all("control changes", gently=True)
+    scene.desk.standing().addCallback(stood.append)
+    scene.run(0.19)
+    assert stood == [[]]
+    scene.run(0.02)
+    assert stood == [[], []]
+
+
+def test_a_ramp_that_can_not_end_in_zero_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the name of the topic; the guard, not told that it stands, stops it."""
+    scene, stood = ramping(), []
+    scene.command(GO)
+    scene.desk.stop_all("control changes", gently=True)
+    scene.desk.standing().addCallback(stood.append)
+
+    def broken(body: bytes) -> None:
+        raise RuntimeError("no middleware")
+
+    monkeypatch.setattr(scene.platform.sinks[0], "publish", broken)
+    scene.run(1)
+    assert stood == [["/cmd_vel"]]
+    assert scene.feed.lines[-1] == ("/cmd_vel", True)
+
+
+def test_a_suppressor_does_not_wait_for_a_ramp() -> None:
+    """What others moved there stands at once when a suppression begins."""
+    scene = ramping()
+    scene.command(GO)
+    scene.run(0.3)
+    assert speeds(scene)[-1] < 1.0
+    scene.authority.suppress("/cmd_vel", Suppression(frozenset({8}), scene.now() + 10**9, "eve"))
+    scene.desk.yield_topic("/cmd_vel", "test")
+    assert scene.sent[-1] == ZERO
+
+
+def test_what_has_no_speeds_is_stopped_without_a_ramp() -> None:
+    """A joystick's axes, say; when a ramp would have begun."""
+    scene = Scene(Rules(ramp_ms=200))
+    scene.open("arm", "/arm", "some/msg/Type")
+    scene.command(GO, "arm")
+    scene.run(0.21)
+    assert scene.platform.published == [("/arm", GO), ("/arm", ZERO)]

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Joy
 
 from relay_protocol import link
 from tests.robot_client.fake_relay import FakeRelay, Peer
@@ -66,10 +67,15 @@ class Drive:
         self.robot = robot
         self.node = node
         self.process = robot.run()
-        self.control = robot.relay.register()
-        self.channel = self.open()
+        self.take()
         self.guard = robot.guards(self.process)[0]
         self.heard_by_node()
+
+    def take(self) -> None:
+        """Take the robot in, give control to source 1, and open a channel."""
+        self.control = self.robot.relay.register()
+        assert self.control.order(link.Control(id=1, holder=1, user="ann")).ok
+        self.channel = self.open()
 
     def open(self) -> Peer:
         channel = self.robot.relay.channel(self.control)
@@ -80,8 +86,8 @@ class Drive:
     def heard_by_node(self) -> None:
         """Drive until both the node and the guard have found each other."""
         start = len(self.node.heard("/cmd_vel"))
-        until(lambda: self.channel.sample(5, GO) or len(self.node.heard("/cmd_vel")) > start)
-        self.channel.sample(5, command(0.0))
+        until(lambda: self.channel.command(5, GO) or len(self.node.heard("/cmd_vel")) > start)
+        self.channel.command(5, command(0.0))
         until(self._guard_is_known)
 
     def _guard_is_known(self) -> bool:
@@ -93,7 +99,7 @@ class Drive:
     def drive(self) -> int:
         """Drive for half a second; when the last command was heard, nanoseconds."""
         for _ in range(10):
-            self.channel.sample(5, GO)
+            self.channel.command(5, GO)
             time.sleep(0.05)  # the pace of a driver
         return int(self.node.heard("/cmd_vel")[-1]["at"])
 
@@ -240,12 +246,27 @@ def test_killed_daemon_stops(drive: Drive) -> None:
     until(lambda: not drive.guard.is_running())
 
 
+def test_killed_daemon_lets_go_of_a_joystick(drive: Drive) -> None:
+    """The guard's zero has as many axes and buttons as the last command had."""
+    drive.node.do("listen", "/joy", "joy")
+    drive.channel.say(link.Advertise(number=6, topic="/joy", type="sensor_msgs/msg/Joy"))
+    assert drive.channel.expect(link.Advertised).motion
+    body = bytes(serialize_message(Joy(axes=[0.5, 0.0, -1.0], buttons=[1, 0])))
+    until(lambda: drive.channel.command(6, body) or drive.node.heard("/joy"))
+    drive.channel.command(6, body)
+    drive.process.kill()
+    until(lambda: not any(drive.node.heard("/joy")[-1]["axes"]))
+    assert drive.node.heard("/joy")[-1]["axes"] == [0.0, 0.0, 0.0]
+    assert drive.node.heard("/joy")[-1]["buttons"] == [0, 0]
+    until(lambda: not drive.guard.is_running())
+
+
 def test_frozen_daemon_stops(drive: Drive) -> None:
     """SIGSTOP of the daemon: its guard sends zero in time; what waited in the frozen daemon is not executed."""
     last = drive.drive()
     drive.process.send_signal(signal.SIGSTOP)
     for _ in range(5):
-        drive.channel.sample(5, GO)
+        drive.channel.command(5, GO)
     assert drive.zero_after(last) < STOP_MS
     time.sleep(1.0)  # the commands grow old
     thawed = time.monotonic_ns()
@@ -267,8 +288,8 @@ def test_sigterm_stops_and_leaves(drive: Drive) -> None:
 
 def test_old_commands_are_not_executed(drive: Drive) -> None:
     """A command over its deadline, or stamped in the future, moves nothing and is counted."""
-    drive.channel.sample(5, command(0.7), age=0.6)
-    drive.channel.sample(5, command(0.7), age=-0.6)
+    drive.channel.command(5, command(0.7), age=0.6)
+    drive.channel.command(5, command(0.7), age=-0.6)
     until(lambda: drive.control.expect(link.Health).stale_commands >= 2)
     assert 0.7 not in [each["x"] for each in drive.node.heard("/cmd_vel")]
 
@@ -301,17 +322,17 @@ def test_frozen_guard_lets_nothing_move(drive: Drive) -> None:
     drive.guard.suspend()
     try:
         held_back = time.monotonic() + PATIENCE
-        while not drive.channel.sample(5, GO) and drive.node.heard("/cmd_vel")[-1]["x"] != 0.0:
+        while not drive.channel.command(5, GO) and drive.node.heard("/cmd_vel")[-1]["x"] != 0.0:
             assert time.monotonic() < held_back
             time.sleep(0.05)  # the pace of a driver
         stood = len(drive.node.heard("/cmd_vel"))
         for _ in range(10):
-            drive.channel.sample(5, GO)
+            drive.channel.command(5, GO)
             time.sleep(0.05)  # the pace of a driver
         assert {each["x"] for each in drive.node.heard("/cmd_vel")[stood:]} <= {0.0}
     finally:
         drive.guard.resume()
-    until(lambda: drive.channel.sample(5, GO) or drive.node.heard("/cmd_vel")[-1]["x"] != 0.0)
+    until(lambda: drive.channel.command(5, GO) or drive.node.heard("/cmd_vel")[-1]["x"] != 0.0)
 
 
 def test_wrong_type_before_the_driver_is_up_does_no_harm(drive: Drive) -> None:
@@ -322,7 +343,7 @@ def test_wrong_type_before_the_driver_is_up_does_no_harm(drive: Drive) -> None:
     drive.node.do("listen", "/base", "twist")
     drive.channel.say(link.Advertise(number=7, topic="base", type="geometry_msgs/Twist"))
     assert drive.channel.expect(link.Advertised).motion
-    until(lambda: drive.channel.sample(7, GO) or drive.node.heard("/base"))
+    until(lambda: drive.channel.command(7, GO) or drive.node.heard("/base"))
     drive.process.kill()
     until(lambda: drive.node.heard("/base")[-1]["x"] == 0.0)
     until(lambda: not drive.guard.is_running())
@@ -335,3 +356,39 @@ def test_simulated_time_is_told(enrolled: Robot, relay: FakeRelay) -> None:
     assert control.expect(link.Describe).sim_time is True
     until(lambda: enrolled.guards(process))
     assert "--sim-time" in enrolled.guards(process)[0].cmdline()
+
+
+def test_killed_while_stopped_it_never_moves_again(drive: Drive) -> None:
+    """kill -9 right after a stop: the next daemon is stopped from its first moment, until somebody resumes it."""
+    drive.drive()
+    assert drive.control.order(link.Stop(id=2, by="eve", why="test")).ok
+    drive.process.kill()
+    drive.process.wait()
+    until(lambda: not drive.guard.is_running())
+    since = time.monotonic_ns()
+    drive.process = drive.robot.run()
+    drive.take()
+    stopped = drive.control.expect(link.Safety).stopped
+    assert stopped is not None
+    assert (stopped.by, stopped.why) == ("eve", "test")
+    for _ in range(20):
+        drive.channel.command(5, GO)
+        time.sleep(0.05)  # the pace of a driver
+    assert [each for each in drive.node.heard("/cmd_vel") if each["at"] > since and each["x"] != 0.0] == []
+    assert drive.control.order(link.Resume(id=3, by="ann")).ok
+    time.sleep(0.6)  # lets go
+    drive.guard = drive.robot.guards(drive.process)[0]
+    drive.heard_by_node()
+
+
+def test_stop_while_driving_is_zero_at_once(drive: Drive) -> None:
+    """Commands that go on come to nothing: what is heard after the answer is zero alone."""
+    drive.drive()
+    assert drive.control.order(link.Stop(id=2, by="eve")).ok
+    told = time.monotonic_ns()
+    for _ in range(10):
+        drive.channel.command(5, GO)
+        time.sleep(0.05)  # the pace of a driver
+    settled = told + 100 * MS  # what was published before the answer is on its way
+    assert [each for each in drive.node.heard("/cmd_vel") if each["at"] > settled and each["x"] != 0.0] == []
+    assert drive.control.order(link.Resume(id=3, by="eve")).ok

@@ -84,3 +84,24 @@ def test_only_the_driver_leaving_stops() -> None:
 def test_guard_is_later_than_the_daemon_and_in_time() -> None:
     """The guard acts after the daemon had its chance, and before the robot must stand."""
     assert DAEMON_SHARE < GUARD_SHARE < 1
+
+
+def test_a_topic_may_have_a_shorter_time() -> None:
+    """Each is stopped in its own; who waits is woken for the first."""
+    dog, arm = Watchdog(500, DAEMON_SHARE), TypedTopic("/arm", "T")
+    dog.within("/arm", 200)
+    dog.command(CMD, "a", True, 0)
+    dog.command(arm, "a", True, 100 * MS)
+    assert dog.due() == 260 * MS
+    assert dog.expired(399 * MS) == [arm]
+    assert dog.expired(400 * MS) == [CMD]
+
+
+def test_who_needs_time_to_stop_begins_earlier() -> None:
+    """And knows when it must be over."""
+    dog = Watchdog(500, DAEMON_SHARE, earlier_ms=150)
+    dog.command(CMD, "a", True, 0)
+    assert dog.due() == 250 * MS
+    assert dog.latest(CMD, 100 * MS) == 500 * MS
+    assert dog.expired(249 * MS) == []
+    assert dog.expired(250 * MS) == [CMD]

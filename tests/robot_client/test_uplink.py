@@ -320,3 +320,62 @@ def test_what_arrives_is_whole_and_in_order(steps: list[tuple[str, int, int]]) -
         assert stamps == sorted(stamps)
     if not closed:
         assert len(got) + link.dropped == offered
+
+
+def test_muted_subscription_sends_nothing_and_others_go_on() -> None:
+    """Also what waited, or was held back by a throttle, is let go; what has begun is finished."""
+    uplink = Uplink(lambda: 0.0)
+    for number in (1, 2):
+        uplink.open(number)
+    uplink.open(3, throttle=1.0)
+    uplink.offer(1, 0, bytes(3 * PART_BYTES))
+    begun = uplink.take(1)
+    for number in (1, 1, 2, 3, 3):
+        uplink.offer(number, 0, b"x")
+    for number in (1, 3):
+        uplink.mute(number, hold=False)
+        assert not uplink.offer(number, 0, b"y")
+    left = begun
+    while uplink.ready:
+        left += uplink.take(1)
+    frames = FrameDecoder(2**25).feed(b"".join(left))
+    assert sorted((each.number, len(each.body)) for each in frames) == [(1, 3 * PART_BYTES), (2, 1)]
+    assert (uplink.waiting, uplink.held, uplink.next_due()) == (0, 0, None)
+
+
+def test_muted_subscription_with_hold_repeats_what_left_last() -> None:
+    """What left, not what came; without any it says nothing."""
+    uplink = Uplink(lambda: 0.0)
+    uplink.open(1)
+    uplink.mute(1, hold=True)
+    assert not uplink.offer(1, 0, b"a")
+    uplink.unmute(1)
+    uplink.offer(1, 0, b"b")
+    uplink.take(1)
+    uplink.offer(1, 0, b"c")
+    uplink.mute(1, hold=True)
+    assert uplink.offer(1, 7, b"d")
+    assert FrameDecoder(2**25).feed(b"".join(uplink.take(1))) == [SampleFrame(1, 7, b"b")]
+
+
+def test_latched_sample_that_came_while_muted_goes_afterwards() -> None:
+    """Its publisher may never say it again; of others nothing is made up for."""
+    uplink = Uplink(lambda: 0.0)
+    uplink.open(1, latched=True)
+    uplink.open(2)
+    for number in (1, 2):
+        uplink.mute(number, hold=False)
+        uplink.offer(number, 5, b"old")
+        uplink.offer(number, 6, b"new")
+    assert uplink.unmute(1)
+    assert not uplink.unmute(2)
+    assert FrameDecoder(2**25).feed(b"".join(uplink.take(1))) == [SampleFrame(1, 6, b"new")]
+
+
+def test_muting_what_is_not_there_is_passed_over() -> None:
+    """A subscription that has ended, or was never muted."""
+    uplink = Uplink(lambda: 0.0)
+    uplink.mute(1, hold=True)
+    assert not uplink.unmute(1)
+    uplink.open(1)
+    assert not uplink.unmute(1)

@@ -9,11 +9,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import functools
+import itertools
 import json
 import math
 import mimetypes
 import secrets
 import time
+import types
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -23,6 +26,8 @@ from urllib.parse import parse_qsl, unquote
 import av
 import cv2
 import numpy as np
+from fake_control import ADDRESS, Alerts, Control, fleet_answer, meant
+from fake_recordings import Recordings, Refused
 from websockets.frames import Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
@@ -61,6 +66,7 @@ TOPICS = {
     "/cmd_vel_nav": "geometry_msgs/msg/Twist",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/odom": "nav_msgs/msg/Odometry",
+    "/relay/control": "switchboard_msgs/msg/Control",
     "/relay/status": "switchboard_msgs/msg/Status",
     "/scan": "sensor_msgs/msg/LaserScan",
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -70,8 +76,10 @@ CAMERAS = {
     "/camera/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
     "/camera_rear/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
 }
+ORDERS = ("take_control", "release_control", "grant_control", "refuse_control", "stop", "resume")
 CAMERA_SIZE = (640, 480)
 CAMERA_RATE = 12.0
+LINK = {"rtt_ms": 3.4, "p95_ms": 6.1, "jitter_ms": 0.4, "lost": 0, "quality": "good"}
 CSP = (
     "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; connect-src 'self' ws: wss:; "
     "object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
@@ -191,10 +199,23 @@ class Relay:
         self.rights = {user: dict(levels) for user, levels in RIGHTS.items()}
         self.robots = {name: dict(robot) for name, robot in ROBOTS.items()}
         self.silent = False
+        self.mute = False
         self.frozen = False
+        self.dead = False
+        self.blind = False
+        self.broken = False
+        self.topics = dict(TOPICS)
         self.reduced = 0.0
         self.ahead = 0.0
         self.last_seen = time.time() - 7200
+        self.numbers = itertools.count(1)
+        self.controls = {
+            name: Control(name, functools.partial(self.control_changed, name)) for name in ROBOTS
+        }
+        self.alerts = Alerts()
+        self.recordings = Recordings(
+            [name for name in TOPICS if not name.startswith("/relay/")], list(CAMERAS)
+        )
 
     @property
     def channels(self) -> list[Channel]:
@@ -206,9 +227,11 @@ class Relay:
 
     def robot(self, user: str, name: str) -> Json:
         facts = self.robots[name]
-        clients = [{"user": c.user, "since": int(c.since)} for c in self.channels if c.robot == name]
+        clients = [
+            {"user": c.user, "since": int(c.since), "camera": ""} for c in self.channels if c.robot == name
+        ]
         if facts["state"] == "in_use":
-            clients.append({"user": "ann", "since": int(time.time()) - 300})
+            clients.append({"user": "ann", "since": int(time.time()) - 300, "camera": "/camera/image_raw"})
         state = facts["state"] if facts["state"] == "offline" or not clients else "in_use"
         there = state != "offline"
         return {
@@ -217,27 +240,60 @@ class Relay:
             "state": state,
             "level": self.rights[user][name],
             "clients": clients,
+            "holder": getattr(self.controls[name].holder, "user", None),
+            "stopped": self.controls[name].stopped,
             "battery": 0.76 if there else None,
             "rtt_ms": 4.2 if there else None,
             "last_seen": int(time.time() if there else self.last_seen),
         }
 
+    def control_changed(self, robot: str) -> None:
+        for channel in self.channels:
+            if channel.robot == robot and "/relay/control" in channel.subscribed:
+                channel.tell_control()
+
     def robot_list(self, user: str) -> Json:
         return {"robots": [self.robot(user, name) for name in self.rights[user]]}
 
     def do(self, order: Json) -> None:
-        """One order of a test: close, level, silent (no data), frozen (no answers), say, offline.
+        """One order of a test: close, level, silent (no data), mute (no status), frozen (no answers), say, offline,
+        dead (the robot answers no ping), gone (a topic that is there no more).
 
+        Of the event stream: blind (it tells nothing), broken (there is none).
+        Of control: take_away, stopped (by whom), resumed, grace (seconds), deny (why).
+        Of alerts: alert, see ``Alerts.put``.
         Of video: close_video, reduced (a thin link), ahead (seconds by which the robot's clock is wrong).
+        Of recordings: see ``Recordings.do``.
         """
+        self.recordings.do(order)
         self.silent = order.get("silent", self.silent)
+        self.mute = order.get("mute", self.mute)
         self.frozen = order.get("frozen", self.frozen)
+        self.dead = order.get("dead", self.dead)
+        self.blind = order.get("blind", self.blind)
+        self.broken = order.get("broken", self.broken)
+        self.topics.pop(order.get("gone", ""), None)
         self.reduced = order.get("reduced", self.reduced)
         self.ahead = order.get("ahead", self.ahead)
         if "level" in order:
             self.rights[order["user"]][order["robot"]] = order["level"]
+            self.controls[order["robot"]].rights_changed()
         if "state" in order:
             self.robots[order["robot"]]["state"] = order["state"]
+        if "alert" in order:
+            self.alerts.put(**order["alert"])
+        if "robot" in order:
+            control = self.controls[order["robot"]]
+            control.grace = order.get("grace", control.grace)
+            control.denial = order.get("deny", control.denial)
+            if "stopped" in order:
+                control.stopped = {"by": order["stopped"], "why": "", "since": time.time(), "told": True}
+                control.changed()
+            if order.get("resumed"):
+                control.stopped = None
+                control.changed()
+            if order.get("take_away"):
+                control.take_away()
         if order.get("clear_log"):
             self.log.clear()
         for channel in self.channels:
@@ -286,6 +342,7 @@ class Channel(Socket):
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self.since = time.time()
+        self.number = next(self.relay.numbers)
         self.subscribed: dict[str, set[str]] = {}
         self.due: dict[str, float] = {}
 
@@ -298,6 +355,8 @@ class Channel(Socket):
         self.note(message)
         if op == "subscribe":
             self.subscribed.setdefault(message["topic"], set()).add(message["id"])
+            if message["topic"] == "/relay/control":
+                self.tell_control()
         elif op == "unsubscribe":
             ids = self.subscribed.get(message["topic"], set())
             ids.discard(message["id"])
@@ -311,12 +370,21 @@ class Channel(Socket):
         elif op == "call_service":
             self.call(message)
 
+    def tell_control(self) -> None:
+        if not self.relay.frozen:
+            told = self.relay.controls[self.robot].told(self)
+            self.send({"op": "publish", "topic": "/relay/control", "msg": told})
+
     def call(self, message: Json) -> None:
-        if self.relay.frozen:
+        if self.relay.frozen or (self.relay.dead and message["args"].get("robot")):
             return
         values: Json = {}
+        service = message["service"].removeprefix("/relay/")
+        if service in ORDERS:
+            values = self.relay.controls[self.robot].order(self, service, message["args"]["why"])
         if message["service"] == "/rosapi/topics":
-            values = {"topics": list(TOPICS), "types": list(TOPICS.values())}
+            topics = self.relay.topics
+            values = {"topics": list(topics), "types": list(topics.values())}
         elif message["service"] == "/relay/ping":
             values = {
                 "relay_time_ns": time.time_ns(),
@@ -335,7 +403,7 @@ class Channel(Socket):
         }
         for topic in self.subscribed:
             rate, make = makers.get(topic, (0, dict))
-            quiet = self.relay.silent and topic != "/relay/status"
+            quiet = self.relay.mute if topic == "/relay/status" else self.relay.silent
             if rate and not quiet and now >= self.due.get(topic, 0):
                 self.due[topic] = now + 1 / rate
                 self.send({"op": "publish", "topic": topic, "msg": make()})
@@ -348,10 +416,50 @@ class Channel(Socket):
             "level": facts["level"],
             "clients": facts["clients"],
             "rtt_ms": {"relay_robot": facts["rtt_ms"]},
+            "links": dict.fromkeys(("client_relay", "relay_robot", "client_robot"), LINK),
+            "people": self.people(),
+            "more": 0,
             "drops": 0,
+            "video": [
+                {"camera": v.camera, "codec": v.codec, "state": "open", "viewers": 1, "width": v.width}
+                | {"height": v.height, "quality": v.quality, "fps": v.rate}
+                for v in self.relay.viewings
+                if v.robot == self.robot
+            ],
             "motion": {"topics": ["/cmd_vel"], "types": [], "deadline_ms": 500, "stop_within_ms": 500},
             "health": {"battery": 0.76, "cpu": 0.23, "memory": 0.41, "rtt_ms": 4.2, "stale_commands": 0},
         }
+
+    def people(self) -> list[Json]:
+        there: dict[str, Json] = {}
+        holder = self.relay.controls[self.robot].holder
+        for each in self.relay.channels + self.relay.viewings:
+            if each.robot != self.robot:
+                continue
+            person = there.setdefault(
+                each.user,
+                {
+                    "user": each.user,
+                    "you": each.user == self.user,
+                    "control": False,
+                    "connections": [],
+                    "watching": [],
+                },
+            )
+            address = ADDRESS if self.level == "owner" else None
+            if isinstance(each, Viewing):
+                person["watching"].append({"camera": each.camera, "since": self.since, "address": address})
+                continue
+            person["control"] |= each is holder
+            facts = {
+                "client": each.number,
+                "since": each.since,
+                "you": each is self,
+                "control": each is holder,
+            }
+            link = {"rtt_ms": 3.4, "robot_rtt_ms": 8.0, "quality": "good", "drops": 0, "address": address}
+            person["connections"].append({**facts, **link})
+        return list(there.values())
 
 
 class Viewing(Socket):
@@ -474,8 +582,10 @@ class Connection:
             self.reply(204)
         elif path == "/api/v1/session":
             self.session(method, body)
+        elif path.startswith("/api/v1/robots/") and "/recordings" in path:
+            self.recordings(method, path, body)
         elif path.startswith("/api/v1/"):
-            await self.robots(path)
+            await self.robots(method, path, body)
         elif path.endswith("/video/cameras"):
             self.cameras(path.split("/")[2])
         else:
@@ -509,10 +619,18 @@ class Connection:
             facts = {"user": user, "admin": user == "admin", "realm": "lab"}
             self.reply(200, facts, Set_Cookie=f"session={token}; HttpOnly; SameSite=Strict; Path=/")
 
-    async def robots(self, path: str) -> None:
+    async def robots(self, method: str, path: str, body: bytes) -> None:
         user, name = self.user, path.removeprefix("/api/v1/robots").strip("/")
         if user is None:
             self.problem(401, "You are not logged in.")
+        elif method == "POST":
+            self.orders(user, path.removeprefix("/api/v1/").split("/"), json.loads(body))
+        elif path == "/api/v1/fleet/groups":
+            self.reply(200, {"groups": [{"name": "hall", "robots": ["rover-1"]}]})
+        elif path == "/api/v1/alerts":
+            self.reply(200, {"alerts": self.relay.alerts.of(list(self.relay.rights[user]))})
+        elif name == "stream" and self.relay.broken:
+            self.problem(503, "There is no stream.")
         elif name == "stream":
             await self.events(user)
         elif name == "":
@@ -521,6 +639,57 @@ class Connection:
             self.reply(200, self.relay.robot(user, name))
         else:
             self.problem(404, f"There is no robot '{name}' for you.")
+
+    def orders(self, user: str, parts: list[str], ask: Json) -> None:
+        self.relay.log.append({"user": user, "op": "POST " + "/".join(parts), **ask})
+        if parts[0] == "alerts":
+            self.reply(200, self.relay.alerts.acknowledge(parts[1], user))
+        elif parts[0] == "fleet":
+            found = meant(ask["robots"], list(self.relay.rights[user]))
+            lines = fleet_answer(ask, *found, lambda robot: self.order(user, robot, ask["do"], ask))
+            self.reply(
+                200, "".join(f"{json.dumps(line)}\n" for line in lines).encode(), "application/x-ndjson"
+            )
+        elif (done := self.order(user, parts[1], parts[-1], ask))["ok"]:
+            self.reply(202 if done.get("pending") else 200, {})
+        else:
+            self.problem(403, "Only who has control, or an owner, may do that.")
+
+    def order(self, user: str, robot: str, what: str, ask: Json) -> Json:
+        """Done on one robot for all connections of a user."""
+        offline = self.relay.robots[robot]["state"] == "offline"
+        if offline and what != "stop":
+            return {"ok": False, "message": "the robot is offline"}
+        if what not in ("stop", "resume"):
+            return {"ok": True, "values": {"success": True}}
+        control = self.relay.controls[robot]
+        client = next(
+            (c for c in self.relay.channels if c.user == user and c in (control.holder, control.request)),
+            None,
+        )
+        if client is None:
+            client = types.SimpleNamespace(user=user, level=self.relay.rights[user][robot], number=0)
+        answer = control.order(client, what, ask.get("why", ""))
+        return {"ok": answer["success"], "message": answer["message"], "pending": offline}
+
+    def recordings(self, method: str, path: str, body: bytes) -> None:
+        robot, _, below = path.removeprefix("/api/v1/robots/").partition("/recordings")
+        user, robot = self.user, unquote(robot)
+        if user is None or robot not in self.relay.rights[user]:
+            self.problem(401 if user is None else 404, f"There is no robot '{robot}' for you.")
+            return
+        ask = json.loads(body) if body else {}
+        if method != "GET":
+            self.relay.log.append({"user": user, "robot": robot, "op": f"{method} recordings{below}", **ask})
+        level = self.relay.rights[user][robot]
+        try:
+            status, answer = self.relay.recordings.answer(method, robot, below, user, level, ask)
+        except Refused as error:
+            self.problem(error.status, str(error))
+            return
+        kind = "application/octet-stream" if isinstance(answer, bytes) else "application/json"
+        more = {"Content_Disposition": 'attachment; filename="it.mcap"'} if isinstance(answer, bytes) else {}
+        self.reply(status, answer, kind, **more)
 
     def cameras(self, robot: str) -> None:
         if self.user is None or robot not in self.relay.rights[self.user]:
@@ -532,8 +701,11 @@ class Connection:
 
     async def events(self, user: str) -> None:
         self.writer.write(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n")
-        while not self.writer.is_closing():
-            self.writer.write(f"event: robots\ndata: {json.dumps(self.relay.robot_list(user))}\n\n".encode())
+        while not self.writer.is_closing() and not self.relay.broken:
+            alerts = {"alerts": self.relay.alerts.streamed(list(self.relay.rights[user]))}
+            for event, data in (("robots", self.relay.robot_list(user)), ("alerts", alerts)):
+                if not self.relay.blind:
+                    self.writer.write(f"event: {event}\ndata: {json.dumps(data)}\n\n".encode())
             await self.writer.drain()
             await asyncio.sleep(0.5)
 
@@ -567,6 +739,7 @@ class Connection:
                         socket.take(json.loads(frame.data))  # type: ignore[union-attr]
         finally:
             self.relay.sockets.discard(socket)
+            self.relay.controls[robot].left(socket)
 
     def flush(self, protocol: ServerProtocol) -> None:
         for data in protocol.data_to_send():

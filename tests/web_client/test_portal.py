@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from playwright.sync_api import Page, expect
+from switchboard_browser import hold_joystick, ready_to_drive, seen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from playwright.sync_api import Route
 
     OpenPage = Callable[..., Page]
     FakeRelay = Any
@@ -18,26 +21,6 @@ if TYPE_CHECKING:
 PASSWORD = "correct horse"
 ZERO = (0, 0)
 COCKPIT = "/cockpit/rover-1"
-
-
-def seen(page: Page, testid: str) -> Any:
-    return page.get_by_test_id(testid)
-
-
-def ready_to_drive(page: Page) -> None:
-    expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
-    expect(seen(page, "limit-linear")).to_be_visible()
-    expect(seen(page, "joystick").locator(".back")).to_be_visible()
-
-
-def hold_joystick(page: Page, dx: float = 0, dy: float = -60) -> None:
-    """Presses the joystick with the mouse and pulls it away from its middle (pixels)."""
-    # At rest nothing moves below the pointer any more.
-    box = seen(page, "joystick").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.move(x, y)
-    page.mouse.down()
-    page.mouse.move(x + dx, y + dy, steps=4)
 
 
 def driving(relay: FakeRelay, at_least: int = 3) -> None:
@@ -151,6 +134,49 @@ class TestFleet:
         assert card.locator("img, b").count() == 0
 
 
+class TestStopAll:
+    def pressed(self, page: Page, relay: FakeRelay) -> None:
+        page.get_by_role("button", name="Stop all robots").click()
+        expect(seen(page, "toast")).to_contain_text("1 robot is away, and will be stopped when back.")
+        [asked] = relay.log(op="POST fleet")
+        assert (asked["do"], asked["robots"]) == ("stop", ["*"])
+
+    @pytest.mark.parametrize("path", ["/fleet", "/alerts"])
+    def test_before_the_robots_are_known(self, open_page: OpenPage, relay: FakeRelay, path: str) -> None:
+        """Which robots there are is for the relay to know."""
+        relay.do(blind=True)
+        self.pressed(open_page(path, user="admin"), relay)
+
+    def test_where_there_is_no_page(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A wrong address takes nobody's STOP away."""
+        page = open_page("/nowhere", user="admin")
+        expect(page.get_by_text("There is no such page")).to_be_visible()
+        self.pressed(page, relay)
+
+    def test_where_a_page_does_not_load(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Neither does one that hangs, nor one that fails."""
+        page = open_page("/fleet", user="admin")
+        expect(seen(page, "robot-card")).to_have_count(3)
+        waiting: list[Route] = []
+        page.route("**/assets/Alerts-*.js", lambda route: waiting.append(route))
+        seen(page, "alerts-link").click()
+        expect(seen(page, "robot-card")).to_have_count(0)
+        self.pressed(page, relay)
+        [stuck] = waiting
+        stuck.abort()
+        expect(page.get_by_text("The page could not be loaded")).to_be_visible()
+        expect(page.get_by_role("button", name="Stop all robots")).to_be_visible()
+
+    def test_not_where_nobody_is_logged_in(self, open_page: OpenPage) -> None:
+        """There is nobody whose robots could be meant, nor where somebody has none."""
+        page = open_page("/nowhere")
+        expect(seen(page, "login-user")).to_be_visible()
+        expect(seen(page, "stop")).to_have_count(0)
+        page = open_page("/fleet", user="newcomer")
+        expect(seen(page, "fleet-empty")).to_be_visible()
+        expect(seen(page, "stop")).to_have_count(0)
+
+
 class TestCockpit:
     def test_everything_arrives(self, open_page: OpenPage) -> None:
         """Picture, scan, odometry, latency and topics show live data."""
@@ -161,7 +187,7 @@ class TestCockpit:
         expect(seen(page, "latency-badge")).to_contain_text(re.compile(r"\d+ ms"))
         expect(seen(page, "leg-client-robot")).to_contain_text(re.compile(r"\d+ ms"))
         expect(seen(page, "leg-relay-robot")).to_have_text("4 ms")
-        expect(seen(page, "topic-row")).to_have_count(10)
+        expect(seen(page, "topic-row")).to_have_count(11)
         for canvas in ("camera-canvas", "scan-canvas"):
             colours = seen(page, canvas).evaluate(
                 """canvas => {
@@ -189,7 +215,7 @@ class TestCockpit:
         """The page asks for three topics and one camera, and for one more topic while its echo is open."""
         page = open_page(COCKPIT, user="driver")
         expect(seen(page, "odom-x")).to_have_text("−1.00")
-        shown = {"/relay/status", "/scan", "/odom"}
+        shown = {"/relay/status", "/relay/control", "/scan", "/odom"}
         assert {entry["topic"] for entry in relay.log(op="subscribe")} == shown
         relay.until(lambda: relay.log(op="watch"), "no camera was watched")
         assert [entry["topic"] for entry in relay.log(op="watch")] == ["/camera/image_raw/compressed"]
@@ -210,6 +236,26 @@ class TestCockpit:
         expect(page.get_by_text(re.compile(r"stale, \d+ s old"))).to_have_count(2)
         relay.do(silent=False)
         expect(seen(page, "camera-stale")).to_have_count(0)
+
+    def test_a_relay_that_tells_nothing_more_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Three seconds after the last status, what it told of robot and people counts as old."""
+        page = open_page(COCKPIT, user="driver")
+        expect(seen(page, "person")).to_have_count(1)
+        expect(seen(page, "status-stale")).to_have_count(0)
+        relay.do(mute=True)
+        expect(seen(page, "status-stale")).to_be_visible()
+        expect(seen(page, "presence")).to_contain_text("stale")
+        relay.do(mute=False)
+        expect(seen(page, "status-stale")).to_have_count(0)
+
+    def test_the_three_legs_are_told_on_request(self, open_page: OpenPage) -> None:
+        """The badge opens a table with each leg now, in 95 of 100 cases, and how many were lost."""
+        page = open_page(COCKPIT, user="driver", width=390, height=844)
+        expect(seen(page, "latency-badge")).to_contain_text(re.compile(r"\d+ ms"))
+        seen(page, "latency-badge").click()
+        table = page.get_by_role("group", name="Round trips")
+        for leg in ("You to relay", "Relay to robot", "You to robot"):
+            expect(table.get_by_role("row", name=leg)).to_contain_text(re.compile(r"\d+ ms.*6 ms.*0"))
 
     def test_refusals_are_told(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """A status message of the relay appears in its own words."""
@@ -276,7 +322,7 @@ class TestDriving:
         driving(relay)
         page.keyboard.up("w")
         assert_one_zero_then_silence(page, relay)
-        assert relay.commands()[0] == (0.5, 0)
+        assert relay.commands()[:2] == [ZERO, (0.5, 0)]
 
     def test_keys_in_a_text_field_do_not_drive(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """Typing into the filter is typing."""
@@ -323,23 +369,6 @@ class TestDriving:
         assert_one_zero_then_silence(page, relay)
         page.mouse.up()
 
-    def test_stop_button(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """STOP sends a zero at once, without anything being held."""
-        page = open_page(COCKPIT, user="driver")
-        ready_to_drive(page)
-        seen(page, "stop").click()
-        relay.until(relay.commands, "no zero came")
-        page.wait_for_timeout(300)
-        assert relay.commands() == [ZERO]
-
-    def test_stop_by_keyboard(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """STOP can be reached and pressed by keyboard."""
-        page = open_page(COCKPIT, user="driver")
-        ready_to_drive(page)
-        seen(page, "stop").focus()
-        page.keyboard.press("Enter")
-        relay.until(lambda: relay.commands() == [ZERO], "no zero came")
-
     def test_late_link_stops(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """When pongs stay out, driving ends, the page says so, and nothing is sent until it is taken hold of anew."""
         page = open_page(COCKPIT, user="driver")
@@ -353,6 +382,23 @@ class TestDriving:
         relay.do(frozen=False)
         expect(seen(page, "link-late")).to_have_count(0)
         assert relay.commands()[-1] == ZERO
+        page.mouse.up()
+
+    def test_a_robot_that_does_not_answer_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """While the relay answers and the robot does not, neither the way to it nor the driving looks well."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        expect(seen(page, "leg-client-robot")).to_contain_text("ms")
+        hold_joystick(page)
+        expect(seen(page, "driving")).to_be_visible()
+        relay.do(dead=True)
+        expect(seen(page, "robot-late")).to_be_visible(timeout=5000)
+        expect(seen(page, "driving")).to_have_count(0)
+        expect(seen(page, "latency-badge")).to_have_text("robot late")
+        relay.do(dead=False)
+        # Asked again once the relay has given up on the ping that is out.
+        expect(seen(page, "driving")).to_be_visible()
+        expect(seen(page, "latency-badge")).to_have_text(re.compile(r"\d+ ms"))
         page.mouse.up()
 
     def test_nothing_old_is_sent_after_a_reconnect(self, open_page: OpenPage, relay: FakeRelay) -> None:
@@ -376,8 +422,8 @@ class TestDriving:
         page.reload()
         ready_to_drive(page)
         expect(page.get_by_label("Command topic")).to_have_value("/cmd_vel_nav")
-        seen(page, "stop").click()
-        relay.until(lambda: relay.commands("/cmd_vel_nav"), "no zero came on the chosen topic")
+        page.keyboard.press("w")
+        relay.until(lambda: relay.commands("/cmd_vel_nav")[-1:] == [ZERO], "nothing came on the chosen topic")
         assert relay.commands("/cmd_vel") == []
 
     def test_touch(self, open_page: OpenPage, relay: FakeRelay) -> None:
@@ -404,11 +450,10 @@ class TestRights:
         page = open_page(COCKPIT, user="viewer")
         expect(seen(page, "camera-fps")).to_have_text(re.compile(r"[1-9]\d* fps"))
         expect(seen(page, "drive-blocked")).to_contain_text("viewer")
-        expect(seen(page, "stop")).to_be_disabled()
+        expect(seen(page, "control-take")).to_have_count(0)
         hold_joystick(page)
         page.mouse.up()
         page.keyboard.press("w")
-        page.keyboard.press("Space")
         page.wait_for_timeout(300)
         assert relay.log(op="publish") == []
         assert relay.log(op="advertise") == []
@@ -458,7 +503,7 @@ class TestRights:
 
 @pytest.mark.parametrize("width", [390, 768, 1280])
 class TestWidths:
-    @pytest.mark.parametrize("path", ["/login", "/fleet", COCKPIT, "/nowhere"])
+    @pytest.mark.parametrize("path", ["/login", "/fleet", "/alerts", COCKPIT, "/nowhere"])
     def test_no_sideways_scrolling(self, open_page: OpenPage, width: int, path: str) -> None:
         """No page is wider than its window."""
         page = open_page(path, width=width, user=None if path == "/login" else "admin")

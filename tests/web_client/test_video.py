@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Locator, Page, expect
+from switchboard_browser import ready_to_drive
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -201,6 +202,31 @@ def test_a_revoked_right_is_said(open_page: OpenPage, relay: FakeRelay) -> None:
     expect(part(page, "fps")).to_have_text(RUNS)
 
 
+def test_a_picture_that_is_decoded_late_takes_back_no_reason(open_page: OpenPage, relay: FakeRelay) -> None:
+    """A picture that was under way when the stream ended is shown, and what is said about the end stays."""
+    page = watching(open_page)
+    page.evaluate(
+        """() => {
+            const decode = window.createImageBitmap
+            window.createImageBitmap = async (...given) => {
+                document.body.dataset.late = 'waits'
+                await new Promise((end) => (window.goOn = end))
+                const bitmap = await decode(...given)
+                setTimeout(() => (document.body.dataset.late = 'shown'))
+                return bitmap
+            }
+        }"""
+    )
+    expect(page.locator("body[data-late=waits]")).to_be_attached()
+    relay.do(close_video=4403, reason="revoked by admin", clear_log=True)
+    words = "You have no right to view this camera. Revoked by admin."
+    expect(part(page, "words")).to_have_text(words)
+    page.evaluate("window.goOn()")
+    expect(page.locator("body[data-late=shown]")).to_be_attached()
+    page.evaluate("() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+    expect(part(page, "words")).to_have_text(words)
+
+
 @pytest.mark.parametrize("code", [1001, 1011, 4408, 4503])
 def test_it_comes_back_by_itself(open_page: OpenPage, relay: FakeRelay, code: int) -> None:
     """After an end that may pass the page asks again."""
@@ -247,7 +273,7 @@ def test_h264_that_the_robot_has_not_falls_back(open_page: OpenPage, relay: Fake
     relay.until(lambda: last_watch(relay).get("codec") == "h264", "H.264 was not asked for")
     relay.do(close_video=4503, reason="the robot has no encoder for H.264")
     expect(part(page, "codec-note")).to_have_text(
-        "The camera can’t be shown now. The robot has no encoder for H.264. JPEG is shown instead."
+        "The robot has no encoder for H.264. JPEG is shown instead."
     )
     relay.until(lambda: last_watch(relay) == {"topic": FRONT}, "JPEG was not asked for")
     expect(part(page, "stale")).to_have_count(0)
@@ -285,7 +311,7 @@ def test_two_cameras_and_the_joystick_fit_on_a_phone(open_page: OpenPage) -> Non
     page = watching(open_page, width=390, height=844)
     part(page, "add").click()
     expect(part(page, "pane")).to_have_count(2)
-    expect(page.get_by_test_id("joystick").locator(".back")).to_be_visible()
+    ready_to_drive(page)
     cameras = [each.bounding_box() for each in part(page, "canvas").all()]
     joystick = page.get_by_test_id("joystick").bounding_box()
     assert joystick is not None

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 from link_relay import ENROLMENT_CODE, Link, LinkRelay
+from robot_tasks import Wheels
 from robots_under_test import ROBOTS
 
 
@@ -24,6 +25,13 @@ def channel(relay: LinkRelay) -> Iterator[Link]:
     """A channel link of its own for each case."""
     with relay.channel() as link:
         yield link
+
+
+@pytest.fixture
+def drive(relay: LinkRelay) -> Iterator[Wheels]:
+    """A robot that can be driven."""
+    with relay.channel() as watching, relay.channel() as driving:
+        yield Wheels(relay, driving, watching)
 
 
 @pytest.fixture(scope="session")

@@ -3,19 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
-import pytest
 from conformance_suite import case, not_offered
 from link_relay import LinkRelay
-from robot_tasks import CDR, Wheels
-
-
-@pytest.fixture
-def drive(relay: LinkRelay) -> Iterator[Wheels]:
-    """A robot that can be driven."""
-    with relay.channel() as watching, relay.channel() as driving:
-        yield Wheels(relay, driving, watching)
+from robot_tasks import CDR, DRIVER, Wheels
 
 
 @case("motion", "SPEC 2.5 advertised, motion")
@@ -55,8 +46,8 @@ def test_old_commands(drive: Wheels) -> None:
     """Commands older than deadline_ms are dropped."""
     drive.stands(drive.start())
     for _ in range(5):
-        drive.command(0.2, age=drive.deadline + 0.05)
-    drive.never_moves()
+        drive.command(0.3, age=drive.deadline + 0.05)
+    drive.never_goes(0.3)
     drive.start()
 
 
@@ -77,8 +68,8 @@ def test_commands_of_the_future(drive: Wheels) -> None:
     """Commands that lie in the future are dropped."""
     drive.stands(drive.start())
     for _ in range(5):
-        drive.command(0.2, age=-60)
-    drive.never_moves()
+        drive.command(0.3, age=-60)
+    drive.never_goes(0.3)
 
 
 @case("motion", "SPEC 2.5, Clocks and deadline, 4")
@@ -95,7 +86,7 @@ def test_no_number(drive: Wheels) -> None:
 def test_nonsense_for_a_command(drive: Wheels) -> None:
     """Bytes that are no command are dropped, and the next command is obeyed."""
     for body in (b"", b"{", b"\0", b"[]", b"null", b'{"linear": 5}', CDR, CDR + b"x" * 47):
-        drive.driving.sample(2, body)
+        drive.driving.command(2, body, DRIVER)
     drive.never_moves()
     drive.start()
 

@@ -231,3 +231,17 @@ def test_events_are_forgotten_in_batches_by_age_and_by_number(database: Database
         assert [queries.purge_events(s, before=5.0, most=2, batch=2) for _ in range(4)] == [2, 2, 1, 0]
         assert left() == [8, 9]
         assert queries.purge_events(s, before=5.0) == 0
+
+
+def test_when_robots_were_removed(database: Database) -> None:
+    """By the audit log: the last time of each, and of none that were not asked about."""
+    with database.begin() as s:
+        for at, action, target in (
+            (1.0, "robot.remove", "rover"),
+            (2.0, "robot.remove", "rover"),
+            (3.0, "robot.add", "rover"),
+            (4.0, "robot.remove", "tank"),
+        ):
+            queries.append_audit(s, at=at, actor="cli:root", action=action, target=target)
+        assert queries.removed_robots(s, {"rover", "arm"}) == {"rover": 2.0}
+        assert queries.removed_robots(s, ()) == {}

@@ -54,5 +54,5 @@ seen.absent = await new Promise((resolve) => absent.get(() => resolve(""), resol
 
 ros.close();
 inTime();
-console.log(JSON.stringify(seen));
-process.exit(0);
+// More than a pipe holds: only when it is written may the process end.
+process.stdout.write(JSON.stringify(seen) + "\n", () => process.exit(0));

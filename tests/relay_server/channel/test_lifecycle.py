@@ -12,6 +12,7 @@ from relay_protocol.errors import Refused
 from relay_server.channel import State
 from relay_server.channel.lifecycle import JOIN_SECONDS, REOPEN_SECONDS
 from relay_server.channel.states import NEXT, Event
+from relay_server.channel.wire import Sent
 from tests.relay_server.memory import MemoryLink, World, fails, text
 
 
@@ -20,6 +21,9 @@ class Member:
 
     def tell(self, level: str, text: str, id: Any = None) -> None:
         """Not asked."""
+
+    def judge_again(self) -> None:
+        """May hear everything."""
 
 
 def brought_to(world: World, state: State) -> None:
@@ -194,7 +198,7 @@ def test_a_robot_that_never_joins_keeps_nobody_waiting_for_ever(world: World) ->
     for work in (
         world.channel.asking.round_trip(),
         world.channel.asking.definition("std_msgs/msg/String"),
-        world.channel.asking.call("/reset", "", b"", 2.0),
+        world.channel.asking.call("/reset", "", b"", 2.0, Sent(1)),
     ):
         Deferred.fromCoroutine(work).addErrback(lambda failure: told.append(str(failure.value)))
     world.clock.pump([1.0] * 4)

@@ -8,6 +8,7 @@ from relay_protocol import link
 from relay_protocol.rights import Level
 from relay_server.channel import listener as listener_module
 from relay_server.channel import topics as module
+from relay_server.channel.subscriptions import LOOK_SECONDS
 from tests.relay_server.channel.watching import counting, heard, watching
 from tests.relay_server.memory import GRAPH, STRING, World, text
 
@@ -139,6 +140,35 @@ def test_late_joiners_get_the_latched_samples_of_every_publisher(world: World) -
     assert heard(late) == ["b", "c"]
     late.says("subscribe", topic="/chatter", id="again")
     assert heard(late) == []
+
+
+def test_late_joiners_get_nothing_of_what_is_inhibited_before_that_ends(world: World) -> None:
+    """Then they get the latched sample they have missed, once; with its last value held it comes at once."""
+    number, (first,) = watching(world, {})
+    world.subscribed(number, latched=True, publishers=1)
+    world.channel.sample(number, text("a"))
+    assert heard(first) == ["a"]
+    silent = link.Inhibited(resource="/chatter", ms=900, by="olga")
+    world.robot.safety = link.Safety(inhibited=[silent])
+    late, gone, third = world.person(), world.person(), world.person()
+    for each in (late, gone):
+        each.says("subscribe", topic="/chatter")
+    world.clock.advance(LOOK_SECONDS)
+    assert heard(late) == []
+    gone.says("unsubscribe", topic="/chatter")
+    world.robot.safety = link.Safety()
+    world.clock.advance(LOOK_SECONDS)
+    assert [heard(each) for each in (first, late, gone)] == [[], ["a"], []]
+    world.robot.safety = link.Safety(inhibited=[silent])
+    third.says("subscribe", topic="/chatter")
+    world.robot.safety = link.Safety()
+    world.channel.sample(number, text("b"))
+    world.clock.advance(LOOK_SECONDS)
+    assert [heard(each) for each in (late, third)] == [["b"], ["a", "b"]]
+    world.robot.safety = link.Safety(inhibited=[link.Inhibited(resource="/chatter", ms=900, hold=True)])
+    held = world.person()
+    held.says("subscribe", topic="/chatter")
+    assert heard(held) == ["b"]
 
 
 def test_latched_samples_do_not_outlive_the_link(world: World) -> None:

@@ -65,6 +65,9 @@ class FakeRelay(socketserver.ThreadingUnixStreamServer):
 
     :ivar asked: requests so far, as ``METHOD /path``
     :ivar answer: status code and body for ``GET /status``
+    :ivar ordered: bodies of ``POST /fleet``, ``/stop`` and ``/resume`` so far
+    :ivar lines: status code and body for the first of these
+    :ivar motion: the same for the others
     """
 
     daemon_threads = True
@@ -73,6 +76,9 @@ class FakeRelay(socketserver.ThreadingUnixStreamServer):
         super().__init__(str(path), _Handler)
         self.asked: list[str] = []
         self.answer: tuple[int, bytes] = (200, b"{}")
+        self.ordered: list[Any] = []
+        self.lines: tuple[int, bytes] = (200, b"")
+        self.motion: tuple[int, bytes] = (200, b"{}")
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -87,6 +93,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _respond(self) -> None:
         self.server.asked.append(f"{self.command} {self.path}")
         status, body = self.server.answer if self.command == "GET" else (204, b"")
+        if self.path in ("/fleet", "/stop", "/resume"):
+            length = int(self.headers["Content-Length"])
+            self.server.ordered.append(json.loads(self.rfile.read(length)))
+            status, body = self.server.lines if self.path == "/fleet" else self.server.motion
         self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()

@@ -15,6 +15,7 @@ import click
 import pytest
 from sqlalchemy import create_engine, text
 
+from relay_db.schema import HEAD
 from relay_server.cli import main
 from relay_server.cli.relaysocket import SOCKET_NAME
 
@@ -153,7 +154,7 @@ def test_another_database_is_taken_by_url(cli: Any, tmp_path: Path) -> None:
     result = cli("user", "list", "--json", SWITCHBOARD_DB=url)
     assert [each["user"] for each in json.loads(result.stdout)] == ["ann"]
     assert not cli.data.exists()
-    assert cli.json("--db", url, "db", "upgrade") == {"database": url, "schema": "0001"}
+    assert cli.json("--db", url, "db", "upgrade") == {"database": url, "schema": HEAD}
 
 
 def test_a_database_that_is_not_there_is_exit_code_3(cli: Any, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from relay_db.engine import Database
 from relay_protocol import identity
 from relay_protocol.errors import Refused
 from relay_server.passwords import code_hash
+from relay_server.recording.library import FOLDER, Entry, State, text_of
 
 
 def _enrol(cli: Any, robot: str, code: str, agent: str = "robot 1") -> str:
@@ -117,3 +118,20 @@ def test_a_robot_is_removed(cli: Any) -> None:
     assert cli.json("robot", "list") == []
     for command in ("remove", "code", "keys"):
         assert "no robot 'rover'" in cli.fails("robot", command, "rover")
+
+
+def test_what_is_recorded_of_a_robot_is_told_before_it_is_removed(cli: Any) -> None:
+    """How many and how large; the relay deletes them."""
+    cli.ok("robot", "add", "rover")
+    folder = cli.data / FOLDER
+    folder.mkdir()
+    for id, size in (("a", 1_200_000), ("b", 50_000)):
+        entry = Entry(id, 1, "rover", 1, "ann", ("/odom",), (), 1.0, 10**7, 60.0, state=State.COMPLETE)
+        (folder / f"{id}.json").write_bytes(text_of(entry))
+        (folder / f"{id}.mcap").write_bytes(bytes(size))
+    asked = cli("robot", "remove", "rover", stdin="n\n")
+    assert "its keys and all rights on it, and its 2 recordings (1.3 MB)?" in asked.stderr
+    told = cli.ok("robot", "remove", "rover", "--yes")
+    assert "The relay deletes its 2 recordings (1.3 MB): now if it runs, else when it starts." in told
+    *_, entry = cli.json("audit", "list")
+    assert entry["data"] == {"recordings": 2}

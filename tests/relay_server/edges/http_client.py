@@ -16,7 +16,7 @@ from twisted.internet.testing import StringTransportWithDisconnection
 
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import BadCredentials, Principal
-from relay_server.auth import TooManyTries
+from relay_server.auth import Opening, TooManyTries
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.site import Missing, Portal, RelaySite, Robots, Root
@@ -36,6 +36,7 @@ class MemoryDesk:
         self.tokens = {"ann": ANN, "root": ROOT}
         self.up = True
         self.listeners: list[Callable[[], None]] = []
+        self.tickets: list[Opening] = []
 
     async def password(self, user: str, password: str, address: str) -> tuple[Principal, str]:
         """One password is right, one too many."""
@@ -69,10 +70,11 @@ class MemoryDesk:
         """One robot."""
         return [{"name": "rover", "seen by": principal.name}]
 
-    async def issue_ticket(self, principal: Principal, robot: str) -> str:
+    async def issue_ticket(self, principal: Principal, opens: Opening) -> str:
         """A ticket for the one robot."""
-        if robot != "rover":
+        if opens.robot != "rover":
             raise NotFound("there is no such robot, or you have no right on it")
+        self.tickets.append(opens)
         return f"ticket of {principal.name}"
 
     async def healthy(self) -> bool:
@@ -127,11 +129,26 @@ class Transport(StringTransportWithDisconnection):
 
 
 def api_of(
-    clock: Any, desk: Any, origins: Origins, below: dict[str, Any] | None = None, *, tls: bool = False
+    clock: Any,
+    desk: Any,
+    origins: Origins,
+    below: dict[str, Any] | None = None,
+    beside: dict[str, Any] | None = None,
+    events: dict[str, Any] | None = None,
+    *,
+    tls: bool = False,
 ) -> Api:
     """The API in front of a desk."""
     return Api(
-        clock, desk, origins, CollectorRegistry(), {} if below is None else below, cookie="sb", secure=tls
+        clock,
+        desk,
+        origins,
+        CollectorRegistry(),
+        {} if below is None else below,
+        {} if beside is None else beside,
+        cookie="sb",
+        secure=tls,
+        events=events,
     )
 
 
@@ -144,7 +161,9 @@ class World:
         self.cap = AddressCap(4)
         origins = Origins("https" if tls else "http")
         self.below: dict[str, Any] = {}
-        api = api_of(self.clock, self.desk, origins, self.below, tls=tls)
+        self.beside: dict[str, Any] = {}
+        self.events: dict[str, Any] = {}
+        api = api_of(self.clock, self.desk, origins, self.below, self.beside, self.events, tls=tls)
         websocket = WebSocketResource(ClientFactory(self.clock, lambda: 0, self.desk, self.cap))  # type: ignore[arg-type]
         root = Root(Robots(websocket, Missing(), "1.2.3"), api.app.resource(), Portal(folder))
         self.site = RelaySite(root, self.clock, self.cap, tls)

@@ -69,6 +69,7 @@ class Hall:
             self.registry,
             self.world.channels,
             self.world.videos,
+            self.world.desks,
             self.journal,
             clock.seconds,
             lambda: 1000.0,

@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
-from relay_server.edges import api as module
+from relay_server.access import Principal
+from relay_server.auth import Opening
+from relay_server.edges import stream as module
 from tests.relay_server.edges.http_client import ORIGIN, World, parse
 
 SESSION = "/api/v1/session"
@@ -101,11 +103,38 @@ def test_robots_and_tickets(world: World) -> None:
     assert world.ask("GET", "/api/v1/robots/rover", **token).json["name"] == "rover"
     assert world.ask("GET", "/api/v1/robots/tank", **token).status == 404
     ticket = world.ask("POST", "/api/v1/tickets", {"robot": "rover"}, **token)
-    assert ticket.json == {"ticket": "ticket of ann", "expires_in": 60, "robot": "rover"}
+    assert ticket.json == {
+        "ticket": "ticket of ann",
+        "expires_in": 60,
+        "robot": "rover",
+        "for": "robot",
+        "camera": "",
+    }
     assert world.ask("POST", "/api/v1/tickets", {"robot": "tank"}, **token).status == 404
     assert world.ask("POST", "/api/v1/tickets", {}, **token).status == 400
     for path in ("/api/v1/robots", "/api/v1/robots/rover", "/api/v1/robots/stream", "/metrics"):
         assert world.ask("GET", path).status == 401
+
+
+@pytest.mark.parametrize(
+    ("fields", "opens"),
+    [
+        ({}, Opening("rover")),
+        ({"for": "robot"}, Opening("rover")),
+        ({"for": "video"}, Opening("rover", video=True)),
+        ({"for": "video", "camera": "/eye"}, Opening("rover", video=True, camera="/eye")),
+        ({"camera": "/eye"}, None),
+        ({"for": "everything"}, None),
+        ({"for": "video", "camera": "x" * 1000}, None),
+    ],
+)
+def test_a_ticket_is_for_the_websocket_or_for_cameras(
+    world: World, fields: dict[str, str], opens: Opening | None
+) -> None:
+    """What makes no sense is told."""
+    answer = world.ask("POST", "/api/v1/tickets", {"robot": "rover", **fields}, Authorization="Bearer ann")
+    assert answer.status == (400 if opens is None else 201)
+    assert world.desk.tickets == ([] if opens is None else [opens])
 
 
 def test_health_tells_whether_the_database_answers(world: World) -> None:
@@ -179,10 +208,50 @@ def test_the_stream_tells_at_once_then_at_every_change_and_every_few_seconds(wor
     assert events(transport) == ["robots"]
     for _ in range(10):
         world.desk.changed()
+    assert events(transport) == []
+    world.clock.advance(module.COALESCE_SECONDS)
+    assert events(transport) == ["robots"]
     world.clock.advance(module.COALESCE_SECONDS)
     assert events(transport) == []
     world.clock.advance(module.STREAM_SECONDS)
     assert events(transport) == ["robots"]
+
+
+def test_what_changes_while_the_stream_is_being_told_is_told_after_it(world: World) -> None:
+    """It may have come too late for what was looked up already."""
+    seen: list[dict[str, Any]] = []
+
+    async def alerts(principal: Principal) -> list[dict[str, Any]]:
+        now = list(seen)
+        if not seen:
+            seen.append({"id": "a1"})
+            world.desk.changed()
+        return now
+
+    world.events["alerts"] = alerts
+    transport = streaming(world)
+    assert b'data: {"alerts":[]}' in transport.value()
+    world.clock.advance(module.COALESCE_SECONDS)
+    assert b'data: {"alerts":[{"id":"a1"}]}' in transport.value()
+
+
+def test_other_events_are_told_at_once_and_when_they_are_another_list(world: World) -> None:
+    """Each under its name; robots are told all the time."""
+    shown: list[dict[str, Any]] = [{"id": "a1"}]
+
+    async def alerts(principal: Principal) -> list[dict[str, Any]]:
+        assert principal.name == "ann"
+        return shown
+
+    world.events["alerts"] = alerts
+    transport = streaming(world)
+    assert b'event: alerts\ndata: {"alerts":[{"id":"a1"}]}\n\n' in transport.value()
+    assert events(transport) == ["robots", "alerts"]
+    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
+    assert events(transport) == ["robots"]
+    shown = []
+    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
+    assert events(transport) == ["robots", "alerts"]
 
 
 def test_a_client_that_leaves_its_stream_leaves_nothing_behind(world: World) -> None:

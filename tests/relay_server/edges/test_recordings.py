@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from twisted.internet.defer import Deferred
 
-from relay_protocol.errors import NotFound
+from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import Principal
 from relay_server.edges import recordings as module
 from relay_server.recording import Ask
-from tests.relay_server.edges.http_client import HOST, Transport, World, parse
+from tests.relay_server.edges.http_client import HOST, Answer, Transport, World, parse
 
 HERE = "/api/v1/robots/rover/recordings"
 ANN = {"Authorization": "Bearer ann"}
@@ -25,12 +25,21 @@ class File:
     """A file whose parts the test gives when it wants to."""
 
     name = "rover-a.mcap"
+    tag = "a"
 
     def __init__(self, size: int = len(CONTENT)) -> None:
         self.size = size
         self.open = True
+        self.begun = 0
+        self.busy = False
         self.denied: Callable[[str], None] = lambda reason: None
         self.asked: list[tuple[int, int, Deferred[bytes]]] = []
+
+    async def begin(self) -> None:
+        """It is sent."""
+        if self.busy:
+            raise Unavailable("too much at once")
+        self.begun += 1
 
     def watch(self, denied: Callable[[str], None]) -> None:
         """Keep who is to be told."""
@@ -66,6 +75,10 @@ class Desk:
         assert (principal.name, robot, address) == ("ann", "rover", "192.0.2.9")
         self.asks.append(ask)
         return {"id": "a"}
+
+    async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
+        """One topic."""
+        return {"topics": ["/odom"]}
 
     async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
         """The one."""
@@ -104,12 +117,21 @@ def world(tmp_path: Path, desk: Desk) -> World:
     return made
 
 
-def fetch(world: World) -> Transport:
+def fetch(world: World, method: str = "GET", **headers: str) -> Transport:
     """Somebody downloads; the head of the answer and the beginning of the file come later."""
     transport = world.connect()
-    head = f"GET {HERE}/a/file HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\n\r\n"
-    world.send(transport, head.encode())
+    head = f"{method} {HERE}/a/file HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\n"
+    head += "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in headers.items())
+    world.send(transport, f"{head}\r\n".encode())
     return transport
+
+
+def received(world: World, file: File, **headers: str) -> Answer:
+    """What somebody gets who takes all that comes."""
+    transport = fetch(world, **headers)
+    while file.asked:
+        file.gives()
+    return parse(transport.value())
 
 
 def test_each_address_does_its_own(world: World, desk: Desk) -> None:
@@ -119,6 +141,7 @@ def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     assert (answer.status, answer.headers["location"]) == (201, f"{HERE}/a")
     assert desk.asks == [Ask(topics=["/odom"], seconds=5.0)]
     assert world.ask("GET", f"{HERE}/a", **ANN).json == {"id": "a"}
+    assert world.ask("GET", f"{HERE}/new", **ANN).json == {"topics": ["/odom"]}
     assert world.ask("POST", f"{HERE}/a/stop", **ANN).json["state"] == "complete"
     assert world.ask("DELETE", f"{HERE}/a", **ANN).status == 204
     assert desk.deleted == ["a"]
@@ -166,6 +189,7 @@ def test_a_file_comes_in_parts(world: World, desk: Desk) -> None:
         assert desk.file.asked[0][1] <= module.PART_BYTES
         desk.file.gives()
     answer = parse(transport.value())
+    assert (answer.status, answer.headers["accept-ranges"], answer.headers["etag"]) == (200, "bytes", '"a"')
     assert answer.headers["content-disposition"] == 'attachment; filename="rover-a.mcap"'
     assert answer.headers["content-length"] == str(len(CONTENT))
     assert answer.body == CONTENT
@@ -199,3 +223,71 @@ def test_a_file_that_may_or_can_not_be_sent_on_breaks_off(world: World, desk: De
     assert not transport.connected
     assert not desk.file.open
     assert len(parse(transport.value()).body) < len(CONTENT)
+
+
+END = len(CONTENT)
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "stop"),
+    [
+        ("bytes=0-0", 0, 1),
+        ("bytes=5-9", 5, 10),
+        (f"bytes={END - 3}-", END - 3, END),
+        ("bytes=0-", 0, END),
+        ("bytes=-7", END - 7, END),
+        (f"bytes=-{END + 5}", 0, END),
+        (f"bytes=1-{END + 5}", 1, END),
+        ("Bytes = 5-9", 5, 10),
+    ],
+)
+def test_a_part_of_a_file(world: World, desk: Desk, asked: str, start: int, stop: int) -> None:
+    """RFC 9110 section 14: from the beginning, the end, or between."""
+    answer = received(world, desk.file, Range=asked)
+    assert (answer.status, answer.headers["content-range"]) == (206, f"bytes {start}-{stop - 1}/{END}")
+    assert answer.headers["content-length"] == str(stop - start)
+    assert answer.body == CONTENT[start:stop]
+    assert desk.file.begun == 1
+
+
+@pytest.mark.parametrize(
+    "asked", ["bytes=0-1,5-6", "lines=1-2", "bytes=9-5", "bytes=x-", "bytes", "bytes=-0"]
+)
+def test_a_range_that_is_not_understood_is_passed_over(world: World, desk: Desk, asked: str) -> None:
+    """All of the file comes."""
+    answer = received(world, desk.file, Range=asked)
+    assert (answer.status, answer.body) == (200, CONTENT)
+
+
+def test_a_file_has_nothing_behind_its_end(world: World, desk: Desk) -> None:
+    """The answer says how long it is; nothing is sent, so nothing is put on record."""
+    answer = received(world, desk.file, Range=f"bytes={END}-")
+    assert (answer.status, answer.headers["content-range"]) == (416, f"bytes */{END}")
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert (desk.file.begun, desk.file.open) == (0, False)
+
+
+@pytest.mark.parametrize(
+    ("tag", "status"), [('"a"', 206), ('"b"', 200), ('W/"a"', 200), ("Sat, 21 Nov 2026 19:00:00 GMT", 200)]
+)
+def test_only_the_same_file_is_gone_on_with(world: World, desk: Desk, tag: str, status: int) -> None:
+    """Otherwise all of it comes; a weak tag or a date proves nothing (section 13.1.5)."""
+    answer = received(world, desk.file, Range="bytes=10-", If_Range=tag)
+    assert (answer.status, answer.body) == (status, CONTENT[10:] if status == 206 else CONTENT)
+
+
+def test_a_head_tells_what_a_get_would_bring(world: World, desk: Desk) -> None:
+    """Nothing is read, and nothing put on record."""
+    answer = parse(fetch(world, "HEAD", Range="bytes=5-9").value())
+    assert (answer.status, answer.headers["content-length"], answer.body) == (200, str(END), b"")
+    assert (answer.headers["accept-ranges"], answer.headers["etag"]) == ("bytes", '"a"')
+    assert (desk.file.asked, desk.file.begun, desk.file.open) == ([], 0, False)
+
+
+def test_a_file_that_may_not_begin_is_not_promised(world: World, desk: Desk) -> None:
+    """The answer is an error in words, under no file's name."""
+    desk.file.busy = True
+    answer = received(world, desk.file)
+    assert (answer.status, answer.json["detail"]) == (503, "too much at once")
+    assert "content-disposition" not in answer.headers
+    assert not desk.file.open

@@ -8,7 +8,13 @@ import pytest
 import pytest_twisted
 
 from relay_protocol import PROTOCOL_VERSION, limits, link
-from relay_protocol.frames import encode_json, encode_part, encode_sample, encode_video
+from relay_protocol.frames import (
+    encode_json,
+    encode_part,
+    encode_picture_part,
+    encode_sample,
+    encode_video,
+)
 from relay_server.video import State, Stream
 from tests.relay_server.edges.robot_ends import Hall, Robot
 from tests.relay_server.video.watching import CAMERA, Watcher, jpeg
@@ -63,6 +69,35 @@ async def test_a_robot_joins_a_stream_and_pictures_flow(hall: Hall) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_picture_in_parts_is_one_picture_and_each_part_is_answered(hall: Hall) -> None:
+    """One that breaks off is not shown, whatever way the next one comes."""
+    end, _, watcher = await joined(hall)
+    body = jpeg()
+    end.sends(encode_picture_part(1, 5, len(body), 0, body[:8]))
+    end.sends(encode_picture_part(1, 5, len(body), 8, body[8:20]))
+    end.sends(encode_picture_part(2, 6, len(body), 0, body[:9]))
+    end.sends(encode_picture_part(2, 6, len(body), 9, body[9:]))
+    end.sends(encode_picture_part(3, 7, len(body), 0, body[:9]))
+    end.sends(encode_video(4, 8, body))
+    assert [(each.number, each.body) for each in watcher.pictures] == [(2, body), (4, body)]
+    took = [(each["number"], each.get("upto")) for each in end.hears() if each["op"] == "took"]
+    assert took == [(1, 8), (1, 20), (2, 9), (2, None), (3, 9), (4, None)]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_part_of_what_was_given_up_ends_the_stream(hall: Hall) -> None:
+    """The robot can't know any more what it sends."""
+    end, stream, watcher = await joined(hall)
+    body = jpeg()
+    end.sends(encode_picture_part(1, 5, len(body), 0, body[:8]))
+    end.sends(encode_video(2, 6, body))
+    end.sends(encode_picture_part(1, 5, len(body), 8, body[8:]))
+    assert "does not follow" in end.refusal()["reason"]
+    assert len(watcher.pictures) == 1
+    assert stream.state is not State.OPEN
+
+
+@pytest_twisted.ensureDeferred
 async def test_the_ticket_of_a_stream_is_good_once(hall: Hall) -> None:
     """The stream that is open already goes on."""
     _, stream, _, ticket = await asked_to_show(hall)
@@ -82,10 +117,23 @@ async def test_the_ticket_of_a_stream_is_good_once(hall: Hall) -> None:
         (encode_sample(1, 1, b"x"), "samples go over the channel link"),
         (encode_part(1, 1, 1, 0, b"x"), "samples go over the channel link"),
         ((limits.PICTURE_FRAME + 1).to_bytes(4, "big"), "at most 4194304"),
+        (encode_picture_part(1, 1, limits.PICTURE_FRAME - 12, 0, b"x"), "at most 4194291"),
+        (encode_picture_part(1, 1, 13, 0, b"<html></html>"), "this is no JPEG"),
         (encode_json(b'{"op":"graph"}'), "graph"),
         (encode_json(b'{"op":"ping","t":1,"x":"' + b"x" * limits.JSON_BODY + b'"}'), "JSON of more than"),
     ],
-    ids=["html", "more", "nothing", "sample", "part", "too large", "another link's", "long JSON"],
+    ids=[
+        "html",
+        "more",
+        "nothing",
+        "sample",
+        "part",
+        "too large",
+        "too large in parts",
+        "html in parts",
+        "another link's",
+        "long JSON",
+    ],
 )
 @pytest_twisted.ensureDeferred
 async def test_what_has_no_place_on_a_streams_link_ends_it(hall: Hall, data: bytes, words: str) -> None:
@@ -132,9 +180,10 @@ async def test_html_instead_of_a_picture_ends_the_stream(hall: Hall) -> None:
     assert list(hall.world.videos) == []
 
 
+@pytest.mark.parametrize("picture", [encode_video(1, 1, jpeg()), encode_picture_part(1, 1, 9, 0, b"x")])
 @pytest.mark.parametrize("where", ["opening", "control", "channel"])
 @pytest_twisted.ensureDeferred
-async def test_pictures_have_no_place_on_other_links(hall: Hall, where: str) -> None:
+async def test_pictures_have_no_place_on_other_links(hall: Hall, where: str, picture: bytes) -> None:
     """Neither before the proof nor after it."""
     end = hall.dial() if where == "opening" else await hall.registered()
     if where == "channel":
@@ -144,7 +193,7 @@ async def test_pictures_have_no_place_on_other_links(hall: Hall, where: str) -> 
         (ask,) = [each for each in end.hears() if each["op"] == "open_channel"]
         end = hall.dial()
         end.says(link.Join(version=PROTOCOL_VERSION, ticket=ask["ticket"]))
-    end.sends(encode_video(1, 1, jpeg()))
+    end.sends(picture)
     assert end.refusal()["reason"] == "pictures have a link of their own"
 
 

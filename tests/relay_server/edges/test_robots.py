@@ -109,7 +109,7 @@ async def test_a_key_revoked_while_its_proof_is_judged_does_not_stay(
 
 @pytest_twisted.ensureDeferred
 async def test_a_robots_flood_of_alerts_does_not_reach_the_database(hall: Hall) -> None:
-    """Some are kept, the rest is counted; another robot's events are kept meanwhile."""
+    """Some are kept, the rest is counted; another robot's events are kept meanwhile, and that this one goes."""
     robot = await hall.registered()
     for number in range(5000):
         robot.says(link.Alert(level="error", text=str(number)))
@@ -117,7 +117,10 @@ async def test_a_robots_flood_of_alerts_does_not_reach_the_database(hall: Hall) 
     assert hall.journal.event("robot.online", "relay", cause="robot:other")
     await until(lambda: hall.journal._waiting == 0)
     kept = await hall.store.read(queries.list_events, kind="robot.alert")
-    assert len(kept) == BURST - 1
+    assert len(kept) == BURST
+    robot.breaks()
+    await until(lambda: not hall.online and hall.journal._waiting == 0)
+    assert len(await hall.store.read(queries.list_events, kind="robot.offline")) == 1
 
 
 @pytest_twisted.ensureDeferred
@@ -408,3 +411,27 @@ async def test_of_feedback_a_slow_robot_gets_the_newest(hall: Hall) -> None:
     robot.hears()
     robot.connection._outbox.resume()
     assert [(each["id"], each["cdr"]) for each in robot.hears()] == [("a", "4999"), ("b", "4999")]
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_control_link_is_measured_every_second(hall: Hall) -> None:
+    """Also between heartbeats; what is not answered is seen, and a link that is gone is lost."""
+    robot = await hall.registered()
+    assert hall.presence is not None
+    for _ in range(5):
+        for each in robot.hears():
+            if each["op"] == "ping":
+                hall.world.clock.advance(0.12)
+                robot.says(link.Pong(t=each["t"], at=0))
+        hall.world.clock.advance(0.88)
+    reading = hall.presence.reading()
+    assert reading.rtt == pytest.approx(0.12)
+    assert (reading.lost, reading.quality) == (0, "fair"), (
+        "the ping it passed over, its first, is not waited for"
+    )
+    hall.world.clock.pump([1.0] * 3)
+    assert hall.presence.reading().quality == "bad"
+    hall.world.clock.pump([1.0] * 1)
+    assert hall.presence.reading().quality == "lost"
+    robot.breaks()
+    assert hall.presence.reading().quality == "lost"

@@ -12,6 +12,7 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits
 from relay_server import closing, wsframe
+from relay_server.auth import Opening
 from relay_server.edges import bounded
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.websocket import ClientProtocol
@@ -30,7 +31,7 @@ def gate() -> MemoryGate:
         ("/robots/rover", {"Authorization": "Bearer good"}, ("bearer", "good")),
         ("/robots/rover", {"Authorization": "bearer  good "}, ("bearer", "good")),
         ("/robots/rover", {"subprotocol": "bearer.good"}, ("bearer", "good")),
-        ("/robots/rover?ticket=good", {}, ("ticket", "good", "rover")),
+        ("/robots/rover?ticket=good", {}, ("ticket", "good", Opening("rover"))),
         ("/robots/rover", {"Cookie": "good", "Origin": "http://relay:9090"}, ("cookie", "good")),
         ("/robots/rover?ticket=bad", {"Authorization": "Bearer good"}, ("bearer", "good")),
         ("/robots/%72over", {"Authorization": "Bearer good"}, ("bearer", "good")),

@@ -15,6 +15,7 @@ from websockets.uri import parse_uri
 
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import BadCredentials, Principal
+from relay_server.auth import Opening
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.websocket import ClientFactory
 from relay_server.outbox import Outbox
@@ -87,9 +88,9 @@ class MemoryGate:
         """An access token."""
         return await self._prove("bearer", token)
 
-    async def ticket(self, ticket: str, robot: str) -> Principal:
+    async def ticket(self, ticket: str, asked: Opening) -> Principal:
         """A ticket."""
-        return await self._prove("ticket", ticket, robot)
+        return await self._prove("ticket", ticket, asked)
 
     async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
         """A cookie."""

@@ -8,19 +8,21 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.local import rosapi
+from relay_server.local import control, rosapi
 from relay_server.local.catalogue import SERVICES, TYPES
 from relay_server.local.view import KEPT, _kept
 from tests.relay_server.local.asking import OWN_SERVICES, ask
 from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World
 
 STATUS = "switchboard_msgs/msg/Status"
+CONTROL = "switchboard_msgs/msg/Control"
+OWN = ["/relay/control", "/relay/status"]
 
 ANSWERS: list[tuple[str, Any, Any]] = [
     (
         "topics",
         None,
-        {"topics": ["/chatter", "/cmd_vel", "/relay/status"], "types": [STRING, TWIST, STATUS]},
+        {"topics": ["/chatter", "/cmd_vel", *OWN], "types": [STRING, TWIST, CONTROL, STATUS]},
     ),
     ("topics_for_type", {"type": "std_msgs/String"}, {"topics": ["/chatter"]}),
     ("topics_for_type", {"type": STRING}, {"topics": ["/chatter"]}),
@@ -60,7 +62,11 @@ ANSWERS: list[tuple[str, Any, Any]] = [
     (
         "node_details",
         {"node": "relay"},
-        {"subscribing": [], "publishing": ["/relay/status"], "services": ["/relay/ping"]},
+        {
+            "subscribing": [],
+            "publishing": OWN,
+            "services": sorted(name for name in SERVICES if name.startswith("/relay/")),
+        },
     ),
     ("action_servers", None, {"action_servers": ["/dock"]}),
     ("action_type", {"action": "dock"}, {"type": "a_msgs/action/Dock"}),
@@ -97,7 +103,7 @@ def test_the_relays_own_services_are_listed_with_the_robots(operator: Person) ->
 def test_what_one_may_not_call_is_not_shown(viewer: Person) -> None:
     """A viewer calls nothing of the robot, and sees no service of it; the relay's own are open to everyone."""
     assert ask(viewer, "/rosapi/services") == {"services": sorted(SERVICES)}
-    assert ask(viewer, "/rosapi/topics")["topics"] == ["/chatter", "/cmd_vel", "/relay/status"]
+    assert ask(viewer, "/rosapi/topics")["topics"] == ["/chatter", "/cmd_vel", *OWN]
 
 
 def test_hidden_names_are_not_listed(world: World, operator: Person) -> None:
@@ -130,10 +136,10 @@ def test_what_clients_publish_and_hear_is_the_relays(world: World, operator: Per
     assert ask(viewer, "/rosapi/publishers", {"topic": "/plan"}) == {"publishers": ["/relay"]}
     assert ask(viewer, "/rosapi/subscribers", {"topic": "/chatter"}) == {"subscribers": ["/logger", "/relay"]}
     details = ask(viewer, "/rosapi/node_details", {"node": "/relay"})
-    assert details["publishing"] == ["/plan", "/relay/status"]
+    assert details["publishing"] == ["/plan", *OWN]
     assert details["subscribing"] == ["/chatter"]
     operator.session.end()
-    assert ask(viewer, "/rosapi/topics")["topics"] == ["/chatter", "/cmd_vel", "/relay/status"]
+    assert ask(viewer, "/rosapi/topics")["topics"] == ["/chatter", "/cmd_vel", *OWN]
     assert ask(viewer, "/rosapi/subscribers", {"topic": "/chatter"}) == {"subscribers": ["/logger"]}
 
 
@@ -164,9 +170,9 @@ def test_a_change_of_rights_or_of_the_graph_shows_at_once(world: World, operator
     )
     assert ask(operator, "/rosapi/topics")["topics"] == sorted({*before, "/new"} - {"/chatter"})
     operator.session.permit.rules = Rules([Grant(Level.VIEWER, deny=("subscribe:/new",))])
-    assert ask(operator, "/rosapi/topics")["topics"] == ["/cmd_vel", "/relay/status", "/secret"]
+    assert ask(operator, "/rosapi/topics")["topics"] == ["/cmd_vel", *OWN, "/secret"]
     world.robot_goes()
-    assert ask(operator, "/rosapi/topics")["topics"] == ["/relay/status"]
+    assert ask(operator, "/rosapi/topics")["topics"] == OWN
 
 
 def test_what_is_kept_for_speed_is_bounded(world: World, viewer: Person) -> None:
@@ -242,7 +248,7 @@ def test_an_unknown_service_of_the_relay_is_judged_like_any(viewer: Person, oper
 
 def test_every_service_has_a_handler_and_a_type_whose_fields_its_answers_have(operator: Person) -> None:
     """The answers of rosapi have the fields of rosapi_msgs, neither more nor less."""
-    assert set(SERVICES) - {"/relay/ping"} == set(rosapi.SERVICES)
+    assert set(SERVICES) - {"/relay/ping", *control.SERVICES} == set(rosapi.SERVICES)
     for name in rosapi.SERVICES:
         args = {
             "topic": "/chatter", "service": "/reset", "node": "/base", "action": "/dock",
@@ -272,8 +278,8 @@ def test_thousands_of_topics_are_listed_without_judging_them_anew(
     """The second call of callers with the same rights judges nothing."""
     topics = {f"/t/{number}": link.Topic(types=[STRING], publishers=["/talker"]) for number in range(2000)}
     world.registry.graph(world.robot, link.Graph(full=True, topics=dict(topics)))
-    assert len(ask(operator, "/rosapi/topics")["topics"]) == 2001
+    assert len(ask(operator, "/rosapi/topics")["topics"]) == 2002
     judged: list[str] = []
     monkeypatch.setattr(Rules, "judge", lambda rules, operation, name: judged.append(name))
-    assert len(ask(operator, "/rosapi/topics")["topics"]) == 2001
+    assert len(ask(operator, "/rosapi/topics")["topics"]) == 2002
     assert not judged

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -36,7 +36,7 @@ def test_the_relays_status_comes_every_second_while_it_is_wanted(world: World, v
     assert status["topic"] == "relay/status"
     assert status["msg"]["robot"] == "rover"
     assert status["msg"]["level"] == "viewer"
-    assert status["msg"]["clients"] == [{"user": "ann", "since": 1.7e9}]
+    assert status["msg"]["clients"] == [{"user": "ann", "since": 1.7e9, "camera": ""}]
     assert status["msg"]["motion"]["deadline_ms"] == 500
     world.clock.pump([0.5] * 4)
     assert len(viewer.hears("publish")) == 2
@@ -105,6 +105,27 @@ def test_status_tells_of_the_streams_one_may_view(world: World, viewer: Person) 
             "reduced": 0.4,
             "delay_ms": 41.5,
         }
+    ]
+    TYPES.from_json(STATUS, told["msg"], 0)
+
+
+class Onlooker(NamedTuple):
+    """Somebody who watches."""
+
+    name: str
+    camera: str
+    address: str = "192.0.2.9"
+
+
+def test_status_tells_who_watches_what_one_may_view(world: World, viewer: Person) -> None:
+    """Beside those who work with the robot."""
+    for name, camera in (("bob", CAMERA), ("eve", "/vault/image")):
+        world.registry.looks_on(world.robot, Onlooker(name, camera))
+    viewer.says("subscribe", topic="/relay/status")
+    (told,) = viewer.hears("publish")
+    assert [(each["user"], each["camera"]) for each in told["msg"]["clients"]] == [
+        ("ann", ""),
+        ("bob", CAMERA),
     ]
     TYPES.from_json(STATUS, told["msg"], 0)
 

@@ -133,8 +133,8 @@ def test_raw_types_wait_for_definitions_and_say_what_fails(world: World, operato
     )
     world.channel.message(link.Failed(what="get_type", ref=STRING, reason="not installed"))
     answer = got()
-    assert answer["topics"] == ["/chatter", "/cmd_vel", "/relay/status"]
-    chatter, cmd_vel, status = answer["typedefs_full_text"]
+    assert answer["topics"] == ["/chatter", "/cmd_vel", "/relay/control", "/relay/status"]
+    chatter, cmd_vel, _, status = answer["typedefs_full_text"]
     assert chatter == f"# no definition: type {STRING}: not installed"
     assert cmd_vel == f"int8 a\n{'=' * 80}\nMSG: a_msgs/B\nint8 b\n"
     assert status.startswith("string robot\n")
@@ -175,7 +175,7 @@ def test_raw_types_are_bounded(world: World, operator: Person, monkeypatch: pyte
     monkeypatch.setattr(types, "RAW_CHARACTERS", 60)
     got = begin(operator, "/rosapi/topics_and_raw_types")
     world.define(STRING, TWIST)
-    chatter, cmd_vel, status = got()["typedefs_full_text"]
+    chatter, cmd_vel, _, status = got()["typedefs_full_text"]
     assert chatter == "string data\n"
     assert "left out" in cmd_vel
     assert "left out" in status

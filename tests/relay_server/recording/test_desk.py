@@ -18,6 +18,7 @@ from relay_server.access import Access, Principal
 from relay_server.frontdesk import NO_ROBOT, Admission
 from relay_server.journal import Journal
 from relay_server.recording import Ask, Library, RecordingDesk, Recordings
+from relay_server.recording.desk import FETCH_SECONDS
 from relay_server.recording.recordings import FINISH_SECONDS, USER_RECORDINGS
 from relay_server.recording.writer import Writer
 from relay_server.store import Store
@@ -74,6 +75,7 @@ class Desk:
         world = self.world
         made = Recordings(reactor, world.clock, library, world.channels, world.videos, self.wall)
         made.open()
+        made.recover()
         return made
 
     def wall(self) -> float:
@@ -96,6 +98,14 @@ class Desk:
         await self.store.write(queries.revoke_right, self._robot, user_id=who.user_id)
         await self.access.refresh()
 
+    async def deny(self, name: str, *patterns: str) -> None:
+        """An operator's right is narrowed."""
+        who = {"ann": self.ann, "bob": self.bob}[name]
+        await self.store.write(
+            queries.grant_right, self._robot, "operator", user_id=who.user_id, deny=list(patterns)
+        )
+        await self.access.refresh()
+
     def says(self, *words: str) -> None:
         """The robot, which is at work, says something."""
         number = self.world.link.all(link.Subscribe)[-1].number
@@ -114,6 +124,7 @@ class Desk:
         """The file."""
         file = await self.desk.download(who, "rover", id, HERE)
         try:
+            await file.begin()
             return await file.part(0, file.size + 1)
         finally:
             file.close()
@@ -147,11 +158,15 @@ async def test_a_recording_is_begun_looked_at_stopped_and_fetched(desk: Desk, tm
     begun = await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
     assert (begun["state"], begun["topics"], begun["megabytes"]) == ("recording", ("/chatter",), 1.0)
     assert "robot_id" not in begun
+    desk.world.clock.advance(2)
+    assert (await desk.desk.one(desk.ann, "rover", begun["id"], HERE))["lasted"] == 2.0
     desk.says("a", "b")
     assert "still being recorded" in await failure(
         desk.desk.download(desk.ann, "rover", begun["id"], HERE), Unavailable
     )
     done = await desk.desk.stop(desk.ann, "rover", begun["id"], HERE)
+    desk.world.clock.advance(1)
+    assert done["lasted"] == 2.0
     assert (done["state"], done["messages"], done["drops"]) == ("complete", 2, 0)
     assert done["reason"] == "stopped by ann"
     path = tmp_path / "copy.mcap"
@@ -181,6 +196,20 @@ async def test_who_does_what_is_on_record(desk: Desk) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_download_in_parts_is_on_record_once(desk: Desk) -> None:
+    """Of each who has it; after a while again."""
+    done = await desk.recorded(desk.ann, "a")
+    for who in (desk.ann, desk.bob, desk.ann, desk.bob):
+        await desk.fetch(who, done["id"])
+    fetched = [actor for actor, action, _ in await desk.audit() if action == "recording.download"]
+    assert fetched == ["user:ann", "user:bob"]
+    desk.world.clock.advance(FETCH_SECONDS)
+    await desk.fetch(desk.ann, done["id"])
+    assert (await desk.audit())[-1][:2] == ("user:ann", "recording.download")
+    assert len(await desk.audit()) == 4
+
+
+@pytest_twisted.ensureDeferred
 async def test_who_may_not_see_or_record_it_does_not_find_it(desk: Desk) -> None:
     """A viewer can't get by the file at what he may not record; nor can a stranger."""
     done = await desk.recorded(desk.ann, "a")
@@ -192,6 +221,48 @@ async def test_who_may_not_see_or_record_it_does_not_find_it(desk: Desk) -> None
         assert "no such recording" in await failure(ask(desk.eve, "rover", done["id"], HERE), NotFound)
         assert await failure(ask(desk.ann, "tank", done["id"], HERE), NotFound) == NO_ROBOT
     assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_could_be_recorded_is_told(desk: Desk) -> None:
+    """To each what is his, with the room there is; to who may record nothing, why."""
+    desk.world.robot.cameras = (link.Camera(name="/camera", type="sensor_msgs/msg/Image"),)
+    found = await desk.desk.possible(desk.ann, "rover", HERE)
+    assert found == {
+        "topics": sorted(desk.world.robot.graph.topics),
+        "cameras": ["/camera"],
+        "denied": "",
+        "megabytes": 5.0,
+        "left": 5.0,
+    }
+    assert "/chatter" in found["topics"]
+    await desk.recorded(desk.ann, "a")
+    await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    assert 3.9 < (await desk.desk.possible(desk.ann, "rover", HERE))["left"] < 4
+    none = await desk.desk.possible(desk.eve, "rover", HERE)
+    assert (none["topics"], none["cameras"]) == ([], [])
+    assert "needs the level operator" in none["denied"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_pictures_are_not_to_be_had_by_recording_their_topic(desk: Desk) -> None:
+    """Nor is the file, for who may not view them; also after the topic has gone, and after a restart."""
+    image = link.Topic(types=["sensor_msgs/msg/CompressedImage"], publishers=["/eye"])
+    desk.world.registry.graph(desk.world.robot, link.Graph(topics={"/eye/compressed": image}))
+    wanted = Ask(topics=["/eye/compressed"], megabytes=1)
+    done = await desk.desk.start(desk.bob, "rover", wanted, HERE)
+    await desk.desk.stop(desk.bob, "rover", done["id"], HERE)
+    await desk.deny("ann", "view:/eye/*")
+    assert "view on /eye/compressed is denied" in await failure(
+        desk.desk.start(desk.ann, "rover", wanted, HERE), Refused
+    )
+    assert "/eye/compressed" not in (await desk.desk.possible(desk.ann, "rover", HERE))["topics"]
+    assert "/eye/compressed" in (await desk.desk.possible(desk.bob, "rover", HERE))["topics"]
+    desk.world.robot_goes()
+    desk.recordings.library.open()
+    assert await desk.desk.all(desk.ann, "rover", HERE) == []
+    await failure(desk.desk.download(desk.ann, "rover", done["id"], HERE), NotFound)
+    assert [each["id"] for each in await desk.desk.all(desk.bob, "rover", HERE)] == [done["id"]]
 
 
 @pytest_twisted.ensureDeferred

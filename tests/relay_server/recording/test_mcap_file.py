@@ -6,6 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from rosbags.interfaces import QosDurability, QosLiveliness, QosReliability
+from rosbags.rosbag2.storage_mcap import McapReader
 
 from relay_server.recording.mcap_file import Full, McapFile, Track, mend
 from tests.relay_server.memory import text
@@ -51,6 +54,38 @@ def test_a_topic_whose_definition_changes_becomes_another_channel(tmp_path: Path
     assert [each.schema for each in read(path)] == [b"string data\n", b"string data\nint8 more\n"]
 
 
+@pytest.mark.parametrize("broken", [False, True])
+def test_what_is_latched_is_played_as_latched(tmp_path: Path, broken: bool) -> None:
+    """Each channel says what its publishers offer, as rosbag2 reads it, also in a file that was mended."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        file = McapFile(stream, 10**6, ros=True)
+        for number, track in enumerate((CHATTER, CHATTER._replace(topic="/map", latched=True), CHATTER)):
+            file.add(track, number, number, text(f"{number}"))
+        file.flush()
+        if not broken:
+            file.finish()
+            assert file.size == path.stat().st_size
+    if broken:
+        assert mend(path, lambda: False) == 3
+    assert [each.body for each in read(path)] == [text("0"), text("1"), text("2")]
+    reader = McapReader(path)
+    reader.open()
+    try:
+        offered = {each.topic: each.ext.offered_qos_profiles for each in reader.connections}  # type: ignore[union-attr]
+    finally:
+        reader.close()
+    (latched,) = offered["/map"]
+    assert (latched.durability, latched.reliability) == (
+        QosDurability.TRANSIENT_LOCAL,
+        QosReliability.RELIABLE,
+    )
+    assert (latched.liveliness, latched.lifespan.sec) == (QosLiveliness.AUTOMATIC, 9223372036)
+    assert offered["/chatter"] == []
+    with path.open("rb") as stream:
+        assert [each.name for each in make_reader(stream).iter_metadata()] == ["rosbag2"]
+
+
 @pytest.mark.parametrize("size", [10, 1000, 100_000])
 @pytest.mark.parametrize("flush", [False, True])
 def test_a_file_is_never_larger_than_its_limit(tmp_path: Path, size: int, flush: bool) -> None:
@@ -61,7 +96,8 @@ def test_a_file_is_never_larger_than_its_limit(tmp_path: Path, size: int, flush:
         file = McapFile(stream, limit, ros=True)
         with pytest.raises(Full):
             for number in range(100_000):
-                file.add(CHATTER._replace(topic=f"/t{number % 50}"), number, number, body)
+                track = CHATTER._replace(topic=f"/t{number % 50}", latched=number % 2 == 0)
+                file.add(track, number, number, body)
                 if flush:
                     file.flush()
         file.finish()

@@ -7,11 +7,12 @@ from collections.abc import Callable
 import pytest
 
 from relay_protocol import link
-from relay_protocol.errors import Invalid, Unavailable
+from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
 from relay_server.recording import compressed
 from relay_server.recording.library import Entry, State
+from relay_server.recording.mcap_file import Track
 from relay_server.recording.recorder import AGAIN_SECONDS, Recorder, why_denied
 from relay_server.recording.writer import Message, Outcome
 from tests.relay_server.memory import STRING, World, text
@@ -129,7 +130,7 @@ def test_samples_are_written_as_they_came(world: World) -> None:
     assert desk.paper.bodies == [text("5"), text("6"), text("7")]
     assert [(each.log_time, each.publish_time) for each in desk.paper.written] == [(5, 5), (6, 6), (7, 7)]
     (track,) = {each.track for each in desk.paper.written}
-    assert track == (HERE, STRING, "cdr", "string data\n")
+    assert track == Track(HERE, STRING, "cdr", "string data\n")
 
 
 def test_samples_of_a_robot_that_speaks_json_are_written_as_json(world: World) -> None:
@@ -137,7 +138,7 @@ def test_samples_of_a_robot_that_speaks_json_are_written_as_json(world: World) -
     desk, number = begun(world, "json")
     world.channel.sample(number, b' {"data":  "a"}', 5)
     world.channel.sample(number, b"no json", 6)
-    assert desk.paper.written[0].track == (HERE, STRING, "json", "")
+    assert desk.paper.written[0].track == Track(HERE, STRING, "json")
     first, second = desk.paper.written
     assert first.make is not None and first.make(first.body) == b'{"data":"a"}'
     with pytest.raises(Exception, match="JSON"):
@@ -158,6 +159,7 @@ def test_a_latched_sample_does_not_seem_to_have_come_long_ago(world: World) -> N
     desk.starts()
     (message,) = desk.paper.written
     assert (message.log_time, message.publish_time) == (world.channel.now_ns(), 5)
+    assert message.track.latched
 
 
 def test_a_robot_that_comes_back_goes_on_in_the_same_file(world: World) -> None:
@@ -232,7 +234,7 @@ def test_it_ends_with_the_right(world: World, denied: str) -> None:
 def test_it_ends_when_who_records_may_nothing_any_more(world: World) -> None:
     """Logged out, or the robot was removed."""
     desk, _ = begun(world)
-    desk.permit.on_revoke("your right on this robot was revoked")
+    desk.permit.on_revoke(Refused("your right on this robot was revoked"))
     assert desk.paper.closing
     assert desk.entry.reason == "your right on this robot was revoked"
 
@@ -246,6 +248,19 @@ def test_what_a_viewer_may_is_not_enough(world: World) -> None:
     for denied in (f"view:{CAMERA}", f"record:{CAMERA}", "subscribe:/chatter"):
         desk.rights(denied)
         assert denied in why_denied(desk.permit, desk.entry)
+
+
+def test_pictures_of_a_topic_take_the_right_to_view_them(world: World) -> None:
+    """A topic that begins to carry some ends the recording, which is the business of who may view from then on."""
+    desk, _ = begun(world)
+    desk.rights(f"view:{HERE}")
+    assert desk.entry.state is State.RECORDING
+    told = link.Graph(topics={HERE: link.Topic(types=["sensor_msgs/msg/Image"], publishers=["/eye"])})
+    world.registry.graph(world.robot, told)
+    assert desk.paper.closing
+    assert "view on /chatter is denied" in desk.entry.reason
+    assert desk.entry.pictures == (HERE,)
+    assert "view on /chatter is denied" in why_denied(desk.permit, desk.entry)
 
 
 def test_a_topic_that_is_not_there_is_refused_and_nothing_has_begun(world: World) -> None:
@@ -283,7 +298,7 @@ def test_pictures_are_written_as_messages(world: World) -> None:
     for number in (1, 2):
         video.shows(world, stream, number)
     first, second = desk.paper.written
-    assert first.track == (f"{CAMERA}/compressed", compressed.TYPE, "cdr", compressed.TEXT)
+    assert first.track == Track(f"{CAMERA}/compressed", compressed.TYPE, "cdr", compressed.TEXT)
     assert first.log_time == first.publish_time
     assert desk.paper.bodies[0] == compressed.message(jpeg(), first.log_time, "jpeg")
     assert second.log_time >= first.log_time

@@ -76,10 +76,14 @@ def test_a_robot_that_goes_ends_it(world: World) -> None:
     person = driving(world)
     world.robot_goes()
     drive(person)
-    assert person.told() == ["robot rover is offline; the message was dropped"]
+    assert person.told() == [
+        "you have lost control of rover: the robot's link was lost",
+        "robot rover is offline; the message was dropped",
+    ]
     world.robot_comes(encodings=["json"])
     world.robot_joins()
     assert len(world.link.all(link.Advertise)) == 1
+    world.clock.advance(0.6)
     drive(person)
     assert len(world.link.samples) == 1
 

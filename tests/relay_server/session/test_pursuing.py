@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
+from relay_protocol.errors import Refused
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.session import pursuing as module
 from tests.relay_server.memory import FIBONACCI, Person, World
@@ -192,7 +193,7 @@ def test_a_revoked_permit_cancels_goals(world: World) -> None:
     """The session is closed; the robot lets go of what it asked for."""
     person = at_work(world)
     send(person)
-    person.session.permit.on_revoke("your right on this robot was revoked")
+    person.session.permit.on_revoke(Refused("your right on this robot was revoked"))
     assert person.client.closed is not None
     assert len(world.link.all(link.CancelActionGoal)) == 1
     finish(world)

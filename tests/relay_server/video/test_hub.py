@@ -6,8 +6,13 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Unavailable
-from relay_server.video import State, Stream
-from relay_server.video.hub import ROBOT_STREAMS, USER_STREAMS, USER_VIEWERS
+from relay_server.video import State, Stream, TooOften
+from relay_server.video.hub import (
+    ROBOT_STREAMS,
+    STREAMS_A_SECOND,
+    STREAMS_AT_ONCE,
+    USER_VIEWERS,
+)
 from relay_server.video.stream import STREAM_VIEWERS
 from tests.relay_server.memory import World
 from tests.relay_server.video.watching import (
@@ -83,7 +88,7 @@ def test_a_user_watches_a_robot_so_many_times(world: World) -> None:
 def test_nobody_takes_all_streams_of_a_robot_for_himself(world: World) -> None:
     """Not with forms nobody else wants, nor with cameras that are not there; what others watch he may as well."""
     robot_comes(world)
-    for number in range(USER_STREAMS):
+    for number in range(12):
         Watcher().watch(world, camera=f"/nowhere/{number}")
     with pytest.raises(Unavailable, match="you have 12 streams of robot rover to yourself"):
         Watcher().watch(world)
@@ -91,6 +96,54 @@ def test_nobody_takes_all_streams_of_a_robot_for_himself(world: World) -> None:
     assert Watcher().watch(world) is shared
     Watcher(8).watch(world, camera="/nowhere/0")
     Watcher().watch(world, camera=OTHER)
+
+
+def test_of_a_robot_that_makes_few_streams_nobody_takes_all(world: World) -> None:
+    """Three quarters of those it says it makes, and all of one that makes but one."""
+    robot_comes(world, streams=4)
+    for width in (20, 30, 40):
+        Watcher().watch(world, link.VideoSettings(width=width))
+    with pytest.raises(Unavailable, match="you have 3 streams"):
+        Watcher().watch(world, link.VideoSettings(width=50))
+    Watcher(8).watch(world, link.VideoSettings(width=50))
+    with pytest.raises(Unavailable, match="shows 4 streams already, the most it can"):
+        Watcher(9).watch(world, link.VideoSettings(width=60))
+    world.videos.shut()
+    robot_comes(world, streams=1)
+    Watcher().watch(world)
+
+
+def test_a_user_begins_streams_only_so_fast(world: World) -> None:
+    """Whatever he left before; he is told when he may again. He may elsewhere, and watch what others began."""
+    robot_comes(world)
+    for number in range(STREAMS_AT_ONCE):
+        watcher = Watcher()
+        watcher.watch(world, link.VideoSettings(width=16 + number))
+        watcher.leave()
+    shared = Watcher(8).watch(world)
+    assert len(world.videos.of(world.robot)) == 1
+    with pytest.raises(TooOften, match="you begin streams of robot rover") as caught:
+        Watcher().watch(world, link.VideoSettings(width=16))
+    assert caught.value.retry_after == 1 / STREAMS_A_SECOND
+    assert Watcher().watch(world) is shared
+    other = world.registry.presence(2, "digger", "main")
+    world.videos.watch(other, CAMERA, link.VideoSettings(), Watcher())
+    world.clock.advance(caught.value.retry_after)
+    Watcher().watch(world, link.VideoSettings(width=16))
+    with pytest.raises(TooOften):
+        Watcher().watch(world, link.VideoSettings(width=17))
+
+
+def test_a_page_with_many_cameras_may_be_loaded_again_and_again(world: World) -> None:
+    """Every few seconds, for ever, each camera in two forms in turn."""
+    robot_comes(world)
+    for load in range(100):
+        watchers = [Watcher() for _ in range(12)]
+        for number, watcher in enumerate(watchers):
+            watcher.watch(world, link.VideoSettings(width=16 + load % 2), f"/camera/{number}")
+        world.clock.advance(6)
+        for watcher in watchers:
+            watcher.leave()
 
 
 def test_a_robot_has_so_many_streams(world: World) -> None:
@@ -109,7 +162,7 @@ def test_a_robot_has_so_many_streams(world: World) -> None:
 
 
 def test_when_the_robot_is_busy_the_nearest_stream_is_shared(world: World) -> None:
-    """Nearest in pixels, of the same camera and codec, which is not the one refused."""
+    """Nearest in pixels, of the same camera and codec, cropped and turned alike, which is not the one refused."""
     robot_comes(world)
     small, large = showing(world, 32, 24), showing(world, 64, 48)
     showing(world, 40, 30, codec="png")
@@ -121,17 +174,21 @@ def test_when_the_robot_is_busy_the_nearest_stream_is_shared(world: World) -> No
     assert busy(world, link.VideoSettings()).stream is large
     assert busy(world, link.VideoSettings(width=60)).stream is large
     assert busy(world, link.VideoSettings(height=20)).stream is small
-    assert busy(world, link.VideoSettings(crop=(0, 0, 30, 20))).stream is small
+    assert busy(world, link.VideoSettings(crop=(0, 0, 30, 20))).error is not None
     watcher.leave()
     assert watcher not in small.viewers
 
 
-def test_a_picture_with_the_same_edits_is_nearer_than_one_of_the_size(world: World) -> None:
-    """Turned the other way it would be another picture."""
+def test_a_picture_that_is_turned_otherwise_is_not_near(world: World) -> None:
+    """It would mislead who drives by it."""
     robot_comes(world)
     upright, turned = showing(world, 32, 24), showing(world, 24, 32, rotate=90)
     assert busy(world, link.VideoSettings(width=32, height=24, rotate=90)).stream is turned
     assert busy(world, link.VideoSettings(width=24, height=32)).stream is upright
+    assert busy(world, link.VideoSettings(width=32, height=24, invert=True)).error is not None
+    stamped = showing(world, 64, 48, stamp=True)
+    assert busy(world, link.VideoSettings(width=60, height=45)).stream is upright
+    assert busy(world, link.VideoSettings(width=32, height=24, stamp=True)).stream is stamped
 
 
 def test_what_may_be_another_topic_is_not_near(world: World) -> None:

@@ -7,6 +7,7 @@ import pytest
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, Unavailable
 from relay_server.video import NO_CAMERA, NothingCame, State
+from relay_server.video.pictures import SPAN_SECONDS, STALE_SECONDS, Lateness
 from relay_server.video.states import LINKED, NEXT, Event
 from relay_server.video.stream import (
     FIRST_PICTURE_SECONDS,
@@ -91,9 +92,30 @@ def test_a_picture_goes_to_everybody_and_the_robot_is_told_at_once(world: World)
     assert (picture.number, picture.codec, picture.width, picture.height) == (5, "jpeg", 48, 32)
     assert picture.key
     assert picture.body == jpeg(48, 32)
-    assert picture.arrived == world.clock.seconds()
+    assert picture.good_until == world.clock.seconds() + STALE_SECONDS
     assert picture.stamp == pytest.approx(1.7e9 + world.clock.seconds())
     assert stream.newest is picture
+
+
+def test_what_the_network_held_up_is_good_for_less_long(world: World) -> None:
+    """After a stall old pictures come in a heap, which nobody shall take for what the camera sees now."""
+    stream, watcher, _ = watched(world)
+    for number, late in enumerate((0.0, 0.3, 2.0)):
+        shows(world, stream, number, late=late)
+    left = [picture.good_until - world.clock.seconds() for picture in watcher.pictures]
+    assert left == pytest.approx([STALE_SECONDS, STALE_SECONDS - 0.3, STALE_SECONDS - 2.0])
+
+
+def test_what_is_late_is_learnt_anew_when_a_clock_was_set() -> None:
+    """After ten to twenty seconds; what comes sooner than ever is known at once."""
+    lateness = Lateness()
+    assert lateness.of(100.0, 1.0) == 0
+    assert lateness.of(101.0, 2.5) == pytest.approx(0.5)
+    assert lateness.of(103.0, 3.0) == 0
+    late = [lateness.of(3.0 + second - 5.0 + 100.0, 3.0 + second) for second in range(1, 30)]
+    assert late[0] == pytest.approx(5.0)
+    assert late[-1] == pytest.approx(0.0)
+    assert sum(each > 1 for each in late) <= 2 * SPAN_SECONDS
 
 
 def test_who_comes_later_is_told_what_the_others_know(world: World) -> None:

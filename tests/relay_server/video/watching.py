@@ -93,12 +93,12 @@ class Watcher:
         self.error = error
 
 
-def robot_comes(world: World, *cameras: str) -> None:
-    """The robot registers and tells of its cameras."""
+def robot_comes(world: World, *cameras: str, streams: int = 0) -> None:
+    """The robot registers and tells of its cameras, and how many streams it can make."""
     world.control = MemoryLink()
     world.registry.registered(world.robot, world.control)
     has = [link.Camera(name=name, width=640, height=480) for name in cameras or (CAMERA, OTHER)]
-    world.registry.cameras(world.robot, link.Cameras(cameras=has))
+    world.registry.cameras(world.robot, link.Cameras(cameras=has, streams=streams))
 
 
 def asked(world: World) -> list[link.OpenVideo]:
@@ -116,7 +116,12 @@ def robot_joins(world: World) -> MemoryLink:
     return end
 
 
-def shows(world: World, stream: Stream, number: int = 1, body: bytes | None = None) -> None:
-    """The robot sends a picture."""
-    stamp = round((world.clock.seconds() + 1.7e9) * 1e9)
+def shows(
+    world: World, stream: Stream, number: int = 1, body: bytes | None = None, late: float = 0.0
+) -> None:
+    """The robot sends a picture.
+
+    :param late: seconds it took longer than others
+    """
+    stamp = round((world.clock.seconds() + 1.7e9 - late) * 1e9)
     stream.picture(VideoFrame(number, stamp, jpeg() if body is None else body))

@@ -89,7 +89,7 @@ def test_relay_is_told_of_all_cameras_after_the_welcome() -> None:
 
 def test_robot_without_cameras_says_so(scene: Scene) -> None:
     """An empty list is told too: the relay need not wait for one."""
-    assert scene.said == [link.Cameras(cameras=[])]
+    assert scene.said == [link.Cameras(streams=8)]
 
 
 def test_changes_are_told_once_a_second_at_most(scene: Scene) -> None:
@@ -110,10 +110,10 @@ def test_changes_are_told_once_a_second_at_most(scene: Scene) -> None:
 def test_what_was_seen_of_a_camera_is_told_and_kept(scene: Scene) -> None:
     """Size, encoding and rate, also to a relay that comes later; forgotten with the camera."""
     scene.desk.look(topics(a=IMAGE))
-    scene.keeper.on_seen(Seen(camera="/a", encoding="rgb8", width=640, height=480, fps=15.0))
-    scene.keeper.on_seen(Seen(camera="/gone", encoding="rgb8", width=1, height=1, fps=1.0))
+    scene.keeper.on_seen(Seen(camera="/a", encoding="rgb8", width=640, height=480, fps=15.0, at=7.5))
+    scene.keeper.on_seen(Seen(camera="/gone", encoding="rgb8", width=1, height=1, fps=1.0, at=7.5))
     scene.clock.advance(TELL_EVERY)
-    known = link.Camera(name="/a", type=IMAGE, encoding="rgb8", width=640, height=480, fps=15.0)
+    known = link.Camera(name="/a", type=IMAGE, encoding="rgb8", width=640, height=480, fps=15.0, seen=7.5)
     assert scene.said[-1].cameras == [known]
     scene.desk.unregistered("lost")
     scene.desk.registered(2.0)
@@ -150,13 +150,17 @@ def test_no_more_cameras_are_told_than_the_contract_takes(scene: Scene) -> None:
         ("/a/compressed", "raw", "/a", False),
         ("/b", "compressed", "/b", False),
         ("/a/compressed", "compressed", "/a/compressed", True),
+        ("/c", "compressed", "/c/compressed", True),
+        ("/d/compressed", "compressed", "/d/compressed", False),
     ],
 )
 def test_transport_chooses_the_topic(
     scene: Scene, camera: str, transport: str, topic: str, compressed: bool
 ) -> None:
     """Raw and compressed pictures of one camera are two topics; who asks for the other kind gets it if it is there."""
-    scene.desk.look(topics(a=IMAGE, a_compressed=COMPRESSED, b=IMAGE))
+    scene.desk.look(
+        topics(a=IMAGE, a_compressed=COMPRESSED, b=IMAGE, c_compressed=COMPRESSED, d_compressed=IMAGE)
+    )
     line = scene.order(camera, transport=transport)
     assert (line.camera, line.topic, line.compressed, line.source) == (camera, topic, compressed, "")
 

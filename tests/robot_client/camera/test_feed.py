@@ -61,9 +61,9 @@ def test_only_the_newest_picture_reaches_the_reactor(scene: Scene) -> None:
 
 def test_first_look_is_told_at_once_and_the_rate_later(scene: Scene) -> None:
     """What stays as it was is not told again."""
-    scene.put(1)
+    scene.put(2_500_000_000)
     scene.turn()
-    assert scene.seen == [Seen(camera="/c", encoding="rgb8", width=64, height=48, fps=0.0)]
+    assert scene.seen == [Seen(camera="/c", encoding="rgb8", width=64, height=48, fps=0.0, at=2.5)]
     for _ in range(10):
         for stamp in range(10):
             scene.put(stamp)
@@ -71,6 +71,19 @@ def test_first_look_is_told_at_once_and_the_rate_later(scene: Scene) -> None:
         scene.clock.advance(LOOK_EVERY)
     assert 2 <= len(scene.seen) <= 4
     assert scene.feed.fps == pytest.approx(10, rel=0.1)
+
+
+def test_what_was_seen_last_is_told_when_nobody_watches_any_more(scene: Scene) -> None:
+    """With the time, by which others know how old it is; of what was never seen there is nothing to tell."""
+    for second in range(1, 4):
+        scene.put(second * 10**9)
+        scene.turn()
+        scene.clock.advance(LOOK_EVERY)
+    scene.feed.close()
+    assert scene.seen[-1] == Seen(camera="/c", encoding="rgb8", width=64, height=48, fps=1.0, at=3.0)
+    unseen = Scene()
+    unseen.feed.close()
+    assert unseen.seen == []
 
 
 def test_new_size_is_told(scene: Scene) -> None:

@@ -17,6 +17,7 @@ from robot_client.camera.lines import (
     Open,
     Seen,
     Settings,
+    Silent,
     Taken,
     decoder,
     encode,
@@ -33,7 +34,10 @@ class Scene:
         self.reactor = Reactor(decoder.decode)
         self.alerts: list[str] = []
         self.keeper = CameraKeeper(self.reactor, Settings(address="relay:1", node="camera", streams=8))
-        self.keeper.on_alert = lambda level, text: self.alerts.append(text)
+        self.keeper.on_alert = self._told
+
+    def _told(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
+        self.alerts.append(f"{kind} {about} {'over' if over else level}")
 
     @property
     def process(self) -> Process:
@@ -124,7 +128,7 @@ def test_killed_process_is_started_again(scene: Scene) -> None:
     scene.keeper.open(opening("a"))
     scene.answer(Taken(stream="a"))
     scene.process.end()
-    assert len(scene.alerts) == 1
+    assert scene.alerts == ["module camera error"]
     scene.keeper.open(opening("a"))
     assert len(scene.reactor.processes) == 1
     scene.reactor.advance(RESTART[0])
@@ -223,6 +227,30 @@ def test_noise_is_passed_over(scene: Scene, noise: bytes) -> None:
     scene.keeper.on_seen = seen.append
     scene.keeper.open(opening("a"))
     scene.process.protocol.outReceived(noise)
-    told = Seen(camera="/c", encoding="rgb8", width=4, height=3, fps=2.0)
+    told = Seen(camera="/c", encoding="rgb8", width=4, height=3, fps=2.0, at=7.5)
     scene.answer(told)
     assert seen == [told]
+
+
+def test_silent_topics_are_told_to_each_process(scene: Scene) -> None:
+    """Whenever they change, and to a process that starts, before its streams."""
+    scene.keeper.silence({"/b", "/a"})
+    scene.keeper.open(opening("a"))
+    assert scene.told() == [Silent(topics=["/a", "/b"]), opening("a")]
+    scene.keeper.silence([])
+    assert scene.told()[-1] == Silent(topics=[])
+
+
+def test_a_process_that_is_missed_is_told_to_be_there_again_or_not_needed(scene: Scene) -> None:
+    """Nobody goes on worrying."""
+    scene.keeper.open(opening("a"))
+    scene.answer(Taken(stream="a"))
+    scene.process.end()
+    scene.keeper.open(opening("a"))
+    scene.reactor.advance(RESTART[0])
+    scene.answer(Alive())
+    scene.answer(Alive())
+    assert scene.alerts == ["module camera error", "module camera over"]
+    scene.process.end()
+    scene.reactor.advance(RESTART[1])
+    assert scene.alerts[2:] == ["module camera error", "module camera over"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import PICTURE_FRAME
 from relay_protocol.link import VideoSettings
+from relay_protocol.pictures import look_at
 from robot_client.camera import formats
 from robot_client.camera.making import Maker, pixels_shot
 from robot_client.camera.shot import Look, Shot, Wish
@@ -33,6 +36,23 @@ def test_jpeg_of_the_camera_goes_as_it_is(settings: VideoSettings) -> None:
     file = jpeg()
     made = Maker(settings).make(file_shot(file), ASKED)
     assert made == (file, 64, 48, "jpeg")
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        lambda file: file + b"\xff\xd9",
+        lambda file: file + file,
+        lambda file: file[:2] + b"\xff\x01" + file[2:],
+    ],
+    ids=["two ends", "two pictures", "a stray marker"],
+)
+def test_odd_jpeg_of_the_camera_is_made_anew(odd: Callable[[bytes], bytes]) -> None:
+    """Decoders don't mind, but the relay would end the stream over it."""
+    file = odd(jpeg())
+    made = Maker(VideoSettings()).make(file_shot(file), ASKED)
+    assert made.body != file
+    assert look_at("jpeg", made.body) == (64, 48, True)
 
 
 @pytest.mark.parametrize(

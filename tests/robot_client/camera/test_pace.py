@@ -1,15 +1,20 @@
-"""The pace, on simulated uplinks: a pipe of one rate, a round trip, pictures whose size follows quality and size."""
+"""The pace, and the parts in which pictures leave, on simulated uplinks: a pipe of one rate, a round trip, pictures
+whose size follows quality and size.
+"""
 
 from __future__ import annotations
 
 import itertools
 import random
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
-from relay_protocol.link import VideoSettings
+from relay_protocol.frames import FrameDecoder, PicturePart, VideoFrame
+from relay_protocol.link import Took, VideoSettings
+from robot_client.camera.leaving import Leaving
 from robot_client.camera.pace import TARGET, UNDER_WAY, Pace, steps
+from robot_client.camera.shot import Look, Shot
 
 TICK = 0.001
 ENCODING = 0.008
@@ -22,6 +27,13 @@ class Taken(NamedTuple):
     at: float
     delay: float
     step: float
+
+
+def shot(arrived: float) -> Shot:
+    def unread() -> Any:
+        raise AssertionError("nobody here reads pixels")
+
+    return Shot(0, arrived, lambda: Look("rgb8", 640, 480), unread)
 
 
 class Uplink:
@@ -40,6 +52,9 @@ class Uplink:
         self.rate = mbit * MBIT
         self.pace = Pace(settings or VideoSettings())
         self.trip = trip
+        self.in_pipe = 0.0
+        """Bytes."""
+        self.given_up = 0
         self._stalls = stalls
         self.most_under_way = 0
         self.largest = 0
@@ -49,8 +64,11 @@ class Uplink:
         self._next = 0.0
         self._newest: float | None = None
         self._encoding: tuple[float, float] | None = None
-        self._pipe: list[list[float]] = []
-        self._coming: list[tuple[float, int, float]] = []
+        self._leaving = Leaving(self.pace, self._write)
+        self._decoder = FrameDecoder(2**25)
+        self._under_way: dict[int, float] = {}
+        self._pipe: list[tuple[Took, float]] = []
+        self._coming: list[tuple[float, Took]] = []
         self._number = 0
 
     def run(self, seconds: float) -> list[Taken]:
@@ -66,24 +84,40 @@ class Uplink:
             self._make()
         return taken
 
+    def _write(self, data: list[bytes]) -> None:
+        for frame in self._decoder.feed(b"".join(data)):
+            assert isinstance(frame, (VideoFrame, PicturePart))
+            upto = None
+            if isinstance(frame, PicturePart) and frame.offset + len(frame.body) < frame.total:
+                upto = frame.offset + len(frame.body)
+            self._pipe.append((Took(number=frame.number, upto=upto), len(frame.body)))
+            self.in_pipe += len(frame.body)
+        numbers = {each.number for each, _ in self._pipe} | {each.number for _, each in self._coming}
+        self.most_under_way = max(self.most_under_way, len(numbers))
+
     def _carry(self) -> None:
         room = self.rate * TICK
         while self._pipe and room > 0:
-            first = self._pipe[0]
-            part = min(first[1], room)
-            first[1] -= part
+            took, size = self._pipe.pop(0)
+            part = min(size, room)
             room -= part
-            if first[1] <= 0:
-                self._pipe.pop(0)
-                stalled = self._random.uniform(0.05, 0.35) if self._random.random() < self._stalls else 0.0
-                self._coming.append((self.now + self.trip + stalled, int(first[0]), first[2]))
+            self.in_pipe -= part
+            if part < size:
+                self._pipe.insert(0, (took, size - part))
+                continue
+            stalled = self._random.uniform(0.05, 0.35) if self._random.random() < self._stalls else 0.0
+            self._coming.append((self.now + self.trip + stalled, took))
 
     def _answers(self) -> list[Taken]:
         taken = []
         while self._coming and self._coming[0][0] <= self.now:
-            _, number, arrived = self._coming.pop(0)
-            self.pace.took(number, self.now, self.trip)
-            taken.append(Taken(self.now, self.now - arrived, self.pace.reduced))
+            took = self._coming.pop(0)[1]
+            self.given_up += self._leaving.answered(took, self.now, self.trip)
+            if took.upto is None:
+                # Those before it that have no such answer were given up.
+                self._under_way = {each: at for each, at in self._under_way.items() if each >= took.number}
+                arrived = self._under_way.pop(took.number)
+                taken.append(Taken(self.now, self.now - arrived, self.pace.reduced))
         return taken
 
     def _make(self) -> None:
@@ -95,9 +129,8 @@ class Uplink:
                 self._full * JPEG[self.pace.quality] * self.pace.scale**1.8 * self._random.uniform(0.85, 1.15)
             )
             self._number += 1
-            self.pace.sent(self._number, int(size) + 600, self.now, arrived)
-            self._pipe.append([self._number, size + 600, arrived])
-            self.most_under_way = max(self.most_under_way, len(self._pipe) + len(self._coming))
+            self._under_way[self._number] = arrived
+            self._leaving.put(self._number, shot(arrived), bytes(int(size) + 600), self.now)
 
 
 def changes(taken: list[Taken]) -> int:
@@ -125,6 +158,17 @@ def test_steps_give_up_quality_then_size_then_rate() -> None:
 def test_png_has_no_quality_to_give_up() -> None:
     """A PNG gets smaller by its size alone."""
     assert {step.quality for step in steps(VideoSettings(codec="png"))} == {80}
+
+
+@pytest.mark.parametrize("trip", [0.002, 0.02])
+def test_quick_uplink_carries_large_pictures(trip: float) -> None:
+    """At 1 Gbit/s pictures of 126 KB go out as asked, all of them, soon after the round trip."""
+    uplink = Uplink(1000, trip, fps=30, full=126_000)
+    uplink.run(1)
+    taken = uplink.run(10)
+    assert {each.step for each in taken} == {0.0}
+    assert len(taken) >= 10 * 30 - 3
+    assert max(each.delay for each in taken) < ENCODING + 2 * trip + 0.02
 
 
 @pytest.mark.parametrize("trip", [0.002, 0.05])
@@ -165,6 +209,26 @@ def test_squeezed_uplink_is_in_time_within_5_s_and_recovers(mbit: float, trip: f
     uplink.run(10)
     assert uplink.pace.reduced == 0.0
     assert {each.step for each in uplink.run(10)} == {0.0}
+
+
+@pytest.mark.parametrize("trip", [0.002, 0.02])
+@pytest.mark.parametrize("mbit", [1, 0.2])
+@pytest.mark.parametrize("before", [10, 1000])
+def test_large_pictures_do_not_stand_before_small_ones(before: float, mbit: float, trip: float) -> None:
+    """Pictures of 126 KB on a link that becomes thin are given up, and 5 s later it is in time, whenever that was."""
+    for phase in range(6):
+        uplink = Uplink(before, trip, fps=30, full=126_000)
+        uplink.run(10 + phase * 0.013)
+        assert uplink.given_up == 0
+        uplink.rate = mbit * MBIT
+        uplink.run(5)
+        assert uplink.given_up
+        taken = uplink.run(10)
+        assert max(each.delay for each in taken) < TARGET
+        assert len(taken) >= 10 * 2
+        uplink.rate = before * MBIT
+        uplink.run(10)
+        assert uplink.pace.reduced < 0.2
 
 
 @pytest.mark.parametrize("mbit", [0.2, 0.5, 1, 2, 4])
@@ -235,6 +299,7 @@ def test_busy_processor_is_not_taken_for_a_thin_link(mbit: float, full: int, sta
     """Where an answer is late by up to a third of a second now and then, what the link bears stays nearly as asked."""
     uplink = Uplink(mbit, full=full, stalls=stalls)
     taken = uplink.run(60)
+    assert uplink.given_up <= len(taken) / 50
     assert sum(each.step for each in taken) / len(taken) < 0.2
 
 

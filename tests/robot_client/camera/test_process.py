@@ -15,6 +15,7 @@ import numpy.typing as npt
 import psutil
 import pytest
 from switchboard_processes import mortal
+from switchboard_rtsp import RtspCamera, card
 
 from relay_protocol import frames, link
 from tests.robot_client.fake_relay import FakeRelay, Peer
@@ -46,7 +47,8 @@ class Scene:
         self.relay = relay
         self.robot = robot
         self.process = robot.run(*options)
-        self.control = relay.register()
+        # A busy machine may keep a process from its processor for seconds.
+        self.control = relay.register(heartbeat=5.0)
 
     def cameras(self) -> list[psutil.Process]:
         return self.robot.children(self.process, PROCESS)
@@ -127,6 +129,22 @@ def test_settings_are_followed_and_cameras_shared(scene: Scene) -> None:
     assert len(scene.cameras()) == 1
 
 
+def test_inhibited_camera_shows_nothing_for_its_time(scene: Scene) -> None:
+    """Its pictures are samples of its topic too; another form of it goes on, and so does it afterwards."""
+    peer, other = scene.video(RAW), scene.video(COMPRESSED, stream="s2")
+    picture(peer)
+    picture(other)
+    begun = time.time()
+    assert scene.control.order(link.Inhibit(id=5, resource=RAW, ms=1500)).ok
+    quiet = time.time()
+    while (after := picture(peer)[0].stamp / 1e9) < quiet:
+        pass
+    assert after >= begun + 1.4
+    while picture(other)[0].stamp / 1e9 < quiet:
+        pass
+    assert not [each for each in other.skipped if isinstance(each, link.NotPlaying)]
+
+
 def test_jpeg_of_the_camera_itself_passes_untouched(scene: Scene) -> None:
     """A CompressedImage nobody wants edited goes out as it came, also where a better quality was asked for."""
     asked = scene.video(COMPRESSED, link.VideoSettings(quality=100))
@@ -204,3 +222,46 @@ def test_camera_without_ros_and_the_limit_of_streams(
     scene.control.say(link.CloseVideo(stream="s1"))
     peer.expect_end()
     assert picture(scene.video("/film", stream="s3"))[0].number == 1
+
+
+@pytest.fixture
+def network(relay: FakeRelay, robot: Robot, tmp_path: Path) -> Iterator[tuple[Scene, RtspCamera]]:
+    """A daemon whose settings name a camera of the network."""
+    with closing(RtspCamera(login="ann:s3cret")) as camera:
+        config = tmp_path / "robot.toml"
+        config.write_text(f'[cameras]\n"/gate" = "{camera.url}"\n')
+        scene = Scene(relay, robot, "--config", str(config))
+        scene.until_listed("/gate")
+        yield scene, camera
+
+
+def test_camera_of_the_network_has_one_connection(network: tuple[Scene, RtspCamera]) -> None:
+    """However many streams there are, of whatever quality of service, which is ROS's; it shows what is before it."""
+    scene, camera = network
+    one = scene.video("/gate")
+    other = scene.video("/gate", link.VideoSettings(width=80, qos="default"), "s2")
+    assert picture(one)[1].shape == card(0).shape
+    assert picture(other)[1].shape == (60, 80, 3)
+    assert camera.visits == 1
+    square = picture(one)[1][20, 20].astype(int)
+    assert np.abs(square - card(0)[20, 20]).max() < 20
+
+
+def test_silent_camera_holds_up_nobody(network: tuple[Scene, RtspCamera], robot: Robot) -> None:
+    """While it is waited for its stream is closed in time, and so are process and daemon. Nor does any process or log
+    show its password.
+    """
+    scene, camera = network
+    peer = scene.video("/gate")
+    picture(peer)
+    (process,) = scene.cameras()
+    shown = [*process.cmdline(), *process.environ().values(), *psutil.Process(scene.process.pid).cmdline()]
+    camera.stall()
+    scene.control.say(link.CloseVideo(stream="s1"))
+    peer.expect(link.Bye)
+    peer.expect_end()
+    scene.process.terminate()
+    scene.process.wait(5)
+    assert not process.is_running()
+    camera.close()
+    assert not [text for text in (*shown, robot.log.read_text()) if "s3cret" in text]

@@ -13,6 +13,7 @@ from twisted.internet.testing import StringTransportWithDisconnection
 
 from relay_protocol import frames, link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError
+from robot_client.camera.leaving import PART
 from robot_client.camera.lines import Open
 from robot_client.camera.shot import Look, Made, Shot, Wish
 from robot_client.camera.stream import FAULTS, TELL_EVERY, Busy, Stream
@@ -170,7 +171,7 @@ def test_thin_uplink_makes_less_and_says_so() -> None:
     """After a picture that took seconds the next is wished smaller, and `playing` says how much."""
     scene = Scene().joined()
     scene.shot(1)
-    scene.make(50_000)
+    scene.make(15_000)
     scene.heard()
     scene.clock.advance(2.0)
     scene.say(link.Took(number=1))
@@ -184,6 +185,23 @@ def test_thin_uplink_makes_less_and_says_so() -> None:
     assert playing["width"] == 16
     assert 0 < playing["reduced"] <= 1
     assert playing["delay_ms"] == 2000
+
+
+def test_after_a_picture_that_was_given_up_one_stands_alone() -> None:
+    """What the relay has of it is nothing to go on from."""
+    scene = Scene(codec="h264").joined()
+    scene.shot(1)
+    scene.make(200_000)
+    parts = scene.heard()[1:]
+    assert [each.offset for each in parts] == [0, PART, 2 * PART]
+    for part in parts:
+        scene.shot(2)
+        assert len(scene.view.making) == 1
+        scene.clock.advance(1.0)
+        scene.say(link.Took(number=1, upto=part.offset + PART))
+    assert scene.heard() == []
+    assert [wish.key for wish in scene.view.wishes] == [True, True]
+    assert scene.view.wishes[-1].scale < 1
 
 
 def test_measured_delay_is_told_once_a_second_at_most() -> None:

@@ -9,9 +9,11 @@ from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor, task
 
 from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.link import MotionPolicy
 from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, Outcome
 from robot_client.platforms.ros2 import Ros2Platform
 from robot_client.platforms.ros2_goals import RosGoal
+from robot_client.sweep import Sweep
 from tests.robot_client.ros import Peer, until
 
 FIBONACCI = "example_interfaces/action/Fibonacci"
@@ -105,6 +107,20 @@ async def test_goal_cancelled_at_once_never_begins(ros: Ros2Platform, peer: Peer
     wanted.goal.cancel()
     assert wanted.outcomes[0].status == NEVER_BEGAN
     assert "cancelled before it began" in wanted.outcomes[0].reason
+
+
+@pytest_twisted.ensureDeferred
+async def test_all_goals_of_an_action_are_cancelled_whoever_gave_them(ros: Ros2Platform, peer: Peer) -> None:
+    """One request without a goal's id is enough; where there is no goal left it is no error."""
+    await serve(ros, peer, "/forever", "forever")
+    wanted = [Wanted(ros, "/forever", 3), Wanted(ros, "/forever", 3)]
+    await until(lambda: all(each.fed for each in wanted))
+    sweep = Sweep(MotionPolicy(actions=["/forever"]), ros, reactor, lambda topic: False)
+    for _ in range(2):
+        asked, answered = sweep.cancel_goals()
+        assert asked == {"/forever"}
+        assert await answered == []
+        assert [(await each.end()).status for each in wanted] == [CANCELED, CANCELED]
 
 
 @pytest_twisted.ensureDeferred

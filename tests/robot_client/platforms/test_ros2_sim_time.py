@@ -13,8 +13,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor
 
 from relay_protocol.link import MotionPolicy
+from robot_client.authority import Authority
 from robot_client.clocks import now_ns
-from robot_client.motion import MOTION_QOS, MotionDesk, NoGuard
+from robot_client.guard_feed import NoGuard
+from robot_client.motion import MOTION_QOS, MotionDesk
 from robot_client.offset import Offset
 from robot_client.platforms.ros2 import Ros2Platform
 from robot_client.topics import TypedTopic
@@ -59,7 +61,9 @@ async def test_paused_simulation_keeps_no_robot_moving(ros: Ros2Platform, peer: 
     topic = f"/cmd_{ros._nodes.kind}"
     peer.do("clock", 5.0)
     peer.do("listen", topic, "twist")
-    desk = MotionDesk(MotionPolicy(types=[TWIST]), ros, reactor, now_ns, NoGuard())
+    authority = Authority()
+    authority.hold(1, "ann", "operator", now_ns())
+    desk = MotionDesk(MotionPolicy(types=[TWIST]), ros, reactor, now_ns, NoGuard(), authority)
     on, offset = TypedTopic(topic, TWIST), Offset()
     offset.add(now_ns(), now_ns(), now_ns())
     desk.open("driver", on, ros.advertise(topic, TWIST, False, MOTION_QOS))
@@ -68,13 +72,13 @@ async def test_paused_simulation_keeps_no_robot_moving(ros: Ros2Platform, peer: 
     body = bytes(serialize_message(command))
 
     def drive() -> bool:
-        desk.command("driver", body, now_ns(), offset)
+        desk.command("driver", body, now_ns(), offset, 1)
         return bool(peer.heard(topic))
 
     await until(drive)
     await until(lambda: peer.heard(topic)[-1]["x"] == 0.0)
     assert desk.watchdog_stops >= 1
-    assert not desk.command("driver", body, now_ns() - 10**9, offset)
+    assert not desk.command("driver", body, now_ns() - 10**9, offset, 1)
     assert desk.stale_commands == 1
     desk.close("driver")
 
@@ -92,7 +96,7 @@ for simulated in (True, False):
         def publish(self, body): print(deserialize_message(body, TwistStamped).header.stamp.sec > 0)
         def get_subscription_count(self): return 1
     outlets._publishers[TypedTopic("/cmd", "{STAMPED}")] = Publisher()
-    outlets.zero(TypedTopic("/cmd", "{STAMPED}"))
+    outlets.zero(TypedTopic("/cmd", "{STAMPED}"), b"")
     import rclpy; rclpy.shutdown()
 """
     done = subprocess.run(

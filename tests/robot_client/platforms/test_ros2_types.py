@@ -7,14 +7,17 @@ import sys
 from pathlib import Path
 
 import pytest
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Twist, TwistStamped
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import BatteryState, Image
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import BatteryState, Image, Joy
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from relay_protocol.errors import Invalid, NotFound
 from robot_client.platforms.base import Motion
+from robot_client.platforms.ros2_motion import JOY, TRAJECTORY
 from robot_client.platforms.ros2_types import Types, introspected
 from tests.robot_client.platforms.ends import STAMPED, TWIST
 
@@ -99,6 +102,52 @@ def test_commands_are_judged() -> None:
     assert judge(TWIST, bytes(serialize_message(nan))) is Motion.INVALID
     assert judge(TWIST, b"garbage") is Motion.INVALID
     assert judge(STAMPED, bytes(serialize_message(stamped))) is Motion.STILL
+
+
+def test_a_stamped_command_is_judged_like_a_plain_one() -> None:
+    """Its header may be any; a number that is none is no command."""
+    moving, nan = TwistStamped(), TwistStamped()
+    moving.header.frame_id = nan.header.frame_id = "base_link"
+    moving.twist.linear.y = 0.1
+    nan.twist.angular.x = float("inf")
+    judge = Types().judge
+    assert judge(STAMPED, bytes(serialize_message(moving))) is Motion.MOVING
+    assert judge(STAMPED, bytes(serialize_message(nan))) is Motion.INVALID
+    assert judge(STAMPED, bytes(serialize_message(moving))[:-8]) is Motion.INVALID
+
+
+def test_a_joystick_rests_with_as_many_axes_and_buttons() -> None:
+    """Whatever is pressed moves; zero has all of it let go, and the stamp of now."""
+    types = Types()
+    joy = Joy(axes=[0.0, 0.5], buttons=[0, 1, 0])
+    joy.header.frame_id = "pad"
+    body = bytes(serialize_message(joy))
+    assert types.judge(JOY, body) is Motion.MOVING
+    zero = types.zero(JOY, Time(sec=9), types.resting(JOY, body))
+    assert types.judge(JOY, zero) is Motion.STILL
+    said = deserialize_message(zero, Joy)
+    assert (list(said.axes), list(said.buttons)) == ([0.0, 0.0], [0, 0, 0])
+    assert (said.header.frame_id, said.header.stamp.sec) == ("pad", 9)
+    assert types.judge(JOY, bytes(serialize_message(Joy(axes=[float("nan")])))) is Motion.INVALID
+    assert types.judge(JOY, bytes(serialize_message(Joy(axes=[0.0], buttons=[1])))) is Motion.MOVING
+
+
+def test_a_trajectory_moves_wherever_it_leads() -> None:
+    """Also to zero; one without points does not, and that is what follows it."""
+    types = Types()
+    way = JointTrajectory(joint_names=["a"], points=[JointTrajectoryPoint(positions=[0.0])])
+    body = bytes(serialize_message(way))
+    assert types.judge(TRAJECTORY, body) is Motion.MOVING
+    zero = types.zero(TRAJECTORY, Time(), types.resting(TRAJECTORY, body))
+    assert types.judge(TRAJECTORY, zero) is Motion.STILL
+    assert deserialize_message(zero, JointTrajectory).joint_names == ["a"]
+    way.points[0].positions = [float("inf")]
+    assert types.judge(TRAJECTORY, bytes(serialize_message(way))) is Motion.INVALID
+
+
+def test_zeros_of_a_velocity_are_all_alike() -> None:
+    """Nothing of the command is needed for them."""
+    assert Types().resting(TWIST, bytes(serialize_message(Twist()))) == b""
 
 
 def test_interfaces_of_the_robot_are_known() -> None:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot_client.sim.camera import HEIGHT, WIDTH, Camera, Image, to_jpeg, to_rgb
+from robot_client.sim.camera import HEIGHT, WIDTH, Camera, Image, draw_clock, to_jpeg, to_rgb
 from robot_client.sim.world import Circle, Colour, Look, Pose, Texture, World, box
 from robot_client.sim.worlds import WORLDS
 
@@ -37,6 +37,48 @@ def test_picture_is_640_by_480_bgr(camera: Camera) -> None:
     frame = camera.render(HALL.start, 0.0, NOON)
     assert frame.shape == (HEIGHT, WIDTH, 3) == (480, 640, 3)
     assert frame.dtype == np.uint8
+
+
+def test_a_larger_picture_shows_the_same(camera: Camera) -> None:
+    """Twice the size halved again is nearly the usual picture."""
+    large = Camera(HALL, 2 * WIDTH, 2 * HEIGHT).render(HALL.start, 0.0, NOON)
+    assert large.shape == (2 * HEIGHT, 2 * WIDTH, 3)
+    halved = cv2.resize(large, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    assert np.abs(scene(halved) - scene(camera.render(HALL.start, 0.0, NOON))).mean() < 3
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(1280, 720), (1920, 1080), (320, 240), (320, 1080), (1920, 240)]
+)
+def test_other_sizes_are_drawn_whole(width: int, height: int) -> None:
+    """Of any form: sky above, floor below, and both captions within the picture, apart from each other."""
+    frame = Camera(HALL, width, height).render(HALL.start, 0.0, NOON)
+    assert frame.shape == (height, width, 3)
+    blue, _, red = frame[0].mean(axis=0)
+    assert blue > red + 30
+    bottom = frame[-1].astype(int)
+    assert np.ptp(bottom.mean(axis=0)) < 20
+    written = np.flatnonzero((frame[height // 2 :].min(axis=2) > 225).any(axis=0))
+    assert 0 < written[0] < width / 10 < width * 0.9 < written[-1] < width - 1
+    assert np.diff(written).max() > width / 4
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (1280, 720)])
+def test_the_clock_can_be_read_back(width: int, height: int) -> None:
+    """Of clocks drawn for a second's milliseconds, the one in a picture that was encoded is found again."""
+    seen = cv2.imdecode(
+        np.frombuffer(to_jpeg(Camera(HALL, width, height).render(HALL.start, 0.0, NOON)), np.uint8),
+        cv2.IMREAD_COLOR,
+    )
+    corner = slice(height * 9 // 10, None), slice(0, width // 3)
+
+    def unlike(milliseconds: int) -> float:
+        drawn = np.zeros_like(seen)
+        draw_clock(drawn, milliseconds / 1000 + 0.0002)
+        return float(((seen[corner] > 160) ^ (drawn[corner] > 160)).sum())
+
+    told = round(NOON * 1000)
+    assert min(range(told - 200, told + 200), key=unlike) == told
 
 
 @pytest.mark.parametrize("moved", [Pose(-2.2, -0.4, 0.0), Pose(-2.4, -0.4, 0.1), Pose(-2.4, -0.2, 0.0)])
@@ -123,5 +165,4 @@ def test_jpeg_decodes_to_about_the_same(camera: Camera) -> None:
 def test_rgb_turns_the_channels_round(camera: Camera) -> None:
     """The raw topic is announced as rgb8."""
     frame = camera.render(HALL.start, 0.0, NOON)
-    pixels = np.frombuffer(to_rgb(frame), np.uint8).reshape(frame.shape)
-    assert np.array_equal(pixels, frame[:, :, ::-1])
+    assert np.array_equal(to_rgb(frame), frame[:, :, ::-1])

@@ -205,6 +205,18 @@ def test_pictures_raw_and_compressed(robot: subprocess.Popen[str], graph: Graph)
     assert np.abs(difference).mean() < 6
 
 
+def test_the_camera_has_the_size_and_rate_it_is_told(graph: Graph) -> None:
+    """Both topics carry it, and no more than two pictures come in a second."""
+    with simulator("--namespace", "large", "--camera-size", "1280x720", "--camera-fps", "2"):
+        raw = graph.watch("/large/camera/image_raw", Image, qos_profile_sensor_data)()
+        assert (raw.width, raw.height, raw.step, len(raw.data)) == (1280, 720, 3840, 3840 * 720)
+        fresh = graph.watch("/large/camera/image_raw/compressed", CompressedImage, qos_profile_sensor_data)
+        shown = [fresh() for _ in range(4)]
+    assert cv2.imdecode(np.frombuffer(shown[0].data, np.uint8), cv2.IMREAD_COLOR).shape == (720, 1280, 3)
+    stamps = [each.header.stamp.sec + each.header.stamp.nanosec / 1e9 for each in shown]
+    assert stamps[-1] - stamps[0] > 1
+
+
 def test_transforms_agree_with_odometry(robot: subprocess.Popen[str], graph: Graph) -> None:
     """/tf tells where the body stands, /tf_static (latched) where the sensors sit."""
     graph.watch("/odom", Odometry)()
@@ -295,10 +307,19 @@ def test_record_is_written_at_once(graph: Graph, tmp_path: Path) -> None:
     assert [event["t"] for event in written] == sorted(event["t"] for event in written)
 
 
-def test_bad_namespace_is_told_in_a_sentence() -> None:
-    """What is no ROS name is refused before anything runs."""
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--namespace", "a b", "'a b' is no ROS namespace"),
+        ("--camera-size", "1280", "'1280' is no size: write width and height in pixels, as 1280x720"),
+        ("--camera-size", "1280x2000", "1280x2000 is out of range: 320x240 to 1920x1080"),
+        ("--camera-fps", "61", "61 is not in the range"),
+    ],
+)
+def test_what_makes_no_sense_is_told_in_a_sentence(option: str, value: str, words: str) -> None:
+    """It is refused before anything runs."""
     done = subprocess.run(
-        [sys.executable, "-m", "robot_client.sim.main", "--namespace", "a b"],
+        [sys.executable, "-m", "robot_client.sim.main", option, value],
         env={**os.environ, **SETTINGS},
         capture_output=True,
         text=True,
@@ -306,5 +327,5 @@ def test_bad_namespace_is_told_in_a_sentence() -> None:
         check=False,
     )
     assert done.returncode == 2
-    assert "'a b' is no ROS namespace" in done.stderr
+    assert words in done.stderr
     assert "Traceback" not in done.stderr

@@ -25,6 +25,7 @@ from relay_server import passwords
 from relay_server.access import Access
 from relay_server.auth import Authenticator
 from relay_server.channel import Channels
+from relay_server.control import ControlRules, Desks
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.site import Missing, RelaySite, Robots, Root
 from relay_server.edges.video import Video, VideoFactory
@@ -38,6 +39,7 @@ from relay_server.session import Timing
 from relay_server.store import Store
 from relay_server.tls import ServerTls
 from relay_server.video import Stream, Videos
+from tests.relay_server.control_record import MemoryRecord
 from tests.relay_server.edges.http_client import api_of
 from tests.relay_server.memory import MemoryLink
 
@@ -86,6 +88,7 @@ class Show:
             self.registry,
             channels,
             self.videos,
+            Desks(clock, MemoryRecord(), ControlRules(), self.registry.changed, time.time),
             Journal(store, time.time),
             origins,
             Timing(2.0, 0.1, 5.0),

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import pytest_twisted
+from twisted.internet import reactor, task
 from twisted.internet.defer import DeferredList, ensureDeferred
 
 from relay_protocol import limits, link
@@ -79,6 +80,20 @@ async def test_viewers_who_stop_or_crawl_cost_the_fast_ones_nothing(show: Show) 
 
 
 @pytest_twisted.ensureDeferred
+async def test_one_picture_is_under_way_however_many_the_kernel_would_take(show: Show) -> None:
+    """Who could not read for a while gets what was on its way, and then the newest; what came between is left out."""
+    control = show.robot_comes()
+    looker = show.looks(STREAM, window=4096)
+    stream = await show.joined(control)
+    for size in range(40_000, 160_000, 20_000):
+        show.shows(stream, jpeg(size))
+        await task.deferLater(reactor, 0.05)  # type: ignore[arg-type]
+    await looker.head()
+    assert [len((await looker.part())[1]) for _ in range(2)] == [len(jpeg(40_000)), len(jpeg(140_000))]
+    looker.leave()
+
+
+@pytest_twisted.ensureDeferred
 async def test_a_stalled_viewer_costs_one_picture_and_is_cut_in_time(
     show: Show, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -106,8 +121,8 @@ async def test_a_stalled_viewer_costs_one_picture_and_is_cut_in_time(
 
     await until(cut)
     assert 3_000_000 < most < 4 * limits.MIB
-    # Looked at once a second.
-    assert 5.0 <= time.monotonic() - began < 8.0
+    # Looked at once a second, and a busy machine takes its time.
+    assert 5.0 <= time.monotonic() - began < 12.0
     assert await looker.closed() < 1
     assert await show.events("video.left")
 

@@ -8,6 +8,8 @@ import pytest
 import pytest_twisted
 
 from relay_protocol import link
+from relay_server.auth import Opening
+from relay_server.video import hub
 from tests.relay_server.edges.video.show import (
     CAMERA,
     CAMERAS,
@@ -23,9 +25,9 @@ from tests.relay_server.edges.video.show import (
 COOKIE = {"Authorization": "", "Cookie": "sb=ann's"}
 
 
-async def ticket(show: Show, robot: str = "rover") -> str:
+async def ticket(show: Show, camera: str = "", *, video: bool = True) -> str:
     """A ticket of ann's."""
-    return await show.desk.issue_ticket(await show.desk.token("ann's"), robot)
+    return await show.desk.issue_ticket(await show.desk.token("ann's"), Opening("rover", video, camera))
 
 
 @pytest.mark.parametrize(
@@ -71,6 +73,34 @@ async def test_a_ticket_shows_one_stream_of_its_robot(show: Show) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_ticket_for_something_else_shows_nothing(show: Show) -> None:
+    """Neither one for the robot's websocket, nor one for another camera."""
+    show.robot_comes()
+    for address, used in (
+        (STREAM, await ticket(show, video=False)),
+        (STREAM, await ticket(show, "/other")),
+        (CAMERAS, await ticket(show, CAMERA)),
+    ):
+        join = "&" if "?" in address else "?"
+        looker = show.looks(f"{address}{join}ticket={used}", Authorization="")
+        assert (await looker.problem())[0] == 401
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_look_at_the_head_spends_no_ticket(show: Show) -> None:
+    """Players ask for it before they ask for the rest."""
+    control = show.robot_comes()
+    address = f"{STREAM}&ticket={await ticket(show, CAMERA)}"
+    for _ in range(2):
+        assert (await show.looks(address, method="HEAD", Authorization="").answer())[0] == 200
+    looker = show.looks(address, Authorization="")
+    show.shows(await show.joined(control), jpeg())
+    assert (await looker.head())[0] == 200
+    looker.leave()
+    assert (await show.looks(address, method="HEAD", Authorization="").answer())[0] == 401
+
+
+@pytest_twisted.ensureDeferred
 async def test_cameras_are_those_one_may_view(show: Show) -> None:
     """With how they are shown now; what is not known is null."""
     control = show.robot_comes()
@@ -89,6 +119,7 @@ async def test_cameras_are_those_one_may_view(show: Show) -> None:
         "width": 32,
         "height": 24,
         "fps": None,
+        "seen": None,
     }
     assert (shown["viewers"], shown["state"]) == (1, "open")
     assert (shown["settings"]["width"], shown["playing"]["quality"]) == (16, 80)
@@ -158,7 +189,8 @@ async def test_head_tells_what_there_would_be_without_waking_the_robot(
     ("method", "path", "status"),
     [
         ("GET", STREAM + "&width=wide", 400),
-        ("GET", STREAM + "&type=png", 400),
+        ("GET", STREAM + "&type=vp8", 400),
+        ("GET", STREAM.replace("/stream", "/stream_viewer") + "&width=wide", 400),
         ("GET", SNAPSHOT + "&codec=h264", 400),
         ("POST", STREAM, 405),
         ("GET", "/robots/rover/video", 404),
@@ -173,6 +205,31 @@ async def test_what_is_no_question_is_answered_in_words(
 ) -> None:
     """As problem details."""
     assert (await show.looks(path, method).problem())[0] == status
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_page_around_a_stream_asks_for_it_with_the_same_words(show: Show) -> None:
+    """It needs no credential, says nothing of its own, and what is in its address is text to it."""
+    path = STREAM.replace("/stream", "/stream_viewer") + "&width=320&x=%22><script>1</script>"
+    status, headers, body = await show.looks(
+        path.replace(">", "%3E").replace("<", "%3C"), Authorization=""
+    ).answer()
+    assert (status, headers.get_content_type()) == (200, "text/html")
+    assert "default-src 'self'" in headers["content-security-policy"]
+    assert f'<img src="stream?topic={CAMERA}&amp;width=320&amp;x=%22%3E%3Cscript'.encode() in body
+    assert b"<script" not in body
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_camera_that_is_only_compressed_may_be_named_by_its_raw_topic(show: Show) -> None:
+    """As users of image_transport do."""
+    control = show.robot_comes()
+    show.registry.cameras(show.robot, link.Cameras(cameras=[link.Camera(name="/usb/image/compressed")]))
+    looker = show.looks("/robots/rover/video/stream?topic=/usb/image&type=ros_compressed")
+    stream = await show.joined(control)
+    assert (stream.camera, stream.settings.transport) == ("/usb/image", "compressed")
+    looker.leave()
+    await until(lambda: not stream.viewers)
 
 
 @pytest.mark.parametrize(
@@ -225,3 +282,24 @@ async def test_a_relay_that_goes_down_ends_streams_and_takes_no_new_ones(show: S
     show.desk.say_goodbye("the relay is going down")
     assert await looker.problem() == (503, "the relay is going down")
     assert (await show.looks(STREAM).problem())[0] == 503
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_begins_streams_too_fast_is_told_when_he_may_again(
+    show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With 429, in words and in a header; a stream that there is he may watch."""
+    monkeypatch.setattr(hub, "STREAMS_AT_ONCE", 1)
+    monkeypatch.setattr(hub, "STREAMS_A_SECOND", 1 / 60)
+    control = show.robot_comes()
+    first = show.looks(STREAM)
+    stream = await show.joined(control)
+    status, headers, body = await show.looks(SNAPSHOT + "&width=16").answer()
+    assert status == 429
+    assert 55 <= int(headers["retry-after"]) <= 60
+    assert json.loads(body)["detail"].endswith(f"try again in {headers['retry-after']} s")
+    same = show.looks(SNAPSHOT)
+    await until(lambda: len(stream.viewers) == 2)
+    show.shows(stream, jpeg())
+    assert (await same.answer())[0] == 200
+    first.leave()

@@ -14,8 +14,9 @@ from websockets.sync.client import ClientConnection, connect
 from relay_db import queries
 from relay_protocol import link
 from relay_server import closing
+from relay_server.auth import Opening
 from relay_server.edges.video import socket as module
-from relay_server.video import Stream
+from relay_server.video import Stream, hub
 from tests.relay_server.edges.video.show import CAMERA, SECRET, Show, jpeg, until
 from tests.relay_server.video.watching import DELTA, KEY
 
@@ -87,6 +88,31 @@ async def watched(show: Show, query: str = "") -> tuple[Eye, Stream]:
     return eye, await show.joined(control)
 
 
+@pytest.mark.parametrize(
+    ("ticket", "good"),
+    [
+        (Opening("rover", video=True, camera=CAMERA), True),
+        (Opening("rover", video=True), True),
+        (Opening("rover", video=True, camera=SECRET), False),
+        (Opening("rover"), False),
+        (Opening("tank", video=True), False),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_a_ticket_must_be_for_this_camera(show: Show, ticket: Opening, good: bool) -> None:
+    """One for the robot's own websocket is not."""
+    show.robot_comes()
+    ann = await show.desk.token("ann's")
+    query = f"&ticket={show.auth.issue_ticket(ann, ticket)}"
+    if good:
+        await (await opens(show, query, token="")).leave()
+    else:
+        with pytest.raises(InvalidStatus) as refused:
+            await opens(show, query, token="")
+        assert refused.value.response.status_code == 401
+    await until(lambda: not show.access._permits)
+
+
 @pytest_twisted.ensureDeferred
 async def test_a_picture_is_a_header_and_then_the_bytes(show: Show) -> None:
     """What is sent from now on is told before, and when it changes."""
@@ -154,6 +180,28 @@ async def test_who_takes_no_picture_is_cut(show: Show, monkeypatch: pytest.Monke
     show.shows(stream, jpeg())
     assert (await eye.closed())[0] == closing.TOO_SLOW
     assert not stream.viewers
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_takes_a_picture_slowly_is_not_cut(show: Show, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As long as something of it arrives, however long its answers to pings wait behind it."""
+    monkeypatch.setattr(module, "STALL_SECONDS", 1.0)
+    monkeypatch.setattr(module, "LOOK_SECONDS", 0.1)
+    control = show.robot_comes()
+    handshake = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec_WebSocket_Version": "13",
+        "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    }
+    looker = show.looks(f"/robots/rover/video/ws?topic={CAMERA}", window=4096, **handshake)
+    stream = await show.joined(control)
+    await looker.head()
+    show.shows(stream, jpeg(60_000))
+    assert len(await looker.slowly(15_000, 3.5)) > 40_000
+    assert stream.viewers
+    await until(lambda: not stream.viewers)
+    looker.leave()
 
 
 @pytest_twisted.ensureDeferred
@@ -260,3 +308,15 @@ async def test_what_ends_a_stream_is_told_with_a_code(show: Show) -> None:
     await until(lambda: show.access._permits)
     show.desk.say_goodbye("the relay is going down")
     assert await eye.closed() == (closing.GOING_AWAY, "the relay is going down")
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_begins_streams_too_fast_is_told_so(show: Show, monkeypatch: pytest.MonkeyPatch) -> None:
+    """4503, with the words; it helps to try again later."""
+    monkeypatch.setattr(hub, "STREAMS_AT_ONCE", 1)
+    monkeypatch.setattr(hub, "STREAMS_A_SECOND", 1 / 60)
+    eye, _ = await watched(show)
+    code, words = await (await opens(show, "&width=16")).closed()
+    assert code == closing.UNAVAILABLE
+    assert words.startswith("you begin streams of robot rover faster than it can; try again in ")
+    await eye.leave()

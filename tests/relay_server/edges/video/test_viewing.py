@@ -9,14 +9,16 @@ from types import SimpleNamespace
 import pytest
 
 from relay_server.edges.video import viewing
+from relay_server.edges.video.snapshot import Snapshot
 from relay_server.edges.video.viewing import Made, Waiting
-from relay_server.video import STALE_SECONDS, Picture
+from relay_server.video import Picture
+from relay_server.video.pictures import STALE_SECONDS
 from tests.relay_server.memory import Time
 
 
 def picture(number: int, at: float, codec: str = "jpeg", *, key: bool = True, size: int = 3) -> Picture:
     """One that arrived then."""
-    return Picture(number, 0.0, at, codec, 32, 24, key, bytes(size))
+    return Picture(number, 0.0, at + STALE_SECONDS, codec, 32, 24, key, bytes(size))
 
 
 class Line:
@@ -61,6 +63,15 @@ def test_a_picture_that_has_waited_too_long_is_not_sent(line: Line, time: Time) 
     line.put(2)
     time.now += STALE_SECONDS - 0.01
     assert line.taken == [2]
+
+
+def test_a_snapshot_is_no_old_picture(time: Time) -> None:
+    """It waits for one that is not."""
+    snapshot = Snapshot(time)
+    snapshot.picture(picture(1, time() - 2 * STALE_SECONDS))
+    assert not snapshot.done.called
+    snapshot.picture(picture(2, time()))
+    assert snapshot.done.result.number == 2
 
 
 def test_of_h264_all_go_since_the_last_that_stands_alone(line: Line) -> None:

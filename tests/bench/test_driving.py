@@ -1,0 +1,25 @@
+"""Commands that say when they were sent."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.driving import ages_ms, stamped_turn
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize("sent", [0, 123_456_789_012_345, 10**13 - MS])
+def test_the_age_of_a_command_is_read_from_the_record(sent: int) -> None:
+    """To a hundredth of a millisecond, also when the count has begun anew meanwhile."""
+    record = [
+        {"event": "command", "t": sent + 250 * MS, "v": 0.2, "w": stamped_turn(sent)},
+        {"event": "command", "t": sent + 300 * MS, "v": 0.0, "w": 0.0},
+        {"event": "standstill", "t": sent + 310 * MS},
+    ]
+    assert ages_ms(record) == pytest.approx([250.0], abs=0.01)
+
+
+def test_what_is_written_into_a_command_moves_nothing_else() -> None:
+    """The turning speed is the same to a part in ten thousand."""
+    assert stamped_turn(10**13 - 1) == pytest.approx(0.6, abs=1.1e-4)

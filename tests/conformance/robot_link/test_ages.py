@@ -1,0 +1,78 @@
+"""How old what is asked for may be: what moves the robot has a deadline, everything else has none."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import time
+from fnmatch import fnmatchcase
+from typing import Any
+
+from conformance_suite import case, not_offered
+from link_relay import Link, LinkRelay
+from robot_tasks import CDR, DRIVER, FIBONACCI, TRIGGER, fibonacci, service
+
+
+def motion(relay: LinkRelay) -> dict[str, Any]:
+    """What it counts as motion."""
+    return dict(relay.facts().get("motion", {}))
+
+
+def long_ago() -> int:
+    """A stamp of long before any deadline."""
+    return time.monotonic_ns() // 2
+
+
+def stale(control: Link) -> int:
+    """What it has not obeyed for its age, by the second message about its health from now on."""
+    with contextlib.suppress(AssertionError):
+        while True:
+            control.expect("health", 0.0)
+    control.expect("health", 20)
+    return int(control.expect("health", 20).get("stale_commands", 0))
+
+
+@case("send_action_goal", "SPEC 2.5, Clocks and deadline, 9")
+def test_old_goal_that_moves(relay: LinkRelay, channel: Link) -> None:
+    """The holder's goal for what counts as motion never begins when its stamp is too old, and is counted."""
+    plain = [each.replace("*", "") for each in motion(relay).get("actions", []) if not set("?[") & set(each)]
+    if not plain:
+        not_offered("no action that counts as motion")
+    control = relay.control
+    assert control.order("resume", by="the suite").get("ok", True)
+    assert control.order("control", holder=DRIVER, user="the suite", level="operator").get("ok", True)
+    before = stale(control)
+    deadline = motion(relay).get("deadline_ms", 500) * 1_000_000
+    channel.say(
+        "send_action_goal",
+        id="old",
+        action=plain[0],
+        type=FIBONACCI,
+        source=DRIVER,
+        stamp=time.monotonic_ns() - deadline - 50_000_000,
+        cdr=base64.b64encode(CDR + bytes(4)).decode(),
+        args={},
+    )
+    end = channel.expect("action_result", id="old")
+    assert (end["status"], end["result"]) == (0, False)
+    assert end["reason"]
+    assert stale(control) == before + 1
+
+
+@case("send_action_goal", "SPEC 2.5, Clocks and deadline, 9")
+def test_old_goal_that_moves_nothing(relay: LinkRelay, channel: Link) -> None:
+    """A goal for what does not count as motion is pursued however old its stamp is."""
+    fibonacci(relay, channel, 3, stamp=long_ago())
+    assert channel.expect("action_result", id="g")["status"] == 4
+
+
+@case("call_service", "SPEC 2.5, Clocks and deadline, 9")
+def test_old_call_that_moves_nothing(relay: LinkRelay, channel: Link) -> None:
+    """A call of what does not count as motion is made however old its stamp is."""
+    name = service(relay)
+    if any(fnmatchcase(name, each) for each in motion(relay).get("services", [])):
+        not_offered(f"{name} counts as motion")
+    cdr = "cdr" in relay.hello["encodings"]
+    args = {"cdr": base64.b64encode(CDR + b"\0").decode()} if cdr else {"args": {}}
+    channel.say("call_service", id="old", service=name, type=TRIGGER, timeout=5, stamp=long_ago(), **args)
+    assert channel.expect("service_response", id="old")["result"] is True

@@ -1,0 +1,169 @@
+"""Alerts are kept as they are now, and rules by which people are told of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_db.queries.alerts import RULES
+from relay_protocol.errors import Invalid, NotFound
+
+
+def an_alert(robot: int, id: str = "a1", **other: object) -> queries.AlertRecord:
+    """One that lasts."""
+    made = queries.AlertRecord(
+        id, robot, "rover", "offline", "", "error", "it is gone", 10.0, 10.5, 1, 1, None, None, None
+    )
+    return made._replace(**other)  # type: ignore[arg-type]  # the fields of a record
+
+
+def a_rule(user: int) -> dict[str, object]:
+    """What is needed for a rule."""
+    return {"user_id": user, "level": "warning", "channel": "portal", "group_s": 60.0, "created": 1.5}
+
+
+def test_an_alert_is_written_again_in_its_place(database: Database) -> None:
+    """The same id is the same row, with what it is now."""
+    with database.begin() as s:
+        robot = queries.add_robot(s, "rover").id
+        queries.save_alerts(s, [an_alert(robot), an_alert(robot, "b2", last=11.0)])
+        queries.save_alerts(s, [an_alert(robot, times=3, over=12.25, ack_by="ann", ack_at=11.5)])
+    with database.reading() as s:
+        assert queries.get_alert(s, "a1") == an_alert(robot, times=3, over=12.25, ack_by="ann", ack_at=11.5)
+        assert [each.id for each in queries.list_alerts(s)] == ["b2", "a1"]
+        assert [each.id for each in queries.list_alerts(s, open=True)] == ["b2"]
+        assert [each.id for each in queries.list_alerts(s, [robot], open=False)] == ["a1"]
+        assert queries.list_alerts(s, [robot + 1]) == queries.list_alerts(s, []) == []
+        assert [each.id for each in queries.list_alerts(s, limit=1, offset=1)] == ["a1"]
+        assert queries.get_alert(s, "nothing\x00") is None
+
+
+def test_alerts_go_with_their_robot_and_none_comes_for_one_that_is_gone(database: Database) -> None:
+    """A robot may be removed while its alert is on the way."""
+    with database.begin() as s:
+        robot = queries.add_robot(s, "rover").id
+        queries.save_alerts(s, [an_alert(robot)])
+        queries.remove_robot(s, robot)
+        queries.save_alerts(s, [an_alert(robot, "b2")])
+        assert queries.list_alerts(s) == []
+
+
+def test_what_a_relay_begins_with_is_what_lasts_or_was_over_of_late(database: Database) -> None:
+    """Old ones stay in the table."""
+    with database.begin() as s:
+        robot = queries.add_robot(s, "rover").id
+        queries.save_alerts(
+            s, [an_alert(robot), an_alert(robot, "b2", over=20.0), an_alert(robot, "c3", over=30.0)]
+        )
+        assert sorted(each.id for each in queries.recent_alerts(s, 25.0)) == ["a1", "c3"]
+
+
+def test_an_acknowledgement_is_seen_by_who_looks_for_changes(database: Database) -> None:
+    """It counts the revision up, and names who and when."""
+    with database.begin() as s:
+        robot = queries.add_robot(s, "rover").id
+        queries.save_alerts(s, [an_alert(robot)])
+        before = queries.revision(s)
+        assert queries.acknowledge_alert(s, "a1", "cli:ann", 12.5).ack_by == "cli:ann"
+        assert queries.revision(s) == before + 1
+        assert queries.acknowledgements(s) == {"a1": ("cli:ann", 12.5)}
+        assert queries.acknowledge_alert(s, "a1", "cli:bob", 13.5).ack_by == "cli:ann"
+        assert queries.revision(s) == before + 1
+        queries.save_alerts(s, [an_alert(robot, "b2", over=11.0)])
+        with pytest.raises(Invalid, match="over"):
+            queries.acknowledge_alert(s, "b2", "cli:ann", 12.5)
+        assert queries.get_alert(s, "b2") == an_alert(robot, "b2", over=11.0)
+        with pytest.raises(NotFound, match="no such alert"):
+            queries.acknowledge_alert(s, "z9", "ann", 1.0)
+
+
+def test_old_alerts_and_too_many_are_forgotten_but_none_that_lasts(database: Database) -> None:
+    """The oldest of those that are over go first, a batch at a time."""
+    with database.begin() as s:
+        robot = queries.add_robot(s, "rover").id
+        over = [an_alert(robot, f"o{each}", last=float(each), over=float(each)) for each in range(6)]
+        queries.save_alerts(s, [*over, an_alert(robot, "open", last=0.0)])
+        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 2
+        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 1
+        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 1
+        assert queries.purge_alerts(s, 3.0, most=3, batch=2) == 0
+        assert [each.id for each in queries.list_alerts(s)] == ["o5", "o4", "open"]
+
+
+def test_rules_are_kept_as_they_were_given(database: Database) -> None:
+    """Whoever asks for all of them gets those of users who may log in."""
+    quiet = {"from": "22:00", "to": "07:00", "zone": "Europe/Rome", "least": "error"}
+    with database.begin() as s:
+        ann, bob = queries.add_user(s, "ann", None).id, queries.add_user(s, "bob", None).id
+        made = queries.add_alert_rule(
+            s,
+            ann,
+            name="pager",
+            robots="r*",
+            kinds=["offline"],
+            level="error",
+            channel="webhook",
+            url="https://example.org/hook",
+            secret="s" * 32,
+            over=False,
+            group_s=5.0,
+            quiet=quiet,
+            created=1.5,
+        )
+        other = queries.add_alert_rule(s, **a_rule(bob))  # type: ignore[arg-type]  # its fields by name
+        assert made == (
+            made.id, ann, "ann", "default", "pager", "r*", ("offline",), "error", "webhook",
+            "https://example.org/hook", "s" * 32, False, 5.0, quiet, 1.5,
+        )  # fmt: skip
+        assert queries.list_alert_rules(s) == [made, other]
+        queries.set_disabled(s, bob, True)
+        assert queries.list_alert_rules(s) == queries.list_alert_rules(s, ann) == [made]
+        assert queries.list_alert_rules(s, bob) == [other]
+
+
+def test_a_rule_is_removed_by_whom_it_belongs_to(database: Database) -> None:
+    """Of another user it is as if it were not there; with its user it goes."""
+    with database.begin() as s:
+        ann, bob = queries.add_user(s, "ann", None).id, queries.add_user(s, "bob", None).id
+        one = queries.add_alert_rule(s, **a_rule(ann)).id  # type: ignore[arg-type]  # as above
+        two = queries.add_alert_rule(s, **a_rule(ann)).id  # type: ignore[arg-type]  # as above
+        before = queries.revision(s)
+        assert not queries.remove_alert_rule(s, one, bob)
+        assert queries.revision(s) == before
+        assert queries.remove_alert_rule(s, one, ann)
+        assert queries.revision(s) == before + 1
+        assert [each.id for each in queries.list_alert_rules(s)] == [two]
+        queries.remove_user(s, ann)
+        assert queries.list_alert_rules(s) == []
+
+
+def test_a_user_has_a_bounded_number_of_rules(database: Database) -> None:
+    """And nobody has one who is not there."""
+    with database.begin() as s:
+        ann = queries.add_user(s, "ann", None).id
+        for _ in range(RULES):
+            queries.add_alert_rule(s, **a_rule(ann))  # type: ignore[arg-type]  # as above
+        with pytest.raises(Invalid, match="at most 32"):
+            queries.add_alert_rule(s, **a_rule(ann))  # type: ignore[arg-type]  # as above
+        with pytest.raises(NotFound):
+            queries.add_alert_rule(s, **a_rule(ann + 1))  # type: ignore[arg-type]  # as above
+
+
+def test_an_acknowledgement_the_relay_has_not_seen_outlives_its_next_word(database: Database) -> None:
+    """It ends when the alert becomes worse or comes back, as any."""
+    with database.begin() as s:
+        robot = queries.add_robot(s, "rover").id
+        queries.save_alerts(s, [an_alert(robot)])
+        queries.acknowledge_alert(s, "a1", "cli:ann", 12.5)
+        queries.save_alerts(s, [an_alert(robot, times=2, last=13.0)])
+        assert queries.acknowledgements(s) == {"a1": ("cli:ann", 12.5)}
+        queries.save_alerts(s, [an_alert(robot, times=3, last=14.0, over=14.0, news=2)])
+        assert queries.get_alert(s, "a1") == an_alert(
+            robot, times=3, last=14.0, over=14.0, news=2, ack_by="cli:ann", ack_at=12.5
+        )
+        queries.save_alerts(s, [an_alert(robot, times=4, last=15.0, news=2)])
+        assert queries.acknowledgements(s) == {}
+        queries.acknowledge_alert(s, "a1", "cli:ann", 15.5)
+        queries.save_alerts(s, [an_alert(robot, times=5, last=16.0, news=3)])
+        assert queries.acknowledgements(s) == {}

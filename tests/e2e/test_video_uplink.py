@@ -1,0 +1,130 @@
+"""One uplink for a robot's pictures: each goes up once, smaller where it is thin, and again after a restart."""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+from switchboard_proxy import ChaosProxy
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_video import Crowd, Eye, decoded, known, streams
+from switchboard_waiting import wait_for
+
+TARGET_MS = 300
+"""The delay a robot keeps its pictures under."""
+
+
+class Thin(NamedTuple):
+    """A robot whose uplink can be made thin."""
+
+    relay: Relay
+    robot: Robot
+    proxy: ChaosProxy
+    token: str
+
+
+@contextlib.contextmanager
+def behind_a_proxy(world: Any, name: str, *sim_options: str) -> Iterator[Thin]:
+    """Beside the others, at the same relay."""
+    proxy = ChaosProxy(world.relay.robots_port)
+    robot = Robot(world.relay, name, port=proxy.port, camera=True, sim_options=sim_options)
+    try:
+        world.relay.cli("right", "grant", "viewer", name, "viewer")
+        yield Thin(world.relay, robot, proxy, world.viewer)
+    finally:
+        robot.stop()
+        proxy.close()
+
+
+@pytest.fixture(scope="module")
+def thin(world: Any) -> Iterator[Thin]:
+    """One robot with its camera as it is."""
+    with behind_a_proxy(world, "thin") as made:
+        yield made
+
+
+@pytest.fixture
+def sharp(world: Any) -> Iterator[Thin]:
+    """One whose pictures are large and many."""
+    with behind_a_proxy(world, "sharp", "--camera-size", "1280x720", "--camera-fps", "30") as made:
+        yield made
+
+
+def test_ten_viewers_are_one_stream_which_ends_with_the_last(thin: Thin) -> None:
+    """The robot makes it once for all, and two seconds after the last has left nothing is sent any more."""
+    known(thin.relay, thin.token, "thin")
+    with Crowd(thin.relay, thin.token, 9, "thin") as crowd, Eye(thin.relay, thin.token, "thin") as eye:
+        eye.picture()
+        wait_for("each has a picture", lambda: all(each.seen for each in crowd.viewers))
+        (stream,) = streams(thin.relay, thin.token, "thin")
+        assert stream["viewers"] == 10
+        before, seen = thin.proxy.up, crowd.viewers[0].seen
+        pictures = eye.watch(2)
+        sizes = statistics.median(len(each.body) for each in pictures)
+        # One after the other through one link: not more bytes than one stream has.
+        assert thin.proxy.up - before < 1.5 * sizes * (crowd.viewers[0].seen - seen + 2)
+    left = time.monotonic()
+    wait_for("the stream is closed", lambda: not streams(thin.relay, thin.token, "thin"), 2)
+    time.sleep(max(0.0, left + 2 - time.monotonic()))  # so long it may go on
+    before = thin.proxy.up
+    time.sleep(1)  # to see that nothing comes
+    assert thin.proxy.up - before < sizes / 2
+
+
+@pytest.mark.parametrize("kilobits", [1000, 200])
+def test_a_thin_uplink_makes_pictures_smaller_not_late(thin: Thin, kilobits: int) -> None:
+    """After 5 s the delay is under the target; when the uplink is as before, so are the pictures."""
+    known(thin.relay, thin.token, "thin")
+    with Eye(thin.relay, thin.token, "thin") as eye:
+        whole = eye.watch_until("pictures are as asked for", lambda _: eye.playing["reduced"] == 0, 30)
+        thin.proxy.squeeze(kilobits * 1000)
+        try:
+            eye.watch(5)
+            pictures = eye.watch(4)
+            playing = eye.playing
+        finally:
+            thin.proxy.squeeze(None)
+        delays = sorted(each.delay_ms for each in pictures)
+        assert statistics.median(delays) < TARGET_MS, (delays, playing)
+        assert playing["delay_ms"] < TARGET_MS, (delays, playing)
+        assert playing["reduced"] > 0
+        assert statistics.median(len(each.body) for each in pictures) < len(whole.body) / 2
+        eye.watch_until("pictures are as before", lambda _: eye.playing["reduced"] == 0, 60)
+        after = eye.picture()
+        assert decoded(after.body).shape == (480, 640, 3)
+
+
+def test_large_pictures_under_way_do_not_hold_up_the_small_ones(sharp: Thin) -> None:
+    """At 200 kbit/s what would take seconds is given up; 5 s later the delay is under the target."""
+    known(sharp.relay, sharp.token, "sharp")
+    with Eye(sharp.relay, sharp.token, "sharp", quality=100) as eye:
+        eye.watch_until("pictures are large", lambda each: len(each.body) > 150_000, 30)
+        eye.watch(3)
+        sharp.proxy.squeeze(200_000)
+        eye.watch(5)
+        pictures = eye.watch(4)
+        delays = sorted(each.delay_ms for each in pictures)
+        assert statistics.median(delays) < TARGET_MS, (delays, eye.playing)
+        assert max(len(each.body) for each in pictures) < 20_000
+        assert eye.playing["reduced"] > 0
+        sharp.proxy.squeeze(None)
+        eye.watch_until("pictures are large again", lambda each: each.head["width"] == 1280, 60)
+
+
+def test_pictures_go_on_when_the_daemon_is_started_again(thin: Thin) -> None:
+    """On the same websocket, by themselves."""
+    known(thin.relay, thin.token, "thin")
+    with Eye(thin.relay, thin.token, "thin") as eye:
+        before = eye.picture()
+        thin.robot.daemon.kill()
+        thin.robot.start_daemon()
+        again = eye.watch_until(
+            "a picture taken after that", lambda each: each.head["stamp"] > before.head["stamp"] + 1, 30
+        )
+        assert decoded(again.body).shape == (480, 640, 3)
+        assert len(eye.watch(1)) > 3

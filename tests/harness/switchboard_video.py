@@ -1,0 +1,205 @@
+"""Cameras as those see them who watch: by request, by MJPEG, by websocket."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import re
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from email.parser import BytesParser
+from typing import Any, NamedTuple
+from urllib.parse import urlencode
+
+import cv2
+import numpy as np
+from switchboard_http import Answer, ask
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
+from websockets.sync.client import connect
+
+CAMERA = "/camera/image_raw"
+"""Of the simulated robot."""
+
+WAIT_SECONDS = 20.0
+
+
+def path(what: str, robot: str = "rover", **parameters: Any) -> str:
+    """An address below a robot's ``video``."""
+    return f"/robots/{robot}/video/{what}?{urlencode({'topic': CAMERA, **parameters})}"
+
+
+def get(relay: Relay, token: str, what: str, robot: str = "rover", **parameters: Any) -> Answer:
+    """One request."""
+    return ask(relay.http_port, "GET", path(what, robot, **parameters), token=token)
+
+
+def streams(relay: Relay, token: str, robot: str = "rover") -> list[dict[str, Any]]:
+    """How the camera is shown now."""
+    cameras = get(relay, token, "cameras", robot).json["cameras"]
+    return next((each["streams"] for each in cameras if each["name"] == CAMERA), [])
+
+
+def known(relay: Relay, token: str, robot: str = "rover") -> None:
+    """Wait until the relay knows the robot's camera."""
+
+    def there() -> bool:
+        cameras = get(relay, token, "cameras", robot).json["cameras"]
+        return any(each["name"] == CAMERA for each in cameras)
+
+    wait_for("the camera is known", there)
+
+
+def decoded(picture: bytes) -> Any:
+    """Its pixels, height × width × 3."""
+    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None
+    return pixels
+
+
+class Part(NamedTuple):
+    """One part of a multipart answer."""
+
+    headers: Any
+    body: bytes
+
+
+class Mjpeg:
+    """A viewer of ``…/video/stream``, who finds the parts by their boundary as RFC 2046 has it."""
+
+    def __init__(self, relay: Relay, token: str, robot: str = "rover", **parameters: Any) -> None:
+        self.seen = 0
+        """Parts so far."""
+        self._connection = http.client.HTTPConnection("127.0.0.1", relay.http_port, timeout=WAIT_SECONDS)
+        headers = {"Authorization": f"Bearer {token}"}
+        self._connection.request("GET", path("stream", robot, **parameters), headers=headers)
+        self.answer = self._connection.getresponse()
+        boundary = re.fullmatch(
+            r"multipart/x-mixed-replace; *boundary=(\S+)", self.answer.headers["Content-Type"]
+        )
+        assert self.answer.status == 200
+        assert boundary
+        self._delimiter = b"--" + boundary[1].encode()
+        self._bytes = b""
+
+    def part(self) -> Part | None:
+        """The next; ``None`` at the end, which may be a reset."""
+        while True:
+            before, delimiter, rest = self._bytes.partition(self._delimiter)
+            if delimiter:
+                self._bytes = rest
+                head, _, body = before.removeprefix(b"\r\n").partition(b"\r\n\r\n")
+                if head:
+                    self.seen += 1
+                    return Part(BytesParser().parsebytes(head), body.removesuffix(b"\r\n"))
+                continue
+            try:
+                data = self.answer.read1(1 << 18)
+            except ConnectionResetError:
+                return None
+            if not data:
+                return None
+            self._bytes += data
+
+    def close(self) -> None:
+        """Leave."""
+        self.answer.close()
+        self._connection.close()
+
+
+class Crowd(contextlib.ExitStack):
+    """Many MJPEG viewers, each read by a thread."""
+
+    def __init__(self, relay: Relay, token: str, count: int, robot: str = "rover", **parameters: Any) -> None:
+        super().__init__()
+        self._pool = ThreadPoolExecutor(count)
+        self._left = threading.Event()
+        self.viewers = [Mjpeg(relay, token, robot, **parameters) for _ in range(count)]
+        self.callback(self._pool.shutdown)
+        self.callback(self._left.set)
+        for each in self.viewers:
+            self._pool.submit(self._read, each)
+
+    def _read(self, viewer: Mjpeg) -> None:
+        with contextlib.closing(viewer):
+            while not self._left.is_set() and viewer.part() is not None:
+                pass
+
+    def rates(self, seconds: float) -> list[float]:
+        """Pictures per second of each from now on."""
+        before, began = [each.seen for each in self.viewers], time.monotonic()
+        self._left.wait(seconds)
+        passed = time.monotonic() - began
+        return [(each.seen - seen) / passed for each, seen in zip(self.viewers, before, strict=True)]
+
+
+class Shown(NamedTuple):
+    """One picture that came by the websocket, and how old it was then."""
+
+    head: dict[str, Any]
+    body: bytes
+    delay_ms: float
+
+
+class Eye:
+    """A viewer by ``…/video/ws``."""
+
+    def __init__(self, relay: Relay, token: str, robot: str = "rover", **parameters: Any) -> None:
+        self.playing: dict[str, Any] = {}
+        """The latest word of how it is made."""
+        self._stack = contextlib.ExitStack()
+        connecting = connect(
+            f"ws://127.0.0.1:{relay.http_port}{path('ws', robot, **parameters)}",
+            additional_headers={"Authorization": f"Bearer {token}"},
+            close_timeout=1,
+        )
+        self.connection = self._stack.enter_context(connecting)
+
+    def __enter__(self) -> Eye:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def untaken(self, seconds: float = WAIT_SECONDS) -> Shown:
+        """The next picture, which is not answered."""
+        while True:
+            message = json.loads(self.connection.recv(timeout=seconds))
+            if message["op"] == "playing":
+                self.playing = message
+                continue
+            assert message["op"] == "picture"
+            body = self.connection.recv(timeout=seconds)
+            assert isinstance(body, bytes)
+            assert len(body) == message["size"]
+            return Shown(message, body, (time.time() - message["stamp"]) * 1000)
+
+    def took(self, shown: Shown) -> None:
+        """Have the next one."""
+        self.connection.send(json.dumps({"op": "took", "number": shown.head["number"]}))
+
+    def picture(self, seconds: float = WAIT_SECONDS) -> Shown:
+        """The next picture, and the word that it is here."""
+        shown = self.untaken(seconds)
+        self.took(shown)
+        return shown
+
+    def watch(self, seconds: float) -> list[Shown]:
+        """All that comes in this time."""
+        until = time.monotonic() + seconds
+        shown = []
+        while time.monotonic() < until:
+            shown.append(self.picture())
+        return shown
+
+    def watch_until(self, what: str, condition: Callable[[Shown], bool], seconds: float) -> Shown:
+        """Watch until a picture is as it should be."""
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            shown = self.picture()
+            if condition(shown):
+                return shown
+        raise AssertionError(f"not within {seconds:g} s: {what}; playing {self.playing}")

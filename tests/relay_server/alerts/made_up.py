@@ -1,0 +1,32 @@
+"""Alerts and rules of the tests' own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from relay_db.queries import AlertRecord, AlertRuleRecord
+from relay_server.alerts.message import Message, Notice
+
+SECRET = "0123456789abcdef"
+
+
+def alert(id: str = "a1", **other: Any) -> AlertRecord:
+    """A robot that is offline."""
+    made = AlertRecord(
+        id, 1, "rover", "offline", "", "error", "nothing comes", 10.0, 10.5, 1, 1, None, None, None
+    )
+    return made._replace(**other)
+
+
+def rule(**other: Any) -> AlertRuleRecord:
+    """A webhook for all."""
+    made = AlertRuleRecord(
+        7, 3, "ann", "default", "", "*", (), "warning", "webhook", "http://127.0.0.1/hook", SECRET, True, 60.0,
+        None, 1.0,
+    )  # fmt: skip
+    return made._replace(**other)
+
+
+def message(*notices: Notice, left_out: int = 0) -> Message:
+    """With one notice, if none is given."""
+    return Message("d1", notices or (Notice(alert(), "begun"),), left_out)

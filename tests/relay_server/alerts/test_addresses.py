@@ -1,0 +1,61 @@
+"""Nothing of special networks may be reached, unless it is allowed."""
+
+from __future__ import annotations
+
+from ipaddress import ip_address, ip_network
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_protocol.errors import Invalid
+from relay_server.alerts.addresses import allowed, networks
+
+
+@pytest.mark.parametrize("address", ["8.8.8.8", "93.184.215.14", "2606:2800:21f:cb07::1", "64:ff9b::808:808"])
+def test_public_addresses_are_allowed(address: str) -> None:
+    """Also one that a network of IPv6 alone has for a public IPv4."""
+    assert allowed(address)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "0.0.0.0", "0.1.2.3", "10.0.0.1", "100.64.0.1", "127.0.0.1", "127.9.9.9", "169.254.169.254", "172.16.0.1",
+        "172.31.255.255", "192.0.0.1", "192.0.2.1", "192.168.1.1", "198.18.0.1", "198.51.100.1", "203.0.113.1",
+        "224.0.0.1", "239.255.255.255", "240.0.0.1", "255.255.255.255",
+        "::", "::1", "::7f00:1", "::ffff:127.0.0.1", "::ffff:10.0.0.1", "64:ff9b::a00:1", "64:ff9b:1::1",
+        "100::1", "2001::1", "2001:db8::1", "2002:7f00:1::", "3fff::1", "5f00::1", "fc00::1", "fd12::1", "fe80::1",
+        "fe80::1%eth0", "fec0::1", "ff02::1", "2606:2800::1%eth0",
+        "", "localhost", "1.2.3", "0x7f000001", "2130706433", "127.1", "8.8.8.8 ",
+    ],
+)  # fmt: skip
+def test_special_addresses_are_not(address: str) -> None:
+    """Nor what is no address: names are resolved before."""
+    assert not allowed(address)
+
+
+def test_an_administrator_can_allow_networks() -> None:
+    """These, and no others."""
+    also = networks(["192.168.7.0/24", "fd00:7::/64"])
+    assert allowed("192.168.7.9", also)
+    assert allowed("::ffff:192.168.7.9", also)
+    assert allowed("fd00:7::9", also)
+    assert not allowed("192.168.8.9", also)
+    assert not allowed("fd00:8::9", also)
+
+
+@pytest.mark.parametrize("text", ["", "intranet", "192.168.7.1/24", "10.0.0.0/33"])
+def test_a_network_that_is_none_is_told_in_words(text: str) -> None:
+    """An administrator who mistypes must not open something else."""
+    with pytest.raises(Invalid, match="is no network"):
+        networks([text])
+
+
+@given(st.ip_addresses())
+def test_nothing_passes_that_python_counts_as_local(address: object) -> None:
+    """Two lists are wrong more seldom than one."""
+    plain = ip_address(str(address))
+    if allowed(str(plain)) and plain not in ip_network("64:ff9b::/96"):
+        assert plain.is_global
+        assert not (plain.is_private or plain.is_loopback or plain.is_link_local or plain.is_multicast)

@@ -1,0 +1,312 @@
+"""What happens to robots becomes alerts, rows, and what each person may see of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet.defer import Deferred
+
+from relay_db import queries
+from relay_protocol import link
+from relay_protocol.errors import NotFound, Refused
+from relay_server.access import Access, Principal
+from relay_server.alerts import kinds
+from relay_server.alerts.desk import AlertDesk, TooOften
+from relay_server.alerts.hub import ABSENT_SECONDS, TIDY_EVERY, Alerts
+from relay_server.alerts.message import Message
+from relay_server.alerts.rules import Ask
+from relay_server.alerts.senses import Thresholds
+from relay_server.alerts.ways import Ways
+from relay_server.journal import Journal
+from relay_server.registry import Presence
+from relay_server.store import Store
+from tests.relay_server.alerts.receiver import REACTOR
+from tests.relay_server.edges.robot_ends import until
+from tests.relay_server.memory import World
+
+
+class Scene:
+    """A relay's alerts on a real database; the robot rover, ann who operates it, vic who watches, eve who may not."""
+
+    def __init__(self, world: World, store: Store) -> None:
+        self.world = world
+        self.store = store
+        self.sent: list[Message] = []
+        self.access = Access(store, self.wall)
+        self.journal = Journal(store, self.wall)
+        with store.database.begin() as s:
+            self.number = queries.add_robot(s, "rover").id
+            self.people = {
+                name: Principal(queries.add_user(s, name, None).id, name, "default", False, 0, None)
+                for name in ("ann", "vic", "eve")
+            }
+            queries.grant_right(s, self.number, "operator", user_id=self.people["ann"].user_id)
+            queries.grant_right(
+                s, self.number, "viewer", user_id=self.people["vic"].user_id, deny=["subscribe:/diagnostics"]
+            )
+        self.robot: Presence = world.registry.presence(self.number, "rover", "default")
+        world.robot = self.robot
+        self.alerts = self.begin()
+        ways = Ways(REACTOR, self.wall, (), ())
+        self.desk = AlertDesk(
+            self.alerts, ways, store, self.access, self.journal, world.clock.seconds, self.wall
+        )
+
+    def wall(self) -> float:
+        """Unix time."""
+        return 1.7e9 + self.world.clock.seconds()
+
+    def begin(self) -> Alerts:
+        """A relay's alerts."""
+        world = self.world
+        thresholds = Thresholds(6.0, 0.2, 0.1)
+        return Alerts(
+            world.clock, self.wall, self.store, self.access, world.registry, world.channels, self.journal,
+            thresholds, self._send,
+        )  # fmt: skip
+
+    async def _send(self, rule: Any, message: Message, doubtful: bool) -> None:
+        self.sent.append(message)
+
+    def says(self, kind: str, **data: Any) -> None:
+        """An event about the robot."""
+        self.journal.event(kind, "test", cause="test", robot_id=self.number, **data)
+
+    async def seen(self, name: str) -> list[str]:
+        """Kinds of what somebody sees, by both ways."""
+        listed = [each["kind"] for each in await self.desk.all(self.people[name])]
+        assert sorted(listed) == sorted(each["kind"] for each in await self.desk.shown(self.people[name]))
+        return sorted(listed)
+
+
+@pytest.fixture
+def scene(world: World, store: Store) -> Scene:
+    """Nothing has happened yet."""
+    return Scene(world, store)
+
+
+@pytest_twisted.ensureDeferred
+async def test_events_become_alerts_of_their_kind(scene: Scene) -> None:
+    """What a robot tells is filed by what it may tell; to who lost control while nothing moved, nothing happened."""
+    scene.says("robot.stopped", user="ann", why="smoke")
+    scene.says("robot.stopped", user="vic", why="fire")
+    scene.says("control.lost", user="ann", why="gone", moving=False)
+    scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about="motor", over=False)
+    scene.says("robot.alert", level="odd", text="x", alert_kind="offline", about="", over=False)
+    scene.says("other.event")
+    assert await scene.seen("ann") == ["diagnostics", "robot", "stop"]
+    assert await scene.seen("vic") == ["robot", "stop"]
+    assert await scene.seen("eve") == []
+    texts = {
+        each["kind"]: (each["text"], each["level"]) for each in await scene.desk.all(scene.people["ann"])
+    }
+    assert texts["stop"] == ("stopped by ann: smoke", "warning")
+    assert texts["robot"] == ("x", "warning")
+    scene.says("robot.resumed")
+    scene.says("control.lost", user="ann", why="gone", moving=True)
+    scene.says("control.taken")
+    lasting = await scene.desk.all(scene.people["ann"], open=True)
+    assert sorted(each["kind"] for each in lasting) == ["diagnostics", "robot"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_operators_acknowledge_and_others_are_refused(scene: Scene) -> None:
+    """Who may not know of it hears that there is none."""
+    scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about="motor", over=False)
+    ((alert),) = await scene.desk.all(scene.people["ann"])
+    for name in ("vic", "eve"):
+        with pytest.raises(NotFound):
+            await scene.desk.acknowledge(scene.people[name], alert["id"])
+    scene.says("robot.stopped", user="ann", why="")
+    stop = next(each for each in await scene.desk.all(scene.people["vic"]) if each["kind"] == "stop")
+    with pytest.raises(Refused, match="operator"):
+        await scene.desk.acknowledge(scene.people["vic"], stop["id"])
+    done = await scene.desk.acknowledge(scene.people["ann"], alert["id"])
+    assert done["acknowledged"]["by"] == "ann"
+    with pytest.raises(NotFound):
+        await scene.desk.acknowledge(scene.people["ann"], "zz")
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_page_gets_the_same_list_until_something_changes(scene: Scene) -> None:
+    """So that nothing is sent twice."""
+    scene.says("robot.stopped", user="ann", why="")
+    first = await scene.desk.shown(scene.people["ann"])
+    assert await scene.desk.shown(scene.people["ann"]) is first
+    scene.alerts.version += 1
+    assert await scene.desk.shown(scene.people["ann"]) is first
+    scene.says("robot.resumed")
+    assert (await scene.desk.shown(scene.people["ann"]))[0]["state"] == "over"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_rule_tells_its_user_what_he_may_know(scene: Scene) -> None:
+    """Rules of both; only who may hear diagnostics is told of them. Secrets are shown once."""
+    ask = Ask("webhook", url="https://example.org/hook")
+    made = await scene.desk.add_rule(scene.people["ann"], ask, "192.0.2.9")
+    assert len(made["secret"]) >= 32
+    await scene.desk.add_rule(scene.people["vic"], ask, "192.0.2.9")
+    (listed,) = (await scene.desk.rules(scene.people["ann"]))["rules"]
+    assert "secret" not in listed
+    assert listed["url"] == "https://example.org/…"
+    scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about="motor", over=False)
+    scene.world.clock.advance(1)
+    await scene.access.robots(scene.people["vic"])
+    await until(lambda: len(scene.sent) >= 1)
+    assert len(scene.sent) == 1
+    with pytest.raises(NotFound):
+        await scene.desk.remove_rule(scene.people["vic"], made["id"], "192.0.2.9")
+    await scene.desk.remove_rule(scene.people["ann"], made["id"], "192.0.2.9")
+    entries = await scene.store.read(queries.list_audit)
+    assert [each.action for each in entries].count("alert_rule.add") == 2
+    assert "/hook" not in str(entries)
+
+
+@pytest_twisted.ensureDeferred
+async def test_rules_are_not_tested_without_end(scene: Scene) -> None:
+    """Five at once, then one each twelve seconds."""
+    made = await scene.desk.add_rule(scene.people["ann"], Ask("portal"), "192.0.2.9")
+    for _ in range(5):
+        assert (await scene.desk.test_rule(scene.people["ann"], made["id"]))["ok"]
+    with pytest.raises(TooOften):
+        await scene.desk.test_rule(scene.people["ann"], made["id"])
+    scene.world.clock.advance(13)
+    assert (await scene.desk.test_rule(scene.people["ann"], made["id"]))["ok"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_another_relay_goes_on_where_one_was_killed(scene: Scene) -> None:
+    """What lasts lasts; a robot that does not come back is missed after a while."""
+    scene.says("robot.stopped", user="ann", why="")
+    await scene.alerts.flush()
+    later = scene.begin()
+    await later.start()
+    assert later.lasts(scene.robot, "stop") == "warning"
+    later._absent = {scene.number: ("rover", "default")}
+    scene.world.clock.pump([0.25] * int(4 * ABSENT_SECONDS + 8))
+    assert later.lasts(scene.robot, "offline") == "error"
+    await later.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_daemon_that_began_anew_has_forgotten_what_it_told(scene: Scene) -> None:
+    """What it told before is over; what it tells again lasts."""
+    await scene.alerts.start()
+    scene.world.robot_comes()
+    scene.robot.description = link.Describe(started=1.0)
+    scene.says("robot.online")
+    for about in ("motor", "arm"):
+        scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about=about, over=False)
+    scene.world.clock.advance(1)
+    scene.says("robot.online")
+    scene.robot.description = link.Describe(started=2.0)
+    scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about="arm", over=False)
+    scene.world.clock.advance(0.25)
+    assert scene.alerts.lasting(scene.robot, "diagnostics") == ["arm"]
+    await scene.alerts.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_was_removed_leaves_no_alerts(scene: Scene) -> None:
+    """Neither shown nor kept."""
+    scene.says("robot.stopped", user="ann", why="")
+    await scene.store.write(queries.remove_robot, scene.number)
+    await scene.alerts.refresh()
+    await scene.alerts.flush()
+    assert list(scene.alerts.book) == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_acknowledgement_in_the_database_is_taken_up(scene: Scene) -> None:
+    """And lasts, whatever the robot says next; but one of before the alert became worse is not."""
+    told = {"text": "x", "alert_kind": "module", "over": False}
+    for about in ("arm", "leg"):
+        scene.says("robot.alert", level="warning", about=about, **told)
+    await scene.alerts.flush()
+    for each in list(scene.alerts.book):
+        await scene.store.write(queries.acknowledge_alert, each.id, "cli:root", scene.wall())
+    scene.says("robot.alert", level="warning", about="arm", **told)
+    scene.says("robot.alert", level="error", about="leg", **told)
+    await scene.alerts.refresh()
+    assert {each.about: each.ack_by for each in scene.alerts.book} == {"arm": "cli:root", "leg": None}
+    await scene.alerts.flush()
+    rows = await scene.store.read(queries.list_alerts)
+    assert {each.about: each.ack_by for each in rows} == {"arm": "cli:root", "leg": None}
+
+
+@pytest_twisted.ensureDeferred
+async def test_pages_are_told_when_there_is_something_else_to_show(scene: Scene) -> None:
+    """What is only told again waits for the tidying; in a flood as well."""
+    await scene.alerts.start()
+    told = {"level": "error", "text": "x", "alert_kind": "diagnostics", "over": False}
+    for each in range(kinds.OPEN + 1):
+        scene.says("robot.alert", about=f"part {each}", **told)
+    before = scene.alerts.version
+    for each in range(kinds.OPEN + 1):
+        scene.says("robot.alert", about=f"part {each}", **told)
+    assert scene.alerts.version == before
+    scene.says("robot.stopped", user="ann", why="")
+    assert scene.alerts.version == before + 1
+    scene.says("robot.resumed")
+    assert scene.alerts.version == before + 2
+    scene.world.clock.pump([0.25] * TIDY_EVERY)
+    assert scene.alerts.version > before + 2
+    await scene.alerts.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_a_robot_tells_no_more_is_over_also_for_another_relay(scene: Scene) -> None:
+    """Once it says that it has told all; its words without an end last, and what the relay knows itself."""
+    told = {"level": "error", "text": "x", "over": False}
+    parts = (("diagnostics", "motor"), ("diagnostics", "arm"), ("module", "guard"), ("gripper", "left"))
+    for kind, about in parts:
+        scene.says("robot.alert", alert_kind=kind, about=about, **told)
+    scene.says("robot.stopped", user="ann", why="")
+    await scene.alerts.stop()
+    scene.alerts = later = scene.begin()
+    await later.start()
+    scene.says("robot.online")
+    scene.says("robot.alert", alert_kind="diagnostics", about="arm", **told)
+    scene.says("robot.alert", alert_kind="diagnostics", about="lidar", **told)
+    assert len(later.book.open_of(scene.number)) == 6
+    for _ in range(2):
+        scene.journal.tell("robot.alerts_told", scene.number)
+        lasting = {(each.kind, each.about) for each in later.book.open_of(scene.number)}
+        assert lasting == {
+            ("diagnostics", "arm"),
+            ("diagnostics", "lidar"),
+            ("gripper", "left"),
+            ("stop", ""),
+        }
+    await later.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_alert_is_not_written_while_it_is_being_written(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever asks for it, what comes later is written later, and both wait until theirs is."""
+    doors: list[Deferred[None]] = []
+    write = scene.store.write
+
+    async def slow(*what: Any) -> Any:
+        doors.append(Deferred())
+        await doors[-1]
+        return await write(*what)
+
+    monkeypatch.setattr(scene.store, "write", slow)
+    scene.alerts.tell(scene.robot, "module", "arm", "warning", "first")
+    first = Deferred.fromCoroutine(scene.alerts.flush())
+    scene.alerts.tell(scene.robot, "module", "arm", "error", "second")
+    second = Deferred.fromCoroutine(scene.alerts.flush())
+    assert len(doors) == 1
+    doors[0].callback(None)
+    await until(lambda: len(doors) == 2)
+    assert not second.called
+    doors[1].callback(None)
+    await first
+    await second
+    (row,) = await scene.store.read(queries.list_alerts)
+    assert (row.level, row.text) == ("error", "second")

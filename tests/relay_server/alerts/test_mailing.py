@@ -1,0 +1,129 @@
+"""Messages through apprise: only by what the administrator allows, and nowhere within his networks."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Iterator
+from typing import Any
+
+import pytest
+import pytest_twisted
+from switchboard_hook import MailServer
+
+from relay_protocol.errors import Invalid
+from relay_server.alerts.addresses import networks
+from relay_server.alerts.mailing import Mailing
+from relay_server.alerts.message import Message, Notice, Undelivered
+from relay_server.alerts.names import Names
+from relay_server.alerts.ways import Ways, check_schemes
+from tests.relay_server.alerts.made_up import alert, message, rule
+from tests.relay_server.alerts.receiver import REACTOR
+
+
+@pytest.fixture
+def server() -> Iterator[MailServer]:
+    """A mail server on this machine."""
+    made = MailServer()
+    yield made
+    made.stop()
+
+
+@pytest_twisted.async_yield_fixture
+async def mailing() -> AsyncIterator[Mailing]:
+    """Sends by mail alone, also to this machine."""
+    names = Names(REACTOR)
+    made = Mailing(REACTOR, names.addresses, ["mailto"], networks(["127.0.0.0/8"]))
+    names.start()
+    made.start()
+    yield made
+    made.stop()
+    names.stop()
+
+
+def url(server: MailServer, host: str = "127.0.0.1") -> str:
+    """Of apprise, for this server."""
+    way = f"smtp={host}&port={server.port}&mode=insecure"
+    return f"mailto://relay.example?{way}&from=relay@x.example&to=ann@x.example"
+
+
+def by(url: str) -> Any:
+    """A rule that sends there."""
+    return rule(channel="apprise", url=url, secret="")
+
+
+@pytest.mark.parametrize("doubtful", [False, True])
+@pytest_twisted.ensureDeferred
+async def test_a_message_arrives_by_mail(mailing: Mailing, server: MailServer, doubtful: bool) -> None:
+    """With a subject of one line, whatever a robot says."""
+    evil = alert(kind="module", about="arm\r\nBcc: eve@x.example", text="gone\r\nX-Evil: yes")
+    await mailing.send(by(url(server)), message(Notice(evil, "begun")), doubtful)
+    (mail,) = server.mails
+    assert "Subject: rover: error: module arm" in mail
+    assert "\nBcc:" not in mail
+    assert "\nX-Evil" not in mail
+    assert "gone" in mail
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_server_in_a_network_that_is_not_allowed_is_not_reached(server: MailServer) -> None:
+    """By address or by name."""
+    names = Names(REACTOR)
+    mailing = Mailing(REACTOR, names.addresses, ["mailto"], ())
+    names.start()
+    mailing.start()
+    try:
+        for host in ("127.0.0.1", "localhost"):
+            with pytest.raises(Undelivered, match="does not send to"):
+                await mailing.send(by(url(server, host)), message(), False)
+    finally:
+        mailing.stop()
+        names.stop()
+    assert server.mails == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_only_allowed_services_are_taken(mailing: Mailing, server: MailServer) -> None:
+    """When a rule is made, and again when it sends: settings change."""
+    await mailing.check(url(server))
+    for wrong in ("json://example.org/x", "mailto", "", "file:///etc/passwd", "mailto://"):
+        with pytest.raises(Invalid):
+            await mailing.check(wrong)
+    with pytest.raises(Undelivered, match="may not have the parameter 'wkd'"):
+        await mailing.send(by(url(server) + "&WKD=yes"), message(), False)
+    with pytest.raises(Undelivered, match="does not allow"):
+        await mailing.send(by("json://example.org/x"), message(), False)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_server_that_is_not_there_is_told_in_words(
+    mailing: Mailing, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And nothing of the URL is logged."""
+    server = MailServer()
+    server.stop()
+    with caplog.at_level(logging.DEBUG), pytest.raises(Undelivered, match="did not take") as error:
+        await mailing.send(by(url(server) + "&pass=topsecret&user=ann"), message(), False)
+    assert error.value.again
+    assert "topsecret" not in caplog.text
+
+
+def test_a_long_message_says_how_many_more_there_are() -> None:
+    """People get lines, and a number."""
+    many = Message("d1", [Notice(alert(f"a{number}"), "begun") for number in range(50)], 7)
+    assert many.title == "57 alerts"
+    assert many.text.splitlines()[-1] == "and 37 more"
+    assert len(many.text.splitlines()) == 21
+
+
+@pytest.mark.parametrize("scheme", ["file", "syslog", "https", "mail-to", "", "mailto://"])
+def test_what_works_on_the_relays_own_machine_can_not_be_allowed(scheme: str) -> None:
+    """Nor what is no scheme."""
+    with pytest.raises(Invalid, match="is no scheme"):
+        check_schemes([scheme])
+
+
+def test_without_schemes_there_is_no_apprise() -> None:
+    """The channel is not offered."""
+    ways = Ways(REACTOR, lambda: 0.0, (), ())
+    assert (ways.channels, ways.schemes) == (("portal", "webhook"), [])
+    assert Ways(REACTOR, lambda: 0.0, (), ("mailtos",)).channels[-1] == "apprise"

@@ -1,0 +1,244 @@
+"""No parameter of a URL makes apprise read a file of the relay's machine, or fetch an address of its networks."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from urllib.parse import quote
+
+import pytest
+import pytest_twisted
+
+from relay_protocol.errors import Invalid
+from relay_server.alerts.addresses import networks
+from relay_server.alerts.mailing import Mailing
+from relay_server.alerts.message import Undelivered
+from relay_server.alerts.names import Names
+from relay_server.alerts.services import PARAMETERS, SERVERS
+from tests.relay_server.alerts.made_up import message, rule
+from tests.relay_server.alerts.receiver import REACTOR, Hook, serve
+
+SLACK = "slack://T1JJ3T3L2/A1BRTD4JD/TIiajkdnlazkcOXrIdevi7FQ"
+DISCORD = f"discord://{'1' * 18}/{'a' * 64}"
+TELEGRAM = "tgram://123456789:abcdefg_hijklmnop/987654321"
+MAIL = "mailtos://ann:password@mail.example.org"
+TEAMS = f"workflows://prod-1.example.org/{'a' * 32}/{'b' * 43}"
+
+
+class Scene:
+    """Apprise with all its services, and a server of this machine that is not to be reached."""
+
+    def __init__(self, allowed: str = "") -> None:
+        self.hook = Hook()
+        self.port = serve(self.hook)
+        self.names = Names(REACTOR)
+        nets = networks([allowed] if allowed else [])
+        self.mailing = Mailing(REACTOR, self.names.addresses, list(PARAMETERS), nets)
+        self.names.start()
+        self.mailing.start()
+
+    @property
+    def place(self) -> str:
+        """Where the server listens."""
+        return f"127.0.0.1:{self.port.getHost().port}"
+
+    async def fails(self, url: str) -> Undelivered:
+        """Why a message by this URL does not arrive."""
+        with pytest.raises(Undelivered) as error:
+            await self.mailing.send(rule(channel="apprise", url=url, secret=""), message(), False)
+        return error.value
+
+    async def close(self) -> None:
+        """All ends."""
+        self.mailing.stop()
+        self.names.stop()
+        await self.port.stopListening()
+
+
+@pytest_twisted.async_yield_fixture
+async def scene() -> AsyncIterator[Scene]:
+    """No special network is allowed."""
+    made = Scene()
+    yield made
+    await made.close()
+
+
+@pytest_twisted.async_yield_fixture
+async def open_scene() -> AsyncIterator[Scene]:
+    """This machine is allowed."""
+    made = Scene("127.0.0.0/8")
+    yield made
+    await made.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "name"),
+    [
+        (f"{SLACK}?template=/etc/hostname", "template"),
+        (f"{SLACK}?footer=no&template=http://127.0.0.1/admin", "template"),
+        (f"{SLACK}?footer=no;template=/etc/hostname", "template"),
+        (f"{SLACK}?TEMPLATE=/etc/hostname", "template"),
+        (f"{SLACK}?%74emplate=/etc/hostname", "template"),
+        (f"{SLACK}?%20template=/etc/hostname", "+template"),
+        (f"{SLACK}?template", "template"),
+        (f"{SLACK}?:name=value", ":name"),
+        (f"{SLACK}?redirect=yes", "redirect"),
+        (f"{DISCORD}?template=/etc/hostname", "template"),
+        (f"{DISCORD}?avatar_url=http://127.0.0.1/", "avatar_url"),
+        (f"{TELEGRAM}?template=/etc/hostname", "template"),
+        (f"{TEAMS}?template=/etc/hostname", "template"),
+        (f"{MAIL}?pgp=yes", "pgp"),
+        (f"{MAIL}?pgppub=file:///etc/hostname", "pgppub"),
+        (f"{MAIL}?pgpprv=/etc/hostname", "pgpprv"),
+        (f"{MAIL}?wkd=yes", "wkd"),
+        (f"{MAIL}?+X-Header=value", "+X-Header"),
+        (f"{MAIL}?%20to=ann@example.org", "+to"),
+        (f"{MAIL}?cto=600", "cto"),
+        (f"{MAIL}?rto=600", "rto"),
+        (f"{MAIL}?retry=9", "retry"),
+        (f"{MAIL}?tags=a", "tags"),
+        ("ntfys://ntfy.example.org/topic?attach=http://127.0.0.1/x", "attach"),
+        ("jsons://example.org/x?+Metadata-Flavor=Google", "+Metadata-Flavor"),
+        ("jsons://example.org/x?-key=value", "-key"),
+        ("jsons://example.org/x?:key=value", ":key"),
+        ("jsons://example.org/x?method=DELETE", "method"),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_a_parameter_that_is_not_known_as_harmless_is_refused(
+    scene: Scene, url: str, name: str
+) -> None:
+    """By its name, when a rule is made and when one that was kept sends; however it is written."""
+    words = f"may not have the parameter '{name}'"
+    with pytest.raises(Invalid) as error:
+        await scene.mailing.check(url)
+    assert words in str(error.value)
+    late = await scene.fails(url)
+    assert (words in str(late), late.again) == (True, False)
+
+
+@pytest_twisted.ensureDeferred
+async def test_nothing_is_fetched_for_a_rule_that_is_refused(scene: Scene) -> None:
+    """A server of this machine hears of none of them, neither as one that was kept sends nor as one is made."""
+    inside = quote(f"http://{scene.place}/admin", safe="")
+    forms = ("?template={}", "?a=b;template={}")
+    urls = [url + form.format(inside) for url in (SLACK, DISCORD, TELEGRAM, TEAMS) for form in forms]
+    for url in urls:
+        await scene.fails(url)
+    assert scene.hook.got == []
+    for url in urls:
+        with pytest.raises(Invalid):
+            await scene.mailing.check(url)
+    assert scene.hook.got == []
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"{SLACK}/%23general?footer=no&format=text",
+        f"{DISCORD}?tts=no&thread=123",
+        f"{TELEGRAM}?silent=yes&topic=7",
+        TEAMS,
+        f"{MAIL}?smtp=mail.example.org&port=465&from=relay@example.org&to=ann@example.org&mode=ssl",
+        "ntfys://ntfy.example.org/topic?priority=high",
+        "gotifys://gotify.example.org/abcdefghijklmno?priority=high",
+        "mmosts://chat.example.org/3ccdd113474722377935511fc85d3dd4?channel=robots",
+        "jsons://ann:password@example.org:8443/a/b?verify=no",
+        "opsgenie://a1b2c3d4-a1b2-a1b2-a1b2-a1b2c3d4e5f6/?priority=high&",
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_urls_as_people_write_them_are_taken(scene: Scene, url: str) -> None:
+    """Of each kind of service."""
+    await scene.mailing.check(url)
+
+
+@pytest.mark.parametrize("scheme", ["fcm", "vapid", "matrixs", "zulip", "apprise", "nonsense"])
+def test_a_service_that_was_not_looked_at_can_not_be_allowed(scheme: str) -> None:
+    """Push services read key files, others ask addresses of the user's choice; the words name what there is."""
+    with pytest.raises(Invalid, match=f"'{scheme}' is no service that a relay can allow.*mailtos.*slack"):
+        Mailing(REACTOR, Names(REACTOR).addresses, ["mailtos", scheme], ())
+
+
+def test_the_lists_have_nothing_that_names_a_file_or_an_address() -> None:
+    """Who adds a service does not add one of these by mistake."""
+    suspicious = (
+        "template",
+        "file",
+        "pgp",
+        "wkd",
+        "attach",
+        "url",
+        "icon",
+        "image",
+        "redirect",
+        "cto",
+        "rto",
+    )
+    for scheme, names in PARAMETERS.items():
+        assert [each for each in names if any(word in each for word in suspicious)] == [], scheme
+
+
+def test_each_service_is_one_of_apprise_and_a_server_of_the_users_choice_is_known_as_one() -> None:
+    """Apprise tells by its templates which of them take a host."""
+    import apprise
+
+    found = {
+        scheme: any("{host}" in each for each in entry["details"]["templates"])
+        for entry in apprise.Apprise().details()["schemas"]
+        for scheme in (*(entry["protocols"] or ()), *(entry["secure_protocols"] or ()))
+    }
+    assert {each: found[each] for each in PARAMETERS} == {each: each in SERVERS for each in PARAMETERS}
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "json://{}/x",
+        "json://localhost:{port}/x",
+        "json://2130706433:{port}/x",
+        "gotify://{}/abcdefghijklmno",
+        "mmost://{}/3ccdd113474722377935511fc85d3dd4",
+        "ntfy://{}/topic",
+        "mailto://ann:password@example.org?smtp=127.0.0.1&port={port}&mode=insecure",
+        f"workflows://{{}}/{'a' * 32}/{'b' * 43}",
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_a_server_of_the_users_choice_is_judged_like_that_of_a_webhook(scene: Scene, form: str) -> None:
+    """Whichever service it is, and however it is written."""
+    error = await scene.fails(form.format(scene.place, port=scene.port.getHost().port))
+    assert ("does not send to" in str(error), error.again) == (True, False)
+    assert scene.hook.got == []
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1%2Fx", "a.example%3A25", "a.example%3Fx", "b%40a.example"])
+@pytest_twisted.ensureDeferred
+async def test_a_host_that_two_might_read_in_two_ways_is_refused(scene: Scene, host: str) -> None:
+    """Though a server of e-mail may be written as a parameter, where nearly all is possible."""
+    error = await scene.fails(f"{MAIL}?smtp={host}")
+    assert (str(error), error.again) == ("the URL names no server by a plain name or address", False)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_redirect_of_such_a_server_is_not_followed(open_scene: Scene) -> None:
+    """It may lead anywhere."""
+    inside = Hook(200)
+    port = serve(inside)
+    open_scene.hook.status = 302
+    open_scene.hook.headers = {"location": f"http://127.0.0.1:{port.getHost().port}/"}
+    try:
+        error = await open_scene.fails(f"json://{open_scene.place}/x")
+    finally:
+        await port.stopListening()
+    assert (str(error), error.again) == ("the service did not take the message", True)
+    assert (len(open_scene.hook.got), inside.got) == (1, [])
+
+
+@pytest.mark.parametrize(
+    "url", ["tgram://", "tgram://123456789:", "slack://[", "jsons://", "discord://x", "mailto://["]
+)
+@pytest_twisted.ensureDeferred
+async def test_what_no_service_understands_is_told_in_words(scene: Scene, url: str) -> None:
+    """Also where apprise itself stumbles."""
+    with pytest.raises(Invalid, match="is no URL of"):
+        await scene.mailing.check(url)

@@ -1,0 +1,115 @@
+"""``switchboard alerts``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_server import logs
+from relay_server import run as running
+from relay_server.config import Settings
+
+
+@pytest.fixture
+def people(cli: Any) -> Any:
+    """User ann; robot rover with an alert that lasts and one that is over."""
+    cli.ok("user", "add", "ann", "--no-password")
+    cli.ok("robot", "add", "rover")
+    database = Database(f"sqlite:///{cli.data / 'switchboard.db'}")
+    with database.begin() as s:
+        robot = queries.find_robot(s, "rover")
+        assert robot is not None
+        one = queries.AlertRecord(
+            "a1",
+            robot.id,
+            "rover",
+            "module",
+            "arm",
+            "error",
+            "gone\x1b[2J",
+            10.0,
+            10.0,
+            1,
+            1,
+            None,
+            None,
+            None,
+        )
+        queries.save_alerts(s, [one, one._replace(id="b2", about="leg", over=12.0, last=11.0)])
+    database.close()
+    return cli
+
+
+def test_alerts_are_listed_and_acknowledged(people: Any) -> None:
+    """By state and robot; who acknowledges is on record."""
+    assert [each["id"] for each in people.json("alerts", "list")] == ["b2", "a1"]
+    assert [each["id"] for each in people.json("alerts", "list", "--open", "--robot", "rover")] == ["a1"]
+    assert "\x1b" not in people.ok("alerts", "list")
+    done = people.json("alerts", "ack", "a1")
+    assert done["acknowledged"]["by"].startswith("cli:")
+    assert "looks after it" in people.ok("alerts", "list", "--open")
+    assert people.json("audit", "list")[-1]["action"] == "alert.acknowledge"
+    assert people.json("alerts", "ack", "a1")["acknowledged"] == done["acknowledged"]
+    assert [each["action"] for each in people.json("audit", "list")].count("alert.acknowledge") == 1
+    assert "no such alert" in people.fails("alerts", "ack", "zz")
+    assert "over already" in people.fails("alerts", "ack", "b2")
+
+
+@pytest.mark.parametrize(
+    ("options", "low", "critical"),
+    [((), 0.2, 0.1), (("--battery-low", "0"), 0.0, 0.0), (("--battery-critical", "0"), 0.2, 0.0)],
+)
+def test_alerts_of_batteries_are_switched_off_by_a_low_charge_of_nothing(
+    cli: Any, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], low: float, critical: float
+) -> None:
+    """Whatever is critical otherwise."""
+    began: list[Settings] = []
+    monkeypatch.setattr(running, "run", lambda settings, ready: began.append(settings))
+    monkeypatch.setattr(logs, "begin", lambda *how: None)
+    cli.ok("serve", *options)
+    assert (began[0].alerts.battery_low, began[0].alerts.battery_critical) == (low, critical)
+
+
+def test_rules_are_added_listed_and_removed(people: Any) -> None:
+    """A secret is printed once, an address never again."""
+    made = people.json(
+        "alerts", "rules", "add", "ann", "--webhook", "https://example.org/secret/path", "--kind", "offline",
+        "--robots", "r*", "--level", "error", "--group", "5", "--quiet", "22:00-07:00@Europe/Rome", "--no-over",
+    )  # fmt: skip
+    assert len(made.pop("secret")) >= 32
+    (listed,) = people.json("alerts", "rules", "list", "--user", "ann")
+    assert listed == made
+    assert (listed["url"], listed["kinds"], listed["over"]) == ("https://example.org/…", ["offline"], False)
+    assert listed["quiet"] == {"from": "22:00", "to": "07:00", "zone": "Europe/Rome", "least": "error"}
+    url = "mailtos://ann:password@example.org"
+    assert "password" not in people.ok("alerts", "rules", "add", "ann", "--apprise", stdin=f"{url}\n")
+    people.ok("alerts", "rules", "add", "ann", "--portal")
+    shown = people.ok("alerts", "rules", "list")
+    assert "mailtos://…" in shown
+    assert "password" not in shown + people.ok("audit", "list", "--json")
+    people.ok("alerts", "rules", "remove", str(made["id"]), "--yes")
+    assert len(people.json("alerts", "rules", "list")) == 2
+    assert "no rule" in people.fails("alerts", "rules", "remove", str(made["id"]), "--yes")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), "give one of"),
+        (("--portal", "--webhook", "https://example.org"), "give one of"),
+        (("--webhook", "ftp://example.org"), "webhook's 'url'"),
+        (("--portal", "--quiet", "night"), "are no hours"),
+        (("--portal", "--quiet", "22:00-07:00@Mars"), "no time zone"),
+        (("--portal", "--quiet", "22-7"), "this is no rule"),
+        (("--portal", "--group", "1"), "this is no rule"),
+    ],
+)
+def test_rules_that_make_no_sense_are_refused_in_words(
+    people: Any, options: tuple[str, ...], words: str
+) -> None:
+    """And nothing is kept."""
+    assert words in people.fails("alerts", "rules", "add", "ann", *options)
+    assert people.json("alerts", "rules", "list") == []

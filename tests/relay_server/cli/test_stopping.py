@@ -1,0 +1,100 @@
+"""``switchboard stop`` and ``switchboard resume``."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_server.cli.app import os_user
+
+
+def pending(cli: Any) -> list[tuple[int, str, str]]:
+    """What robots are still to be told."""
+    database = Database(f"sqlite:///{cli.data}/switchboard.db")
+    try:
+        with database.reading() as s:
+            return [(each.robot_id, each.by, each.why) for each in queries.pending_stops(s)]
+    finally:
+        database.close()
+
+
+def test_without_a_relay_the_order_is_kept(cli: Any) -> None:
+    """For the next that runs; it is in the audit log."""
+    cli.ok("robot", "add", "rover")
+    cli.ok("robot", "add", "mule")
+    said = cli.ok("stop", "rover", "--why", "smoke")
+    assert (
+        said == "Robot rover can't be reached now; it will be stopped before anything else when it is back.\n"
+    )
+    assert pending(cli) == [(1, os_user(), "smoke")]
+    assert cli.json("stop", "--all") == {
+        "robots": [{"robot": "mule", "done": False}, {"robot": "rover", "done": False}]
+    }
+    assert len(pending(cli)) == 2
+    assert [each["action"] for each in cli.json("audit", "list")][-3:] == ["robot.stopped"] * 3
+
+
+def test_an_order_that_was_not_told_is_taken_back(cli: Any) -> None:
+    """Once; then only the robot itself knows, which must be online for that."""
+    cli.ok("robot", "add", "rover")
+    cli.ok("stop", "rover")
+    assert cli.ok("resume", "rover", "--why", "all clear") == "Robot rover may move again.\n"
+    assert pending(cli) == []
+    assert "no stop of this robot waits to be told" in cli.fails("resume", "rover", code=3)
+
+
+def test_one_robot_or_all(cli: Any) -> None:
+    """Neither and both are wrong usage; what does not exist is told."""
+    cli.ok("robot", "add", "rover")
+    assert "name a robot, or say --all" in cli("stop").stderr
+    assert cli("stop").exit_code == 2
+    assert cli("stop", "rover", "--all").exit_code == 2
+    assert "there is no robot 'mule'" in cli.fails("stop", "mule")
+    assert "there is no robot 'mule'" in cli.fails("resume", "mule")
+    assert pending(cli) == []
+
+
+def test_a_relay_that_runs_is_asked(live: Any, relay: Any) -> None:
+    """It says what became of each; what failed makes the command fail."""
+    relay.motion = (
+        200,
+        json.dumps(
+            {
+                "robots": [
+                    {"robot": "a", "done": True},
+                    {"robot": "b", "done": False},
+                    {"robot": "c", "done": False, "reason": "the contactor does not answer\x1b[2J"},
+                ]
+            }
+        ).encode(),
+    )
+    result = live("stop", "--all", "--why", "smoke")
+    assert result.exit_code == 1
+    first, second, third = result.stdout.splitlines()
+    assert first == "Robot a is stopped."
+    assert "b can't be reached now" in second
+    assert "the contactor does not answer" in third
+    assert "\x1b" not in third
+    assert relay.ordered == [{"robot": None, "why": "smoke", "by": os_user()}]
+    relay.motion = (200, b"{}")
+    assert live.ok("resume", "a") == "Robot a may move again.\n"
+    assert relay.asked == ["POST /stop", "POST /resume"]
+
+
+def test_what_a_relay_refuses_is_told(live: Any, relay: Any) -> None:
+    """With the exit code that fits."""
+    for status, code in ((404, 1), (409, 1), (503, 3)):
+        relay.motion = (status, json.dumps({"detail": "in its own words"}).encode())
+        assert live.fails("resume", "rover", code=code) == "Error: in its own words\n"
+    relay.motion = (200, b"<html>")
+    assert "answered something else" in live.fails("stop", "rover", code=3)
+
+
+def test_help_shows_examples(cli: Any) -> None:
+    """And what the exit codes mean."""
+    for command in ("stop", "resume"):
+        said = cli.ok(command, "--help")
+        assert "Examples:" in said
+        assert "Exit codes:" in said

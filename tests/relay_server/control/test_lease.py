@@ -1,0 +1,92 @@
+"""The table of control: from every state only what can follow."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from relay_server.control.lease import FREE, NEXT, Event, Lease, Request, State
+from tests.relay_server.steering import Place
+
+PLACE = Place()
+ANN, BOB = PLACE.connection("ann"), PLACE.connection("bob")
+
+
+def held() -> Lease:
+    """Ann has control."""
+    return FREE.give(ANN, 1.0).done(2.0)
+
+
+def requested() -> Lease:
+    """Bob asks for it."""
+    return held().requested(Request(BOB, 3.0, 33.0, "my turn"))
+
+
+def test_nobody_has_control_before_the_robot_has_agreed() -> None:
+    """Who is coming is not yet there."""
+    asked = FREE.give(ANN, 1.0)
+    assert (asked.state, asked.holder) == (State.ASKING, None)
+    assert asked.coming_to(ANN)
+    assert not asked.held_by(ANN)
+    assert held().held_by(ANN)
+    assert held().holder == (ANN, 2.0)
+
+
+def test_a_hand_over_leaves_nobody_in_between() -> None:
+    """While the robot is told of Bob, neither Ann nor Bob moves it."""
+    handing = requested().give(BOB, 4.0)
+    assert handing.holder is None
+    assert handing.request is None
+    assert handing.done(5.0).held_by(BOB)
+
+
+def test_a_robot_that_does_not_agree_leaves_it_free() -> None:
+    """Asked for somebody, or for nobody."""
+    assert FREE.give(ANN, 1.0).failed() == FREE
+    assert held().free().failed() == FREE
+    assert held().free().done(3.0) == FREE
+
+
+def test_a_lost_link_frees_it_from_every_state() -> None:
+    """Whoever had it, was to have it or asked for it."""
+    for lease in (FREE, FREE.give(ANN, 1.0), held(), requested(), held().free()):
+        assert lease.lost() == FREE
+
+
+def test_a_request_is_taken_back() -> None:
+    """The holder holds on."""
+    assert requested().state is State.REQUESTED
+    assert requested().requested_by(BOB)
+    assert requested().withdrawn() == held()
+
+
+def test_there_are_never_two() -> None:
+    """Whatever happens in whatever order, there is at most one of holder and coming, and a request only to a holder."""
+    events = {
+        Event.GIVE: lambda lease: lease.give(BOB, 1.0),
+        Event.FREE: lambda lease: lease.free(),
+        Event.DONE: lambda lease: lease.done(1.0),
+        Event.FAILED: lambda lease: lease.failed(),
+        Event.REQUEST: lambda lease: lease.requested(Request(BOB, 1.0, 2.0, "")),
+        Event.WITHDRAW: lambda lease: lease.withdrawn(),
+        Event.LOST: lambda lease: lease.lost(),
+    }
+    reached = set()
+    for path in itertools.product(Event, repeat=4):
+        lease = FREE
+        for event in path:
+            if (lease.state, event) in NEXT:
+                lease = events[event](lease)
+                reached.add(lease.state)
+        assert lease.holder is None or lease.coming is None
+        assert (lease.holder is not None) == (lease.state in (State.HELD, State.REQUESTED))
+        assert (lease.coming is not None) == (lease.state is State.ASKING)
+        assert (lease.request is not None) == (lease.state is State.REQUESTED)
+    assert reached == set(State)
+
+
+def test_what_can_not_follow_is_an_error_of_ours() -> None:
+    """Nobody asks for what is free."""
+    with pytest.raises(ValueError, match="'request' can't happen while control is free"):
+        FREE.requested(Request(BOB, 1.0, 2.0, ""))

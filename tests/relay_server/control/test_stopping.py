@@ -1,0 +1,249 @@
+"""A stop reaches the robot, now or as soon as it is there."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_db.queries import StopRecord
+from relay_protocol import link
+from relay_protocol.errors import Unavailable
+from relay_server.control import Actor, NotDone
+from relay_server.control import stopping as module
+from tests.relay_server.steering import Place, outcome, result
+
+ANN = Actor("ann", "user:ann", 7, "192.0.2.7", 3)
+
+
+def test_a_robot_that_is_there_is_stopped_at_once() -> None:
+    """The order is on its way before anything is written; nothing is left to be told."""
+    place = Place().online()
+    assert result(place.desk.stopping.stop(ANN, "smoke")) is True
+    (order,) = place.link.orders(link.Stop)
+    assert (order.by, order.why) == ("ann", "smoke")
+    assert place.record.stops == {}
+    assert place.record.kinds == ["robot.stopped"]
+
+
+def test_what_the_robot_has_done_is_known_before_it_says_so_of_itself() -> None:
+    """Between its answer and its next word about itself nobody is told that it may move, or that it may not."""
+    place = Place().online()
+    result(place.desk.stopping.stop(ANN, "smoke"))
+    stopped = place.desk.standing.stopped
+    assert stopped is not None
+    assert (stopped.by, stopped.why, stopped.told) == ("ann", "smoke", True)
+    result(place.desk.stopping.resume(ANN, ""))
+    assert place.desk.standing.stopped is None
+    place.offline()
+    result(place.desk.stopping.stop(ANN, "smoke"))
+    place.online()
+    stopped = place.desk.standing.stopped
+    assert stopped is not None
+    assert stopped.told
+
+
+def test_until_the_robot_confirms_it_is_kept() -> None:
+    """Everybody sees that it is ordered, and whether the robot says so itself."""
+    place = Place().online()
+    place.link.silent = True
+    asked = outcome(place.desk.stopping.stop(ANN, "smoke"))
+    assert list(place.record.stops) == [1]
+    stopped = place.desk.standing.stopped
+    assert stopped is not None
+    assert (stopped.by, stopped.why, stopped.told) == ("ann", "smoke", False)
+    place.desk.told(link.Safety(stopped=link.Stopped(by="ann", why="smoke", since=5.0)))
+    place.link.answers(place.link.orders(link.Stop)[0])
+    assert asked == [True]
+    assert place.record.stops == {}
+    stopped = place.desk.standing.stopped
+    assert stopped == ("ann", "smoke", 5.0, True)
+
+
+def test_a_robot_that_is_away_is_told_before_anything_else() -> None:
+    """When it registers; and not again the next time."""
+    place = Place()
+    assert result(place.desk.stopping.stop(ANN, "smoke")) is False
+    assert list(place.record.stops) == [1]
+    place.online()
+    assert isinstance(place.link.said[0], link.Stop)
+    assert place.record.stops == {}
+    place.offline()
+    place.online()
+    assert place.link.said == []
+
+
+def test_a_robot_that_says_nothing_is_told_again_when_it_is_back() -> None:
+    """Ten seconds are waited, because hardware may take its time; then the asker knows that it is not done yet."""
+    place = Place().online()
+    place.link.silent = True
+    asked = outcome(place.desk.stopping.stop(ANN, ""))
+    place.clock.advance(10.1)
+    assert asked == [False]
+    place.offline()
+    place.online()
+    assert len(place.link.orders(link.Stop)) == 1
+    assert place.record.stops == {}
+
+
+def test_what_of_it_could_not_be_done_is_told_and_the_robot_is_stopped_all_the_same() -> None:
+    """While it says that it stands it is not told again, and the order is kept until it is resumed."""
+    place = Place().online()
+    place.link.unable = "the contactor does not answer"
+    with pytest.raises(NotDone, match="the contactor does not answer"):
+        result(place.desk.stopping.stop(ANN, ""))
+    assert list(place.record.stops) == [1]
+    place.offline()
+    place.online()
+    place.desk.told(link.Safety(stopped=link.Stopped(by="ann", since=5.0)))
+    assert place.link.said == []
+    result(place.desk.stopping.resume(ANN, ""))
+    assert place.record.stops == {}
+
+
+def test_a_robot_that_could_not_keep_its_stop_is_told_again_when_it_has_forgotten_it() -> None:
+    """Each time it comes back without; nobody resumes it meanwhile."""
+    place = Place().online()
+    place.link.unable = "no space left on device"
+    outcome(place.desk.stopping.stop(ANN, "smoke"))
+    for _ in range(2):
+        place.offline()
+        with pytest.raises(Unavailable, match="may be stopped"):
+            result(place.desk.stopping.resume(ANN, ""))
+        place.online()
+        place.link.unable = "no space left on device"
+        place.desk.told(link.Safety())
+        place.desk.told(link.Safety())
+        assert [order.why for order in place.link.orders(link.Stop)] == ["smoke"]
+        assert list(place.record.stops) == [1]
+    place.offline()
+    place.online()
+    place.desk.told(link.Safety())
+    assert len(place.link.orders(link.Stop)) == 1
+    assert place.record.stops == {}, "it has kept it this time"
+
+
+def test_a_database_that_is_lost_keeps_nobody_from_stopping() -> None:
+    """A robot that is there is stopped; of one that is away it is told that the order may be lost."""
+    place = Place().online()
+    place.record.fails = Unavailable("the database is locked")
+    assert result(place.desk.stopping.stop(ANN, "")) is True
+    place.offline()
+    with pytest.raises(Unavailable, match="can't be kept for when it is back: the database is locked"):
+        result(place.desk.stopping.stop(ANN, ""))
+    place.online()
+    assert len(place.link.orders(link.Stop)) == 1
+
+
+def test_a_stop_keeps_the_holder() -> None:
+    """Whoever had control has it when the robot is resumed."""
+    place = Place().online()
+    ann = place.holding()
+    result(place.desk.stopping.stop(ANN, ""))
+    assert place.desk.passes(ann, "/cmd_vel")
+    assert result(place.desk.stopping.resume(ANN, "")) is None
+    assert place.desk.passes(ann, "/cmd_vel")
+    assert place.link.holders == [ann.number]
+
+
+def test_resume_takes_back_a_stop_that_was_not_told() -> None:
+    """The robot hears nothing of it when it comes."""
+    place = Place()
+    result(place.desk.stopping.stop(ANN, ""))
+    result(place.desk.stopping.resume(ANN, "all clear"))
+    assert place.desk.standing.stopped is None
+    assert place.record.stops == {}
+    assert place.record.kinds == ["robot.stopped", "robot.resumed"]
+    place.online()
+    assert place.link.said == []
+
+
+def test_a_robot_that_stopped_and_left_is_resumed_when_it_is_back() -> None:
+    """Not before: only it can say that it may move again."""
+    place = Place().online()
+    result(place.desk.stopping.stop(ANN, ""))
+    place.desk.told(link.Safety(stopped=link.Stopped(by="ann", since=5.0)))
+    place.offline()
+    with pytest.raises(Unavailable, match="offline, and stopped"):
+        result(place.desk.stopping.resume(ANN, ""))
+    assert place.desk.standing.stopped is not None
+
+
+def test_a_robot_that_is_away_and_was_told_nothing_is_not_resumed() -> None:
+    """It may stand since before the relay began."""
+    with pytest.raises(Unavailable, match="may be stopped: it can be resumed when it is back"):
+        result(Place().desk.stopping.resume(ANN, ""))
+
+
+def test_a_stop_that_is_ordered_while_the_robot_resumes_stands() -> None:
+    """What comes later counts."""
+    place = Place()
+    result(place.desk.stopping.stop(ANN, "one"))
+    place.online()
+    place.link.silent = True
+    resuming = outcome(place.desk.stopping.resume(ANN, ""))
+    stopping = outcome(place.desk.stopping.stop(ANN, "two"))
+    place.link.answers(place.link.orders(link.Resume)[0])
+    assert resuming == [None]
+    assert place.record.stops[1].why == "two"
+    place.link.answers(place.link.orders(link.Stop)[-1])
+    assert stopping == [True]
+
+
+def test_orders_of_the_database_are_told_once() -> None:
+    """Those that were given elsewhere; one that is dealt with already comes back only from a slow database."""
+    place = Place().online()
+    stopping = place.desk.stopping
+    order = StopRecord(1, "root", "maintenance", 1.8e9)
+    assert stopping.expect(order)
+    stopping.came()
+    assert [each.why for each in place.link.orders(link.Stop)] == ["maintenance"]
+    assert not stopping.expect(order)
+    assert not stopping.expect(None)
+    assert place.desk.standing.stopped == ("root", "maintenance", order.at, True)
+
+
+def test_an_order_that_is_given_by_a_clock_that_was_set_back_counts() -> None:
+    """Orders are told apart, not put in order, by their moments."""
+    place = Place().online()
+    result(place.desk.stopping.stop(ANN, ""))
+    result(place.desk.stopping.resume(ANN, ""))
+    assert place.desk.stopping.expect(StopRecord(1, "root", "maintenance", 5.0))
+    assert place.desk.standing.stopped is not None
+    assert not place.desk.stopping.expect(StopRecord(1, "root", "maintenance", 5.0))
+
+
+def test_a_stop_that_is_not_kept_is_not_said_to_be() -> None:
+    """Of a robot that is away, one more than can be written at a time; what is being written is told."""
+    place = Place()
+    place.record.hold = True
+    asked = [outcome(place.desk.stopping.stop(ANN, str(number))) for number in range(module.KEEPING + 1)]
+    assert asked[:-1] == [[]] * module.KEEPING
+    assert isinstance(asked[-1][0], Unavailable)
+    assert "are being written already" in str(asked[-1][0])
+    for held in place.record.held:
+        held.callback(None)
+    assert asked[:-1] == [[False]] * module.KEEPING
+    place.online()
+    assert [order.why for order in place.link.orders(link.Stop)] == [str(module.KEEPING - 1)]
+    assert place.record.stops == {}
+
+
+def test_many_who_stop_a_robot_that_does_not_answer_do_not_flood_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has been told."""
+    monkeypatch.setattr(module, "AT_ONCE", 2)
+    place = Place().online()
+    place.link.silent = True
+    for _ in range(5):
+        outcome(place.desk.stopping.stop(ANN, ""))
+    assert len(place.link.orders(link.Stop)) == 2
+
+
+def test_who_stops_a_robot_again_and_again_does_not_fill_the_databases_queue() -> None:
+    """The robot is told each time; what is written at a time is bounded, and long reasons are cut."""
+    place = Place().online()
+    place.link.silent = True
+    place.record.hold = True
+    for _ in range(3 * module.KEEPING):
+        outcome(place.desk.stopping.stop(ANN, "x" * 5000))
+    assert len(place.link.orders(link.Stop)) == 3 * module.KEEPING
+    assert len(place.record.held) == module.KEEPING
+    assert len(place.link.orders(link.Stop)[0].why) == 500

@@ -1,0 +1,134 @@
+"""``/api/v1/alerts`` on transports in memory."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from relay_protocol.errors import NotFound
+from relay_server.access import Principal
+from relay_server.alerts import Ask
+from relay_server.alerts.desk import TooOften
+from relay_server.edges import alerts as module
+from tests.relay_server.edges.http_client import World
+
+HERE = "/api/v1/alerts"
+ANN = {"Authorization": "Bearer ann"}
+
+
+class Desk:
+    """Keeps what it is asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[object, ...]] = []
+
+    async def all(
+        self, principal: Principal, robot: str, open: bool | None, limit: int
+    ) -> list[dict[str, Any]]:
+        """One."""
+        self.asked.append((principal.name, robot, open, limit))
+        return [{"id": "a1"}]
+
+    async def acknowledge(self, principal: Principal, alert_id: str) -> dict[str, Any]:
+        """Only this."""
+        if alert_id != "a1":
+            raise NotFound("there is no such alert")
+        return {"id": alert_id}
+
+    async def rules(self, principal: Principal) -> dict[str, Any]:
+        """None."""
+        return {"rules": []}
+
+    async def add_rule(self, principal: Principal, ask: Ask, address: str) -> dict[str, Any]:
+        """Any."""
+        self.asked.append((principal.name, ask, address))
+        return {"id": 7}
+
+    async def remove_rule(self, principal: Principal, number: int, address: str) -> None:
+        """Any."""
+        self.asked.append((principal.name, number, address))
+
+    async def test_rule(self, principal: Principal, number: int) -> dict[str, Any]:
+        """Not twice."""
+        if number == 8:
+            raise TooOften("you test rules", 11.5)
+        return {"ok": True, "reason": ""}
+
+
+@pytest.fixture
+def desk() -> Desk:
+    """Who is asked."""
+    return Desk()
+
+
+@pytest.fixture
+def world(tmp_path: Path, desk: Desk) -> World:
+    """A site with alerts."""
+    made = World(tmp_path)
+    made.beside["alerts"] = partial(module.beside, desk)
+    return made
+
+
+def test_each_address_does_its_own(world: World, desk: Desk) -> None:
+    """With the words of the query, and the body's."""
+    assert world.ask("GET", HERE, **ANN).json == {"alerts": [{"id": "a1"}]}
+    world.ask("GET", f"{HERE}?robot=rover&open=true&limit=5", **ANN)
+    world.ask("GET", f"{HERE}?open=false", **ANN)
+    assert desk.asked == [("ann", "", None, 100), ("ann", "rover", True, 5), ("ann", "", False, 100)]
+    assert world.ask("POST", f"{HERE}/a1/acknowledge", **ANN).json == {"id": "a1"}
+    assert world.ask("GET", f"{HERE}/rules", **ANN).json == {"rules": []}
+    answer = world.ask("POST", f"{HERE}/rules", {"channel": "portal", "group_s": 30}, **ANN)
+    assert (answer.status, answer.json) == (201, {"id": 7})
+    assert desk.asked[-1] == ("ann", Ask("portal", group_s=30.0), "192.0.2.9")
+    assert world.ask("DELETE", f"{HERE}/rules/7", **ANN).status == 204
+    assert desk.asked[-1] == ("ann", 7, "192.0.2.9")
+    assert world.ask("POST", f"{HERE}/rules/7/test", **ANN).json["ok"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "status"),
+    [
+        ("GET", f"{HERE}?open=maybe", None, 400),
+        ("GET", f"{HERE}?limit=0", None, 400),
+        ("GET", f"{HERE}?limit=501", None, 400),
+        ("GET", f"{HERE}?limit=0000000019999", None, 400),
+        ("GET", f"{HERE}?limit=%D9%A1", None, 400),
+        ("GET", f"{HERE}?limit=-1", None, 400),
+        ("POST", f"{HERE}/a2/acknowledge", None, 404),
+        ("GET", f"{HERE}/a1", None, 404),
+        ("PUT", f"{HERE}/rules", None, 405),
+        ("POST", f"{HERE}/rules", {"channel": "portal", "user": "bob"}, 400),
+        ("POST", f"{HERE}/rules", {"channel": "portal", "group_s": 0}, 400),
+        ("POST", f"{HERE}/rules", ["portal"], 400),
+        ("DELETE", f"{HERE}/rules/x", None, 404),
+        ("DELETE", f"{HERE}/rules/99999999999999999999", None, 404),
+        ("POST", f"{HERE}/rules/8/test", None, 429),
+    ],
+)
+def test_what_makes_no_sense_is_told_as_problem_details(
+    world: World, method: str, path: str, body: Any, status: int
+) -> None:
+    """Each with its status; who asks too often hears how long to wait."""
+    answer = world.ask(method, path, body, **ANN)
+    assert (answer.status, answer.headers["content-type"]) == (status, "application/problem+json")
+    if status == 429:
+        assert answer.headers["retry-after"] == "12"
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("GET", ""), ("POST", "/a1/acknowledge"), ("GET", "/rules"), ("POST", "/rules"), ("DELETE", "/rules/7"),
+        ("POST", "/rules/7/test"),
+    ],
+)  # fmt: skip
+def test_nobody_gets_in_without_credentials(world: World, desk: Desk, method: str, path: str) -> None:
+    """And a cookie changes nothing without a listed Origin."""
+    assert world.ask(method, HERE + path, {} if method == "POST" else None).status == 401
+    if method != "GET":
+        answer = world.ask(method, HERE + path, {}, Cookie="sb=ann", Origin="https://evil.example")
+        assert answer.status == 403
+    assert desk.asked == []

@@ -1,0 +1,202 @@
+"""Control over HTTP, on transports in memory."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from relay_protocol.errors import NotFound, Refused, Unavailable
+from relay_server.access import Principal
+from relay_server.console import Outcome
+from relay_server.control import Answer, NotDone
+from relay_server.edges import control as module
+from tests.relay_server.edges.http_client import ORIGIN, World
+
+HERE = "/api/v1/robots/rover"
+ANN = {"Authorization": "Bearer ann"}
+STOPPED = {"by": "ann", "why": "smoke", "since": 5.0, "told": True}
+
+
+class Console:
+    """Keeps what it is asked.
+
+    :ivar fails: what goes wrong
+    """
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+        self.done = True
+        self.fails: Exception | None = None
+
+    def _keep(self, what: str, principal: Principal, *asked: Any) -> None:
+        assert principal.name == "ann"
+        if self.fails is not None and what != "control":
+            raise self.fails
+        self.asked.append((what, *asked))
+
+    async def control(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
+        """Who moves it."""
+        if robot != "rover":
+            raise NotFound("there is no such robot, or you have no right on it")
+        return {"robot": robot, "stopped": STOPPED}
+
+    async def release(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+        """Keep it."""
+        self._keep("release", principal, robot, why, address)
+        return Answer(True, "control is given back")
+
+    async def grant(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+        """Keep it."""
+        self._keep("grant", principal, robot, why, address)
+        return Answer(False, "nobody asks for control")
+
+    async def refuse(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+        """Keep it."""
+        self._keep("refuse", principal, robot, why, address)
+        return Answer(True, "you keep control")
+
+    async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
+        """Keep it."""
+        self._keep("stop", principal, robot, why, address)
+        return Outcome(self.done, {**STOPPED, "told": self.done})
+
+    async def resume(self, principal: Principal, robot: str, why: str, address: str) -> None:
+        """Keep it."""
+        self._keep("resume", principal, robot, why, address)
+
+    async def suppress(self, principal: Principal, robot: str, resource: str, ms: int, address: str) -> None:
+        """Keep it."""
+        self._keep("suppress", principal, robot, resource, ms, address)
+
+    async def inhibit(
+        self, principal: Principal, robot: str, resource: str, ms: int, hold: bool, address: str
+    ) -> None:
+        """Keep it."""
+        self._keep("inhibit", principal, robot, resource, ms, hold, address)
+
+
+class Site(World):
+    """A relay's site with control behind it."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.console = Console()
+        self.below.update({part: partial(module.below, self.console, part) for part in module.PARTS})
+
+    def post(self, part: str, body: Any = None, **headers: str) -> Any:
+        """One request with ann's token."""
+        return self.ask("POST", f"{HERE}/{part}", body, **{**ANN, **headers})
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    """A site."""
+    return Site(tmp_path)
+
+
+def test_who_moves_a_robot_is_told(site: Site) -> None:
+    """Of one that is there for the caller."""
+    answer = site.ask("GET", f"{HERE}/control", **ANN)
+    assert (answer.status, answer.json["robot"]) == (200, "rover")
+    assert answer.headers["cache-control"] == "no-store"
+    assert site.ask("GET", "/api/v1/robots/other/control", **ANN).status == 404
+    assert site.ask("GET", f"{HERE}/control").status == 401
+
+
+def test_control_is_given_back_handed_over_and_kept(site: Site) -> None:
+    """With a reason or without any body; but not taken, which a connection does."""
+    assert site.post("control/release", {"why": "done"}).json == {
+        "success": True,
+        "message": "control is given back",
+    }
+    assert site.post("control/grant").json["success"] is False
+    assert site.post("control/refuse").json["success"] is True
+    assert site.console.asked == [
+        ("release", "rover", "done", "192.0.2.9"),
+        ("grant", "rover", "", "192.0.2.9"),
+        ("refuse", "rover", "", "192.0.2.9"),
+    ]
+    assert site.post("control/take").status == 404
+    assert site.post("control").status == 404
+
+
+def test_a_stop_says_whether_it_is_done(site: Site) -> None:
+    """202 for a robot that will be stopped when it is back."""
+    answer = site.post("stop", {"why": "smoke"})
+    assert (answer.status, answer.json) == (200, {"stopped": STOPPED})
+    site.console.done = False
+    answer = site.post("stop")
+    assert (answer.status, answer.json["stopped"]["told"]) == (202, False)
+    assert site.post("resume", {"why": "clear"}).json == {"stopped": None}
+    assert [asked[0] for asked in site.console.asked] == ["stop", "stop", "resume"]
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (NotDone("robot rover could not do it: the contactor does not answer"), 409),
+        (Refused("only who has control of the robot, and its owners, may resume it"), 403),
+        (Unavailable("robot rover is offline"), 503),
+        (NotFound("there is no such robot, or you have no right on it"), 404),
+    ],
+)
+def test_what_goes_wrong_is_told_in_words(site: Site, error: Exception, status: int) -> None:
+    """As problem details; with a stop that is not all done, how the robot stands."""
+    site.console.fails = error
+    for part in ("stop", "resume", "suppress", "inhibit", "control/release"):
+        answer = site.post(part, {"resource": "/cmd_vel"})
+        assert (answer.status, answer.json["detail"]) == (status, str(error)), part
+        assert answer.headers["content-type"] == "application/problem+json"
+    if status == 409:
+        assert site.post("stop").json["stopped"] == STOPPED
+
+
+def test_topics_are_suppressed_and_inhibited(site: Site) -> None:
+    """With the times that are usual where none is given."""
+    assert site.post("suppress", {"resource": "/cmd_vel"}).json == {"resource": "/cmd_vel", "ms": 100}
+    site.post("suppress", {"resource": "/cmd_vel", "ms": 0})
+    assert site.post("inhibit", {"resource": "/scan", "ms": 5000, "hold": True}).status == 200
+    assert site.console.asked == [
+        ("suppress", "rover", "/cmd_vel", 100, "192.0.2.9"),
+        ("suppress", "rover", "/cmd_vel", 0, "192.0.2.9"),
+        ("inhibit", "rover", "/scan", 5000, True, "192.0.2.9"),
+    ]
+
+
+@pytest.mark.parametrize(
+    "body", [{}, {"resource": ""}, {"resource": "/x" * 200}, {"resource": "/x", "ms": "1"}, [], "x", 3]
+)
+def test_bodies_that_make_no_sense_are_refused(site: Site, body: Any) -> None:
+    """Nothing is done."""
+    assert site.post("suppress", body).status == 400
+    assert site.post("inhibit", body).status == 400
+    assert site.console.asked == []
+
+
+def test_a_body_that_is_no_json_is_refused_but_for_none_at_all(site: Site) -> None:
+    """Also one that says to be something else."""
+    assert site.ask("POST", f"{HERE}/stop", raw=b"{", **ANN).status == 400
+    assert site.ask("POST", f"{HERE}/stop", raw=b"why=x", **ANN, Content_Type="text/plain").status == 400
+    assert site.post("stop", {"why": "x" * 5000}).status == 400
+    assert site.console.asked == []
+
+
+def test_a_cookie_counts_only_with_a_listed_origin(site: Site) -> None:
+    """Another site's page can't resume a robot, nor stop it."""
+    cookie = {"Cookie": "sb=ann"}
+    for part in ("stop", "resume", "suppress", "inhibit", "control/release"):
+        body = {"resource": "/x"} if part in ("suppress", "inhibit") else {}
+        assert site.ask("POST", f"{HERE}/{part}", body, **cookie).status == 403
+        assert site.ask("POST", f"{HERE}/{part}", body, **cookie, Origin="https://evil.example").status == 403
+    assert site.console.asked == []
+    assert site.ask("POST", f"{HERE}/stop", {}, **cookie, Origin=ORIGIN).status == 200
+
+
+def test_addresses_take_their_own_methods(site: Site) -> None:
+    """And there is nothing below them."""
+    assert site.ask("GET", f"{HERE}/stop", **ANN).status == 404
+    assert site.ask("DELETE", f"{HERE}/control", **ANN).status == 405
+    assert site.post("stop/now").status == 404

@@ -1,0 +1,515 @@
+"""Orders to many robots, as edges give them: a real database, a robot in memory."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import pytest
+import pytest_twisted
+from twisted.internet.defer import CancelledError, Deferred
+
+from relay_db import queries
+from relay_protocol import link
+from relay_protocol.errors import Invalid, NotFound, Unavailable
+from relay_server.access import Principal
+from relay_server.fleet import LOCAL, FleetDesk, Order, Result
+from relay_server.fleet import desk as module
+from relay_server.fleet.desk import Plan
+from relay_server.fleet.errand import MATCHING_SECONDS, SUBSCRIBER_SECONDS
+from relay_server.fleet.result import VALUES_BYTES
+from relay_server.journal import Journal
+from relay_server.session import Session
+from relay_server.store import Store
+from tests.relay_server.edges.robot_ends import until
+from tests.relay_server.memory import MOTION, STRING, TRIGGER, MemoryClient
+from tests.relay_server.test_frontdesk import HERE, Desk
+
+
+def order(do: str, *robots: str, **fields: Any) -> Order:
+    """An order as it comes."""
+    return msgspec.json.decode(json.dumps({"robots": robots or ("rover",), "do": do, **fields}), type=Order)
+
+
+class Given:
+    """An order that was given, and what came of it."""
+
+    def __init__(self, running: Deferred[None], results: list[Result]) -> None:
+        self.running = running
+        self.results = results
+        self.errors: list[type[BaseException]] = []
+        running.addErrback(lambda failure: self.errors.append(failure.type))
+
+    @property
+    def words(self) -> str:
+        """Of the one result."""
+        (result,) = self.results
+        return result.outcome.message
+
+
+class Fleet:
+    """Orders given at a front desk, with ann who operates rover."""
+
+    def __init__(self, store: Store) -> None:
+        self.front = Desk(store)
+        self.world = self.front.world
+        self.journal = Journal(store, self.front.wall)
+        self.desk = FleetDesk(
+            self.world.clock,
+            self.front.desk,
+            self.front.access,
+            self.world.registry,
+            self.world.desks,
+            store,
+            self.journal,
+            clock_ns=self.world.now_ns,
+            wall=self.front.wall,
+        )
+
+    async def ann(self) -> Principal:
+        """Who operates rover."""
+        principal, _ = await self.front.logged_in()
+        return principal
+
+    async def give(self, asker: Principal, given: Order) -> Given:
+        """Give an order; it is under way when this returns."""
+        plan = await self.desk.plan(asker, given, HERE)
+        begun: list[None] = []
+        results: list[Result] = []
+
+        async def tell(result: Result) -> None:
+            results.append(result)
+
+        running = Deferred.fromCoroutine(self.desk.carry_out(plan, lambda: begun.append(None), tell))
+        made = Given(running, results)
+        await until(lambda: bool(begun or made.errors))
+        return made
+
+    async def works(self, given: Given) -> Session:
+        """The session of an order to rover, whose channel is open."""
+        await until(lambda: bool(self.sessions() or given.results))
+        self.world.clock.advance(0)
+        if self.world.control.all(link.OpenChannel):
+            self.world.robot_joins()
+        self.world.clock.advance(0)
+        (session,) = self.sessions()
+        return session
+
+    async def calls(self) -> link.CallService:
+        """What rover is called for, once it has told of all types."""
+
+        def asked() -> bool:
+            self.world.define()
+            return bool(self.world.link.all(link.CallService))
+
+        await until(asked)
+        (call,) = self.world.link.take(link.CallService)
+        return call
+
+    def answers(self, call: link.CallService, **fields: Any) -> None:
+        """Rover answers a call of a Trigger."""
+        cdr = self.world.cdr(f"{TRIGGER}_Response", **fields)
+        self.world.channel.message(link.ServiceResponse(id=call.id, result=True, cdr=cdr))
+
+    def sessions(self) -> list[Session]:
+        """Those that are open on rover."""
+        return self.front.desk.sessions_of(1)
+
+    async def after(self, true: Callable[[], bool], step: float = 0.02) -> None:
+        """Let time go by until something holds."""
+
+        def holds() -> bool:
+            self.world.clock.advance(step)
+            return true()
+
+        await until(holds)
+
+
+@pytest.fixture
+def fleet(store: Store) -> Iterator[Fleet]:
+    """Rover is in the database; nobody is there."""
+    made = Fleet(store)
+    yield made
+    made.front.auth.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_order_means_robots_one_has_a_right_on(fleet: Fleet) -> None:
+    """By whatever name; what means none of them is told in the same words."""
+    ann = await fleet.ann()
+    with fleet.front.store.database.begin() as s:
+        group = queries.add_robot_group(s, "all")
+        for robot in queries.list_robots(s):
+            queries.add_to_robot_group(s, group.id, robot.id)
+    for robots in (["rover"], ["r*"], ["*"], ["group:ALL"]):
+        plan = await fleet.desk.plan(ann, order("stop", *robots), HERE)
+        assert plan.told() == {"do": "stop", "robots": ["rover"], "unmatched": []}
+    for robots in (["hidden"], ["h*"], ["nowhere"], ["group:none"]):
+        with pytest.raises(NotFound, match="no robot that you have a right on"):
+            await fleet.desk.plan(ann, order("stop", *robots), HERE)
+    assert await fleet.desk.groups(ann) == [{"name": "all", "robots": ["rover"]}]
+    assert list((await fleet.desk.plan(LOCAL, order("stop", "*"), "local")).robots) == ["hidden", "rover"]
+    with pytest.raises(Invalid, match="needs 'service'"):
+        await fleet.desk.plan(ann, order("call"), HERE)
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_order_means_a_thousand_robots_at_most(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More are told before anything is done; but a stop may mean all there are."""
+    monkeypatch.setattr(module, "ROBOTS", 1)
+    with pytest.raises(Invalid, match="means 2 robots; it may mean 1 at most"):
+        await fleet.desk.plan(LOCAL, order("resume", "*"), HERE)
+    assert list((await fleet.desk.plan(LOCAL, order("stop", "*"), HERE)).robots) == ["hidden", "rover"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_call_is_done_by_a_session_of_the_askers(fleet: Fleet) -> None:
+    """It is there while it lasts, judged like any, and gone with the answer; the order is on record."""
+    fleet.world.robot_comes()
+    given = await fleet.give(await fleet.ann(), order("call", service="reset"))
+    session = await fleet.works(given)
+    assert (session.name, session.address) == ("ann", HERE)
+    call = await fleet.calls()
+    assert (call.service, call.source) == ("/reset", session.number)
+    fleet.answers(call, success=True, message="done")
+    await until(lambda: bool(given.results))
+    assert given.results[0].told() == {
+        "robot": "rover",
+        "ok": True,
+        "message": "done",
+        "values": {"success": True, "message": "done"},
+        "pending": False,
+        "seconds": 0.0,
+    }
+    assert not fleet.sessions()
+    assert given.running.called
+    (entry,) = [
+        each for each in await fleet.front.store.read(queries.list_audit) if each.action == "fleet.call"
+    ]
+    assert (entry.actor, entry.target, entry.origin) == ("user:ann", "rover", HERE)
+    assert entry.data == {"robots": 1, "what": "reset", "why": ""}
+    (event,) = await fleet.front.events("fleet.done")
+    assert event.data == {"what": "call reset", "robots": 1, "ok": 1, "failed": 0}
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_fails_is_told_in_words(fleet: Fleet) -> None:
+    """Offline, denied, an answer that says so itself, one that does not come."""
+    ann = await fleet.ann()
+    given = await fleet.give(ann, order("call", service="/reset"))
+    await until(lambda: bool(given.results))
+    assert given.words == "robot rover is offline"
+    fleet.world.robot_comes()
+    with fleet.front.store.database.begin() as s:
+        queries.grant_right(s, fleet.front.rover.id, "viewer", user_id=ann.user_id)
+    await fleet.front.access.refresh()
+    given = await fleet.give(ann, order("call", service="/reset"))
+    await until(lambda: bool(given.results))
+    assert "needs the level operator" in given.words
+    given = await fleet.give(LOCAL, order("call", service="/reset"))
+    await fleet.works(given)
+    fleet.answers(await fleet.calls(), success=False, message="")
+    await until(lambda: bool(given.results))
+    assert given.words == "the service says that it has not succeeded"
+    given = await fleet.give(LOCAL, order("call", service="/reset", timeout=2))
+    await fleet.works(given)
+    await fleet.calls()
+    fleet.world.clock.advance(2)
+    assert given.words == "no answer within 2 s; it may still happen"
+    assert not fleet.sessions()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_service_that_moves_takes_control_while_it_lasts(fleet: Fleet) -> None:
+    """The robot obeys the order's session when the call comes, and nobody afterwards."""
+    fleet.world.robot_comes()
+    fleet.world.robot.description = link.Describe(motion=link.MotionPolicy(services=["/reset"]))
+    given = await fleet.give(await fleet.ann(), order("call", service="/reset", why="tidy up"))
+    session = await fleet.works(given)
+    call = await fleet.calls()
+    assert session.desk.lease.held_by(session)
+    fleet.answers(call, success=True)
+    await until(lambda: bool(given.results))
+    assert given.results[0].outcome.ok
+    assert [(each.holder, each.why) for each in fleet.world.control.all(link.Control)] == [
+        (session.number, "tidy up"),
+        (0, "given back by ann"),
+    ]
+    assert "control.lost" not in fleet.world.record.kinds
+
+
+@pytest_twisted.ensureDeferred
+async def test_control_is_not_taken_from_anybody(fleet: Fleet) -> None:
+    """Nor asked for: whoever has it is named, and who has it himself is not told of somebody else."""
+    ann = await fleet.ann()
+    fleet.world.robot_comes()
+    fleet.world.robot.description = link.Describe(motion=link.MotionPolicy(services=["/reset"]))
+    holder, client = await fleet.front.opens(ann)
+    taken = Deferred.fromCoroutine(holder.desk.take(holder, ""))
+    await until(lambda: taken.called)
+    mine = "you have control of rover yourself, by another connection: give it back there first"
+    for asker, words in ((ann, mine), (LOCAL, "ann has control of rover")):
+        given = await fleet.give(asker, order("call", service="/reset"))
+        await until(lambda given=given: bool(given.results))
+        assert given.words == words
+    assert holder.desk.lease.held_by(holder)
+    assert holder.desk.lease.request is None
+    assert isinstance(client, MemoryClient)
+    holder.end()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_message_waits_for_publisher_and_subscriber(fleet: Fleet) -> None:
+    """And for DDS to bring them together; then it is sent, and the publisher goes."""
+    fleet.world.robot_comes()
+    given = await fleet.give(await fleet.ann(), order("publish", topic="/chatter", msg={"data": "hello"}))
+    await fleet.works(given)
+    fleet.world.define()
+    (advertised,) = fleet.world.link.take(link.Advertise)
+    assert (advertised.topic, advertised.type) == ("/chatter", STRING)
+    await fleet.after(lambda: True, 1.0)
+    fleet.world.channel.message(
+        link.Advertised(number=advertised.number, topic="/chatter", type=STRING, encoding="cdr")
+    )
+    fleet.world.define()
+    fleet.world.clock.pump([0.02] * 2)
+    assert not fleet.world.link.samples
+    fleet.world.clock.pump([MATCHING_SECONDS, 0.02])
+    assert len(fleet.world.link.samples) == 1
+    assert not given.results
+    fleet.world.clock.pump([MATCHING_SECONDS, 0.02])
+    await until(lambda: bool(given.results))
+    assert given.results[0].outcome.ok, given.words
+    assert fleet.world.link.all(link.Unadvertise)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_topic_without_subscribers_is_not_waited_for_long(fleet: Fleet) -> None:
+    """Somebody may come later; but one message is all there is."""
+    fleet.world.robot_comes()
+    given = await fleet.give(await fleet.ann(), order("publish", topic="/secret", msg={"data": "hello"}))
+    await fleet.works(given)
+    (advertised,) = fleet.world.link.take(link.Advertise)
+    fleet.world.channel.message(
+        link.Advertised(number=advertised.number, topic="/secret", type=STRING, encoding="cdr")
+    )
+    fleet.world.define()
+    fleet.world.clock.pump([0.02] * 10)
+    assert not fleet.world.link.samples
+    fleet.world.clock.pump([SUBSCRIBER_SECONDS, 0.02, MATCHING_SECONDS, MATCHING_SECONDS, 0.02])
+    await until(lambda: bool(given.results))
+    assert given.results[0].outcome.ok
+    assert len(fleet.world.link.samples) == 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_one_message_moves_no_robot(fleet: Fleet) -> None:
+    """What counts as motion is refused, by the type that is said and by the one that is known."""
+    fleet.world.robot_comes()
+    assert fleet.world.robot.description is MOTION
+    for fields in ({"topic": "cmd_vel"}, {"topic": "/new", "type": "geometry_msgs/Twist"}):
+        given = await fleet.give(LOCAL, order("publish", **fields))
+        await until(lambda given=given: bool(given.results))
+        assert "counts as motion on rover" in given.words
+    given = await fleet.give(LOCAL, order("publish", topic="/nothing"))
+    await until(lambda: bool(given.results))
+    assert given.words == "there is no topic /nothing on rover; say its type"
+    fleet.world.robot_goes()
+    given = await fleet.give(LOCAL, order("publish", topic="/chatter", type=STRING))
+    await until(lambda: bool(given.results))
+    assert given.words == "robot rover is offline"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stop_is_kept_for_a_robot_that_is_offline(fleet: Fleet) -> None:
+    """It is pending then; resuming is for owners."""
+    ann = await fleet.ann()
+    given = await fleet.give(ann, order("stop", why="wet floor"))
+    await until(lambda: bool(given.results))
+    assert (given.results[0].outcome.ok, given.results[0].outcome.pending) == (True, True)
+    given = await fleet.give(ann, order("resume"))
+    await until(lambda: bool(given.results))
+    assert not given.results[0].outcome.ok
+    given = await fleet.give(LOCAL, order("resume"))
+    await until(lambda: bool(given.results))
+    assert given.results[0].outcome.ok, given.words
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_gives_up_ends_what_has_begun(fleet: Fleet) -> None:
+    """Its session is gone at once, and its place is free."""
+    fleet.world.robot_comes()
+    ann = await fleet.ann()
+    orders = [await fleet.give(ann, order("call", service="/reset")) for _ in range(module.ORDERS)]
+    await until(lambda: len(fleet.sessions()) == module.ORDERS)
+    refused = await fleet.give(ann, order("call", service="/reset"))
+    assert refused.errors == [Unavailable]
+    assert not await fleet.front.events("fleet.done"), "what is refused has not been done"
+    for each in orders:
+        each.running.cancel()
+    assert not fleet.sessions()
+    assert [each.errors for each in orders] == [[CancelledError]] * module.ORDERS
+    again = await fleet.give(ann, order("call", service="/reset"))
+    assert not again.errors
+    again.running.cancel()
+    assert not fleet.desk._orders
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_resume_has_as_long_as_a_stop(fleet: Fleet) -> None:
+    """It goes on in the robot whatever the order says; what is told of one without an answer does not deny that."""
+    fleet.world.robot_comes()
+    fleet.world.control.obeys = None
+    given = await fleet.give(LOCAL, order("resume", timeout=1))
+    await until(lambda: bool(fleet.world.control.all(link.Resume)))
+    fleet.world.clock.advance(1.5)
+    assert not given.results
+    (resume,) = fleet.world.control.all(link.Resume)
+    fleet.world.desks.of(fleet.world.robot).told(link.Done(id=resume.id))
+    await until(lambda: bool(given.results))
+    assert given.results[0].outcome.ok, given.words
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_resume_that_hangs_may_still_happen(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it is told."""
+
+    async def hangs(*_: object) -> None:
+        await Deferred()
+
+    monkeypatch.setattr(fleet.desk._halting, "resume", hangs)
+    given = await fleet.give(LOCAL, order("resume", timeout=1))
+    await fleet.after(lambda: bool(given.results), 1.0)
+    assert given.words == "no answer within 15 s; it may still happen"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_right_that_is_revoked_ends_an_order(fleet: Fleet) -> None:
+    """With the reason; a relay that goes down does so too."""
+    fleet.world.robot_comes()
+    ann = await fleet.ann()
+    given = await fleet.give(ann, order("call", service="/reset"))
+    await until(lambda: bool(fleet.sessions()))
+    with fleet.front.store.database.begin() as s:
+        queries.revoke_right(s, fleet.front.rover.id, user_id=ann.user_id)
+    await fleet.front.access.refresh()
+    await until(lambda: bool(given.results))
+    assert "revoked" in given.words
+    given = await fleet.give(LOCAL, order("call", service="/reset"))
+    await until(lambda: bool(fleet.sessions()))
+    fleet.front.desk.say_goodbye("the relay is going down")
+    await until(lambda: bool(given.results))
+    assert given.words == "the relay is going down"
+    given = await fleet.give(LOCAL, order("call", service="/reset"))
+    await until(lambda: bool(given.results))
+    assert given.words == "the relay is going down"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_long_answer_is_not_passed_on(fleet: Fleet) -> None:
+    """A thousand of them would fill the memory; whether it succeeded is told."""
+    fleet.world.robot_comes()
+    given = await fleet.give(LOCAL, order("call", service="/reset"))
+    await fleet.works(given)
+    fleet.answers(await fleet.calls(), success=True, message="x" * VALUES_BYTES)
+    await until(lambda: bool(given.results))
+    assert given.results[0].outcome.ok
+    assert given.results[0].outcome.values is None
+    assert "64 KiB" in given.words
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stop_stands_before_everything(fleet: Fleet) -> None:
+    """It is told at once to all that are online, however many orders of the asker's are under way."""
+    fleet.world.robot_comes()
+    ann = await fleet.ann()
+    orders = [await fleet.give(ann, order("call", service="/reset")) for _ in range(module.ORDERS)]
+    plan = await fleet.desk.plan(ann, order("stop", why="fire"), HERE)
+    begun: list[None] = []
+    given = Deferred.fromCoroutine(
+        fleet.desk.carry_out(plan, lambda: begun.append(None), lambda result: nothing())
+    )
+    (stop,) = fleet.world.control.all(link.Stop)
+    assert (stop.by, stop.why, begun) == ("ann", "fire", [None])
+    await until(lambda: given.called)
+    assert not fleet.desk._halting.online(queries.RobotRecord(99, "nowhere", "default", ""))
+    for each in orders:
+        each.running.cancel()
+
+
+async def nothing() -> None:
+    """Whatever is told."""
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_controls_a_robot_may_resume_it(fleet: Fleet) -> None:
+    """By an order too, though that has a connection of its own; others may not."""
+    ann = await fleet.ann()
+    fleet.world.robot_comes()
+    session, _ = await fleet.front.opens(ann)
+    given = await fleet.give(ann, order("stop"))
+    await until(lambda: bool(given.results))
+    given = await fleet.give(ann, order("resume"))
+    await until(lambda: bool(given.results))
+    assert given.words == "only who has control of the robot, and its owners, may resume it"
+    taken = Deferred.fromCoroutine(session.desk.take(session, ""))
+    await until(lambda: taken.called)
+    given = await fleet.give(ann, order("resume"))
+    await until(lambda: bool(given.results))
+    assert given.results[0].outcome.ok, given.words
+    session.end()
+
+
+@pytest_twisted.ensureDeferred
+async def test_rights_count_as_they_are_when_a_robot_has_its_turn(fleet: Fleet) -> None:
+    """Who owned it when the order was planned resumes it no more, nor does who has logged out stop what is away."""
+    ann = await fleet.ann()
+    with fleet.front.store.database.begin() as s:
+        queries.grant_right(s, fleet.front.rover.id, "owner", user_id=ann.user_id)
+    await fleet.front.access.refresh()
+    assert (await carried_out(fleet, await fleet.desk.plan(ann, order("stop"), HERE))).outcome.pending
+    plan = await fleet.desk.plan(ann, order("resume"), HERE)
+    with fleet.front.store.database.begin() as s:
+        queries.revoke_right(s, fleet.front.rover.id, user_id=ann.user_id)
+        queries.grant_right(s, fleet.front.rover.id, "operator", user_id=ann.user_id)
+    assert "its owners" in (await carried_out(fleet, plan)).outcome.message
+    resume, stop = [await fleet.desk.plan(ann, order(do), HERE) for do in ("resume", "stop")]
+    fleet.world.record.stops.clear()
+    await fleet.front.desk.logout(ann)
+    for plan in (resume, stop):
+        result = await carried_out(fleet, plan)
+        assert (result.outcome.ok, result.outcome.message) == (False, "your session was ended; log in again")
+    assert not fleet.world.record.stops
+    assert not fleet.front.access._permits
+
+
+async def carried_out(fleet: Fleet, plan: Plan) -> Result:
+    """What comes of an order to one robot."""
+    results: list[Result] = []
+
+    async def tell(result: Result) -> None:
+        results.append(result)
+
+    await fleet.desk.carry_out(plan, lambda: None, tell)
+    (result,) = results
+    return result
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stop_counts_where_rights_can_not_be_looked_up_again(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By those of the plan; nothing moves again by them."""
+    ann = await fleet.ann()
+    stop, resume = [await fleet.desk.plan(ann, order(do), HERE) for do in ("stop", "resume")]
+
+    async def locked(*_: object) -> None:
+        raise Unavailable("the database is locked")
+
+    monkeypatch.setattr(fleet.front.access, "permit", locked)
+    assert (await carried_out(fleet, stop)).outcome.pending
+    assert (await carried_out(fleet, resume)).outcome.message == "the database is locked"

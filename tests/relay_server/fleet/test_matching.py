@@ -1,0 +1,46 @@
+"""Which robots an order means."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_server.fleet.matching import Meant, meant
+
+ROBOTS = ("cleaner-1", "cleaner-2", "cleaner-10", "other")
+GROUPS = {"cleaners": ("cleaner-1", "cleaner-2", "secret"), "mine": ("other",), "empty": ()}
+
+
+@pytest.mark.parametrize(
+    ("asked", "robots", "unmatched"),
+    [
+        (["cleaner-1"], ["cleaner-1"], []),
+        (["cleaner-*"], ["cleaner-1", "cleaner-10", "cleaner-2"], []),
+        (["cleaner-?", "other", "other"], ["cleaner-1", "cleaner-2", "other"], []),
+        (["cleaner-[2-9]"], ["cleaner-2"], []),
+        (["*"], sorted(ROBOTS), []),
+        (["group:cleaners"], ["cleaner-1", "cleaner-2"], []),
+        (["group:Mine", "cleaner-1"], ["cleaner-1", "other"], []),
+        (
+            ["group:empty", "group:nowhere", "Other", "tank", "tank"],
+            [],
+            ["group:empty", "group:nowhere", "Other", "tank"],
+        ),
+        (["group:*"], [], ["group:*"]),
+    ],
+)
+def test_names_patterns_and_groups(asked: list[str], robots: list[str], unmatched: list[str]) -> None:
+    """Each robot once, none that may not be meant; what means none is told."""
+    assert meant(asked, ROBOTS, GROUPS) == Meant(robots, unmatched)
+
+
+@given(st.lists(st.text("ab*?[]", max_size=5), max_size=4), st.sets(st.text("ab", min_size=1, max_size=4)))
+def test_nothing_is_meant_that_does_not_match(asked: list[str], robots: set[str]) -> None:
+    """And nothing that matches is left out."""
+    found = meant(asked, robots, {})
+    assert found.robots == sorted(
+        name for name in robots if any(fnmatchcase(name, each) or each == name for each in asked)
+    )

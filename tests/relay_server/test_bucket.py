@@ -1,0 +1,22 @@
+"""Bursts pass, then so many a second."""
+
+from __future__ import annotations
+
+from twisted.internet.task import Clock
+
+from relay_server.bucket import TokenBucket
+
+
+def test_what_is_taken_comes_back_with_time() -> None:
+    """At its rate, up to what it holds; until then it says how long."""
+    clock = Clock()
+    bucket = TokenBucket(0.5, 2, clock.seconds)
+    assert [bucket.take() for _ in range(3)] == [True, True, False]
+    assert bucket.wait == 2
+    clock.advance(0.5)
+    assert bucket.wait == 1.5
+    clock.advance(1.5)
+    assert bucket.wait == 0
+    assert [bucket.take(), bucket.take()] == [True, False]
+    clock.advance(1000)
+    assert [bucket.take() for _ in range(3)] == [True, True, False]

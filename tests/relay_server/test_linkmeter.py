@@ -1,0 +1,123 @@
+"""How good a link is, told by its round trips."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_server.linkmeter import LOSSES, NO_LINK, SPACING, UNKNOWN, WINDOW, LinkMeter, Reading, joined
+
+
+def measured(*trips: float, every: float = 1.0, start: float = 100.0) -> LinkMeter:
+    """A meter that was told of these round trips, one after the other."""
+    meter = LinkMeter()
+    for turn, trip in enumerate(trips):
+        meter.came_back(start + turn * every, trip)
+    return meter
+
+
+def test_nothing_is_known_before_the_first_round_trip() -> None:
+    """No numbers, and no word either."""
+    assert LinkMeter().reading(100.0, [0.2]) == UNKNOWN
+
+
+def test_median_percentile_and_jitter_are_of_the_window() -> None:
+    """What is older than half a minute counts no more."""
+    meter = measured(*[0.01] * 10, *[0.02] * 10, 0.03)
+    reading = meter.reading(120.0, [])
+    assert (reading.rtt, reading.p95) == (0.02, 0.02)
+    assert reading.jitter == pytest.approx(0.02 / 20)
+    later = meter.reading(100.0 + WINDOW + 19.5, [])
+    assert (later.rtt, later.p95, later.jitter) == (0.03, 0.03, None)
+    assert meter.reading(500.0, []).rtt is None
+
+
+@pytest.mark.parametrize(
+    ("trip", "word"),
+    [(0.001, "good"), (0.0999, "good"), (0.1, "fair"), (0.2999, "fair"), (0.3, "bad"), (0.9, "bad")],
+)
+def test_the_word_goes_by_the_median(trip: float, word: str) -> None:
+    """Good below 100 ms, fair below 300 ms."""
+    assert measured(*[trip] * 5).reading(104.0, []).quality == word
+
+
+def test_the_word_goes_by_the_last_seconds() -> None:
+    """A link that has become slow is so at once, and good again when it is good again."""
+    meter = measured(*[0.01] * 20)
+    for turn in range(5):
+        meter.came_back(120.0 + turn, 0.4)
+    reading = meter.reading(124.5, [])
+    assert (reading.quality, reading.rtt) == ("bad", 0.01)
+    for turn in range(5):
+        meter.came_back(125.0 + turn, 0.01)
+    assert meter.reading(129.5, []).quality == "good"
+
+
+def test_what_takes_longer_than_a_second_is_lost() -> None:
+    """While it is out, and when it has come after all, each once."""
+    meter = measured(0.01, 0.01)
+    assert meter.reading(102.5, [1.1]).lost == 1
+    assert meter.reading(102.5, [1.1]).quality == "bad"
+    meter.came_back(103.0, 1.6)
+    reading = meter.reading(103.0, [])
+    assert (reading.lost, reading.quality) == (1, "bad")
+    for turn in range(5):
+        meter.came_back(104.0 + turn, 0.01)
+    reading = meter.reading(108.5, [])
+    assert (reading.lost, reading.quality) == (1, "good")
+    assert meter.reading(140.0, []).lost == 0
+
+
+def test_pings_that_were_passed_over_are_lost_only_when_they_were_late() -> None:
+    """A client may answer the latest of several pings alone."""
+    meter = measured(0.01)
+    meter.passed_over(101.0, 0.3)
+    assert meter.reading(101.0, []).lost == 0
+    meter.passed_over(101.0, 1.3)
+    assert meter.reading(101.0, []).lost == 1
+
+
+def test_silence_is_a_lost_link() -> None:
+    """Nothing has come back for three seconds, before the first answer or after it."""
+    assert measured(0.01).reading(104.0, [3.1, 2.1]).quality == "lost"
+    assert LinkMeter().reading(104.0, [3.1]).quality == "lost"
+
+
+def test_of_frequent_round_trips_a_few_are_kept() -> None:
+    """Ten a second for a minute take no more room than a few a second do, and losses are counted to a bound."""
+    meter = measured(*[0.01] * 600, every=0.1)
+    assert len(meter._trips) <= WINDOW / SPACING + 1
+    for turn in range(1000):
+        meter.came_back(160.0 + turn / 1000, 1.5)
+    assert meter.reading(161.0, []).lost == LOSSES
+
+
+def test_two_links_one_after_the_other_take_the_time_of_both() -> None:
+    """And are no better than the sum, or than either."""
+    near = measured(*[0.06] * 5).reading(104.0, [])
+    far = measured(*[0.07] * 5).reading(104.0, [])
+    whole = joined(near, far)
+    assert whole.rtt == pytest.approx(0.13)
+    assert (near.quality, far.quality, whole.quality) == ("good", "good", "fair")
+    assert joined(near, Reading(rtt=0.01, lately=0.01, quality="bad")).quality == "bad"
+    assert joined(near, UNKNOWN) == UNKNOWN
+    assert joined(NO_LINK, UNKNOWN) == NO_LINK == joined(near, NO_LINK)
+
+
+def test_times_are_told_in_milliseconds() -> None:
+    """What nobody knows is null."""
+    told = measured(0.0123, 0.0123).reading(101.0, []).told()
+    assert told == {"rtt_ms": 12.3, "p95_ms": 12.3, "jitter_ms": 0.0, "lost": 0, "quality": "good"}
+    assert NO_LINK.told() == {"rtt_ms": None, "p95_ms": None, "jitter_ms": None, "lost": 0, "quality": "lost"}
+
+
+@given(st.lists(st.floats(0, 5), min_size=1, max_size=100), st.lists(st.floats(0, 10), max_size=5))
+def test_a_reading_is_of_what_was_measured(trips: list[float], out: list[float]) -> None:
+    """The median lies among the round trips, the percentile not below it, and there is a word."""
+    reading = measured(*trips, every=0.3).reading(100.0 + 0.3 * len(trips), out)
+    assert reading.rtt is not None
+    assert reading.p95 is not None
+    assert min(trips) <= reading.rtt <= max(trips)
+    assert reading.rtt <= reading.p95 + 1e-9
+    assert reading.quality in ("good", "fair", "bad", "lost")

@@ -1,0 +1,275 @@
+"""Keeping away: the force of a scan, what follows from it in the simulated robot, and what is said to the relay."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from robot_client.apps.runaway import (
+    BLIND,
+    FLAT,
+    Command,
+    Link,
+    Manners,
+    Phase,
+    Program,
+    Refused,
+    Runaway,
+    Scan,
+    main,
+    repulsion,
+)
+from robot_client.sim.recorder import Recorder
+from robot_client.sim.robot import SCAN_BEGIN, SCAN_RAYS, SCAN_STEP, Robot
+from robot_client.sim.worlds import WORLDS
+
+STEP = 0.02
+LEANING = Command(0.25, -0.15)
+"""A circle that the room is too small for."""
+
+
+def wall(distance: float, direction: float) -> Scan:
+    """A flat wall without end.
+
+    :param distance: metres
+    :param direction: radians from straight ahead to where it is nearest
+    """
+    ranges = []
+    for number in range(SCAN_RAYS):
+        facing = math.cos(SCAN_BEGIN + number * SCAN_STEP - direction)
+        ranges.append(distance / facing if facing > 1e-3 else math.inf)
+    return Scan(ranges, SCAN_BEGIN, SCAN_STEP)
+
+
+@pytest.mark.parametrize("direction", [0.0, 1.0, -2.0, math.pi])
+def test_a_wall_pushes_away_from_itself(direction: float) -> None:
+    """Straight, and with the inverse square of its distance."""
+    force = repulsion(wall(0.5, direction))
+    assert force.strength == pytest.approx(FLAT / 0.5**2, rel=0.02)
+    assert (
+        math.atan2(force.left, force.ahead)
+        == pytest.approx(math.remainder(direction + math.pi, math.tau), abs=0.01)
+        or abs(abs(math.atan2(force.left, force.ahead)) - math.pi) < 0.01
+    )
+
+
+def test_what_met_nothing_pushes_nothing() -> None:
+    """Nor does what is far, or no number."""
+    for nothing in (math.inf, math.nan, None, 0.0, -1.0, 2.0):
+        assert repulsion(Scan([nothing] * 8, 0.0, 0.5)).strength == 0.0
+
+
+def test_it_watches_until_something_ahead_is_near() -> None:
+    """Not what is beside or behind."""
+    runaway = Runaway(Manners(near=0.5))
+    assert runaway.see(wall(0.55, 0.0)) is None
+    assert runaway.see(wall(0.3, math.pi)) is None
+    assert runaway.see(wall(0.3, math.radians(100))) is None
+    assert runaway.see(wall(0.45, 0.0)) is not None
+
+
+def test_it_turns_to_the_side_that_is_free() -> None:
+    """And goes on turning that way until it faces off, then leaves, then gives back."""
+    runaway = Runaway(Manners(near=0.5, clear=0.6, speed=0.2, turn=1.0))
+    assert runaway.see(wall(0.4, math.radians(30))) == Command(0.0, -1.0)
+    assert runaway.see(wall(0.4, math.radians(-5))) == Command(0.0, -1.0)
+    assert runaway.see(wall(0.4, math.radians(130))) == Command(0.2, 0.0)
+    assert runaway.phase is Phase.LEAVING
+    assert runaway.see(wall(0.4, math.radians(20))) == Command(0.0, -1.0)
+    assert runaway.see(wall(0.65, math.radians(130))) is None
+
+
+class Drive:
+    """The simulated robot, somebody who drives it without looking, and the program that keeps it away."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.record = io.BytesIO()
+        self.robot = Robot(WORLDS["room"](), Recorder(self.record), 1, lambda: self.now)
+        self.runaway: Runaway | None = Runaway(Manners())
+        self.wanted: Command | None = None
+        self.distances: list[float] = []
+        self.taken = 0
+
+    def run(self, seconds: float, driver: Command) -> None:
+        for number in range(round(seconds / STEP)):
+            if number % 5 == 0:
+                before, self.wanted = self.wanted, None
+                if self.runaway is not None:
+                    ranges: Any = self.robot.scan()
+                    self.wanted = self.runaway.see(Scan(ranges.tolist(), SCAN_BEGIN, SCAN_STEP))
+                self.taken += self.wanted is not None and before is None
+                self.robot.command(*(self.wanted or driver))
+            self.now += STEP
+            self.robot.step(STEP)
+            pose = self.robot.body.pose
+            self.distances.append(self.robot.world.nearest(pose.x, pose.y).distance)
+
+    @property
+    def bumps(self) -> int:
+        return self.record.getvalue().count(b'"bump"')
+
+
+def test_a_driver_who_does_not_look_bumps() -> None:
+    """Without the program; so the next tests tell something."""
+    drive = Drive()
+    drive.runaway = None
+    drive.run(20, Command(0.3, 0.0))
+    assert drive.bumps == 1
+
+
+def test_straight_at_a_wall_it_turns_the_robot_away_and_gives_it_back() -> None:
+    """Again and again; the driver moves most of the time."""
+    drive = Drive()
+    drive.run(60, Command(0.3, 0.0))
+    assert drive.bumps == 0
+    assert drive.taken >= 3
+    assert drive.wanted is None or drive.runaway is not None
+    assert drive.robot.body.travelled > 8
+
+
+def test_leaning_on_a_wall_the_robot_follows_it() -> None:
+    """The driver turns to the right all the time; beside the wall that becomes a way along it, all around the room."""
+    drive = Drive()
+    drive.run(30, LEANING)
+    drive.distances.clear()
+    places = []
+    for _ in range(200):
+        drive.run(0.5, LEANING)
+        places.append(drive.robot.body.pose[:2])
+    assert drive.bumps == 0
+    assert np.ptp(places, axis=0) == pytest.approx([5.0, 3.0], abs=0.2)
+    assert min(drive.distances) > 0.4
+    assert np.quantile(drive.distances, 0.95) < 0.9
+
+
+# --- over the relay ----------------------------------------------------------------------------------------
+
+
+class Socket:
+    """A websocket in memory."""
+
+    def __init__(self) -> None:
+        self.sent: list[dict[str, Any]] = []
+        self.coming: list[dict[str, Any]] = []
+
+    def send(self, text: str) -> None:
+        self.sent.append(json.loads(text))
+
+    def recv(self, timeout: float) -> str:
+        if not self.coming:
+            raise TimeoutError
+        return json.dumps(self.coming.pop(0))
+
+    def scan(self, scan: Scan) -> None:
+        ranges = [each if each is not None and math.isfinite(each) else None for each in scan.ranges]
+        message = {"ranges": ranges, "angle_min": scan.begin, "angle_increment": scan.step}
+        self.coming.append({"op": "publish", "topic": "/scan", "msg": message})
+
+    def answer(self, success: bool = True, result: bool = True) -> None:
+        asked = [each for each in self.sent if each["op"] == "call_service"][-1]
+        values: Any = {"success": success, "message": ""} if result else "you may not"
+        self.coming.append({"op": "service_response", "id": asked["id"], "result": result, "values": values})
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.socket = Socket()
+        self.program = Program(Link(self.socket, "/scan", "/cmd_vel"), Runaway(Manners()), lambda: self.now)
+        self.socket.sent.clear()
+
+    def step(self, scan: Scan | None = None, seconds: float = 0.11) -> list[dict[str, Any]]:
+        """One turn of the program; what it said."""
+        self.now += seconds
+        if scan is not None:
+            self.socket.scan(scan)
+        self.socket.sent.clear()
+        self.program.step()
+        return list(self.socket.sent)
+
+
+def suppressed(said: list[dict[str, Any]]) -> list[int]:
+    """For how long, by each call."""
+    return [each["args"]["ms"] for each in said if each["op"] == "call_service"]
+
+
+def speeds(said: list[dict[str, Any]]) -> list[float]:
+    return [each["msg"]["angular"]["z"] for each in said if each["op"] == "publish"]
+
+
+def test_it_commands_only_when_the_robot_obeys_it() -> None:
+    """First the suppression, then the relay's word, then the first command; renewed each time."""
+    scene = Scene()
+    assert scene.step(wall(1.0, 0.0)) == []
+    said = scene.step(wall(0.4, 0.1))
+    assert (suppressed(said), speeds(said)) == ([200], [])
+    scene.socket.answer()
+    said = scene.step(wall(0.4, 0.1))
+    assert (suppressed(said), speeds(said)) == ([200], [-1.2])
+
+
+def test_it_gives_the_robot_back_with_zero() -> None:
+    """Then it says nothing more."""
+    scene = Scene()
+    scene.step(wall(0.4, 0.1))
+    scene.socket.answer()
+    scene.step()
+    said = scene.step(wall(1.0, 0.0))
+    assert (suppressed(said), speeds(said)) == ([0], [0.0])
+    scene.socket.answer()
+    assert scene.step(wall(1.0, 0.0)) == []
+    assert scene.step() == []
+
+
+def test_who_sees_nothing_lets_go() -> None:
+    """A scanner that falls silent ends it; until then the robot is held for moments only."""
+    scene = Scene()
+    scene.step(wall(0.4, 0.1))
+    scene.socket.answer()
+    assert suppressed(scene.step()) == [200]
+    said = scene.step(seconds=BLIND)
+    assert (suppressed(said), speeds(said)) == ([0], [0.0])
+
+
+def test_an_answer_that_comes_late_gives_nothing() -> None:
+    """The robot was given back meanwhile: it must not be driven by what was true before."""
+    scene = Scene()
+    scene.step(wall(0.4, 0.1))
+    scene.socket.answer()
+    late = scene.socket.coming.pop()
+    scene.step(wall(1.0, 0.0))
+    scene.socket.coming.append(late)
+    assert scene.step() == []
+    said = scene.step(wall(0.4, 0.1))
+    assert (suppressed(said), speeds(said)) == ([200], [])
+
+
+def test_a_relay_that_refuses_is_believed() -> None:
+    """In its own words."""
+    scene = Scene()
+    scene.step(wall(0.4, 0.1))
+    scene.socket.answer(result=False)
+    with pytest.raises(Refused, match="you may not"):
+        scene.step()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "token", "words"),
+    [
+        (["ws://127.0.0.1:1/robots/r"], "", "SWITCHBOARD_TOKEN"),
+        (["ws://127.0.0.1:1/robots/r"], "t", "is lost"),
+        (["ws://127.0.0.1:1/robots/r", "--near", "0.6", "--clear", "0.5"], "t", "--clear"),
+    ],
+)
+def test_what_is_wrong_is_said_in_words(arguments: list[str], token: str, words: str) -> None:
+    """No token, no relay, distances that make no sense."""
+    done = CliRunner().invoke(main, arguments, env={"SWITCHBOARD_TOKEN": token})
+    assert done.exit_code != 0
+    assert words in done.output

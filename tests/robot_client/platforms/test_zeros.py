@@ -1,0 +1,31 @@
+"""Zero on topics of other nodes, on a real graph."""
+
+from __future__ import annotations
+
+import pytest_twisted
+from geometry_msgs.msg import Twist
+from rclpy.serialization import serialize_message
+from twisted.internet import reactor
+
+from relay_protocol.link import MotionPolicy
+from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.zeros import Zeros
+from tests.robot_client.platforms.ends import TWIST, Listener, node, seen
+from tests.robot_client.ros import until
+
+
+@pytest_twisted.ensureDeferred
+async def test_zero_reaches_who_listens_and_the_publisher_goes(ros: Ros2Platform) -> None:
+    """A node that nobody at the relay commands hears it, again and again, while others of its topics say nothing."""
+    with node("base") as base:
+        base.create_subscription(Twist, "/base_vel", lambda message: None, 1)
+        base.create_subscription(Twist, "/other", lambda message: None, 1)
+        await seen(ros, lambda graph: {"/base_vel", "/other"} <= graph.topics.keys())
+        heard, other = Listener(ros, "/base_vel", TWIST), Listener(ros, "/other", TWIST)
+        Zeros(MotionPolicy(topics=["/base_vel"]), ros, reactor, lambda topic: False).say()
+        await until(lambda: len(heard.bodies) > 5)
+        assert set(heard.bodies) == {bytes(serialize_message(Twist()))}
+        await until(lambda: heard.source.publishers == 0)
+        assert other.bodies == []
+        heard.source.close()
+        other.source.close()

@@ -1,0 +1,123 @@
+"""How old a call or a goal that moves the robot may be."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_protocol import link
+from robot_client.offset import Offset
+from tests.robot_client.scene import DRIVER, Scene
+
+MILLI = 1_000_000
+CDR = link.to_base64(b"abc")
+SERVICES = ("/arm/move", "/navigate_to_pose/_action/send_goal", "/lamp")
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """A robot with services and actions, some of which move it."""
+    made = Scene()
+    for service in SERVICES:
+        made.platform.services[service] = lambda request: request
+    made.platform.actions = {"/navigate_to_pose", "/dock"}
+    return made
+
+
+def call(scene: Scene, service: str, stamp: int | None) -> link.ServiceResponse:
+    """The holder calls a service."""
+    answer = scene.ask(
+        link.CallService(id="c", service=service, type="t", source=DRIVER, stamp=stamp, cdr=CDR)
+    )
+    assert isinstance(answer, link.ServiceResponse)
+    return answer
+
+
+def goal(scene: Scene, action: str, stamp: int | None) -> link.ActionResult | None:
+    """The holder sends a goal; its end, if it never began."""
+    before = len(scene.platform.goals)
+    message = link.SendActionGoal(id=str(before), action=action, type="t", source=DRIVER, stamp=stamp, cdr="")
+    answer = scene.ask(message)
+    if len(scene.platform.goals) > before:
+        return None
+    assert isinstance(answer, link.ActionResult)
+    return answer
+
+
+@pytest.mark.parametrize("service", SERVICES[:2])
+def test_a_call_that_moves_the_robot_must_not_be_older_than_the_deadline(scene: Scene, service: str) -> None:
+    """It is made up to that age; beyond, it is refused in words and counted. So is a goal by its hidden service."""
+    assert call(scene, service, scene.now() - 500 * MILLI + 1).result
+    assert scene.gate.stale == 0
+    answer = call(scene, service, scene.now() - 812 * MILLI)
+    assert not answer.result
+    assert f"a call of {service} moves the robot: it may be 812 ms old" in answer.reason
+    assert "none older than 500 ms" in answer.reason
+    assert scene.gate.stale == 1
+
+
+def test_a_goal_that_moves_the_robot_must_not_be_older_than_the_deadline(scene: Scene) -> None:
+    """It is pursued up to that age; beyond, it never begins."""
+    assert goal(scene, "/navigate_to_pose", scene.now() - 500 * MILLI + 1) is None
+    end = goal(scene, "navigate_to_pose", scene.now() - 501 * MILLI)
+    assert end is not None
+    assert (end.status, end.result) == (0, False)
+    assert "a goal for /navigate_to_pose moves the robot: it may be 501 ms old" in end.reason
+    assert scene.gate.stale == 1
+
+
+def test_the_age_is_the_greatest_possible(scene: Scene) -> None:
+    """A link whose only exchange took 400 ms may hide as much of it."""
+    scene.offset._window.clear()
+    now = scene.now()
+    scene.offset.add(now - 400 * MILLI, now, now)
+    assert goal(scene, "/navigate_to_pose", now - 90 * MILLI) is None
+    assert goal(scene, "/navigate_to_pose", now - 110 * MILLI) is not None
+
+
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [(True, "by its stamp it comes from the future"), (False, "how old it is can't be told yet")],
+)
+def test_what_has_no_age_is_refused(scene: Scene, known: bool, words: str) -> None:
+    """A stamp that the relay's clock can't have shown, and one of a clock that nobody has asked."""
+    stamp = scene.now() + 60_000 * MILLI
+    if not known:
+        scene.offset._window.clear()
+    answer, end = call(scene, "/arm/move", stamp), goal(scene, "/navigate_to_pose", stamp)
+    assert end is not None
+    assert not answer.result
+    assert words in answer.reason
+    assert words in end.reason
+    assert scene.gate.stale == 2
+
+
+def test_without_a_stamp_it_counts_as_sent_when_it_comes(scene: Scene) -> None:
+    """So it was before there were stamps."""
+    assert call(scene, "/arm/move", None).result
+    assert goal(scene, "/navigate_to_pose", None) is None
+    assert scene.gate.stale == 0
+
+
+def test_what_moves_nothing_is_done_however_old_it_is(scene: Scene) -> None:
+    """Other services and actions know no deadline, nor a clock."""
+    assert call(scene, "/lamp", 1).result
+    assert goal(scene, "/dock", 1) is None
+    scene.offset._window.clear()
+    assert call(scene, "/lamp", 1).result
+    assert scene.gate.stale == 0
+
+
+def test_who_may_not_move_the_robot_is_told_so_first(scene: Scene) -> None:
+    """What is refused for its source is not counted for its age."""
+    scene.authority.hold(DRIVER + 1, "bob", "operator", scene.now())
+    assert "only who holds control" in call(scene, "/arm/move", 1).reason
+    assert scene.gate.stale == 0
+
+
+def test_the_relays_clock_of_the_very_link_counts(scene: Scene) -> None:
+    """Its stamps are far from the robot's own clock."""
+    ahead = 10**15
+    other = Offset()
+    other.add(scene.now(), scene.now() + ahead, scene.now())
+    scene.gate.goal("/navigate_to_pose", DRIVER, scene.now() + ahead, other)
+    assert goal(scene, "/navigate_to_pose", scene.now() + ahead) is not None

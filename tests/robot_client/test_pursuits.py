@@ -1,0 +1,258 @@
+"""Goals that move the robot, told to the guard and noted on the disk, in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock
+
+from relay_protocol import link
+from relay_protocol.errors import Unavailable
+from relay_protocol.link import MotionPolicy
+from robot_client.guard_feed import NoGuard
+from robot_client.guard_protocol import CANCEL, GOALS_WITHIN_MS, cancelling
+from robot_client.lasting import MemoryLatch
+from robot_client.platforms.base import CANCELED, GraphView, Outcome
+from robot_client.platforms.memory import MemoryGoal, MemoryPlatform
+from robot_client.pursuits import BEAT, KEPT, LOOKS, MAX_ACTIONS, Pursuits
+from robot_client.sweep import PATIENCE, Sweep
+from robot_client.topics import TypedTopic
+from tests.robot_client.daemon_scene import DRIVER
+from tests.robot_client.daemon_scene import Scene as DaemonScene
+
+SPIN = "/robot1/spin"
+ACCEPTED = b"\0\1\0\0\0"
+REJECTED = b"\0\1\0\0\1"
+
+
+class Feed(NoGuard):
+    """Remembers what the guard would hear."""
+
+    def __init__(self) -> None:
+        self.topics: set[TypedTopic] = set()
+        self.commands: list[tuple[TypedTopic, bool, int]] = []
+
+    def topic(self, on: TypedTopic) -> None:
+        self.topics.add(on)
+
+    def forget(self, on: TypedTopic) -> None:
+        self.topics.discard(on)
+
+    def command(self, on: TypedTopic, moving: bool, at: int) -> None:
+        self.commands.append((on, moving, at))
+
+
+class BrokenLatch(MemoryLatch):
+    def keep_goals(self, actions: list[str]) -> None:
+        raise Unavailable("the disk is full")
+
+
+class Scene:
+    """
+    :param left: what lies on the disk at the start
+    """
+
+    def __init__(self, left: Sequence[str] | None = (), latch: MemoryLatch | None = None) -> None:
+        self.clock = Clock()
+        self.feed = Feed()
+        self.latch = latch or MemoryLatch()
+        self.latch.noted = None if left is None else list(left)
+        self.platform = MemoryPlatform(GraphView())
+        self.asked: list[str] = []
+        policy = MotionPolicy(actions=["*/spin"])
+        sweep = Sweep(policy, self.platform, self.clock, lambda topic: False)
+        self.pursuits = Pursuits(policy.actions, self.feed, sweep, self.latch, self.clock, self.now)
+
+    def now(self) -> int:
+        return round(self.clock.seconds() * 1e9)
+
+    def begin(self, action: str = SPIN) -> MemoryGoal:
+        goal = MemoryGoal(action, b"", None)
+        self.pursuits.check(action)
+        self.pursuits.add(action, goal)
+        return goal
+
+    def appear(self, action: str, answer: bytes | None = ACCEPTED) -> None:
+        """An action is there that answers so, or not at all, to the wish to cancel all its goals."""
+
+        def cancel(request: bytes) -> bytes | Deferred[bytes]:
+            self.asked.append(action)
+            return Deferred() if answer is None else answer
+
+        self.platform.services[action + CANCEL] = cancel
+        actions = {**self.platform.view.actions, action: link.Service(types=["t"])}
+        self.platform.view = GraphView(actions=actions)
+
+    def look(self, times: int = 1) -> None:
+        for _ in range(times):
+            self.pursuits.look()
+            self.clock.advance(1.0)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+def end(goal: MemoryGoal) -> None:
+    goal.result.callback(Outcome(CANCELED, None, "as you wish"))
+
+
+def test_the_guard_hears_of_a_goal_as_long_as_it_goes_on(scene: Scene) -> None:
+    """Often enough that it can tell a daemon that stands still, and no more when the goal has ended."""
+    goal = scene.begin()
+    for _ in range(20):
+        scene.clock.advance(BEAT)
+    times = [at for on, moving, at in scene.feed.commands if moving and on == cancelling(SPIN)]
+    assert len(times) == 21
+    assert 5 * BEAT * 1000 <= GOALS_WITHIN_MS
+    end(goal)
+    assert scene.feed.commands[-1] == (cancelling(SPIN), False, scene.now())
+    told = len(scene.feed.commands)
+    scene.clock.advance(KEPT - 1)
+    assert len(scene.feed.commands) == told
+    assert scene.feed.topics == {cancelling(SPIN)}
+    scene.clock.advance(1)
+    assert scene.feed.topics == set()
+    assert scene.clock.getDelayedCalls() == []
+
+
+def test_the_last_of_an_actions_goals_counts(scene: Scene) -> None:
+    """One that ends leaves the guard and the note to the others, and what follows soon finds the guard ready."""
+    first, second = scene.begin(), scene.begin()
+    end(first)
+    assert scene.feed.commands[-1][1]
+    assert scene.latch.noted == [SPIN]
+    end(second)
+    assert scene.latch.noted == []
+    scene.begin()
+    scene.clock.advance(KEPT * 2)
+    assert scene.feed.topics == {cancelling(SPIN)}
+
+
+def test_actions_with_goals_are_noted(scene: Scene) -> None:
+    """As long as one is under way, so that a daemon that starts knows what was left."""
+    left, right = scene.begin("/left/spin"), scene.begin("/right/spin")
+    assert scene.latch.noted == ["/left/spin", "/right/spin"]
+    end(left)
+    assert scene.latch.noted == ["/right/spin"]
+    end(right)
+    assert scene.latch.noted == []
+
+
+def test_what_is_left_is_cancelled_once_as_it_appears() -> None:
+    """Others are left alone; the note goes when it is done."""
+    scene = Scene(["/late/spin", SPIN])
+    scene.appear("/other/spin")
+    scene.appear(SPIN)
+    scene.look(3)
+    assert scene.asked == [SPIN]
+    assert scene.latch.noted == ["/late/spin"]
+    scene.appear("/late/spin")
+    scene.look(LOOKS)
+    assert scene.asked == [SPIN, "/late/spin"]
+    assert scene.latch.noted == []
+
+
+def test_nothing_begins_before_what_is_left_is_cancelled() -> None:
+    """A new goal would be cancelled with the old ones; other actions need not wait."""
+    scene = Scene([SPIN])
+    with pytest.raises(Unavailable, match="try again in a moment"):
+        scene.begin()
+    scene.begin("/other/spin")
+    scene.appear(SPIN)
+    scene.look()
+    scene.begin()
+    scene.look(LOOKS)
+    assert scene.asked == [SPIN]
+    assert scene.latch.noted == ["/other/spin", SPIN]
+
+
+def test_an_action_that_does_not_answer_is_asked_again() -> None:
+    """Until it does; one that refuses has answered."""
+    scene = Scene([SPIN])
+    scene.appear(SPIN, None)
+    scene.look(2)
+    assert scene.clock.seconds() >= 2 * PATIENCE
+    assert scene.asked == [SPIN, SPIN]
+    scene.appear(SPIN, REJECTED)
+    scene.look(2)
+    assert len(scene.asked) == 3
+
+
+def test_what_never_appears_is_given_up() -> None:
+    """After half a minute, so that goals may begin there."""
+    scene = Scene([SPIN])
+    scene.look(LOOKS)
+    scene.begin()
+    scene.appear(SPIN)
+    scene.look()
+    assert scene.asked == []
+
+
+def test_a_note_that_is_damaged_stands_for_every_action_that_moves() -> None:
+    """Better too much is cancelled than something moves on."""
+    scene = Scene(None)
+    scene.appear(SPIN)
+    scene.appear("/dock_is_free")
+    scene.look()
+    assert scene.asked == [SPIN]
+    scene.begin()
+
+
+def test_a_note_that_can_not_be_written_holds_up_nothing() -> None:
+    """The guard is told all the same."""
+    scene = Scene(latch=BrokenLatch())
+    end(scene.begin())
+    assert [moving for _, moving, _ in scene.feed.commands] == [True, False]
+
+
+def test_there_is_room_for_so_many_actions() -> None:
+    """One more is refused in words while all are busy, and takes the place of an idle one."""
+    scene = Scene()
+    goals = [scene.begin(f"/r{number}/spin") for number in range(MAX_ACTIONS)]
+    with pytest.raises(Unavailable, match=str(MAX_ACTIONS)):
+        scene.begin()
+    scene.begin("/r3/spin")
+    end(goals[0])
+    scene.begin()
+    assert len(scene.feed.topics) == MAX_ACTIONS
+    assert cancelling("/r0/spin") not in scene.feed.topics
+
+
+def test_goals_of_clients_are_followed_by_their_full_names() -> None:
+    """Through the whole daemon, and only where they move the robot."""
+    scene = DaemonScene()
+    scene.platform.actions = {"/spin", "spin", "/look"}
+    control = scene.register()
+    control.say(link.Control(id=1, holder=DRIVER, user="ann", level="operator"))
+    channel = scene.channel(control)
+    for action in ("spin", "/look"):
+        channel.say(link.SendActionGoal(id=action, action=action, type="t", source=DRIVER, cdr=""))
+    assert len(scene.platform.goals) == 2
+    assert scene.latch.noted == ["/spin"]
+    channel.lose()
+    assert scene.platform.goals[0].cancelled
+    assert scene.latch.noted == ["/spin"]  # it has not ended yet
+    end(scene.platform.goals[0])
+    assert scene.latch.noted == []
+
+
+def test_a_daemon_that_starts_looks_for_what_was_left() -> None:
+    """By itself, every second, also where nobody is registered."""
+    latch = MemoryLatch()
+    latch.noted = ["/spin"]
+    scene = DaemonScene(latch)
+    asked: list[bytes] = []
+
+    def cancel(request: bytes) -> bytes:
+        asked.append(request)
+        return ACCEPTED
+
+    scene.platform.services["/spin" + CANCEL] = cancel
+    scene.platform.view = GraphView(actions={"/spin": link.Service(types=["t"])})
+    scene.run(3.0)
+    assert len(asked) == 1
+    assert latch.noted == []

@@ -1,0 +1,199 @@
+"""Who controls the fake relay's robots, what is stopped, and its alerts: enough for the portal's own tests."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatchcase
+from typing import Any
+
+Json = dict[str, Any]
+
+LIMITS = {"operator": {"linear": 1.2, "angular": None}, "owner": {}}
+ADDRESS = "192.0.2.7:50123"
+
+
+class Control:
+    """Control of one robot. A client has ``user``, ``level`` and ``number``.
+
+    :param changed: called after every change
+    """
+
+    def __init__(self, robot: str, changed: Callable[[], None]) -> None:
+        self.robot, self.changed = robot, changed
+        self.holder: Any = None
+        self.request: Any = None
+        self.why = ""
+        self.since = self.asked = 0.0
+        self.grace = 30.0
+        self.stopped: Json | None = None
+        self.denial = ""
+
+    def told(self, client: Any) -> Json:
+        """What ``/relay/control`` says to one client."""
+        request = self._person(self.request, client, self.asked)
+        if request is not None:
+            request |= {"why": self.why, "until": self.asked + self.grace}
+        return {
+            "robot": self.robot,
+            "state": "requested" if self.request else "held" if self.holder else "free",
+            "holder": self._person(self.holder, client, self.since),
+            "request": request,
+            "stopped": self.stopped,
+            "moving": False,
+            "suppressed": [],
+            "inhibited": [],
+            "limits": LIMITS,
+            "you": {
+                "client": client.number,
+                "may_control": client.level != "viewer",
+                "may_resume": client is self.holder or client.level == "owner",
+            },
+        }
+
+    def _person(self, whom: Any, client: Any, since: float) -> Json | None:
+        if whom is None:
+            return None
+        return {"user": whom.user, "client": whom.number, "since": since, "you": whom is client}
+
+    def order(self, client: Any, order: str, why: str) -> Json:
+        """One of the services below ``/relay/``."""
+        done, message = getattr(self, order)(client, why)
+        self.changed()
+        return {"success": done, "message": message}
+
+    def take_control(self, client: Any, why: str) -> tuple[bool, str]:
+        """Free: taken. Held: asked for, or by an owner who waited long enough taken over."""
+        if client.level == "viewer":
+            return False, f"{client.user} may not control {self.robot}"
+        if self.denial:
+            return False, self.denial
+        ripe = self.request is client and time.time() >= self.asked + self.grace
+        mine = self.holder is not None and self.holder.user == client.user
+        if self.holder is None or mine or (client.level == "owner" and ripe):
+            self.holder, self.request, self.since = client, None, time.time()
+            return True, "you have control"
+        if self.request is None:
+            self.request, self.why, self.asked = client, why, time.time()
+        return False, f"{self.holder.user} has control and was asked for it"
+
+    def release_control(self, client: Any, why: str) -> tuple[bool, str]:
+        """Give back control, or a request."""
+        if client is self.request:
+            self.request = None
+        elif client is self.holder:
+            self.holder = self.request = None
+        return True, ""
+
+    def grant_control(self, client: Any, why: str) -> tuple[bool, str]:
+        """The holder's yes."""
+        if client is not self.holder or self.request is None:
+            return False, "nobody asks for control"
+        self.holder, self.request, self.since = self.request, None, time.time()
+        return True, ""
+
+    def refuse_control(self, client: Any, why: str) -> tuple[bool, str]:
+        """The holder's no."""
+        if client is not self.holder:
+            return False, "you have no control of this robot"
+        self.request = None
+        return True, ""
+
+    def stop(self, client: Any, why: str) -> tuple[bool, str]:
+        """For everybody."""
+        self.stopped = {"by": client.user, "why": why, "since": time.time(), "told": True}
+        return True, ""
+
+    def resume(self, client: Any, why: str) -> tuple[bool, str]:
+        """For who has control, and owners."""
+        if client is not self.holder and client.level != "owner":
+            return False, "only who has control, or an owner, may resume it"
+        self.stopped = None
+        return True, ""
+
+    def left(self, client: Any) -> None:
+        """A connection has ended."""
+        if client in (self.holder, self.request):
+            self.release_control(client, "")
+            self.changed()
+
+    def rights_changed(self) -> None:
+        """Who may not control the robot any more does not."""
+        if self.holder is not None and self.holder.level == "viewer":
+            self.holder = self.request = None
+        self.changed()
+
+    def take_away(self) -> None:
+        """Control is lost, whoever had it."""
+        self.holder = self.request = None
+        self.changed()
+
+
+class Alerts:
+    """All alerts of the fake relay, by their ids."""
+
+    def __init__(self) -> None:
+        self.all: dict[str, Json] = {}
+        self._ids = itertools.count(1)
+
+    def put(self, robot: str, text: str, **more: Any) -> str:
+        """A new alert, or with ``id`` more of one that is there; ``old`` says that the stream tells it no more."""
+        id = more.pop("id", None) or str(next(self._ids))
+        now = time.time()
+        plain = {
+            "id": id,
+            "robot": robot,
+            "kind": "battery",
+            "about": "",
+            "level": "warning",
+            "text": text,
+            "first": now,
+            "last": now,
+            "count": 1,
+            "state": "open",
+            "over": None,
+            "acknowledged": None,
+            "may_acknowledge": True,
+            "news": 1,
+            "notify": True,
+        }
+        self.all[id] = {**plain, **self.all.get(id, {}), **more}
+        return id
+
+    def of(self, robots: list[str]) -> list[Json]:
+        """Those of some robots, the latest first."""
+        return sorted((a for a in self.all.values() if a["robot"] in robots), key=lambda a: -a["last"])
+
+    def streamed(self, robots: list[str]) -> list[Json]:
+        """Those that the stream tells: of what is long over it says nothing."""
+        return [alert for alert in self.of(robots) if not alert.get("old")]
+
+    def acknowledge(self, id: str, user: str) -> Json:
+        """Somebody looks after it."""
+        alert = self.all[id]
+        alert |= {"acknowledged": {"by": user, "at": time.time()}, "may_acknowledge": False}
+        return alert
+
+
+def meant(patterns: list[str], robots: list[str]) -> tuple[list[str], list[str]]:
+    """The robots an order to many means, and the patterns that mean none."""
+    means = {each: [robot for robot in robots if fnmatchcase(robot, each)] for each in patterns}
+    return sorted(set().union(*means.values())), [each for each, found in means.items() if not found]
+
+
+def fleet_answer(
+    order: Json, robots: list[str], unmatched: list[str], do: Callable[[str], Json]
+) -> Iterator[Json]:
+    """The lines of the answer to an order to many.
+
+    :param unmatched: what of the order means no robot
+    :param do: does it on one robot, and tells how that went
+    """
+    yield {"do": order["do"], "robots": robots, "unmatched": unmatched}
+    done = 0
+    for robot in robots:
+        line = {"ok": True, "message": "", "values": None, "pending": False, "seconds": 0.1, **do(robot)}
+        done += line["ok"]
+        yield {"robot": robot, **line}
+    yield {"done": True, "robots": len(robots), "ok": done, "failed": len(robots) - done, "seconds": 0.3}

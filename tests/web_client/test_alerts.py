@@ -1,0 +1,223 @@
+"""Alerts, and one order to many robots, in a real browser against a fake relay."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from playwright.sync_api import Page, expect
+from switchboard_browser import seen
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    OpenPage = Callable[..., Page]
+    FakeRelay = Any
+
+
+def alert(relay: FakeRelay, text: str, **more: Any) -> None:
+    """The relay tells of something."""
+    relay.do(alert={"robot": "rover-1", "text": text, **more})
+
+
+class TestAlerts:
+    @pytest.mark.parametrize("path", ["/fleet", "/cockpit/rover-1", "/alerts"])
+    def test_a_new_one_is_told_on_every_page(self, open_page: OpenPage, relay: FakeRelay, path: str) -> None:
+        """What stood before is only counted; what comes is told once, in words that make no elements."""
+        alert(relay, "it stood before")
+        page = open_page(path, user="driver")
+        expect(seen(page, "alerts-count")).to_have_text("1")
+        expect(seen(page, "toast")).to_have_count(0)
+        alert(relay, "<img src=x onerror=alert(1)>")
+        expect(seen(page, "toast")).to_contain_text("rover-1: <img src=x onerror=alert(1)>")
+        assert seen(page, "toast").locator("img").count() == 0
+        expect(seen(page, "alerts-count")).to_have_text("2")
+
+    def test_what_is_not_wanted_is_only_listed(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The user's rules say what is shown by itself."""
+        page = open_page("/alerts", user="driver")
+        expect(seen(page, "alerts-empty")).to_contain_text("No alert stands open on your robots.")
+        alert(relay, "quiet", notify=False)
+        expect(seen(page, "alert")).to_contain_text("quiet")
+        expect(seen(page, "toast")).to_have_count(0)
+
+    def test_many_at_once_are_one_toast(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The toast leads to the list."""
+        page = open_page("/fleet", user="driver")
+        expect(seen(page, "robot-card")).to_have_count(2)
+        # Between two of the fake relay's events all of these come together, or in two lots.
+        for i in range(12):
+            alert(relay, f"number {i}")
+        toast = seen(page, "toast").filter(has_text=re.compile(r"\d+ new alerts of rover-1\."))
+        toast.first.get_by_role("link", name="Alerts").click()
+        expect(seen(page, "alert")).to_have_count(12)
+
+    def test_the_list_is_narrowed_and_acknowledged(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """By state and robot; who acknowledges is shown, and the count goes down."""
+        alert(relay, "low", about="main")
+        alert(relay, "was low", state="over", over=time.time() - 60)
+        relay.do(alert={"robot": "rover-2", "text": "other", "may_acknowledge": False})
+        page = open_page("/alerts", user="driver")
+        expect(seen(page, "alert")).to_have_count(2)
+        other = page.locator("[data-testid=alert][data-robot=rover-2]")
+        expect(other.get_by_test_id("acknowledge")).to_have_count(0)
+        seen(page, "alerts-robot").select_option("rover-1")
+        expect(seen(page, "alert")).to_have_count(1)
+        seen(page, "acknowledge").click()
+        expect(seen(page, "alert")).to_contain_text("driver looks after it")
+        expect(seen(page, "alerts-count")).to_have_text("1")
+        assert len(relay.log(user="driver")) == 1
+        seen(page, "alerts-over").click()
+        expect(seen(page, "alert")).to_contain_text("was low")
+        seen(page, "alerts-all").click()
+        expect(seen(page, "alert")).to_have_count(2)
+
+    def test_what_is_long_over_does_not_come_back(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The stream tells no more of it then; the list does not fall back on what it was told at first."""
+        alert(relay, "low", id="1")
+        page = open_page("/alerts", user="driver")
+        expect(seen(page, "alert")).to_be_visible()
+        alert(relay, "low", id="1", state="over", over=time.time())
+        expect(seen(page, "alerts-empty")).to_be_visible()
+        alert(relay, "low", id="1", old=True)
+        alert(relay, "another", id="2")
+        expect(seen(page, "alert")).to_contain_text("another")
+        expect(seen(page, "alert")).to_have_count(1)
+
+    def test_what_is_gone_without_a_word_is_looked_up(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """An alert that leaves the stream while it is open was ended unheard, or is the user's no more."""
+        alert(relay, "low", id="1")
+        page = open_page("/alerts", user="driver")
+        expect(seen(page, "alert")).to_be_visible()
+        alert(relay, "low", id="1", state="over", over=time.time(), old=True)
+        expect(seen(page, "alerts-empty")).to_be_visible()
+
+    def test_without_a_connection_nothing_is_said_to_be_well(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """The page says that it is out of date, and asks again when the relay is back."""
+        page = open_page("/alerts", user="driver")
+        expect(seen(page, "alerts-empty")).to_contain_text("Nothing is wrong")
+        relay.do(broken=True)
+        expect(page.get_by_text("No connection to the relay.")).to_be_visible()
+        expect(seen(page, "alerts-empty")).not_to_contain_text("Nothing is wrong")
+        alert(relay, "low", old=True)
+        relay.do(broken=False)
+        expect(seen(page, "alert")).to_contain_text("low")
+        expect(page.get_by_text("No connection to the relay.")).to_have_count(0)
+
+    def test_notifications_are_asked_for_by_a_click(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The browser is not asked before; once it allows them, an alert that nobody looks at is shown by it."""
+        page = open_page("/login")
+        page.add_init_script(
+            """
+            window.shown = []
+            window.asked = 0
+            window.Notification = class {
+              static permission = 'default'
+              static async requestPermission() { asked += 1; return (Notification.permission = 'granted') }
+              constructor(words) { shown.push(words) }
+            }
+            document.hasFocus = () => false
+            """
+        )
+        page.request.post(
+            "/api/v1/session",
+            data={"user": "driver", "password": "correct horse"},
+            headers={"X-Requested-With": "switchboard"},
+        )
+        page.goto("/alerts")
+        expect(seen(page, "alerts-empty")).to_be_visible()
+        assert page.evaluate("asked") == 0
+        seen(page, "notify").check()
+        assert page.evaluate("asked") == 1
+        alert(relay, "low")
+        expect(seen(page, "toast")).to_be_visible()
+        assert page.evaluate("shown") == ["rover-1: low"]
+        for i in range(12):
+            alert(relay, f"number {i}")
+        expect(seen(page, "alerts-count")).to_have_text("13")
+        # Between two of the fake relay's events all of these come together, or in two lots.
+        assert len(page.evaluate("shown")) < 6
+
+
+class TestOrders:
+    def hold(self, page: Page) -> None:
+        """Keep the button pressed by which many robots may move again."""
+        seen(page, "order-resume").focus()
+        page.keyboard.down("Space")
+        expect(seen(page, "order-progress")).to_be_visible()
+        page.keyboard.up("Space")
+
+    def test_a_result_for_each_robot(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The pattern is the relay's to read; what failed says why, and the bar is full."""
+        page = open_page("/fleet", user="admin")
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill("rover-*, arm-3")
+        seen(page, "order-do").select_option("call")
+        seen(page, "order-send").click()
+        expect(seen(page, "order-failure")).to_have_text("Which service?")
+        seen(page, "order-name").fill("/start")
+        seen(page, "order-body").fill("{")
+        seen(page, "order-send").click()
+        expect(seen(page, "order-failure")).to_have_text("That is no JSON.")
+        seen(page, "order-body").fill('{"fast": true}')
+        seen(page, "order-send").click()
+        expect(seen(page, "order-progress")).to_have_text("3 of 3 robots, 1 failed, done")
+        [asked] = relay.log(op="POST fleet")
+        assert (asked["robots"], asked["service"], asked["args"]) == (
+            ["rover-*", "arm-3"],
+            "/start",
+            {"fast": True},
+        )
+        expect(seen(page, "order-result")).to_have_count(3)
+
+    def test_chosen_robots_and_what_fails(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Robots are chosen among those shown; to resume one that is away fails in words."""
+        page = open_page("/fleet", user="admin")
+        seen(page, "fleet-order").click()
+        page.get_by_role("button", name="All 3 shown").click()
+        seen(page, "order-do").select_option("resume")
+        self.hold(page)
+        expect(seen(page, "order-progress")).to_have_text("3 of 3 robots, 1 failed, done")
+        failed = page.locator("[data-testid=order-result][data-robot=arm-3]")
+        expect(failed).to_contain_text("failed")
+        expect(failed).to_contain_text("the robot is offline")
+
+    def test_many_are_resumed_by_a_press_that_lasts(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Neither a click nor Enter in a field resumes any; the button kept pressed does."""
+        page = open_page("/fleet", user="admin")
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill("rover-*")
+        seen(page, "order-do").select_option("resume")
+        expect(seen(page, "order-send")).to_have_count(0)
+        seen(page, "order-pattern").press("Enter")
+        seen(page, "order-why").press("Enter")
+        seen(page, "order-resume").click()
+        page.wait_for_timeout(300)  # proves absence
+        assert relay.log(op="POST fleet") == []
+        self.hold(page)
+        expect(seen(page, "order-progress")).to_have_text("2 of 2 robots, done")
+        assert [asked["do"] for asked in relay.log(op="POST fleet")] == ["resume"]
+
+    def test_a_name_that_means_no_robot_is_told(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Who mistypes the robot he means to stop learns that it goes on."""
+        page = open_page("/fleet", user="admin")
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill("rover-1 rovr-2")
+        seen(page, "order-send").click()
+        expect(seen(page, "order-progress")).to_have_text("1 of 1 robots, done")
+        expect(seen(page, "order-unmatched")).to_have_text("No robot of yours is meant by rovr-2.")
+
+    def test_a_long_order_fits_a_phone(self, open_page: OpenPage) -> None:
+        """However many robots are named, the button that names them is no wider than the window."""
+        page = open_page("/fleet", user="admin", width=390)
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill(
+            "rover-1 a-very-long-name-of-a-robot-* group:cleaners-of-the-second-hall"
+        )
+        for do in ("stop", "resume"):
+            seen(page, "order-do").select_option(do)
+            assert page.evaluate("document.documentElement.scrollWidth") <= 390

@@ -1,0 +1,403 @@
+"""Who drives: control, stop, and every way of letting go, in a real browser against a fake relay."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from playwright.sync_api import Page, expect
+from switchboard_browser import hold_joystick, hold_resume, ready_to_drive, seen, stands, take_control
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    OpenPage = Callable[..., Page]
+    FakeRelay = Any
+
+COCKPIT = "/cockpit/rover-1"
+ZERO = (0, 0)
+ROBOT = "rover-1"
+
+
+def driving(relay: FakeRelay, at_least: int = 3) -> None:
+    relay.until(lambda: len([c for c in relay.commands() if c != ZERO]) >= at_least, "no commands came")
+
+
+def ends_with_one_zero(page: Page, relay: FakeRelay) -> None:
+    """One zero, and nothing more."""
+    relay.until(lambda: relay.commands()[-1:] == [ZERO], "no zero came")
+    before = relay.commands()
+    page.wait_for_timeout(500)  # proves absence
+    assert relay.commands() == before
+    moving = max(i for i, command in enumerate(before) if command != ZERO)
+    assert before[moving + 1 :] == [ZERO]
+
+
+def orders(relay: FakeRelay) -> list[str]:
+    """What was asked of ``/relay/…``, without pings."""
+    asked = [entry["service"] for entry in relay.log(op="call_service")]
+    return [name for name in asked if name.startswith("/relay/") and name != "/relay/ping"]
+
+
+class TestControl:
+    def test_nothing_drives_before_control_is_taken(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A free robot is not taken by opening its cockpit, nor by keys and joystick; only by the button."""
+        page = open_page(COCKPIT, user="driver")
+        stands(page, "free")
+        expect(seen(page, "drive-blocked")).to_have_text("Take control to drive.")
+        hold_joystick(page)
+        page.mouse.up()
+        page.keyboard.press("w")
+        page.wait_for_timeout(300)  # proves absence
+        assert relay.commands() == [] and orders(relay) == []
+        take_control(page)
+        expect(seen(page, "control-words")).to_have_text("You have control.")
+        page.keyboard.press("w")
+        relay.until(relay.commands, "no command came")
+
+    def test_two_people_ask_grant_refuse_withdraw(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Each sees what the other does, and only who has control can drive."""
+        ann, bob = open_page(COCKPIT, user="admin"), open_page(COCKPIT, user="driver")
+        take_control(bob)
+        expect(seen(ann, "control-words")).to_have_text("driver has control.")
+        expect(seen(ann, "holder")).to_have_text("driver has control")
+        expect(seen(ann, "drive-blocked")).to_contain_text("driver has control")
+
+        seen(ann, "control-ask").click()
+        seen(ann, "control-why").fill("<b>my turn</b>")
+        seen(ann, "control-ask-send").click()
+        stands(ann, "waiting")
+        expect(seen(ann, "control-left")).to_have_text(re.compile(r"[12]?\d s left to answer"))
+        expect(seen(bob, "control-request")).to_contain_text("admin asks for control. “<b>my turn</b>”")
+        expect(seen(bob, "request-left")).to_have_text(re.compile(r"\d+ s to answer"))
+        seen(bob, "control-refuse").click()
+        stands(ann, "held")
+        expect(seen(ann, "control-answer")).to_have_count(0)
+        expect(seen(bob, "control-request")).to_have_count(0)
+
+        seen(ann, "control-ask").click()
+        seen(ann, "control-ask-send").click()
+        stands(ann, "waiting")
+        seen(ann, "control-withdraw").click()
+        stands(ann, "held")
+        stands(bob, "yours")
+
+        seen(ann, "control-ask").click()
+        seen(ann, "control-ask-send").click()
+        seen(bob, "control-grant").click()
+        stands(ann, "yours")
+        stands(bob, "held")
+        bob.keyboard.press("w")
+        ann.keyboard.press("w")
+        relay.until(relay.commands, "no command came")
+        assert {entry["user"] for entry in relay.log(op="publish", topic="/cmd_vel")} == {"admin"}
+        seen(ann, "control-release").click()
+        stands(bob, "free")
+
+    def test_an_owner_takes_over_after_the_grace_time(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The button shows when the holder has not answered in time."""
+        relay.do(robot=ROBOT, grace=1.0)
+        owner, driver = open_page(COCKPIT, user="admin"), open_page(COCKPIT, user="driver")
+        take_control(driver)
+        seen(owner, "control-ask").click()
+        seen(owner, "control-ask-send").click()
+        expect(seen(owner, "control-words")).to_have_text("driver has not answered. You may take over.")
+        seen(owner, "control-over").click()
+        stands(owner, "yours")
+        stands(driver, "held")
+        expect(seen(driver, "drive-words")).to_have_text("admin has control now.")
+
+    def test_control_of_another_window_is_brought_here(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """One user with two windows needs nobody's leave."""
+        first, second = open_page(COCKPIT, user="driver"), open_page(COCKPIT, user="driver")
+        take_control(first)
+        expect(seen(second, "control-words")).to_have_text("You have control in another window.")
+        seen(second, "control-fetch").click()
+        stands(second, "yours")
+        stands(first, "elsewhere")
+
+    def test_what_the_relay_answers_is_shown(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """An order that is not done is told in the relay's words."""
+        page = open_page(COCKPIT, user="driver")
+        stands(page, "free")
+        relay.do(robot=ROBOT, deny="the robot does not agree")
+        seen(page, "control-take").click()
+        expect(seen(page, "control-answer")).to_have_text("the robot does not agree")
+
+    def test_the_limit_of_the_level_bounds_the_slider(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """What the robot allows an operator is the end of the slider and the scale of the joystick."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        expect(seen(page, "joystick-scale")).to_have_text("0.50 m/s")
+        slider = seen(page, "limit-linear")
+        expect(slider).to_have_attribute("max", "1.2")
+        slider.focus()
+        page.keyboard.press("End")
+        expect(seen(page, "joystick-scale")).to_have_text("1.20 m/s")
+        expect(seen(page, "top-linear")).to_contain_text("of 1.20 allowed")
+        expect(seen(page, "top-angular")).to_have_count(0)
+
+
+class TestStop:
+    def test_by_websocket_and_by_http_at_once(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """STOP asks both ways; the banner says who stopped it, and driving is off."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        page.keyboard.down("w")
+        driving(relay)
+        seen(page, "stop").click()
+        expect(seen(page, "stopped")).to_contain_text("By driver")
+        expect(seen(page, "drive-blocked")).to_contain_text("The robot is stopped.")
+        assert orders(relay)[-1:] == ["/relay/stop"]
+        assert len(relay.log(op=f"POST robots/{ROBOT}/stop")) == 1
+        ends_with_one_zero(page, relay)
+        page.keyboard.up("w")
+
+    @pytest.mark.parametrize("key", ["Enter", "Space"])
+    def test_by_the_keyboard(self, open_page: OpenPage, relay: FakeRelay, key: str) -> None:
+        """The button by Enter, and by space from anywhere; also for who only watches."""
+        page = open_page(COCKPIT, user="viewer")
+        expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+        if key == "Enter":
+            seen(page, "stop").focus()
+        page.keyboard.press(key)
+        expect(seen(page, "stopped")).to_contain_text("By viewer")
+        expect(seen(page, "resume-who")).to_contain_text("owner")
+        expect(seen(page, "resume")).to_have_count(0)
+
+    def test_without_a_websocket(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """While the link is down STOP goes by HTTP alone, and says that it was done."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        relay.do(frozen=True)
+        expect(seen(page, "link-late")).to_be_visible()
+        seen(page, "stop").click()
+        expect(seen(page, "drive-words")).to_contain_text("late")
+        relay.until(lambda: relay.log(op=f"POST robots/{ROBOT}/stop"), "no stop came by HTTP")
+        relay.do(frozen=False)
+        page.reload()
+        expect(seen(page, "stopped")).to_be_visible()
+
+    def test_of_a_robot_that_is_away(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The page says that it will be stopped, not that it is, whichever answer comes first."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        relay.do(robot=ROBOT, state="offline")
+        expect(page.get_by_text("The robot is offline.").first).to_be_visible()
+        seen(page, "stop").click()
+        expect(seen(page, "drive-words")).to_contain_text("It is stopped as soon as it is back.")
+
+    def test_resume_takes_a_press_that_lasts(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A click resumes nothing; the button kept pressed does, by mouse and by keyboard."""
+        page = open_page(COCKPIT, user="admin")
+        for by in ("mouse", "keyboard"):
+            expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+            seen(page, "stop").click()
+            expect(seen(page, "stopped")).to_be_visible()
+            seen(page, "resume").click()
+            page.wait_for_timeout(300)  # proves absence
+            expect(seen(page, "stopped")).to_be_visible()
+            if by == "mouse":
+                hold_resume(page)
+                continue
+            seen(page, "resume").focus()
+            page.keyboard.down("Enter")
+            expect(seen(page, "stopped")).to_have_count(0)
+            page.keyboard.up("Enter")
+        assert orders(relay).count("/relay/resume") == 2
+
+    def test_resume_ends_when_the_focus_leaves_the_button(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """The key comes up elsewhere then, and the robot stays stopped."""
+        page = open_page(COCKPIT, user="admin")
+        expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+        seen(page, "stop").click()
+        seen(page, "resume").focus()
+        page.keyboard.down("Space")
+        page.keyboard.press("Tab")
+        expect(seen(page, "resume")).not_to_be_focused()
+        page.keyboard.up("Space")
+        page.wait_for_timeout(2000)  # proves absence
+        expect(seen(page, "stopped")).to_be_visible()
+        assert "/relay/resume" not in orders(relay)
+
+    def test_of_one_robot_and_of_all_from_the_list(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Each card has its STOP, and the top bar one for all; one that is away is stopped when it is back."""
+        page = open_page("/fleet", user="admin")
+        page.locator("[data-robot=rover-2]").get_by_test_id("stop").click()
+        expect(seen(page, "toast")).to_have_text(re.compile("rover-2 is stopped."))
+        page.get_by_role("button", name="Stop all robots").click()
+        expect(
+            page.get_by_text("2 robots are stopped. 1 robot is away, and will be stopped when back.")
+        ).to_be_visible()
+        [asked] = relay.log(op="POST fleet")
+        assert (asked["do"], asked["robots"]) == ("stop", ["*"])
+
+
+LEAVING = {
+    "blur": "window.dispatchEvent(new Event('blur'))",
+    "pagehide": "window.dispatchEvent(new Event('pagehide'))",
+    "freeze": "document.dispatchEvent(new Event('freeze'))",
+    "offline": "window.dispatchEvent(new Event('offline'))",
+    "contextmenu": "document.body.dispatchEvent(new MouseEvent('contextmenu', { bubbles: true, cancelable: true }))",
+    "pointercancel": "window.dispatchEvent(new PointerEvent('pointercancel', { bubbles: true }))",
+    "lostpointercapture": "document.querySelector('[data-testid=joystick]')"
+    ".dispatchEvent(new PointerEvent('lostpointercapture'))",
+    "second finger": "document.body.dispatchEvent(Object.assign(new Event('touchstart', { bubbles: true }), "
+    "{ touches: [{}, {}] }))",
+    "dialog": "(() => { const d = document.createElement('dialog'); document.body.append(d); d.showModal() })()",
+    "visibilitychange": "Object.defineProperty(document, 'hidden', { value: true, configurable: true });"
+    "document.dispatchEvent(new Event('visibilitychange'))",
+}
+
+
+class TestLettingGo:
+    @pytest.mark.parametrize("way", LEAVING)
+    def test_sends_one_zero(self, open_page: OpenPage, relay: FakeRelay, way: str) -> None:
+        """However the page is taken from the hand, one zero goes out, and the hand still there drives no further."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        page.evaluate(LEAVING[way])
+        page.mouse.move(640, 300, steps=5)
+        ends_with_one_zero(page, relay)
+        page.mouse.up()
+
+    def test_control_that_is_lost(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Driving ends and nothing more is sent, not even a zero: it would take a robot that is free."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        relay.do(robot=ROBOT, take_away=True)
+        expect(seen(page, "drive-words")).to_contain_text("You no longer have control.")
+        stands(page, "free")
+        before = relay.commands()
+        page.mouse.move(640, 300, steps=5)
+        page.wait_for_timeout(500)  # proves absence
+        assert relay.commands() == before
+        page.mouse.up()
+
+    def test_a_command_topic_that_is_gone(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The zero goes to the topic that was driven; another one is driven only by taking hold anew."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        relay.do(gone="/cmd_vel")
+        ends_with_one_zero(page, relay)
+        expect(seen(page, "drive-words")).to_have_text("Stopped: the command topic was changed.")
+        page.mouse.move(640, 300, steps=5)
+        page.wait_for_timeout(300)  # proves absence
+        assert relay.commands("/cmd_vel_nav") == []
+        page.mouse.up()
+        hold_joystick(page)
+        relay.until(lambda: relay.commands("/cmd_vel_nav"), "no command came")
+        page.mouse.up()
+
+    def test_a_robot_that_somebody_stops(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A stop by anybody ends driving here, and says who it was."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        relay.do(robot=ROBOT, stopped="ann")
+        expect(seen(page, "stopped")).to_contain_text("By ann")
+        ends_with_one_zero(page, relay)
+        page.mouse.up()
+
+
+PADS = """
+  window.pad = { index: 0, id: 'Pad', connected: true, axes: [0, 0, 0, 0], timestamp: 0, mapping: 'standard',
+                 buttons: Array.from({ length: 17 }, () => ({ pressed: false, touched: false, value: 0 })) }
+  navigator.getGamepads = () => [window.pad, null, null, null]
+"""
+
+
+class TestGamepad:
+    def open(self, open_page: OpenPage) -> Page:
+        page = open_page("/fleet", user="driver")
+        page.add_init_script(PADS)
+        page.goto(COCKPIT)
+        ready_to_drive(page)
+        seen(page, "input-gamepad").click()
+        expect(seen(page, "gamepad")).to_have_attribute("data-pad", "ready")
+        return page
+
+    def hold(self, page: Page, relay: FakeRelay) -> None:
+        page.evaluate("pad.axes[1] = -1; pad.buttons[5].pressed = true")
+        driving(relay)
+
+    def test_drives_while_the_shoulder_button_is_held(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The stick alone moves nothing; letting the button go sends one zero."""
+        page = self.open(open_page)
+        page.evaluate("pad.axes[1] = -1")
+        page.wait_for_timeout(300)  # proves absence
+        assert relay.commands() == []
+        self.hold(page, relay)
+        assert relay.commands()[-1] == (0.5, 0)
+        page.evaluate("pad.buttons[5].pressed = false")
+        ends_with_one_zero(page, relay)
+
+    def test_that_is_gone_stops(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A pad that is disconnected while it drives sends one zero, and says so."""
+        page = self.open(open_page)
+        self.hold(page, relay)
+        page.evaluate("window.pad = null")
+        ends_with_one_zero(page, relay)
+        expect(seen(page, "drive-words")).to_have_text("Stopped: the gamepad is gone.")
+
+    def test_has_to_be_let_go_after_a_stop(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A page that lost the focus is not driven on by the button that is still held."""
+        page = self.open(open_page)
+        self.hold(page, relay)
+        page.evaluate(LEAVING["blur"])
+        ends_with_one_zero(page, relay)
+
+
+class TestTilt:
+    def test_a_tilted_phone_drives(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Held and tilted it drives, lifted it stops with one zero; silence of the phone stops it, too."""
+        page = open_page(COCKPIT, user="driver", width=390, height=844, has_touch=True, is_mobile=True)
+        ready_to_drive(page)
+        seen(page, "input-tilt").click()
+        session = page.context.new_cdp_session(page)
+
+        def tilt(beta: float) -> None:
+            session.send(
+                "DeviceOrientation.setDeviceOrientationOverride", {"alpha": 0, "beta": beta, "gamma": 0}
+            )
+
+        seen(page, "tilt-ask").click()
+        page.evaluate(
+            "addEventListener('deviceorientation', told => { document.body.dataset.beta = Math.round(told.beta) })"
+        )
+        button = seen(page, "tilt-hold")
+        button.scroll_into_view_if_needed()
+        box = button.bounding_box()
+        assert box is not None
+        at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+        for leave in ("lift", "silence"):
+            before = len(relay.commands())
+            for _ in range(8):
+                tilt(40)
+                # How it is held when it is touched is what counts as level.
+                expect(page.locator("body[data-beta='40']")).to_be_attached()
+                session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
+                for i in range(10):
+                    tilt(10 + i / 2)
+                    page.wait_for_timeout(50)  # a phone tells its angles all the time
+                if len(relay.commands()) > before + 3:
+                    break
+                # Again: the machine was so busy that the phone seemed to have fallen silent.
+                session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+            relay.until(lambda before=before: len(relay.commands()) > before + 3, "no commands came")
+            assert max(ahead for ahead, _ in relay.commands()[before:]) == 0.5
+            if leave == "lift":
+                session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+            ends_with_one_zero(page, relay)
+        session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        expect(seen(page, "drive-words")).to_contain_text("no longer tells how it is held")
