@@ -35,7 +35,7 @@ robot-conformance: ## check a robot that dials LISTEN=0.0.0.0:9091 (docs/conform
 	@$(CASES) tests/conformance/robot_link --listen='$(LISTEN)'
 
 bench: ## measure beside alternatives, about 15 minutes (options: BENCH='hop fanout', BENCH='--quick')
-	@scripts/setup.sh python interfaces bench
+	@scripts/setup.sh python web interfaces browser bench
 	$(BIN)/python -m bench $(BENCH)
 
 lint: setup ## style and import rules

@@ -7,6 +7,7 @@ import base64
 import hashlib
 import json
 import math
+import os
 import random
 import secrets
 import select
@@ -30,7 +31,9 @@ SENSORS = {
 }
 MOTION = {"types": [TWIST], "deadline_ms": 500, "stop_within_ms": 500}
 HOST, PORT, NAME, CODE, FILE = sys.argv[1:]
-robot = SimpleNamespace(v=0.0, w=0.0, until=0, told={}, heartbeat=2.0, wait=0.5)
+robot = SimpleNamespace(v=0.0, w=0.0, until=0, told={}, heartbeat=2.0, wait=0.5, safety=None)
+robot.holder, robot.mover, robot.suppressed, robot.inhibited = 0, 0, {}, {}
+robot.commanding, robot.barred = {}, set()  # sources: when they last wanted it to move; who must let go first
 
 
 def now():
@@ -46,12 +49,99 @@ def motors(v, w):
 
 
 def every_20_ms(*_):
-    if now() > robot.until:  # the watchdog
-        robot.v = robot.w = 0.0
-    motors(robot.v, robot.w)
+    if now() > robot.until or not moves(robot.mover):  # the watchdog
+        robot.v = robot.w = robot.until = 0
+    motors(float(robot.v), float(robot.w))
 
 
-# 2. Frames: four bytes of length, one of kind, the body
+# 2. Who moves them: stop, then whoever suppresses, then whoever holds control
+
+
+def moves(source):
+    if "stopped" in me:
+        return False
+    if now() < robot.suppressed.get("until", 0):
+        return source in robot.suppressed["sources"]
+    return source == robot.holder != 0
+
+
+def obeys(source, moving):
+    """Whether this source is obeyed. Who commanded when he might not must let go first: zero, or nothing for 500 ms."""
+    silent = now() - robot.commanding.pop(source, 0) > 500 * MS
+    if silent or not moving:
+        robot.barred.discard(source)
+    if moving:
+        robot.commanding[source] = now()
+        if "stopped" in me:
+            robot.barred.add(source)
+        if len(robot.commanding) > 100:
+            robot.commanding.pop(next(iter(robot.commanding)))
+    return moves(source) and source not in robot.barred
+
+
+def hold(holder):
+    if holder != robot.holder:
+        against = now() - robot.commanding.get(holder, 0) <= 500 * MS
+        robot.barred = {robot.holder, *({holder} if against and robot.holder else robot.barred & {holder})}
+        robot.holder, robot.until = holder, 0
+
+
+def obey(op, said):
+    """Do what the relay orders; what speaks against it."""
+    topic, until = said.get("resource"), now() + said.get("ms", 0) * MS
+    if op == "control":
+        hold(said.get("holder", 0))
+    elif op == "stop":
+        me.setdefault("stopped", {"by": said["by"], "why": said.get("why", ""), "since": time.time()})
+    elif op == "resume":
+        me.pop("stopped", None)
+        robot.barred.add(robot.holder)
+        robot.commanding[robot.holder] = now()
+    elif op == "suppress" and topic != "/cmd_vel":
+        return f"{topic} does not move this robot"
+    elif op == "suppress":
+        robot.suppressed = {"until": until, "sources": said.get("sources", []), "by": said.get("by", "")}
+    elif topic not in SENSORS:
+        return f"there is no {topic}"
+    else:
+        last = robot.inhibited.get(topic, {}).get("last")
+        robot.inhibited[topic] = {
+            "until": until,
+            "hold": said.get("hold", False),
+            "by": said.get("by", ""),
+            "last": last,
+        }
+    every_20_ms()  # zero is said before the answer
+    if op in ("stop", "resume"):
+        remember()
+    return ""
+
+
+def safety(left=lambda until: until):
+    """What the relay is told whenever it changes."""
+    told = {"holder": robot.holder, "moving": bool(robot.v or robot.w), "suppressed": [], "inhibited": []}
+    if "stopped" in me:
+        told["stopped"] = me["stopped"]
+    for kind, lasting in (("suppressed", {"/cmd_vel": robot.suppressed}), ("inhibited", robot.inhibited)):
+        for topic, each in lasting.items():
+            if now() < each.get("until", 0):
+                shown = {name: each[name] for name in ("sources", "hold", "by") if name in each}
+                told[kind].append({"resource": topic, "ms": left(each["until"]), **shown})
+    return told
+
+
+def remember():
+    """Keep key, relay and stop where a crash does not reach them."""
+    new = Path(FILE + ".new")
+    new.touch(0o600)
+    with new.open("w") as file:
+        file.write(json.dumps(me))
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(FILE)
+
+
+# 3. Frames: four bytes of length, one of kind, the body
 
 
 def dial(address, limit):
@@ -80,7 +170,7 @@ def receive(link):
     link.buffer += data
     while len(link.buffer) >= 5:
         length, kind = struct.unpack_from("!IB", link.buffer)
-        if not 1 <= length <= link.limit or kind > 1:
+        if not 1 <= length <= link.limit or kind not in (0, 1, 5):
             raise ValueError(f"a frame of kind {kind} with {length} bytes breaks the contract")
         if len(link.buffer) < 4 + length:
             return
@@ -88,12 +178,14 @@ def receive(link):
         del link.buffer[: 4 + length]
         if kind == 0:
             yield json.loads(body)
+        elif kind == 1:  # nothing here takes samples: what moves takes commands alone
+            yield {"op": "sample"}
         else:
-            number, stamp = struct.unpack_from("!IQ", body)
-            yield {"op": "sample", "number": number, "stamp": stamp, "message": body[12:]}
+            number, stamp, source = struct.unpack_from("!IQI", body)
+            yield {"op": "command", "number": number, "stamp": stamp, "source": source, "message": body[16:]}
 
 
-# 3. The control link: enrol once, prove who we are, say what we are, open channels
+# 4. The control link: enrol once, prove who we are, say what we are, open channels
 
 
 def greet(control):
@@ -123,18 +215,20 @@ def describe(control):
 def order(links, control, op, said):
     if op == "enrolled":
         me["relay"] = said["relay"]
-        Path(FILE).touch(0o600)
-        Path(FILE).write_text(json.dumps(me))
+        remember()
         raise EOFError("enrolled, now to dial again")
     if op == "challenge" and said["relay"] == me["relay"]:
         prove(control, said["nonce"])
     elif op == "welcome":
         robot.heartbeat = min(max(0.1, float(said["heartbeat"])), 60)
-        robot.wait, control.ping_due = 0.5, 0
+        robot.wait, robot.safety, control.ping_due = 0.5, None, 0
         describe(control)
     elif op == "open_channel" and len(links) < 10:
         links.append(dial(control.socket.getpeername()[:2], 4 * 1024 * 1024))
         say(links[-1], "join", version=1, ticket=said["ticket"])
+    elif op in ("control", "stop", "resume", "suppress", "inhibit"):
+        reason = obey(op, said)
+        say(control, "done", id=said["id"], ok=not reason, reason=reason)
     elif op != "close_channel":  # the relay then hangs up on the channel's own link, too
         if op in ("refused", "challenge"):  # a challenge of another relay: nothing was signed
             seconds = float(said.get("retry_after") or 30)  # without a time only a person can help
@@ -142,7 +236,7 @@ def order(links, control, op, said):
         raise ValueError(f"the relay says {said}")
 
 
-# 4. Channel links: what clients want
+# 5. Channel links: what clients want
 
 
 def request(link, op, said):
@@ -162,16 +256,16 @@ def request(link, op, said):
     elif op == "unadvertise":
         link.commands.discard(number)
         robot.until = 0
-    elif op == "sample":
+    elif op == "command":
         if number in link.commands:
-            command(link, said["stamp"], said["message"])
+            command(link, said["stamp"], said["source"], said["message"])
     elif op == "call_service" and said["service"] == "/beep":
         say(link, "service_response", id=said["id"], result=True, values={"success": True, "message": "beep"})
     elif op == "call_service":
         say(link, "service_response", id=said["id"], result=False, reason="there is only /beep")
     elif op == "send_action_goal":
         say(link, "action_result", id=said["id"], status=0, result=False, reason="there are no actions")
-    elif not op.startswith(("unadvertise_", "cancel_")):  # these want no answer
+    elif not op.startswith(("sample", "unadvertise_", "cancel_")):  # these want no answer
         ref = next((str(said[each]) for each in ("number", "service", "action", "type") if each in said), "")
         say(link, "failed", what=op, ref=ref, reason="this small robot does not have that")
 
@@ -181,10 +275,17 @@ def publish(link):
         if now() >= each["due"] and select.select([], [link.socket], [], 0)[1]:  # never wait to send a sample
             each["due"] = now() + each["every"]
             sample = json.dumps(SENSORS[each["topic"]][1]()).encode()
+            quiet = robot.inhibited.setdefault(each["topic"], {"until": 0})
+            if now() >= quiet["until"]:
+                quiet["last"] = sample
+            elif quiet["hold"] and quiet["last"]:
+                sample = quiet["last"]
+            else:
+                continue
             send(link, 1, struct.pack("!IQ", number, time.time_ns()) + sample)
 
 
-# 5. Commands: how old can one be, by what the pings say of the relay's clock?
+# 6. Commands: how old can one be, by what the pings say of the relay's clock?
 
 
 def ahead(link):
@@ -198,21 +299,23 @@ def compare(link, t, at):
     link.exchanges.append((t, at))
 
 
-def command(link, stamp, body):
+def command(link, stamp, source, body):
     try:
         twist = json.loads(body)
         speeds = [float(twist.get(part, {}).get(axis, 0)) for part in ("linear", "angular") for axis in "xyz"]
         age = now() + ahead(link) - stamp
+        if not obeys(source, any(speeds)):
+            raise ValueError(f"source {source} does not move the robot now")
         if not 0 <= age <= MOTION["deadline_ms"] * MS or not all(map(math.isfinite, speeds)):
             raise ValueError(f"speeds {speeds}, up to {age / SECOND:.3f} s old")
     except Exception as error:
         print(f"a command was dropped: {error}", flush=True)
     else:
         robot.until = now() + (MOTION["stop_within_ms"] - 100) * MS
-        robot.v, robot.w = speeds[0], speeds[5]
+        robot.v, robot.w, robot.mover = speeds[0], speeds[5], source
 
 
-# 6. All links in turn, for ever
+# 7. All links in turn, for ever
 
 
 def serve(links, link, ready):
@@ -230,6 +333,9 @@ def serve(links, link, ready):
     if now() >= link.ping_due:
         link.ping_due = now() + min(1, robot.heartbeat) * SECOND
         say(link, "ping", t=now())
+    if link is links[0] and link.ping_due < math.inf and safety() != robot.safety:
+        robot.safety = safety()
+        say(link, "safety", **safety(lambda until: max(0, until - now()) // MS))
     publish(link)
 
 
@@ -264,6 +370,7 @@ signal.setitimer(signal.ITIMER_REAL, 0.02, 0.02)
 try:
     while True:
         links, robot.heartbeat, robot.wait = [], 2.0, min(2 * robot.wait, 30)
+        hold(0)
         try:
             live(links)
         except Exception as error:

@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import math
+import os
 import random
 import struct
 import sys
@@ -18,7 +19,9 @@ from pathlib import Path
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 TOPIC, TYPE = "/temperature", "std_msgs/msg/Float32"
+ORDERS = ("control", "stop", "resume", "suppress", "inhibit")
 HOST, PORT, NAME, CODE, FILE = sys.argv[1:]
+quiet = {"until": 0.0, "hold": False}
 
 
 def measure():
@@ -42,6 +45,7 @@ class Link:
     def __init__(self, limit, reader, writer):
         self.limit, self.reader, self.writer = limit, reader, writer
         self.heartbeat, self.ping_due, self.subscriptions = 2.0, math.inf, {}
+        self.last = None
         self.beating = asyncio.create_task(self.beat())
         self.beating.add_done_callback(lambda _: writer.transport.abort())  # also when a measurement fails
 
@@ -62,7 +66,7 @@ class Link:
         if not 1 <= length <= self.limit:
             raise ValueError(f"a frame of {length} bytes breaks the contract")
         frame = await self.reader.readexactly(length)
-        if frame[0] == 1 and length >= 13:
+        if (frame[0] == 1 and length >= 13) or (frame[0] == 5 and length >= 17):
             return {"op": "sample"}
         if frame[0] != 0:
             raise ValueError(f"a frame of kind {frame[0]} with {length} bytes breaks the contract")
@@ -93,7 +97,11 @@ class Link:
                 # Nothing waits behind a slow link: the next sample is newer.
                 if time.monotonic() >= each["due"] and not self.writer.transport.get_write_buffer_size():
                     each["due"] = time.monotonic() + each["every"]
-                    self.send(1, struct.pack("!IQ", number, time.time_ns()) + json.dumps(measure()).encode())
+                    if time.monotonic() >= quiet["until"]:
+                        self.last = json.dumps(measure()).encode()
+                    elif not quiet["hold"] or self.last is None:
+                        continue
+                    self.send(1, struct.pack("!IQ", number, time.time_ns()) + self.last)
             await asyncio.sleep(0.02)
 
 
@@ -124,14 +132,56 @@ async def register(control):
     control.say("describe", platform="json")
     topics = {TOPIC: {"types": [TYPE], "publishers": ["/robot"]}}
     control.say("graph", full=True, topics=topics, nodes={"/robot": {}})
+    control.say("safety", **safety(0))
     control.ping_due = 0
+
+
+def keep(state):
+    """Write key, relay and stop where a crash does not reach them."""
+    new = Path(FILE + ".new")
+    new.touch(0o600)
+    with new.open("w") as file:
+        file.write(json.dumps(state))
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(FILE)
+
+
+def obey(said):
+    """Do what the relay orders; what speaks against it. Nothing moves, so there is little to do."""
+    op, topic = said["op"], said.get("resource")
+    if op == "stop":
+        me.setdefault("stopped", {"by": said["by"], "why": said.get("why", ""), "since": time.time()})
+        keep(me)
+    elif op == "resume":
+        me.pop("stopped", None)
+        keep(me)
+    elif op == "suppress":
+        return "nothing here moves"
+    elif op == "inhibit" and topic != TOPIC:
+        return f"there is no {topic}"
+    elif op == "inhibit":
+        quiet.update(until=time.monotonic() + said.get("ms", 0) / 1000, hold=said.get("hold", False))
+    return ""
+
+
+def safety(holder):
+    left = int(1000 * (quiet["until"] - time.monotonic()))
+    inhibited = [{"resource": TOPIC, "hold": quiet["hold"], "ms": left}] if left > 0 else []
+    return {"holder": holder, "stopped": me.get("stopped"), "inhibited": inhibited}
 
 
 async def serve(control):
     channel = asyncio.create_task(asyncio.sleep(0))  # none yet
+    holder = 0
     try:
         while True:
-            said = await control.take("open_channel", "close_channel")
+            said = await control.take("open_channel", "close_channel", *ORDERS)
+            if said["op"] in ORDERS:
+                reason = obey(said)
+                holder = said.get("holder", 0) if said["op"] == "control" else holder
+                control.say("done", id=said["id"], ok=not reason, reason=reason)
+                control.say("safety", **safety(holder))
             if said["op"] == "open_channel":  # one at a time: the new one replaces the old one
                 channel.cancel()
                 channel = asyncio.create_task(join(control, said["ticket"]))
@@ -195,7 +245,6 @@ if not Path(FILE).exists():
         state = asyncio.run(enrol())
     except Exception as error:
         sys.exit(f"not enrolled: {error.args[0] if error.args else 'the relay does not answer'}")
-    Path(FILE).touch(0o600)
-    Path(FILE).write_text(json.dumps(state))
+    keep(state)
 me = json.loads(Path(FILE).read_text())
 asyncio.run(main())
