@@ -53,6 +53,35 @@ PROFILES = {
 }
 
 
+class Pursuer(ActionClient):
+    """An action client that may be asked in any thread.
+
+    In rclpy (7.1) an answer that another thread of the executor takes up before the question has been noted is thrown
+    away ("Ignoring unexpected goal response"), and nothing ever comes of the goal.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._asking = threading.Lock()
+        super().__init__(*arguments, **options)
+
+    def send_goal_async(self, *arguments: Any, **options: Any) -> Any:
+        with self._asking:
+            return super().send_goal_async(*arguments, **options)
+
+    def _get_result_async(self, goal: Any) -> Any:
+        with self._asking:
+            return super()._get_result_async(goal)
+
+    def _cancel_goal_async(self, goal: Any) -> Any:
+        with self._asking:
+            return super()._cancel_goal_async(goal)
+
+    async def execute(self, taken: Any) -> None:
+        with self._asking:
+            pass  # now every question that can have been answered is noted
+        await super().execute(taken)
+
+
 def load(name: str) -> Any:
     """The class of ``std_msgs/msg/String``."""
     package, kind, type_name = name.split("/")
@@ -292,7 +321,7 @@ class Fixture(Node):
         a JSON of ``accepted``, ``status``, ``feedback`` and ``result``. Feedback can be ``heard`` meanwhile."""
         type_ = load(type_name)
         feedback = self._heard[action] = []
-        client = ActionClient(self, type_, action, callback_group=self._group)
+        client = Pursuer(self, type_, action, callback_group=self._group)
         try:
             if not client.wait_for_server(PATIENCE):
                 return ["absent"]

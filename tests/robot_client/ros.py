@@ -17,6 +17,7 @@ from switchboard_domains import free_domain
 from twisted.internet import reactor, task
 
 PATIENCE = 20.0
+CONFORMANCE = Path(__file__).parents[1] / "conformance"
 
 
 @contextmanager
@@ -48,12 +49,13 @@ class Peer:
 
     def __init__(self, environment: dict[str, str]) -> None:
         self.record: list[dict[str, Any]] = []
+        paths = os.pathsep.join(filter(None, (str(CONFORMANCE), environment.get("PYTHONPATH"))))
         self._process = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("ros_peer.py"))],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env=environment,
+            env={**environment, "PYTHONPATH": paths},
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

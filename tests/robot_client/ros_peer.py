@@ -12,8 +12,9 @@ import rclpy
 from builtin_interfaces.msg import Time
 from example_interfaces.action import Fibonacci
 from example_interfaces.srv import AddTwoInts
+from fixture_node import Pursuer
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -143,7 +144,7 @@ def unact(action: str) -> None:
 
 def send(action: str, order: int) -> None:
     """Want a goal pursued; all that comes of it is told."""
-    client = ends.setdefault("send " + action, ActionClient(node, Fibonacci, action))
+    client = ends.setdefault("send " + action, Pursuer(node, Fibonacci, action))
     assert client.wait_for_server(20)
     future = client.send_goal_async(
         Fibonacci.Goal(order=order),
