@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from switchboard_client import Client
-from switchboard_commands import run_command
+from switchboard_forks import run_command
 from switchboard_processes import BIN, Process
 from websockets.sync.client import connect
 
@@ -52,7 +52,9 @@ class Relay:
 
     def run_cli(self, *arguments: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
         """Run an admin command as it is."""
-        return run_command(["--data", str(self.data), *arguments], env=self._environment, stdin=stdin)
+        return run_command(
+            ["switchboard", "--data", str(self.data), *arguments], env=self._environment, stdin=stdin
+        )
 
     def user(self, name: str, password: str = "correct horse", *, admin: bool = False) -> str:
         """Add a user and return an access token."""

@@ -7,6 +7,7 @@ import subprocess
 from typing import Any
 
 from switchboard_domains import free_domain
+from switchboard_forks import run_command
 from switchboard_processes import BIN, Process, ros_environment
 from switchboard_relay import Relay
 from switchboard_waiting import wait_for
@@ -61,7 +62,7 @@ class Robot:
             self.name,
         ]
         command += ["--code", "-", "--state", str(self.state), *options]
-        return subprocess.run(command, input=code, capture_output=True, text=True, timeout=60, check=False)
+        return run_command(command, stdin=code)
 
     def _daemon(self) -> Process:
         command = [str(BIN / "switchboard-robot"), "run", "--state", str(self.state)]

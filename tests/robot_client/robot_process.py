@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import psutil
+from switchboard_forks import Forked, start
 
 from tests.robot_client.fake_relay import FakeRelay
 from tests.robot_client.ros import PATIENCE
@@ -30,23 +29,16 @@ class Robot:
         self.state = state
         self.log = state.with_suffix(".log")
         self._environment = environment
-        self._processes: list[subprocess.Popen[str]] = []
+        self._processes: list[Forked] = []
 
-    def start(self, *arguments: str, stdin: str | None = None) -> subprocess.Popen[str]:
-        with self.log.open("a") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "robot_client.cli", *arguments, "--state", str(self.state)],
-                env=self._environment,
-                stdin=subprocess.PIPE if stdin is not None else subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                text=True,
-            )
-        self._processes.append(process)
+    def start(self, *arguments: str, stdin: str | None = None) -> Forked:
+        said = None
         if stdin is not None:
-            assert process.stdin is not None
-            process.stdin.write(stdin)
-            process.stdin.close()
+            said = self.state.with_suffix(".stdin")
+            said.write_text(stdin)
+        command = ["switchboard-robot", *arguments, "--state", str(self.state)]
+        process = start(command, self.log, self.log, env=self._environment, stdin=said)
+        self._processes.append(process)
         return process
 
     def enroll(self) -> None:
@@ -56,13 +48,13 @@ class Robot:
         self.asked = self.relay.enroll()
         assert process.wait(PATIENCE) == 0, self.log.read_text()
 
-    def run(self, *arguments: str) -> subprocess.Popen[str]:
+    def run(self, *arguments: str) -> Forked:
         return self.start("run", *arguments)
 
-    def guards(self, process: subprocess.Popen[str]) -> list[psutil.Process]:
+    def guards(self, process: Forked) -> list[psutil.Process]:
         return self.children(process, "robot_client.guard")
 
-    def children(self, process: subprocess.Popen[str], module: str) -> list[psutil.Process]:
+    def children(self, process: Forked, module: str) -> list[psutil.Process]:
         return [each for each in psutil.Process(process.pid).children() if module in each.cmdline()]
 
     def close(self) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -14,6 +12,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 from switchboard_browser import chromium, portal, sound_pages
+from switchboard_processes import Process
 
 HERE = Path(__file__).parent
 PASSWORD = "correct horse"
@@ -59,22 +58,12 @@ class FakeRelay:
 
 
 @pytest.fixture
-def relay() -> Iterator[FakeRelay]:
-    process = subprocess.Popen(
-        [sys.executable, str(HERE / "fake_relay.py"), "--portal", str(portal())],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+def relay(tmp_path: Path) -> Iterator[FakeRelay]:
+    process = Process([str(HERE / "fake_relay.py"), "--portal", str(portal())], tmp_path, "fake-relay")
     try:
-        assert process.stdout is not None
-        words = process.stdout.readline().split()
-        assert words[:1] == ["READY"], f"the fake relay did not start: {words}"
-        yield FakeRelay(f"http://127.0.0.1:{words[1]}")
+        yield FakeRelay(f"http://127.0.0.1:{process.wait_to_say('READY').split()[1]}")
     finally:
-        process.terminate()
-        process.wait(10)
-        if process.stdout is not None:
-            process.stdout.close()
+        process.stop()
 
 
 @pytest.fixture(scope="module")
