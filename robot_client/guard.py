@@ -42,6 +42,9 @@ LOOK_EVERY = 20 * MILLI
 LOOK_SELDOM = 500 * MILLI
 """How often to look whether a new publisher has found its listeners: the less the longer nobody was there."""
 
+NICE = -10
+"""The guard does little, and that at once: its scheduling priority, if it may have it (``setpriority(2)``)."""
+
 UNHEARD = 10 * NANO
 """How much longer to repeat while nobody who listens to the topic was found yet, after the daemon's end."""
 
@@ -341,6 +344,8 @@ def main(node: str, within_ms: int, sim_time: bool) -> None:
     """Stop the robot when the daemon that started this can't."""
     with contextlib.suppress(PermissionError):  # a leader of its own already
         os.setsid()  # what ends the daemon's group or terminal must not end its guard
+    with contextlib.suppress(PermissionError):  # it works without, and is late where the computer is busy
+        os.setpriority(os.PRIO_PROCESS, 0, NICE)
     outlet = _own_stdout()
     wake = _wake_on_sigterm()
     guard = Guard(within_ms, RosOutlets(node, sim_time), now_ns)

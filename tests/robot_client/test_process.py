@@ -8,6 +8,7 @@ import signal
 import stat
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -244,6 +245,25 @@ def test_killed_daemon_stops(drive: Drive) -> None:
     drive.process.kill()
     assert drive.zero_after(last) < STOP_MS
     until(lambda: not drive.guard.is_running())
+
+
+def test_guard_goes_before_others_where_it_may(drive: Drive) -> None:
+    """Its priority is raised, unless its user is not allowed to."""
+    assert drive.guard.nice() == (-10 if _may_be_raised() else os.getpriority(os.PRIO_PROCESS, 0))
+
+
+def _may_be_raised() -> bool:
+    """Whether processes of this user may have such a priority; tried by a thread, which is one to Linux."""
+
+    def attempt() -> bool:
+        try:
+            os.setpriority(os.PRIO_PROCESS, 0, -10)
+        except PermissionError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(1) as one:
+        return one.submit(attempt).result()
 
 
 def test_killed_daemon_lets_go_of_a_joystick(drive: Drive) -> None:
