@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -92,6 +93,8 @@ class FrontDesk:
         self._cookie = cookie
         self._clock_ns = clock_ns
         self._wall = wall
+        # By them robots know who has to let go. They must not take a client for one of a relay that ran before.
+        self._numbers = itertools.count(secrets.randbelow(1 << 31) + 1)
         self._sessions: dict[int, dict[int, Session]] = {}
         self._watchings: set[Watching] = set()
         people = People(self.sessions_of, desks.holder, clock.seconds)
@@ -204,6 +207,7 @@ class FrontDesk:
             self.timing,
             self._rounds,
             self._budgets.of(admission.permit.principal.user_id),
+            number=next(self._numbers),
             address=admission.address,
             since=self._wall(),
             ended=self._ended,

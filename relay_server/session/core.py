@@ -5,8 +5,6 @@ Bytes come in as whole websocket messages and go out as frames; every message is
 
 from __future__ import annotations
 
-import itertools
-import secrets
 from collections.abc import Callable
 
 from twisted.logger import Logger
@@ -52,13 +50,11 @@ SMALL = 4 * KIB
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
 
-_numbers = itertools.count(secrets.randbelow(1 << 31) + 1)
-"""By them robots know who has to let go. They must not take a client for one of a relay that ran before."""
-
 
 class Session:
     """See the module's text.
 
+    :param number: of this client; no other of this relay has it
     :param address: where the client is, for people
     :param since: Unix time it came
     :param ended: called once when it is over
@@ -86,11 +82,12 @@ class Session:
         rounds: Rounds,
         allowance: Allowance,
         *,
+        number: int,
         address: str,
         since: float,
         ended: Callable[[Session], None],
     ) -> None:
-        self.number = next(_numbers)
+        self.number = number
         self.permit = permit
         self.robot = robot
         self.channel = channel

@@ -239,6 +239,7 @@ class World:
         self.people: list[Session] = []
         self.presence = People(lambda robot_id: self.people, lambda robot: 0, self.clock.seconds)
         self._tokens = itertools.count(1)
+        self._numbers = itertools.count(1)
 
     def now_ns(self) -> int:
         """The clock in nanoseconds."""
@@ -320,6 +321,7 @@ class World:
             Timing(client_ping=2.0, driving_ping=0.1, stall_limit=5.0),
             self.rounds,
             self.budgets.of(user),
+            number=next(self._numbers),
             address="192.0.2.7",
             since=1.7e9,
             ended=self.people.remove,
