@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import secrets
 from collections.abc import Callable
 
 from twisted.internet.defer import Deferred
@@ -18,6 +19,9 @@ DONE_SECONDS = 3.0
 
 WAITING = 512
 """Orders without an answer at a time; what stops the robot is never one too many."""
+
+FIRST_IDS = 1 << 30
+"""Orders are counted from a number up to this one: far apart from relay to relay, and within 32 bits all the same."""
 
 
 class NotDone(SwitchboardError):
@@ -38,7 +42,8 @@ class Orders:
     def __init__(self, clock: Clock, robot: Presence) -> None:
         self._clock = clock
         self._robot = robot
-        self._ids = itertools.count(1)
+        # A robot may still answer a relay that ran before; its numbers must not be taken for ours (SPEC section 2.4).
+        self._ids = itertools.count(secrets.randbelow(FIRST_IDS) + 1)
         self._waiting: dict[int, _Waiting] = {}
 
     def give(

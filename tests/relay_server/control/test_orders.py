@@ -79,3 +79,17 @@ def test_an_answer_to_nothing_is_let_go() -> None:
     assert stop(place) == [None]
     place.desk.told(link.Done(id=1))
     place.desk.told(link.Done(id=-7, ok=False))
+
+
+def test_an_answer_meant_for_a_relay_that_ran_before_ends_no_order_of_this_one() -> None:
+    """A robot may still have it to say when it dials again."""
+    before = Place().online()
+    for _ in range(3):
+        stop(before)
+    place = Place().online()
+    place.link.silent = True
+    asked = [stop(place) for _ in range(3)]
+    for order in before.link.orders(link.Stop):
+        place.desk.told(link.Done(id=order.id))
+    assert asked == [[], [], []]
+    assert all(0 < order.id < 1 << 31 for order in place.link.orders(link.Stop))
