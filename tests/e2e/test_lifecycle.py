@@ -249,7 +249,7 @@ def test_two_relays_live_side_by_side_on_one_host(house: House, tmp_path: Path) 
 @contextlib.contextmanager
 def demo_in(folder: Path) -> Iterator[Process]:
     """``switchboard demo`` on a data folder, killed with all its children at the end, if need be."""
-    command = [str(BIN / "switchboard"), "demo", "--data", str(folder / "demo")]
+    command = [sys.executable, str(BIN / "switchboard"), "demo", "--data", str(folder / "demo")]
     demo = Process(command, folder, "demo")
     try:
         yield demo
