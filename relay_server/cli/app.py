@@ -142,6 +142,13 @@ pass_app = click.make_pass_decorator(App)
 json_option: Callable[[Any], Any] = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON, and nothing else, to stdout."
 )
+why_option: Callable[[Any], Any] = click.option(
+    "--why",
+    default="",
+    # What is no UTF-8 must not keep an order to stop from being understood.
+    callback=lambda _context, _option, why: why.encode("utf-8", "replace").decode(),
+    help="The reason, for the others and for the record.",
+)
 yes_option: Callable[[Any], Any] = click.option("--yes", is_flag=True, help="Don't ask.")
 
 

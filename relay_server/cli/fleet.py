@@ -11,7 +11,7 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound, Unavailable
-from relay_server.cli.app import App, examples, json_option, pass_app, sure, yes_option
+from relay_server.cli.app import App, examples, json_option, pass_app, sure, why_option, yes_option
 from relay_server.cli.output import progress, say, show, show_json, table, tell
 from relay_server.cli.relaysocket import give_order
 
@@ -24,9 +24,6 @@ timeout_option: Callable[[Any], Any] = click.option(
     default=SECONDS,
     show_default=True,
     help="Seconds each robot has.",
-)
-why_option: Callable[[Any], Any] = click.option(
-    "--why", default="", help="The reason, for the others and for the record."
 )
 
 

@@ -10,12 +10,10 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Unavailable
-from relay_server.cli.app import App, examples, json_option, os_user, pass_app
+from relay_server.cli.app import App, examples, json_option, os_user, pass_app, why_option
 from relay_server.cli.failure import REFUSED
 from relay_server.cli.output import show_json, tell
 from relay_server.cli.relaysocket import NoRelay, order_motion
-
-why_option = click.option("--why", default="", help="The reason, for the others and for the record.")
 
 
 @click.command(

@@ -10,7 +10,7 @@ from relay_server.control.desk import Desk
 from relay_server.control.hub import Desks
 from relay_server.control.lease import FREE, Client, Lease, State
 from relay_server.control.orders import NotDone
-from relay_server.control.record import Actor, DatabaseRecord, Record
+from relay_server.control.record import Actor, DatabaseRecord, Record, reason_in, reason_of
 from relay_server.control.stopping import Stopped
 from relay_server.control.terms import ROBOT, Answer, ControlRules, Standing, actor_of
 
@@ -31,5 +31,7 @@ __all__ = [
     "State",
     "Stopped",
     "actor_of",
+    "reason_in",
+    "reason_of",
     "view",
 ]

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
+import msgspec
 from sqlalchemy.orm import Session
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_db import queries
 from relay_db.queries import StopRecord
+from relay_protocol import jsontext
+from relay_protocol.errors import SwitchboardError
 from relay_server.journal import Journal
 from relay_server.registry import Presence
 from relay_server.store import Store
@@ -20,6 +23,22 @@ WHY = 500
 
 WAITING = 256
 """Audit entries that wait for the database at a time; what is not taken then is in the relay's log."""
+
+
+def reason_of(value: Any) -> str:
+    """The reason of a stop, as far as it can be used: no robot goes on moving for the sake of words.
+
+    :param value: what was given as one
+    """
+    return value[:WHY] if isinstance(value, str) else ""
+
+
+def reason_in(json: msgspec.Raw) -> str:
+    """The same for one in JSON, also where that is none."""
+    try:
+        return reason_of(jsontext.decode_any(bytes(json)))
+    except SwitchboardError:
+        return ""
 
 
 class Actor(NamedTuple):

@@ -12,6 +12,7 @@ from twisted.web.server import Request
 
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
+from relay_server.control import reason_in
 from relay_server.edges.problems import problem_of
 
 
@@ -29,11 +30,12 @@ class StopOrder(msgspec.Struct):
     """Body of ``POST /stop`` and ``POST /resume``; without ``robot`` all are stopped.
 
     :param by: who is at the machine
+    :param why: the reason, where it is one
     """
 
     by: str
     robot: str | None = None
-    why: str = ""
+    why: msgspec.Raw = msgspec.Raw(b"")
 
 
 _order_decoder = msgspec.json.Decoder(StopOrder)
@@ -81,7 +83,7 @@ class AdminSocket:
 
     async def _stop(self, request: Request) -> Any:
         order = jsontext.decode(_order_decoder, request.content.read())
-        return {"robots": await self._stopping.stop_here(order.robot, order.why, order.by)}
+        return {"robots": await self._stopping.stop_here(order.robot, reason_in(order.why), order.by)}
 
     @app.route("/resume", methods=["POST"])
     def resume(self, request: Request) -> Deferred[bytes]:
@@ -89,7 +91,7 @@ class AdminSocket:
 
     async def _resume(self, request: Request) -> Any:
         order = jsontext.decode(_order_decoder, request.content.read())
-        await self._stopping.resume_here(order.robot or "", order.why, order.by)
+        await self._stopping.resume_here(order.robot or "", reason_in(order.why), order.by)
         return {}
 
     async def _told(self, request: Request, work: Awaitable[Any]) -> bytes:

@@ -12,10 +12,12 @@ from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 from werkzeug.exceptions import NotFound as NothingHere
 
+from relay_protocol import jsontext
+from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import NAME, WORDS
 from relay_server.access import Principal
 from relay_server.console import Outcome
-from relay_server.control import Answer, NotDone
+from relay_server.control import Answer, NotDone, reason_of
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.problems import problem
 
@@ -124,7 +126,7 @@ class RobotControl:
 
     async def _stop(self, request: Request) -> Any:
         principal, robot, address = await self._asked(request)
-        why = _body(request, Why).why
+        why = _reason(request)
         try:
             outcome = await self._desk.stop(principal, robot, why, address)
         except NotDone as error:
@@ -173,6 +175,15 @@ def _body(request: Request, kind: type[T]) -> T:
     empty = not request.content.read(1)
     request.content.seek(0)
     return kind() if empty else body_of(request, kind)
+
+
+def _reason(request: Request) -> str:
+    """Why a robot is stopped. A body that can't be read gives no reason, and is none to let it go on moving."""
+    try:
+        said = jsontext.decode_any(request.content.read())
+    except SwitchboardError:
+        return ""
+    return reason_of(said.get("why")) if isinstance(said, dict) else ""
 
 
 def below(desk: Desk, part: str, api: Api, robot: str) -> IResource:

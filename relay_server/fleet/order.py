@@ -7,8 +7,11 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from relay_protocol.errors import Invalid
+from relay_protocol import jsontext
+from relay_protocol.errors import Invalid, SwitchboardError
 from relay_protocol.limits import NAME
+from relay_server.control import reason_in
+from relay_server.control.record import WHY
 
 ROBOTS = 64
 """Names, patterns and groups in one order."""
@@ -17,6 +20,7 @@ SECONDS = 10.0
 """What a robot has when nothing is said."""
 
 _NOTHING = msgspec.Raw(b"{}")
+_NO_REASON = msgspec.Raw(b'""')
 
 Text = Annotated[str, Meta(max_length=NAME)]
 
@@ -39,6 +43,7 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     :param name: of a parameter, ``<node>:<parameter>``
     :param value: of the parameter, any JSON
     :param timeout: seconds for each robot, from when its turn comes
+    :param reason: JSON; of a stop anything, see :attr:`why`
     """
 
     robots: Annotated[
@@ -53,10 +58,17 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     msg: msgspec.Raw = _NOTHING
     value: msgspec.Raw = msgspec.Raw(b"")
     timeout: Annotated[float, Meta(ge=0.1, le=300.0)] = SECONDS
-    why: Annotated[str, Meta(max_length=500)] = ""
+    reason: msgspec.Raw = msgspec.field(default=_NO_REASON, name="why")
+
+    @property
+    def why(self) -> str:
+        """The reason, as far as it can be used."""
+        return reason_in(self.reason)
 
     def check(self) -> None:
         """:raises Invalid: a field is missing, or does not go with what is to be done"""
+        if self.do != "stop" and not _sound(self.reason):
+            raise Invalid(f"'why' must be a string of {WHY} characters at most")
         for field in _NEEDED.get(self.do, ()):
             if not _plain(getattr(self, field)):
                 raise Invalid(f"'{self.do}' needs '{field}'")
@@ -68,6 +80,14 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def subject(self) -> str:
         """What it is about: a service, a topic, a parameter, or nothing."""
         return self.service or self.topic or self.name
+
+
+def _sound(reason: msgspec.Raw) -> bool:
+    try:
+        said = jsontext.decode_any(bytes(reason))
+    except SwitchboardError:
+        return False
+    return isinstance(said, str) and len(said) <= WHY
 
 
 def _plain(value: str | msgspec.Raw) -> str | bytes:

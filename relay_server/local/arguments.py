@@ -7,6 +7,19 @@ from typing import Any
 from relay_protocol.errors import Invalid
 
 
+def argument(args: Any, field: str, position: int = 0, default: Any = None) -> Any:
+    """One argument, whatever it is.
+
+    :param position: its place in a list
+    :param default: for one that is left out
+    """
+    if isinstance(args, dict):
+        return args.get(field, default)
+    if isinstance(args, list):
+        return args[position] if position < len(args) else default
+    return default
+
+
 def text(args: Any, field: str, position: int = 0, default: str | None = None) -> str:
     """One argument, a string.
 
@@ -14,13 +27,7 @@ def text(args: Any, field: str, position: int = 0, default: str | None = None) -
     :param default: for one that is left out; ``None`` when it must be given
     :raises Invalid: it is left out, or no string
     """
-    value: Any = None
-    if isinstance(args, dict):
-        value = args.get(field, default)
-    elif isinstance(args, list):
-        value = args[position] if position < len(args) else default
-    elif default is not None:
-        value = default
+    value = argument(args, field, position, default)
     if not isinstance(value, str):
         raise Invalid(f"give '{field}', a string")
     return value

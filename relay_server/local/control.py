@@ -8,8 +8,8 @@ from typing import Any
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
-from relay_server.control import Answer, actor_of, view
-from relay_server.local.arguments import text
+from relay_server.control import Answer, actor_of, reason_of, view
+from relay_server.local.arguments import argument, text
 from relay_server.session import Session
 
 
@@ -35,7 +35,7 @@ async def refuse_control(session: Session, args: Any) -> Any:
 
 async def stop(session: Session, args: Any) -> Any:
     """``/relay/stop``: for everybody with a right on the robot, which is who has a session."""
-    done = await session.desk.stopping.stop(actor_of(session), _why(args))
+    done = await session.desk.stopping.stop(actor_of(session), reason_of(argument(args, "why")))
     name = session.robot.name
     said = (
         f"robot {name} is stopped" if done else f"robot {name} will be stopped as soon as it can be reached"
@@ -64,7 +64,7 @@ async def suppress(session: Session, args: Any) -> Any:
 async def inhibit(session: Session, args: Any) -> Any:
     """``/relay/inhibit``"""
     resource, ms = resolve(text(args, "resource")), _number(args, "ms", 1, 1000)
-    hold = _argument(args, "hold", 2, False)
+    hold = argument(args, "hold", 2, False)
     if not isinstance(hold, bool):
         raise Invalid("'hold' must be true or false")
     session.judge(Operation.INHIBIT, resource)
@@ -96,16 +96,8 @@ def _in_words(
     return answered
 
 
-def _argument(args: Any, field: str, position: int, default: Any) -> Any:
-    if isinstance(args, dict):
-        return args.get(field, default)
-    if isinstance(args, list):
-        return args[position] if position < len(args) else default
-    return default
-
-
 def _number(args: Any, field: str, position: int, default: int) -> int:
-    value = _argument(args, field, position, default)
+    value = argument(args, field, position, default)
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if not isinstance(value, int) or isinstance(value, bool):

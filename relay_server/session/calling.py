@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 CALLS = 256
 CALL_BYTES = 2 * MIB
 """Arguments of calls that wait, over all of them."""
-URGENT = ("/relay/stop", "/relay/release_control")
+STOP = "/relay/stop"
+URGENT = (STOP, "/relay/release_control")
 """Who has used up what he may ask for may still stop a robot, and let go of it."""
 
 URGENT_CALLS = 16
@@ -85,10 +86,7 @@ class Calling:
                 self.sent(service, self._session.not_before),
             )
         else:
-            if size > LOCAL_BYTES:
-                raise Refused(f"arguments for the relay's own services may have {LOCAL_BYTES} bytes")
-            args = jsontext.decode_any(raw) if raw else {}
-            answer = self._call_local(local, args, is_urgent(ask))
+            answer = self._call_local(local, _arguments(service, raw), is_urgent(ask))
         running = Deferred.fromCoroutine(self._finish(ask, answer))
         self._calls[running] = ask
         self._bytes += size
@@ -151,3 +149,18 @@ _URGENT = {name.lstrip("/") for name in URGENT}
 
 def untold(level: str, text: str, id: rosbridge.Id) -> None:
     """What is wrong with a form was told when it was asked for."""
+
+
+def _arguments(service: str, raw: bytes) -> Any:
+    """What a service of the relay's own is called with.
+
+    :raises SwitchboardError: too much, or no JSON; a stop is none the less one
+    """
+    try:
+        if len(raw) > LOCAL_BYTES:
+            raise Refused(f"arguments for the relay's own services may have {LOCAL_BYTES} bytes")
+        return jsontext.decode_any(raw) if raw else {}
+    except SwitchboardError:
+        if service != STOP:
+            raise
+        return {}

@@ -98,3 +98,10 @@ def test_help_shows_examples(cli: Any) -> None:
         said = cli.ok(command, "--help")
         assert "Examples:" in said
         assert "Exit codes:" in said
+
+
+def test_a_reason_that_is_no_text_does_not_hold_up_a_stop(live: Any, relay: Any) -> None:
+    """Bytes that are no UTF-8 come to the relay as question marks, or it could not read the order."""
+    relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}]}')
+    assert live.ok("stop", "rover", "--why", b"sm\xffke".decode("utf-8", "surrogateescape"))
+    assert [order["why"] for order in relay.ordered] == ["sm?ke"]

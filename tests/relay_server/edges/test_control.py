@@ -178,10 +178,31 @@ def test_bodies_that_make_no_sense_are_refused(site: Site, body: Any) -> None:
 
 def test_a_body_that_is_no_json_is_refused_but_for_none_at_all(site: Site) -> None:
     """Also one that says to be something else."""
-    assert site.ask("POST", f"{HERE}/stop", raw=b"{", **ANN).status == 400
-    assert site.ask("POST", f"{HERE}/stop", raw=b"why=x", **ANN, Content_Type="text/plain").status == 400
-    assert site.post("stop", {"why": "x" * 5000}).status == 400
+    assert site.ask("POST", f"{HERE}/resume", raw=b"{", **ANN).status == 400
+    assert site.ask("POST", f"{HERE}/resume", raw=b"why=x", **ANN, Content_Type="text/plain").status == 400
+    assert site.post("resume", {"why": "x" * 5000}).status == 400
     assert site.console.asked == []
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        (b'{"why": "smoke"}', "smoke"),
+        (b'{"why": null}', ""),
+        (b'{"why": 7}', ""),
+        (b'["smoke"]', ""),
+        (b"{", ""),
+        (b"why=smoke", ""),
+        (b"\xff\xfe", ""),
+        (b'{"why": "\\ud83d"}', ""),
+        (b'{"why": "%s"}' % (b"x" * 5000), "x" * 500),
+    ],
+)
+def test_no_stop_is_refused_for_its_reason(site: Site, body: bytes, why: str) -> None:
+    """Nor for the form it comes in: what can't be used is left out."""
+    for kind in ("application/json", "application/x-www-form-urlencoded"):
+        assert site.ask("POST", f"{HERE}/stop", raw=body, **ANN, Content_Type=kind).status == 200
+    assert site.console.asked == [("stop", "rover", why, "192.0.2.9")] * 2
 
 
 def test_a_cookie_counts_only_with_a_listed_origin(site: Site) -> None:

@@ -48,12 +48,23 @@ def test_what_can_be_ordered(fields: dict[str, Any], subject: str) -> None:
         ({"do": "stop", "service": "/start"}, "'service' does not go with 'stop'"),
         ({"do": "call", "service": "/start", "msg": {"a": 1}}, "'msg' does not go with 'call'"),
         ({"do": "publish", "topic": "/a", "value": 0}, "'value' does not go with 'publish'"),
+        ({"do": "resume", "why": "x" * 501}, "'why' must be a string of 500 characters at most"),
+        ({"do": "call", "service": "/start", "why": None}, "'why' must be a string"),
+        ({"do": "publish", "topic": "/a", "why": "x"}, "'why' does not go with 'publish'"),
     ],
 )
 def test_what_makes_no_sense_is_told(fields: dict[str, Any], words: str) -> None:
     """Rather than passed over."""
     with pytest.raises(Invalid, match=words):
         order(**fields)
+
+
+@pytest.mark.parametrize(
+    ("why", "kept"), [("fire", "fire"), (None, ""), (7, ""), ({"a": [1]}, ""), ("x" * 501, "x" * 500)]
+)
+def test_no_stop_is_refused_for_its_reason(why: Any, kept: str) -> None:
+    """What can't be used of it is left out."""
+    assert order(do="stop", why=why).why == kept
 
 
 @pytest.mark.parametrize(
@@ -68,7 +79,6 @@ def test_what_makes_no_sense_is_told(fields: dict[str, Any], words: str) -> None
         {"do": "stop", "robots": ["a" * 256]},
         {"do": "stop", "timeout": 0},
         {"do": "stop", "timeout": 301},
-        {"do": "stop", "why": "x" * 501},
         {"do": "stop", "wy": "typo"},
     ],
 )

@@ -96,7 +96,7 @@ def test_suppressing_and_inhibiting_take_rights_of_their_own(world: World, peopl
         ("inhibit", {"resource": "/x", "ms": True}, "must be a whole number"),
         ("inhibit", {"resource": "/x", "hold": 1}, "'hold' must be true or false"),
         ("inhibit", {"resource": "/x", "ms": 60_001}, "must be 1 to 60000"),
-        ("stop", {"why": 7}, "give 'why'"),
+        ("take_control", {"why": 7}, "give 'why'"),
     ],
 )
 def test_arguments_that_make_no_sense_fail_the_call(
@@ -107,6 +107,27 @@ def test_arguments_that_make_no_sense_fail_the_call(
     assert (
         not world.control.all(link.Suppress) + world.control.all(link.Inhibit) + world.control.all(link.Stop)
     )
+
+
+@pytest.mark.parametrize(
+    ("args", "why"),
+    [
+        ({"why": None}, ""),
+        ({"why": 7}, ""),
+        ({"why": ["smoke"]}, ""),
+        ([None], ""),
+        (["smoke"], "smoke"),
+        (7, ""),
+        ({"why": "x" * 5000}, "x" * 500),
+        ({"why": "x" * 100_000}, ""),
+    ],
+)
+def test_no_stop_is_refused_for_its_reason(
+    world: World, people: dict[str, Person], args: Any, why: str
+) -> None:
+    """What can't be used of it is left out."""
+    assert ask(people["vic"], "/relay/stop", args)["success"] is True
+    assert [order.why for order in world.control.all(link.Stop)] == [why]
 
 
 def test_who_moves_the_robot_is_told_at_once_and_with_every_change(
