@@ -205,9 +205,7 @@ class MotionDesk:
                 continue
             if track.speaker is None:
                 track.speaker = next((each.sink for each in self._outlets.values() if each.on == on), None)
-            if self._stilling.zero(on, why):
-                self._stilling.repeat(on)
-            else:
+            if not self._stilling.still(on, why):
                 failed.append(on.topic)
         self._log.info("stopped everything: {why}", why=why)
         self._tell_finished()
@@ -277,14 +275,16 @@ class MotionDesk:
 
     def _stand(self, source: str, body: bytes, now: int) -> None:
         on, sink = self._outlets[source]
-        sink.publish(body)
         track = self._tracks[on]
         moved = self._watchdog.moves(on) or track.ramp is not None
         self._watchdog.command(on, source, False, now)
-        self._governor.stood(on, now)
         track.speaker = sink
         if moved:
-            self._stilling.repeat(on)
+            self._stilling.repeat(on)  # before it is published: where that fails it is tried again
+            self._schedule()
+        sink.publish(body)
+        self._governor.stood(on, now)
+        if moved:
             self._tell_finished()
         elif not track.zeros:
             self._guard.command(on, False, now)

@@ -71,15 +71,18 @@ class Stilling:
         for on in topics:
             if gently and self._ease(on):
                 self._log.info("bringing {topic} to a standstill: {why}", topic=on.topic, why=why)
-            elif self.zero(on, why):
+            elif self.still(on, why):
                 self._log.info("stopped {topic}: {why}", topic=on.topic, why=why)
-                self.repeat(on)
             else:
                 failed.append(on.topic)
         return failed
 
-    def zero(self, on: TypedTopic, why: str) -> bool:
-        """Say zero once; whether that could be done."""
+    def still(self, on: TypedTopic, why: str) -> bool:
+        """Say zero now and several times more, whatever was under way; whether it could be said now."""
+        self.repeat(on)
+        return self._zero(on, why)
+
+    def _zero(self, on: TypedTopic, why: str) -> bool:
         track = self._tracks[on]
         try:
             if track.speaker is None:
@@ -89,12 +92,12 @@ class Stilling:
             self._log.error(
                 "could not stop {topic} ({why}): {error}", topic=on.topic, why=why, error=str(error)
             )
-            return False  # the guard, not told, will try
+            return False  # the guard, not told, will try as well
         self.said(on)
         return True
 
     def repeat(self, on: TypedTopic) -> None:
-        """Say it several times more."""
+        """Say it several times more, beginning soon; a ramp is over by that, and what fails is tried again."""
         track = self._tracks[on]
         track.settle()
         track.zeros = REPEATS - 1
@@ -103,9 +106,8 @@ class Stilling:
     def _say_again(self, on: TypedTopic) -> None:
         track = self._tracks[on]
         track.zeros -= 1
-        if not self.zero(on, "once more"):
-            track.zeros = 0
-        elif not track.zeros:
+        said = self._zero(on, "once more")
+        if said and not track.zeros:
             # Not before: what the guard has begun to repeat goes on until this end is done.
             self._guard.command(on, False, self._now())
         if track.zeros:
@@ -136,13 +138,7 @@ class Stilling:
             pause = min(STEP, way.until - now) / NANO
             track.timer = self._clock.callLater(pause, self._step, on, way)
             return
-        track.settle()
-        stopped = self.zero(on, "its ramp is over")
-        if stopped:
-            self.repeat(on)
-        self.over(on, stopped)
-        if not stopped:
-            self.rested(on)
+        self.over(on, self.still(on, "its ramp is over"))
 
     def _slower(self, on: TypedTopic, way: Ramp, now: int) -> bool:
         """Say the speed of this moment; whether there was one to say."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import struct
+from collections.abc import Callable
 
 import pytest
 from twisted.internet.task import Clock
@@ -525,6 +526,82 @@ def test_stop_is_never_a_ramp() -> None:
     scene.run(1)
     assert scene.sent[before:] == [ZERO] * REPEATS
     assert scene.platform.sinks == []
+
+
+def fail_once(scene: Scene, monkeypatch: pytest.MonkeyPatch, topic: int = 0) -> None:
+    """The next message of a publisher is lost with an error."""
+    sink = scene.platform.sinks[topic]
+    honest = sink.publish
+
+    def broken(body: bytes) -> None:
+        monkeypatch.setattr(sink, "publish", honest)
+        raise RuntimeError("middleware is busy")
+
+    monkeypatch.setattr(sink, "publish", broken)
+
+
+def halted(scene: Scene) -> None:
+    assert scene.desk.halt("test") == ["/cmd_vel"]
+
+
+def suppressed(scene: Scene) -> None:
+    scene.authority.suppress("/cmd_vel", Suppression(frozenset({8}), scene.now() + 10**9, "eve"))
+    scene.desk.yield_topic("/cmd_vel", "test")
+
+
+def said_zero(scene: Scene) -> None:
+    with pytest.raises(RuntimeError):
+        scene.command(ZERO)
+
+
+@pytest.mark.parametrize("stop", [halted, suppressed, said_zero])
+def test_a_zero_that_fails_ends_a_ramp_and_is_said_again(
+    monkeypatch: pytest.MonkeyPatch, stop: Callable[[Scene], None]
+) -> None:
+    """Nothing of it is said after a stop, a suppression or a zero of the driver, though that could not be said."""
+    scene = ramping()
+    scene.command(GO)
+    scene.run(0.3)
+    before = len(scene.sent)
+    assert 0.0 < speeds(scene)[-1] < 1.0
+    fail_once(scene, monkeypatch)
+    stop(scene)
+    assert not scene.desk.moving
+    scene.run(1)
+    assert scene.sent[before:] == [ZERO] * (REPEATS - 1)
+    assert scene.feed.lines[-1] == ("/cmd_vel", False)
+
+
+def test_a_zero_that_fails_is_said_again(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the first fails or one of the others; the publisher of a driver who left stays for it."""
+    scene.command(GO)
+    fail_once(scene, monkeypatch)
+    scene.desk.close("a")
+    assert scene.sent == [GO]
+    scene.run(0.05)
+    fail_once(scene, monkeypatch)
+    scene.run(1)
+    assert scene.sent == [GO] + [ZERO] * (REPEATS - 2)
+    assert scene.platform.sinks == []
+    assert scene.feed.lines[-1] == ("/cmd_vel", False)
+
+
+def test_a_topic_on_which_nothing_can_be_said_is_left_to_the_guard(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is tried as often as zero is said, and the guard goes on counting it as moving."""
+    tried: list[bytes] = []
+
+    def broken(body: bytes) -> None:
+        tried.append(body)
+        raise RuntimeError("middleware is gone")
+
+    scene.command(GO)
+    monkeypatch.setattr(scene.platform.sinks[0], "publish", broken)
+    scene.desk.halt("test")
+    scene.run(1)
+    assert tried == [ZERO] * REPEATS
+    assert scene.feed.lines[-1] == ("/cmd_vel", True)
 
 
 def test_a_ramp_ends_in_time_however_late_it_begins() -> None:
