@@ -81,6 +81,7 @@ class Channel:
     ) -> None:
         self.name = name
         self._goal_topics = goal_topics
+        self._gate = gate
         self._silent = silent
         self._wire = wire
         self._offset = offset
@@ -103,7 +104,7 @@ class Channel:
             link.CallService: self._calls.call,
             link.SendActionGoal: self._goals.begin,
             link.CancelActionGoal: self._goals.cancel,
-            link.AdvertiseService: self._services.advertise,
+            link.AdvertiseService: self._advertise_service,
             link.UnadvertiseService: self._services.withdraw,
             link.ServiceResponse: self._services.answer,
             link.AdvertiseAction: self._actions.advertise,
@@ -281,6 +282,10 @@ class Channel:
             sink.close()
             raise
         return _Publishing(sink, on.topic, name)
+
+    def _advertise_service(self, message: link.AdvertiseService) -> None:
+        self._gate.offer(message.service)
+        self._services.advertise(message)
 
     def _unpublish(self, number: int) -> None:
         publishing = self._publishing.pop(number, None)

@@ -121,7 +121,7 @@ class Daemon(Body):
         self._pursuits = Pursuits(policy.actions, guard, sweep, latch, clock, now)
         self.motion.proof = lambda: connection.answered or 0
         self.motion.on_commanded = connection.prove
-        self._gate = Gate(policy, platform, self.authority, now)
+        self._gate = Gate(policy, platform, self.authority, now, settings.safety.stop_call)
         self._goal_topics = GoalTopics(
             settings.safety.goal_topics, platform, self.authority, self.motion, now
         )

@@ -1,6 +1,8 @@
 """Which of the robot's services and actions move it, who may use those, and how old what he asks may be.
 
-SPEC 2.5: "Who moves the robot", 1, and "Clocks and deadline", 9.
+The switch in its hardware is nobody's: a stop throws it, and only a resume lets go of it.
+
+SPEC 2.5: "Who moves the robot", 1 and 3, and "Clocks and deadline", 9.
 """
 
 from __future__ import annotations
@@ -14,7 +16,10 @@ from robot_client.offset import Offset
 from robot_client.platforms.base import Platform
 from robot_client.safety import MILLI, Freshness, freshness
 
-GOAL = "/_action/send_goal"
+HIDDEN = "/_action/"
+"""What the names of an action's own services have between the action's and theirs."""
+
+GOAL = HIDDEN + "send_goal"
 """What the service is called that takes an action's goals."""
 
 
@@ -22,10 +27,16 @@ class Gate:
     """Asks the authority about calls and goals, by the names the platform uses in the end, and judges their age.
 
     :param now: clock that goes on in suspends, nanoseconds
+    :param switch: service that is called at a stop and at a resume, and by no client; empty for none
     """
 
     def __init__(
-        self, policy: MotionPolicy, platform: Platform, authority: Authority, now: Callable[[], int]
+        self,
+        policy: MotionPolicy,
+        platform: Platform,
+        authority: Authority,
+        now: Callable[[], int],
+        switch: str = "",
     ) -> None:
         self.stale = 0
         """Calls and goals that were refused for their age."""
@@ -33,18 +44,20 @@ class Gate:
         self._platform = platform
         self._authority = authority
         self._now = now
+        self._switch = switch
 
     def call(self, service: str, source: int, stamp: int | None, offset: Offset) -> None:
         """See that a source may call a service.
 
         :param stamp: the relay's monotonic nanoseconds before which the call can't have been sent, if it says so
         :param offset: of the relay's clock, by the link on which the call came
-        :raises Refused: it moves the robot, and this source may not, or it may be too old
+        :raises Refused: it moves the robot, and this source may not, or it may be too old; or it is the switch
         :raises Invalid: it is no name
         """
-        if not self._policy.services and not self._policy.actions:
+        if not (self._policy.services or self._policy.actions or self._switch):
             return
         full = self._platform.full_name(service, "service")
+        self._spare(full, "call")
         moves = self._policy.moves_by_service(full)
         if full.endswith(GOAL):
             moves = moves or self._policy.moves_by_action(full[: -len(GOAL)])
@@ -55,16 +68,37 @@ class Gate:
         """See that a source may have a goal pursued; whether that moves the robot.
 
         :param stamp: as of :meth:`call`, like ``offset``
-        :raises Refused: it does, and this source may not, or it may be too old
+        :raises Refused: it does, and this source may not, or it may be too old; or the switch is a part of the action
         :raises Invalid: it is no name
         """
-        if not self._policy.actions:
+        if not (self._policy.actions or self._switch):
             return False
         full = self._platform.full_name(action, "action")
+        self._spare(full + GOAL, "call")
         moves = self._policy.moves_by_action(full)
         if moves:
             self._judge(f"a goal for {full}", source, stamp, offset)
         return moves
+
+    def offer(self, service: str) -> None:
+        """See that a client may offer a service.
+
+        :raises Refused: it is the switch
+        :raises Invalid: it is no name
+        """
+        if self._switch:
+            self._spare(self._platform.full_name(service, "service"), "offer")
+
+    def _spare(self, full: str, what: str) -> None:
+        """See that a service is not the switch.
+
+        :param what: is asked for
+        """
+        if self._switch and full == self._platform.full_name(self._switch, "service"):
+            raise Refused(
+                f"{full} is the switch in the robot's hardware, which no client may {what}: "
+                "call /relay/stop to stop the robot, /relay/resume to let it go"
+            )
 
     def _judge(self, what: str, source: int, stamp: int | None, offset: Offset) -> None:
         verdict = self._authority.judge_request(source)

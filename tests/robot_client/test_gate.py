@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol import link
+from relay_protocol.errors import Refused
+from relay_protocol.link import MotionPolicy
+from robot_client.config import Safety, Settings
+from robot_client.gate import Gate
 from robot_client.offset import Offset
+from robot_client.platforms.base import GraphView
+from tests.robot_client import daemon_scene
 from tests.robot_client.scene import DRIVER, Scene
 
 MILLI = 1_000_000
@@ -121,3 +127,78 @@ def test_the_relays_clock_of_the_very_link_counts(scene: Scene) -> None:
     other.add(scene.now(), scene.now() + ahead, scene.now())
     scene.gate.goal("/navigate_to_pose", DRIVER, scene.now() + ahead, other)
     assert goal(scene, "/navigate_to_pose", scene.now() + ahead) is not None
+
+
+# --- the switch in the hardware ----------------------------------------------------------------------------
+
+
+def armed(settings: Safety) -> tuple[daemon_scene.Line, daemon_scene.Line, list[bytes]]:
+    """A daemon with that switch, control link and channel; what its service is asked."""
+    made = daemon_scene.Scene(settings=Settings(safety=settings), switches=settings.switches)
+    asked: list[bytes] = []
+
+    def thrown(request: bytes) -> bytes:
+        asked.append(request)
+        return b"\0\1\0\0\1\0\0\0\1\0\0\0\0"
+
+    made.platform.view = GraphView(services={"/estop": link.Service(types=["std_srvs/srv/SetBool"])})
+    made.platform.services |= {"/estop": thrown, "estop": thrown}
+    control = made.register()
+    control.say(link.Control(id=1, holder=DRIVER, user="ann", level="owner"))
+    channel = made.channel(control)
+    channel.heard()
+    return control, channel, asked
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+@pytest.mark.parametrize("source", [0, DRIVER, DRIVER + 1])
+@pytest.mark.parametrize("service", ["/estop", "estop"])
+@pytest.mark.parametrize(
+    "settings",
+    [Safety(stop_call="estop"), Safety(stop_call="/estop", motion_services=["*"], motion_actions=[])],
+    ids=["plain", "motion"],
+)
+def test_no_client_calls_the_switch_in_the_hardware(
+    settings: Safety, service: str, source: int, stopped: bool
+) -> None:
+    """Stopped or not, who holds control as little as others, however it is spelled and whatever else it is."""
+    control, channel, asked = armed(settings)
+    if stopped:
+        control.say(link.Stop(id=2, by="eve"))
+    thrown = list(asked)
+    channel.say(link.CallService(id="c", service=service, type="t", source=source, cdr=CDR))
+    (answer,) = [each for each in channel.heard() if each["op"] == "service_response"]
+    assert not answer["result"]
+    assert "/estop is the switch in the robot's hardware, which no client may call" in answer["reason"]
+    assert "/relay/stop" in answer["reason"]
+    assert "/relay/resume" in answer["reason"]
+    assert asked == thrown
+    assert len(thrown) == stopped
+
+
+def test_the_robot_itself_throws_the_switch() -> None:
+    """At a stop and at a resume."""
+    control, _, asked = armed(Safety(stop_call="/estop"))
+    control.say(link.Stop(id=2, by="eve"), link.Resume(id=3, by="eve"))
+    assert [request[4] for request in asked] == [1, 0]
+
+
+def test_no_goal_throws_the_switch(scene: Scene) -> None:
+    """Not even where it bears the name of an action's own service."""
+    gate = Gate(MotionPolicy(), scene.platform, scene.authority, scene.now, "/dock/_action/send_goal")
+    with pytest.raises(Refused, match="no client may call"):
+        gate.goal("dock", DRIVER, None, scene.offset)
+    with pytest.raises(Refused, match="no client may call"):
+        gate.call("/dock/_action/send_goal", DRIVER, None, scene.offset)
+    assert not gate.goal("/dock2", DRIVER, None, scene.offset)
+
+
+def test_no_client_stands_in_for_the_switch() -> None:
+    """Whoever offered a service of its name could answer a stop that stopped nothing."""
+    _, channel, _ = armed(Safety(stop_call="/estop"))
+    channel.say(link.AdvertiseService(service="estop", type="std_srvs/srv/SetBool"))
+    channel.say(link.AdvertiseService(service="/lamp", type="std_srvs/srv/SetBool"))
+    failed, offered = channel.heard()
+    assert (failed["op"], failed["ref"]) == ("failed", "estop")
+    assert "no client may offer" in failed["reason"]
+    assert offered["op"] == "advertised_service"
