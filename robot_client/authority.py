@@ -80,6 +80,8 @@ class Authority:
         """Topics on which the holder said zero last, since the stop."""
         self._resumed: tuple[int, int] | None = None
         """Who held control at the last resume, and when that was."""
+        self._stopped_at: int | None = None
+        """When the robot was stopped last."""
         self._lost = False
         """Whether there is no control link, and was one."""
         self._met: int | None = None
@@ -114,10 +116,14 @@ class Authority:
             self.refused += 1
         return verdict
 
-    def judge_request(self, source: int) -> Verdict:
-        """What becomes of a call or a goal that moves the robot; what is refused is counted."""
+    def judge_request(self, source: int, came: int | None = None) -> Verdict:
+        """What becomes of a call or a goal that moves the robot; what is refused is counted.
+
+        :param came: when it did, own clock, nanoseconds, if it has waited: a stop since then counts though it is over
+        """
         verdict = Verdict.ALLOWED
-        if self.stopped is not None:
+        overtaken = came is not None and self._stopped_at is not None and came < self._stopped_at
+        if self.stopped is not None or overtaken:
             verdict = Verdict.STOPPED
         elif source == NOBODY or source != self.holder:
             verdict = Verdict.NOT_HOLDER
@@ -145,6 +151,7 @@ class Authority:
 
     def stop(self, stopped: link.Stopped, now: int) -> None:
         """Let nothing move until :meth:`resume`; who stopped it first stays on record."""
+        self._stopped_at = now
         if self.stopped is None:
             self._drop_open(now)
             for grip in self._grips.values():

@@ -19,7 +19,7 @@ from relay_protocol.frames import CommandFrame, SampleFrame
 from robot_client.authority import NOBODY
 from robot_client.calls import Calls
 from robot_client.gate import Gate
-from robot_client.goal_topics import GoalTopics
+from robot_client.goal_topics import Goal, GoalTopics
 from robot_client.goals import Goals, refusal
 from robot_client.motion import MOTION_QOS, MotionDesk
 from robot_client.offers import OfferedActions, OfferedServices
@@ -44,8 +44,8 @@ class _Publishing(NamedTuple):
     topic: str
     motion: str | None
     """Name of the publication at the motion desk, if it moves the robot."""
-    goal: TypedTopic | None = None
-    """What it is, if it takes goals."""
+    goal: str | None = None
+    """Name of the publication at the goal topics, if it takes goals."""
 
     @property
     def moves(self) -> bool:
@@ -160,14 +160,13 @@ class Channel:
         try:
             if publishing.motion is not None:
                 self._motion.command(publishing.motion, frame.body, frame.stamp, self._offset, by)
-            elif publishing.goal is None or self._allowed(publishing.goal, frame, by):
+            elif publishing.goal is not None and self._goal_topics is not None:
+                goal = Goal(frame.body, frame.stamp, self._offset, by)
+                self._goal_topics.take(publishing.goal, goal)
+            else:
                 publishing.sink.publish(frame.body)
         except Exception as error:
             self._log.error("could not publish on {topic}: {error}", topic=publishing.topic, error=str(error))
-
-    def _allowed(self, goal: TypedTopic, frame: SampleFrame | CommandFrame, by: int) -> bool:
-        judge = self._goal_topics
-        return judge is not None and judge.allow(goal, frame.body, frame.stamp, self._offset, by)
 
     def close(self) -> None:
         """The link is gone: stop what moves, release all."""
@@ -259,7 +258,9 @@ class Channel:
         elif self._goal_topics is not None and self._goal_topics.concern(on):
             # Kept for late joiners, a goal would send the robot off again.
             sink = self._platform.advertise(*on, False, MOTION_QOS)
-            self._publishing[number] = publishing = _Publishing(sink, on.topic, None, on)
+            name = f"{self.name}/{number}"
+            self._goal_topics.open(name, on, sink)
+            self._publishing[number] = publishing = _Publishing(sink, on.topic, None, name)
         else:
             sink = self._platform.advertise(*on, message.latch, message.qos, message.queue_size)
             self._publishing[number] = publishing = _Publishing(sink, on.topic, None)
@@ -293,6 +294,8 @@ class Channel:
             return
         if publishing.motion is not None:
             self._motion.close(publishing.motion)
+        elif publishing.goal is not None and self._goal_topics is not None:
+            self._goal_topics.close(publishing.goal)
         else:
             publishing.sink.close()
 

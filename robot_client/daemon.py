@@ -123,7 +123,7 @@ class Daemon(Body):
         self.motion.on_commanded = connection.prove
         self._gate = Gate(policy, platform, self.authority, now, settings.safety.stop_call)
         self._goal_topics = GoalTopics(
-            settings.safety.goal_topics, platform, self.authority, self.motion, now
+            settings.safety.goal_topics, platform, self.authority, self.motion, clock, now
         )
         self._settings = settings
         self._connection = connection

@@ -2,26 +2,53 @@
 
 What comes on them is judged like a goal or a call that moves the robot. There is nothing to stop it by on the topic
 itself: an empty goal is one to the origin of the map. A stop cancels what the actions behind it pursue.
+
+There is no stream of goals either, in which the next could stand for one that came too early: one that finds the link
+not known to work both ways waits for that, as long as its age allows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+from twisted.logger import Logger
 
 from robot_client.authority import Authority, Verdict
 from robot_client.motion import MotionDesk
 from robot_client.offset import Offset
-from robot_client.platforms.base import Motion, Platform
+from robot_client.platforms.base import Motion, Platform, Sink
+from robot_client.reactors import Clock, Timer
 from robot_client.safety import Freshness, freshness, void_at
 from robot_client.topics import TypedTopic
+from robot_client.tracks import Outlet
+
+LOOK_EVERY = 0.01
+"""Seconds between looks whether the relay has answered, for a goal that waits for that."""
+
+
+class Goal(NamedTuple):
+    """One message that sends the robot off.
+
+    :ivar stamp: as of :func:`robot_client.safety.freshness`
+    :ivar offset: of the link it came by
+    :ivar by: the connection that gave it
+    """
+
+    body: bytes
+    stamp: int
+    offset: Offset
+    by: int
 
 
 class GoalTopics:
-    """Judges what is published there.
+    """Publishes what may be published there.
 
     :param patterns: of their names, with shell wildcards
-    :param motion: counts what is too old or makes no sense; what it takes for its own is no goal topic
+    :param motion: counts what is too old or makes no sense, and has the link prove itself while goals may come; what it
+        takes for its own is no goal topic
+    :param clock: for what waits
     :param now: clock of :mod:`robot_client.clocks`, nanoseconds
     """
 
@@ -31,37 +58,76 @@ class GoalTopics:
         platform: Platform,
         authority: Authority,
         motion: MotionDesk,
+        clock: Clock,
         now: Callable[[], int],
     ) -> None:
         self._patterns = patterns
         self._platform = platform
         self._authority = authority
         self._motion = motion
+        self._clock = clock
         self._now = now
+        self._open: dict[str, Outlet] = {}
+        self._waiting: dict[str, Timer] = {}
+        self._log = Logger("goals")
 
     def concern(self, on: TypedTopic) -> bool:
         """Whether a topic is one; ``on`` as the platform resolved it."""
         named = any(fnmatchcase(on.topic, pattern) for pattern in self._patterns)
         return named and not self._motion.concerns(on)
 
-    def allow(self, on: TypedTopic, body: bytes, stamp: int, offset: Offset, by: int) -> bool:
-        """Whether a message may be published; one that may not is counted.
+    def open(self, source: str, on: TypedTopic, sink: Sink) -> None:
+        """A client may publish goals now; ``source`` names the publication."""
+        self._open[source] = Outlet(on, sink)
+        self._motion.attend(source)
 
-        :param stamp: as of :func:`robot_client.safety.freshness`
-        :param offset: of the link it came by
-        :param by: the connection that gave it
-        """
-        if self._authority.judge_request(by) is not Verdict.ALLOWED:
-            return False
-        policy, now = self._motion.policy, self._now()
-        deadline, within = policy.deadline_ms, policy.stop_within_ms
-        if (
-            freshness(stamp, now, offset, deadline) is not Freshness.FRESH
-            or void_at(stamp, now, offset, self._motion.proof(), deadline, within) <= now
-        ):
+    def close(self, source: str) -> None:
+        """A publication ends, and its sink is closed; a goal that waits is dropped."""
+        outlet = self._open.pop(source, None)
+        if outlet is None:
+            return
+        self._supersede(source)
+        outlet.sink.close()
+        self._motion.leave(source)
+
+    def take(self, source: str, goal: Goal) -> None:
+        """Publish a goal if it is allowed, fresh and sane, as soon as the link has proved itself; else count it."""
+        self._supersede(source)
+        self._judge(source, goal, self._now())
+
+    def _supersede(self, source: str) -> None:
+        timer = self._waiting.pop(source, None)
+        if timer is not None:
+            timer.cancel()
             self._motion.stale_commands += 1
-            return False
-        if self._platform.judge(on.type, body) is Motion.INVALID:
+
+    def _judge(self, source: str, goal: Goal, came: int) -> None:
+        """
+        :param came: when it did, nanoseconds
+        """
+        self._waiting.pop(source, None)
+        on, sink = self._open[source]
+        if self._authority.judge_request(goal.by, came) is not Verdict.ALLOWED:
+            return
+        now = self._now()
+        deadline = self._motion.policy.deadline_ms
+        fresh = freshness(goal.stamp, now, goal.offset, deadline) is Freshness.FRESH
+        if not fresh or self._void(goal, now, now) <= now:
+            self._motion.stale_commands += 1
+            self._log.info("a goal on {topic} came too late, or in vain", topic=on.topic)
+        elif self._platform.judge(on.type, goal.body) is Motion.INVALID:
             self._motion.invalid_commands += 1
-            return False
-        return True
+        elif self._void(goal, now, self._motion.proof()) <= now:
+            self._waiting[source] = self._clock.callLater(LOOK_EVERY, self._judge, source, goal, came)
+        else:
+            self._publish(on, sink, goal.body)
+
+    def _void(self, goal: Goal, now: int, proof: int) -> int:
+        policy = self._motion.policy
+        return void_at(goal.stamp, now, goal.offset, proof, policy.deadline_ms, policy.stop_within_ms)
+
+    def _publish(self, on: TypedTopic, sink: Sink, body: bytes) -> None:
+        try:
+            sink.publish(body)
+        except Exception as error:
+            self._log.error("could not publish on {topic}: {error}", topic=on.topic, error=str(error))

@@ -83,6 +83,7 @@ class MotionDesk:
         for topic, times in self._rules.topics.items():
             self._watchdog.within(topic, times.stop_within_ms)
         self._outlets: dict[str, Outlet] = {}
+        self._attended: set[str] = set()
         self._tracks: dict[TypedTopic, Track] = {}
         self._stilling = self._make_stilling(self._rules.ramp_ms * MILLI)
         self._timer: Timer | None = None
@@ -118,7 +119,18 @@ class MotionDesk:
         track.sources.add(source)
         self._outlets[source] = Outlet(on, sink)
         self._guard.topic(on)
+        self.attend(source)
+
+    def attend(self, source: str) -> None:
+        """Somebody may move the robot by a publication, here or elsewhere."""
+        self._attended.add(source)
         self.on_commanded(True)
+
+    def leave(self, source: str) -> None:
+        """Nobody may by this one any more."""
+        self._attended.discard(source)
+        if not self._attended:
+            self.on_commanded(False)
 
     def commanded(self, topic: str) -> bool:
         """Whether clients may command a topic."""
@@ -169,8 +181,7 @@ class MotionDesk:
         outlet = self._outlets.pop(source, None)
         if outlet is None:
             return
-        if not self._outlets:
-            self.on_commanded(False)
+        self.leave(source)
         track = self._tracks[outlet.on]
         track.sources.discard(source)
         track.leaving.append(outlet.sink)

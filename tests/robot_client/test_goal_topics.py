@@ -16,16 +16,23 @@ GOAL = twist(1.0)
 
 
 class Goals:
-    """A driver who may publish goals."""
+    """A driver who may publish goals.
 
-    def __init__(self, topic: str = "/robot1/goal_pose") -> None:
-        self.scene = Scene()
+    :param answers: as of :class:`Scene`
+    """
+
+    def __init__(self, topic: str = "/robot1/goal_pose", answers: bool = True) -> None:
+        self.scene = Scene(answers=answers)
         self.topic = topic
         self.control = self.scene.register()
         self.control.say(link.Control(id=1, holder=DRIVER, user="ann", level="operator"))
         self.channel: Line = self.scene.channel(self.control)
         self.channel.heard()
-        self.channel.say(link.Advertise(number=5, topic=topic, type=POSE, latch=True, queue_size=9))
+        if answers:
+            self.advertise()
+
+    def advertise(self) -> None:
+        self.channel.say(link.Advertise(number=5, topic=self.topic, type=POSE, latch=True, queue_size=9))
         self.told = [each for each in self.channel.heard() if each["op"] == "advertised"]
 
     def heard(self) -> list[bytes]:
@@ -112,3 +119,148 @@ def test_other_topics_are_no_goals() -> None:
     assert not other.told[0].get("motion", False)
     other.channel.protocol.dataReceived(frames.encode_sample(5, 0, GOAL))
     assert other.heard() == [GOAL]
+
+
+# --- a relay that takes its time ---------------------------------------------------------------------------
+
+WAY = 0.02
+"""Seconds between a ping and its answer."""
+
+
+class Paced(Goals):
+    """With a relay that answers the pings that come, and when they come."""
+
+    def __init__(self) -> None:
+        super().__init__(answers=False)
+        self.deaf = False
+        self.pings = 0
+        self._due: list[tuple[float, Line, int]] = []
+        self.live(3.0)
+
+    def live(self, seconds: float) -> None:
+        """Time passes, a hundredth at a time."""
+        for _ in range(round(seconds * 100)):
+            self.scene.clock.advance(0.01)
+            now = self.scene.clock.seconds()
+            for line in (self.control, self.channel):
+                asked = [
+                    each["t"] for each in line.heard() if isinstance(each, dict) and each["op"] == "ping"
+                ]
+                self.pings += len(asked) if line is self.control else 0
+                if not (self.deaf and line is self.control):
+                    self._due += [(now + WAY, line, t) for t in asked]
+            for due in [each for each in self._due if each[0] <= now]:
+                self._due.remove(due)
+                due[1].say(link.Pong(t=due[2], at=self.scene.now()))
+
+
+@pytest.fixture
+def paced() -> Paced:
+    return Paced()
+
+
+def test_a_goal_is_obeyed_whenever_it_is_given(paced: Paced) -> None:
+    """However long after the last ping: the control link proves itself often while goals may come."""
+    paced.advertise()
+    for count in range(1, 41):
+        paced.live(0.37)
+        assert paced.say() == count
+    assert paced.scene.daemon.motion.stale_commands == 0
+
+
+def test_the_first_goal_may_come_with_the_topic(paced: Paced) -> None:
+    """It waits for the answer to the ping that this begins with: clients advertise and publish in one go."""
+    paced.live(0.9)
+    paced.advertise()
+    assert paced.say() == 0
+    paced.live(WAY + 0.02)
+    assert paced.heard() == [GOAL]
+    paced.live(2.0)
+    assert paced.heard() == [GOAL]
+
+
+def test_the_link_proves_itself_often_only_while_goals_may_come(paced: Paced) -> None:
+    """Ten times a second, and as agreed when nobody may publish any."""
+    counts = []
+    for step in (lambda: None, paced.advertise, lambda: paced.channel.say(link.Unadvertise(number=5))):
+        step()
+        paced.pings = 0
+        paced.live(4.0)
+        counts.append(paced.pings)
+    assert counts[0] <= 4
+    assert counts[1] >= 35
+    assert counts[2] <= 4
+
+
+def test_a_goal_on_a_link_that_works_one_way_is_dropped_and_counted(paced: Paced) -> None:
+    """Once, and it never comes: neither when it has grown too old, nor when the link works again."""
+    paced.deaf = True
+    paced.live(1.0)
+    paced.advertise()
+    assert paced.say() == 0
+    paced.live(0.44)
+    assert paced.scene.daemon.motion.stale_commands == 0
+    paced.live(0.02)
+    assert paced.scene.daemon.motion.stale_commands == 1
+    paced.deaf = False
+    paced.live(2.0)
+    assert paced.heard() == []
+    assert paced.scene.daemon.motion.stale_commands == 1
+    assert paced.say() == 1
+
+
+def test_of_goals_that_wait_the_newest_goes(paced: Paced) -> None:
+    """The one before is counted as if it had come too late."""
+    paced.live(0.9)
+    paced.advertise()
+    paced.say()
+    paced.say(body=twist(2.0))
+    paced.live(0.2)
+    assert paced.heard() == [twist(2.0)]
+    assert paced.scene.daemon.motion.stale_commands == 1
+
+
+def test_a_goal_that_waits_does_not_outlast_a_stop(paced: Paced) -> None:
+    """Though the robot is resumed before the link has proved itself: a resume moves nothing."""
+    paced.live(0.9)
+    paced.advertise()
+    paced.say()
+    paced.live(0.01)
+    authority = paced.scene.daemon.authority
+    authority.stop(link.Stopped(by="eve", since=1.0), paced.scene.now())
+    authority.resume(paced.scene.now())
+    paced.live(2.0)
+    assert paced.heard() == []
+    assert authority.refused == 1
+    assert paced.say() == 1
+
+
+def test_a_goal_that_waits_does_not_outlast_its_publication(paced: Paced) -> None:
+    """Nor the control of who gave it."""
+    paced.live(0.9)
+    paced.advertise()
+    paced.say()
+    paced.channel.say(link.Unadvertise(number=5))
+    paced.live(0.9)
+    paced.advertise()
+    paced.say()
+    paced.control.say(link.Control(id=2, holder=DRIVER + 1, user="bob", level="operator"))
+    paced.live(2.0)
+    assert paced.heard() == []
+
+
+def test_a_goal_that_can_not_be_published_keeps_nobody_from_the_next(
+    paced: Paced, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though it had waited, and nobody was there to catch the error."""
+
+    def broken(body: bytes) -> None:
+        raise RuntimeError("middleware is gone")
+
+    paced.live(0.9)
+    paced.advertise()
+    with monkeypatch.context() as patched:
+        patched.setattr(paced.scene.platform.sinks[0], "publish", broken)
+        paced.say()
+        paced.live(0.2)
+    assert paced.say() == 1
