@@ -1,13 +1,15 @@
 """The way out of one rule: what is to be told waits, goes together, is tried again, and hurts nobody else's.
 
-Three heaps: *pending* goes with the next message, *held* waits for the end of the quiet hours, and what is in the
-message under way is in none of them. All are bounded; the oldest give way and are counted.
+Three heaps: in the *inbox* is what nobody has judged yet, *pending* goes with the next message, *held* waits for the
+end of the quiet hours; what is in the message under way is in none of them. All are bounded; the mildest give way. Only
+what the user may know of gets to the second and third, and only of that it is counted what gave way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass
+from math import inf
 
 from twisted.internet.defer import CancelledError, Deferred, DeferredSemaphore
 from twisted.logger import Logger
@@ -15,14 +17,18 @@ from twisted.python.failure import Failure
 
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import SwitchboardError
-from relay_server.alerts import rules
+from relay_server.alerts import kinds, rules
 from relay_server.alerts.book import Change
-from relay_server.alerts.kinds import Event
+from relay_server.alerts.heap import Heap, Waiting
 from relay_server.alerts.message import Message, Notice, Undelivered
+from relay_server.bucket import TokenBucket
 from relay_server.clock import Clock, Timer, cancel
 
 MOST = 200
 """Notices that wait for one rule, and again those that wait for the end of quiet hours."""
+
+UNJUDGED = 2000
+"""Notices that wait to be judged while the database does not answer."""
 
 TOLD = 1000
 """Alerts of which one rule remembers that they were told, so that their end is told too."""
@@ -30,8 +36,18 @@ TOLD = 1000
 GATHER_SECONDS = 0.2
 """What comes within this time of the first goes with it."""
 
+URGENT_BURST = 3.0
+URGENT_SECONDS = 10.0
+"""Messages that do not wait for a rule's pause: so many at once, and one in so long after that."""
+
 RETRY_SECONDS = (2.0, 10.0, 30.0, 120.0, 420.0)
 """Pauses before a message is tried again; each is shortened at random by up to a fifth."""
+
+PRESSED_SECONDS = 30.0
+"""While an error waits behind a message, that is tried this often."""
+
+JUDGE_SECONDS = 2.0
+"""The database is asked again after so long who may know of what."""
 
 LONGEST_REST = 3600.0
 """Wall clocks are set: nobody sleeps longer on the word of one."""
@@ -88,45 +104,84 @@ class Delivery:
         self.status = Status()
         self._office = office
         self._places = places
-        self._pending: dict[tuple[str, str], Notice] = {}
-        self._held: dict[tuple[str, str], Notice] = {}
+        self._inbox = Heap(UNJUDGED, fair=True)
+        self._pending = Heap(MOST)
+        self._held = Heap(MOST)
         self._told: dict[str, None] = {}
         """Alerts of which their user knows that they have begun, and not that they are over."""
+        self._unheard: dict[str, None] = {}
+        """Alerts whose beginning was put aside, and was not told since."""
         self._left_out = 0
-        self._since = self._next = 0.0
+        self._next = 0.0
+        self._worst = -1
+        """How bad the worst was that the latest message told."""
+        self._extra = TokenBucket(1 / URGENT_SECONDS, URGENT_BURST, office.clock.seconds)
         self._failing = False
+        self._judging: Deferred[None] | None = None
         self._working: Deferred[None] | None = None
         self._wake: Deferred[None] | None = None
 
     @property
     def waiting(self) -> int:
         """Notices that wait."""
-        return len(self._pending) + len(self._held)
+        return len(self._inbox) + len(self._pending) + len(self._held)
 
     def offer(self, change: Change) -> None:
-        """There is news; if the rule wants it, it goes with the next message."""
+        """There is news; if the rule wants it and its user may know of it, it goes with the next message."""
         if not rules.wants(self.rule, change.alert, change.event):
             return
-        if not self._pending:
-            self._since = self._office.clock.seconds()
-        self._left_out += _put(self._pending, Notice(change.alert, change.event.value))
-        if self._working is None:
-            self._working = Deferred.fromCoroutine(self._work())
-            self._working.addErrback(self._broken)
-        else:
-            self._awake()
+        # What gives way here is not counted: nobody knows whether its number may be told.
+        self._inbox.put(Notice(change.alert, change.event.value), self._office.clock.seconds())
+        if self._judging is None:
+            # Judged when a coroutine can be: mostly before this returns.
+            self._judging = judging = Deferred.fromCoroutine(self._judge())
+            judging.addErrback(self._broken)
+            judging.addBoth(self._judged)
 
     def close(self) -> None:
         """Tell nothing any more."""
-        self._pending.clear()
-        self._held.clear()
-        if self._working is not None:
-            self._working.cancel()
+        for heap in (self._inbox, self._pending, self._held):
+            heap.clear()
+        for each in (self._judging, self._working):
+            if each is not None:
+                each.cancel()
 
     def _broken(self, failure: Failure) -> None:
-        self._working = None
         if not failure.check(CancelledError):
             self.log.failure("telling alerts by rule {rule} failed", failure, rule=self.rule.id)
+
+    # --- who may know -------------------------------------------------------------------------------------
+
+    async def _judge(self) -> None:
+        """Let what the user may know of take a place."""
+        while self._inbox:
+            asked = [each.notice for each in self._inbox]
+            try:
+                known = await self._office.known(self.rule, [each.alert for each in asked])
+            except SwitchboardError:
+                await self._sleep(JUDGE_SECONDS)
+                continue
+            for each in asked:
+                latest = self._inbox.drop(each)
+                if latest is not None and each.alert.id in known:
+                    self._left_out += self._pending.put(*latest)
+            self._begin()
+
+    def _judged(self, _: object) -> None:
+        self._judging = None
+
+    def _begin(self) -> None:
+        if not self._pending:
+            return
+        if self._working is not None:
+            self._awake()
+            return
+        self._working = working = Deferred.fromCoroutine(self._work())
+        working.addErrback(self._broken)
+        working.addBoth(self._worked)
+
+    def _worked(self, _: object) -> None:
+        self._working = None
 
     # --- when ---------------------------------------------------------------------------------------------
 
@@ -139,19 +194,25 @@ class Delivery:
                 continue
             self._sort()
             if self._pending:
-                batch, self._pending = list(self._pending.values()), {}
+                if self._office.clock.seconds() < self._next:
+                    self._extra.take()
                 left_out, self._left_out = self._left_out, 0
-                await self._deliver(batch, left_out)
-        self._working = None
+                await self._deliver(self._pending.take(), left_out)
 
     def _pause(self) -> float:
         """Seconds until there is something to do."""
         now = self._office.clock.seconds()
         if self._pending:
-            return max(self._since + GATHER_SECONDS, self._next) - now
+            regular = max(min(each.since for each in self._pending) + GATHER_SECONDS, self._next)
+            urgent = min((each.since for each in self._pending if self._urgent(each.notice)), default=inf)
+            return min(regular, max(urgent + GATHER_SECONDS, now + self._extra.wait)) - now
         wall = self._office.wall()
         end = rules.quiet_until(self.rule, wall)
         return 0.0 if end is None else end - wall
+
+    def _urgent(self, notice: Notice) -> bool:
+        """Whether it must not wait for others: an error, and what is worse than all that was told last."""
+        return notice.alarms or (not notice.ends and kinds.severity(notice.alert.level) > self._worst)
 
     async def _rest(self, seconds: float) -> None:
         self._wake = Deferred()
@@ -162,6 +223,14 @@ class Delivery:
             cancel(timer)
             self._wake = None
 
+    async def _sleep(self, seconds: float) -> None:
+        slept: Deferred[None] = Deferred()
+        timer: Timer = self._office.clock.callLater(seconds, slept.callback, None)
+        try:
+            await slept
+        finally:
+            cancel(timer)
+
     def _awake(self) -> None:
         wake, self._wake = self._wake, None
         if wake is not None:
@@ -171,44 +240,66 @@ class Delivery:
         """Put aside what is not for quiet hours; after them, take up what still counts."""
         now = self._office.wall()
         if rules.quiet_until(self.rule, now) is None:
-            held, self._held = self._held, {}
-            for key, notice in held.items():
-                if self._still(notice, held):
-                    self._pending.setdefault(key, notice)
-            return
-        for key, notice in list(self._pending.items()):
-            if not rules.passes(self.rule, notice.alert, now):
-                self._left_out += _put(self._held, self._pending.pop(key))
+            held = [each for each in self._held if self._still(each.notice)]
+            fresh = list(self._pending)
+            self._held.clear()
+            self._pending.clear()
+            for each in (*held, *fresh):
+                self._left_out += self._pending.put(*each)
+        else:
+            for each in self._pending:
+                if not rules.passes(self.rule, each.notice.alert, now):
+                    self._put_aside(each)
+        self._drop_ends()
 
-    def _still(self, notice: Notice, held: Collection[tuple[str, str]]) -> bool:
-        """Whether what was held is worth telling: what lasts, and the end of what was told before."""
-        if notice.event != Event.OVER.value:
-            return self._office.lasts(notice.alert.id)
-        if self._office.lasts(notice.alert.id):
-            return False
-        return notice.alert.id in self._told or (notice.alert.id, Event.BEGUN.value) not in held
+    def _put_aside(self, waiting: Waiting) -> None:
+        alert = waiting.notice.alert
+        self._pending.drop(waiting.notice)
+        self._left_out += self._held.put(*waiting)
+        if not waiting.notice.ends and alert.id not in self._told:
+            _keep(self._unheard, alert.id)
+
+    def _still(self, notice: Notice) -> bool:
+        """Whether what was held is worth telling: that something lasts which does, and is over which is."""
+        return self._office.lasts(notice.alert.id) != notice.ends
+
+    def _drop_ends(self) -> None:
+        """Who never heard that something began is not told that it is over."""
+        heard = {each.notice.alert.id for each in self._pending if not each.notice.ends}
+        for notice, _ in self._pending:
+            if notice.ends and notice.alert.id in self._unheard and notice.alert.id not in heard:
+                self._pending.drop(notice)
+                del self._unheard[notice.alert.id]
 
     # --- sending ------------------------------------------------------------------------------------------
 
     async def _deliver(self, batch: list[Notice], left_out: int) -> None:
         """Try until it has arrived, or there is no hope."""
-        name = self._office.name()
-        for pause in (*RETRY_SECONDS, None):
+        name, pauses, due = self._office.name(), iter(RETRY_SECONDS), 0.0
+        while True:
             try:
-                if not await self._try(name, batch, left_out):
-                    return
+                if await self._try(name, batch, left_out):
+                    self._arrived()
+                return
             except SwitchboardError as error:
                 self._failing = True
                 self.status.reason = str(error)
-                if pause is None or not getattr(error, "again", True):
-                    self._give_up(len(batch))
-                    return
-            else:
-                self._arrived()
+                hopeless = not getattr(error, "again", True)
+            now = self._office.clock.seconds()
+            if not hopeless and now >= due:
+                pause = next(pauses, None)
+                hopeless = pause is None
+                due = now + (pause or 0.0) * (1 - 0.2 * self._office.random())
+            if hopeless:
+                self._give_up(len(batch))
                 return
-            until = self._office.clock.seconds() + pause * (1 - 0.2 * self._office.random())
-            while (left := until - self._office.clock.seconds()) > 0:
+            while (left := self._next_try(now, due) - self._office.clock.seconds()) > 0:
                 await self._rest(left)
+
+    def _next_try(self, tried: float, due: float) -> float:
+        """When a message is tried again, monotonic seconds: sooner than it is due while an error waits behind it."""
+        pressed = any(each.notice.alarms for each in self._pending)
+        return min(due, tried + PRESSED_SECONDS) if pressed else due
 
     async def _try(self, name: str, batch: list[Notice], left_out: int) -> bool:
         """Send what the user may still know of; whether there was anything."""
@@ -225,12 +316,13 @@ class Delivery:
         return True
 
     def _remember(self, notices: list[Notice]) -> None:
-        for alert, event in notices:
-            self._told.pop(alert.id, None)
-            if event != Event.OVER.value:
-                self._told[alert.id] = None
-        while len(self._told) > TOLD:
-            del self._told[next(iter(self._told))]
+        self._worst = max(kinds.severity(each.alert.level) for each in notices)
+        for each in notices:
+            self._unheard.pop(each.alert.id, None)
+            if each.ends:
+                self._told.pop(each.alert.id, None)
+            else:
+                _keep(self._told, each.alert.id)
 
     def _arrived(self) -> None:
         self._failing = False
@@ -250,15 +342,12 @@ class Delivery:
         )
 
 
-def _put(heap: dict[tuple[str, str], Notice], notice: Notice) -> int:
-    """Put a notice where its place in time is; how many gave way."""
-    key = (notice.alert.id, notice.event)
-    heap.pop(key, None)
-    heap[key] = notice
-    if len(heap) <= MOST:
-        return 0
-    del heap[next(iter(heap))]
-    return 1
+def _keep(heap: dict[str, None], alert_id: str) -> None:
+    """Remember an alert as the latest of at most :data:`TOLD`."""
+    heap.pop(alert_id, None)
+    heap[alert_id] = None
+    if len(heap) > TOLD:
+        del heap[next(iter(heap))]
 
 
 async def test(office: Office, rule: AlertRuleRecord, places: DeferredSemaphore) -> str:

@@ -12,6 +12,7 @@ from twisted.logger import Logger
 from relay_db import queries
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import SwitchboardError
+from relay_protocol.rights import Rules
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds, rules
 from relay_server.alerts.book import Book, Change, Key
@@ -86,6 +87,8 @@ class Alerts:
         """When each robot's daemon began, as it says itself."""
         self._untold: dict[int, set[Key]] = {}
         """What each robot told before its latest registration and not since, where it has an end of its own."""
+        self._rights: dict[int, tuple[object, dict[int, Rules]]] = {}
+        """By user: the list that :meth:`Access.robots` gave last, and what that says by robot."""
         self._takers: dict[str, Callable[[Presence, dict[str, Any]], None]] = {
             "robot.online": self._came_online,
             "robot.stopped": self._stopped,
@@ -124,6 +127,7 @@ class Alerts:
         :raises Unavailable: the database can't be asked
         """
         self.tellers.take(await self._store.read(queries.list_alert_rules))
+        self._rights.clear()
         # First, that no acknowledgement is taken up of what has become worse since.
         await self.flush()
         for alert, (by, at) in (await self._store.read(queries.acknowledgements)).items():
@@ -304,7 +308,11 @@ class Alerts:
         """Which of these alerts the rule's user may know of now, by their ids."""
         # Who asks is a user, by no token.
         asks = Principal(rule.user_id, rule.user, rule.realm, False, 0, None)
-        rights = {record.id: each for record, each in await self._access.robots(asks)}
+        known = await self._access.robots(asks)
+        kept, rights = self._rights.get(rule.user_id, (None, {}))
+        if kept is not known:
+            rights = {record.id: each for record, each in known}
+            self._rights[rule.user_id] = (known, rights)
         return {
             each.id
             for each in alerts

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 from relay_db.queries import AlertRecord
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.text import inert
+from relay_server.alerts import kinds
+from relay_server.alerts.kinds import Event
 
 SHOWN = 20
 """Alerts a message for people has lines for; the rest is a number."""
@@ -22,6 +24,16 @@ class Notice(NamedTuple):
 
     alert: AlertRecord
     event: str
+
+    @property
+    def ends(self) -> bool:
+        """Whether it tells that the alert is over."""
+        return self.event == Event.OVER.value
+
+    @property
+    def alarms(self) -> bool:
+        """Whether it tells of an error that nobody should have to wait for."""
+        return not self.ends and kinds.severity(self.alert.level) >= kinds.severity("error")
 
 
 @dataclass(frozen=True)
@@ -96,5 +108,5 @@ def line(notice: Notice) -> str:
     """What has happened in a few words."""
     alert = notice.alert
     about = f" {alert.about}" if alert.about else ""
-    over = " is over" if notice.event == "over" else ""
+    over = " is over" if notice.ends else ""
     return inert(f"{alert.robot}: {alert.level}: {alert.kind}{about}{over}")

@@ -14,7 +14,15 @@ from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import Unavailable
 from relay_server.alerts import delivery as module
 from relay_server.alerts.book import Change
-from relay_server.alerts.delivery import MOST, RETRY_SECONDS, TOLD, Delivery, Office
+from relay_server.alerts.delivery import (
+    MOST,
+    PRESSED_SECONDS,
+    RETRY_SECONDS,
+    TOLD,
+    UNJUDGED,
+    Delivery,
+    Office,
+)
 from relay_server.alerts.kinds import Event
 from relay_server.alerts.message import Message, Undelivered
 from tests.relay_server.alerts.made_up import alert, rule
@@ -33,6 +41,7 @@ class Scene:
         self.errors: list[Exception] = []
         self.hanging: list[Deferred[None]] = []
         self.hangs = False
+        self.dumb = False
         self.unknown: set[str] = set()
         self.over: set[str] = set()
         self.asks = 0
@@ -75,6 +84,8 @@ class Scene:
 
     async def _known(self, rule: AlertRuleRecord, alerts: Collection[AlertRecord]) -> set[str]:
         self.asks += 1
+        if self.dumb:
+            raise Unavailable("the database is locked")
         return {each.id for each in alerts} - self.unknown
 
     def _lasts(self, alert_id: str) -> bool:
@@ -118,9 +129,9 @@ def test_after_a_message_the_next_waits_and_tells_all_that_came(scene: Scene) ->
     """No more than one in the rule's time, however much happens; each alert once."""
     way = scene.delivery(group_s=60.0)
     for second in range(120):
-        way.offer(begun("a1"))
-        way.offer(ended("a1"))
-        way.offer(begun(f"b{second % 3}"))
+        way.offer(begun("a1", level="warning"))
+        way.offer(ended("a1", level="warning"))
+        way.offer(begun(f"b{second % 3}", level="warning"))
         scene.wait(1)
     assert [len(each) for each in scene.told()] == [3, 5]
     scene.wait(60)
@@ -141,7 +152,7 @@ def test_a_failed_message_is_tried_again_under_its_name(scene: Scene) -> None:
     scene.errors = [again(), again()]
     way.offer(begun("a1"))
     scene.wait(1)
-    way.offer(begun("a2"))
+    way.offer(begun("a2", level="warning"))
     scene.wait(RETRY_SECONDS[0])
     assert scene.got == []
     scene.wait(RETRY_SECONDS[1])
@@ -204,7 +215,7 @@ def test_who_has_lost_the_right_is_told_nothing(scene: Scene) -> None:
     scene.wait(1)
     assert scene.told() == [["a2 begun"]]
     scene.errors = [again()]
-    way.offer(begun("a3"))
+    way.offer(begun("a3", level="warning"))
     scene.wait(61)
     scene.unknown = {"a3"}
     scene.wait(60)
@@ -212,14 +223,140 @@ def test_who_has_lost_the_right_is_told_nothing(scene: Scene) -> None:
     assert way.waiting == 0
 
 
-def test_what_waits_is_bounded(scene: Scene) -> None:
-    """The oldest give way, and how many did is told."""
+def test_an_error_waits_for_no_pause(scene: Scene) -> None:
+    """Whatever was told a moment before, by the rule as it comes; what waited goes with it."""
     way = scene.delivery()
-    for number in range(MOST + 30):
+    way.offer(begun("control", level="error"))
+    scene.wait(3)
+    way.offer(begun("hot", level="warning"))
+    scene.wait(1)
+    assert scene.told() == [["control begun"]]
+    way.offer(begun("offline", level="error"))
+    scene.wait(0.25)
+    assert scene.told() == [["control begun"], ["hot begun", "offline begun"]]
+    way.offer(ended("offline", level="error"))
+    scene.wait(59)
+    assert len(scene.got) == 2
+    scene.wait(1)
+    assert scene.told()[2:] == [["offline over"]]
+
+
+def test_what_is_worse_than_all_that_was_told_last_waits_for_no_pause(scene: Scene) -> None:
+    """What is as bad does."""
+    way = scene.delivery(level="info")
+    way.offer(begun("a", level="info"))
+    scene.wait(1)
+    way.offer(begun("b", level="warning"))
+    scene.wait(1)
+    way.offer(begun("c", level="warning"))
+    scene.wait(30)
+    assert scene.told() == [["a begun"], ["b begun"]]
+    scene.wait(31)
+    assert scene.told()[2:] == [["c begun"]]
+
+
+def test_errors_that_come_together_leave_together(scene: Scene) -> None:
+    """Also within the pause: one message."""
+    way = scene.delivery()
+    way.offer(begun("a"))
+    scene.wait(5)
+    way.offer(begun("b"))
+    scene.clock.advance(0.1)
+    way.offer(begun("c"))
+    scene.wait(1)
+    assert scene.told() == [["a begun"], ["b begun", "c begun"]]
+
+
+def test_errors_make_no_flood(scene: Scene) -> None:
+    """Three messages more at once, and one in ten seconds after that; all errors are told, and all wait alike."""
+    way = scene.delivery()
+    for number in range(600):
         way.offer(begun(f"a{number}"))
+        scene.wait(0.5)
+    assert len(scene.got) <= 1 + 3 + 300 / 10
+    scene.wait(11)
+    told = [each for message in scene.told() for each in message]
+    assert told == [f"a{number} begun" for number in range(600)]
+    assert scene.got[-1].left_out == 0
+
+
+def test_a_new_error_has_a_message_that_failed_tried_again_sooner(scene: Scene) -> None:
+    """Once in half a minute, so that it does not wait for a receiver that is back; then it leaves at once."""
+    way = scene.delivery()
+    scene.errors = [again() for _ in range(5)]
+    way.offer(begun("a"))
+    scene.wait(170)
+    assert scene.errors == []
+    back = scene.clock.seconds()
+    way.offer(begun("urgent"))
+    while len(scene.got) < 2:
+        scene.wait(1)
+        assert scene.clock.seconds() - back < 31
+    assert scene.told() == [["a begun"], ["urgent begun"]]
+
+
+def test_errors_that_wait_do_not_use_up_the_tries_of_what_failed(scene: Scene) -> None:
+    """It is given up no sooner than without them, and the receiver has a bounded number of tries."""
+    way = scene.delivery()
+    scene.errors = [again() for _ in range(1000)]
+    way.offer(begun("a"))
+    way_out = sum(RETRY_SECONDS) * 0.8
+    scene.wait(1)
+    way.offer(begun("b"))
+    while not way.status.failed:
+        scene.wait(10)
+    assert way_out < scene.clock.seconds() < sum(RETRY_SECONDS) + 60
+    assert len(scene.doubtful) <= 6 + sum(RETRY_SECONDS) / PRESSED_SECONDS
+
+
+def test_what_waits_is_bounded(scene: Scene) -> None:
+    """The mildest give way, among equals ends and then the oldest, and how many did is told."""
+    way = scene.delivery(level="info")
+    way.offer(begun("old", level="info"))
+    way.offer(begun("bad", level="error"))
+    way.offer(ended("bad", level="error"))
+    for number in range(MOST + 30):
+        way.offer(begun(f"a{number}", level="warning"))
     assert way.waiting == MOST
     scene.wait(1)
-    assert (scene.told()[0][0], scene.got[0].left_out) == ("a30 begun", 30)
+    told = scene.told()[0]
+    assert told[:2] == ["bad begun", "bad over"]
+    assert (told[2], told[-1]) == ("a32 begun", f"a{MOST + 29} begun")
+    assert scene.got[0].left_out == 33
+
+
+def test_alerts_of_other_peoples_robots_take_no_place(scene: Scene) -> None:
+    """However many there are, and how bad: what somebody may know of stays, and he is not told their number."""
+    way = scene.delivery()
+    scene.unknown = {f"x{number}" for number in range(2 * MOST)}
+    way.offer(begun("mine", level="warning"))
+    for number in range(2 * MOST):
+        way.offer(begun(f"x{number}", level="error", robot_id=2))
+    assert way.waiting == 1
+    scene.wait(1)
+    assert scene.told() == [["mine begun"]]
+    for number in range(MOST + 5):
+        way.offer(begun(f"mine{number}", level="warning"))
+        way.offer(begun(f"x{number}", level="error", robot_id=2))
+    scene.wait(61)
+    assert [message.left_out for message in scene.got] == [0, 5]
+
+
+def test_while_the_database_does_not_answer_a_robot_does_not_push_out_anothers_alerts(scene: Scene) -> None:
+    """Nothing is judged then, what waits is bounded, and nothing of it is counted."""
+    way = scene.delivery()
+    scene.dumb = True
+    way.offer(begun("mine", level="warning"))
+    for number in range(UNJUDGED + 50):
+        way.offer(begun(f"x{number}", level="error", robot_id=2))
+    assert way.waiting == UNJUDGED
+    scene.wait(30)
+    assert scene.got == []
+    scene.unknown = {f"x{number}" for number in range(UNJUDGED + 50)}
+    scene.dumb = False
+    scene.wait(3)
+    assert scene.told() == [["mine begun"]]
+    assert scene.got[0].left_out == 0
 
 
 def test_quiet_hours_hold_what_still_lasts_at_their_end(scene: Scene) -> None:
@@ -267,6 +404,42 @@ def test_the_end_is_told_though_it_came_back_within_quiet_hours() -> None:
     scene.over |= {"a1", "a2"}
     scene.wait(9 * 3600)
     assert scene.told() == [["a1 begun"], ["a1 over"]]
+    assert way.waiting == 0
+
+
+@pytest.mark.parametrize("past", [0.0, 30.0])
+def test_the_end_of_what_was_only_put_aside_is_not_told(past: float) -> None:
+    """Whether it comes in quiet hours or just after, it says nothing to who never heard that it began."""
+    scene = Scene("2026-11-22 06:59:00")
+    way = scene.delivery(quiet=NIGHT)
+    way.offer(begun("a1", level="warning"))
+    way.offer(begun("a2", level="warning"))
+    scene.wait(59)
+    # Into a message that leaves as the quiet hours have ended.
+    scene.wait(0.9)
+    scene.over = {"a1"}
+    way.offer(ended("a1", level="warning"))
+    scene.wait(past)
+    way.offer(begun("a3", level="warning"))
+    scene.wait(90)
+    told = [each for message in scene.told() for each in message]
+    assert sorted(told) == ["a2 begun", "a3 begun"]
+    scene.over.add("a2")
+    way.offer(ended("a2", level="warning"))
+    scene.wait(61)
+    assert scene.told()[-1] == ["a2 over"]
+
+
+def test_the_end_of_what_got_worse_unheard_is_not_told(scene: Scene) -> None:
+    """Though an end of that level may be told in quiet hours."""
+    scene = Scene("2026-11-22 23:00:00")
+    way = scene.delivery(quiet=NIGHT)
+    way.offer(begun("a1", level="warning"))
+    scene.wait(1)
+    way.offer(ended("a1", level="error"))
+    scene.over.add("a1")
+    scene.wait(10 * 3600)
+    assert scene.got == []
     assert way.waiting == 0
 
 
