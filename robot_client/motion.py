@@ -27,10 +27,9 @@ from robot_client.safety import (
 )
 from robot_client.stilling import Stilling
 from robot_client.topics import TypedTopic
-from robot_client.tracks import Outlet, Track
+from robot_client.tracks import Outlet, Track, Tracks
 
 NANO = 1_000_000_000
-MAX_TOPICS = 64
 MAX_SHAPE = 4096
 """Bytes that may be needed to know what zero looks like: of a joystick's axes, of an arm's joints."""
 KEPT = 30.0
@@ -84,7 +83,8 @@ class MotionDesk:
             self._watchdog.within(topic, times.stop_within_ms)
         self._outlets: dict[str, Outlet] = {}
         self._attended: set[str] = set()
-        self._tracks: dict[TypedTopic, Track] = {}
+        self._tracks = Tracks(guard, self._watchdog.moves)
+        self._tracks.forgotten = self._governor.forget
         self._stilling = self._make_stilling(self._rules.ramp_ms * MILLI)
         self._timer: Timer | None = None
         self._finishing: list[Deferred[None]] = []
@@ -105,20 +105,15 @@ class MotionDesk:
     def open(self, source: str, on: TypedTopic, sink: Sink) -> None:
         """A client may command a topic now; ``source`` names the publication.
 
-        :raises Unavailable: too many topics are commanded
+        It may give its place to another later; a command takes one again.
+
+        :raises Unavailable: too many topics move
         """
-        for other, track in list(self._tracks.items()):
-            if other.topic == on.topic and other.type != on.type and track.idle:
-                self._forget(other)  # some middleware allows one type of a topic in a process
-        if on not in self._tracks:
-            self._make_room()
-            self._tracks[on] = Track()
-        track = self._tracks[on]
+        track = self._place(on)
         if track.idle:
             track.settle()
         track.sources.add(source)
         self._outlets[source] = Outlet(on, sink)
-        self._guard.topic(on)
         self.attend(source)
 
     def attend(self, source: str) -> None:
@@ -158,12 +153,15 @@ class MotionDesk:
             self.stale_commands += 1
             return False
         void = self._void(on, stamp, now, offset)
-        if verdict is Motion.STILL:
+        placed = self._use(on, now)
+        if verdict is Motion.STILL and placed:
             self._stand(source, body, now)
+        elif verdict is Motion.STILL:
+            self._outlets[source].sink.publish(body)
         elif void <= now:
             self.stale_commands += 1
             return False
-        elif verdict is Motion.MOVING and not self._guard.ready(on):
+        elif verdict is Motion.MOVING and not (placed and self._guard.ready(on)):
             self._hold_back(on)
             return False
         else:
@@ -182,7 +180,10 @@ class MotionDesk:
         if outlet is None:
             return
         self.leave(source)
-        track = self._tracks[outlet.on]
+        track = self._tracks.get(outlet.on)
+        if track is None:
+            outlet.sink.close()
+            return
         track.sources.discard(source)
         track.leaving.append(outlet.sink)
         if self._watchdog.release(outlet.on, source):
@@ -247,6 +248,17 @@ class MotionDesk:
         return done
 
     # --- one command ---------------------------------------------------------------------------------------
+
+    def _place(self, on: TypedTopic) -> Track:
+        return self._tracks.take(on, (name for name, each in self._outlets.items() if each.on == on))
+
+    def _use(self, on: TypedTopic, now: int) -> bool:
+        """A topic is commanded by who may; whether there is a place for it."""
+        try:
+            self._place(on).used = now
+        except Unavailable:
+            return False
+        return True
 
     def _deadline(self, on: TypedTopic) -> int:
         own = self._rules.topics.get(on.topic)
@@ -340,21 +352,8 @@ class MotionDesk:
             sink.close()
         if track.idle:
             track.settle()
-            track.timer = self._clock.callLater(KEPT, self._forget, on)
+            track.timer = self._clock.callLater(KEPT, self._tracks.forget, on)
         self._tell_finished()
-
-    def _forget(self, on: TypedTopic) -> None:
-        self._tracks.pop(on).settle()
-        self._governor.forget(on)
-        self._guard.forget(on)
-
-    def _make_room(self) -> None:
-        if len(self._tracks) < MAX_TOPICS:
-            return
-        idle = next((on for on, track in self._tracks.items() if track.idle), None)
-        if idle is None:
-            raise Unavailable(f"{MAX_TOPICS} topics that move the robot are in use; unadvertise one first")
-        self._forget(idle)
 
     def _tell_finished(self) -> None:
         if self._stilling.under_way:

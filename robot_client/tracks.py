@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+from relay_protocol.errors import Unavailable
 from robot_client.authority import NOBODY
+from robot_client.guard_feed import GuardFeed
 from robot_client.platforms.base import Sink
 from robot_client.ramp import Ramp
 from robot_client.reactors import Timer
 from robot_client.topics import TypedTopic
+
+MAX_TOPICS = 64
 
 
 class Outlet(NamedTuple):
@@ -27,6 +32,7 @@ class Track:
     :attr mover: who gave the last command to move
     :attr latest: by when zero must be said after it, nanoseconds
     :attr body: that command; empty where nobody will want to know
+    :attr used: when somebody who might commanded it last, nanoseconds
     :attr rest: what its zero looks like, see ``Platform.resting``
     :attr ramp: on the way to a standstill
     :attr zeros: how often zero is still to be said
@@ -40,6 +46,7 @@ class Track:
         self.mover = NOBODY
         self.latest = 0
         self.body = b""
+        self.used = 0
         self.rest = b""
         self.ramp: Ramp | None = None
         self.zeros = 0
@@ -62,3 +69,49 @@ class Track:
         if self.timer is not None and self.timer.active():
             self.timer.cancel()
         self.timer = None
+
+
+class Tracks(dict[TypedTopic, Track]):
+    """The topics for which the guard has places.
+
+    The guard has few, as each costs it a publisher: who only advertises topics must take none from who commands one.
+
+    :param moves: whether a topic is to move now
+    """
+
+    def __init__(self, guard: GuardFeed, moves: Callable[[TypedTopic], bool]) -> None:
+        super().__init__()
+        self.forgotten: Callable[[TypedTopic], None] = lambda on: None
+        """Called when one has no place any more."""
+        self._guard = guard
+        self._moves = moves
+
+    def take(self, on: TypedTopic, sources: Iterable[str]) -> Track:
+        """What is known of a topic that has a place, or gets that of the one least needed.
+
+        :param sources: publications that may command it, where it had none
+        :raises Unavailable: all topics that have places move
+        """
+        if on not in self:
+            for other in [each for each, track in self.items() if each.topic == on.topic and track.idle]:
+                self.forget(other)  # some middleware allows one type of a topic in a process
+            self._make_room()
+            self[on] = Track()
+            self[on].sources.update(sources)
+            self._guard.topic(on)
+        return self[on]
+
+    def forget(self, on: TypedTopic) -> None:
+        """Take its place away."""
+        self.pop(on).settle()
+        self.forgotten(on)
+        self._guard.forget(on)
+
+    def _make_room(self) -> None:
+        """Give up one that nobody needs, else the one that was commanded longest ago, or never."""
+        if len(self) < MAX_TOPICS:
+            return
+        still = [on for on, track in self.items() if not track.busy and not self._moves(on)]
+        if not still:
+            raise Unavailable(f"{MAX_TOPICS} topics move the robot at this moment; let go of one first")
+        self.forget(min(still, key=lambda on: (not self[on].idle, self[on].used)))

@@ -8,11 +8,12 @@ import pytest
 from twisted.internet.defer import Deferred
 
 from relay_protocol import link
-from relay_protocol.frames import SampleFrame
+from relay_protocol.frames import CommandFrame, SampleFrame
 from relay_protocol.link import MotionPolicy
-from robot_client.motion import KEPT, MAX_TOPICS, MOTION_QOS
+from robot_client.motion import KEPT, MOTION_QOS
 from robot_client.platforms.base import CANCELED, GraphView, Outcome
 from robot_client.platforms.memory import TWIST, twist
+from robot_client.tracks import MAX_TOPICS
 from tests.robot_client.scene import DRIVER, STRING, Scene
 
 
@@ -128,9 +129,10 @@ def test_client_has_no_say_in_how_motion_is_published(scene: Scene) -> None:
 
 
 def test_too_many_motion_topics_are_refused_in_words(scene: Scene) -> None:
-    """The topic over the limit is refused with the reason, and no publisher is left of it."""
+    """The one over the limit, while all others move: with the reason, and no publisher is left of it."""
     for number in range(MAX_TOPICS):
         scene.ask(link.Advertise(number=number, topic=f"/t{number}", type=TWIST))
+        scene.channel.command(CommandFrame(number, scene.now(), DRIVER, twist(1.0)))
     answer = scene.ask(link.Advertise(number=99, topic="/more", type=TWIST))
     assert isinstance(answer, link.Failed)
     assert str(MAX_TOPICS) in answer.reason

@@ -12,12 +12,13 @@ from twisted.internet.task import Clock
 from relay_protocol.errors import Unavailable
 from relay_protocol.link import Limits, MotionPolicy, Stopped
 from robot_client.authority import Authority, Suppression
-from robot_client.motion import KEPT, MAX_SHAPE, MAX_TOPICS, MotionDesk
+from robot_client.motion import KEPT, MAX_SHAPE, MotionDesk
 from robot_client.offset import Offset
 from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
 from robot_client.rules import Rules
 from robot_client.safety import DAEMON_SHARE, REPEATS, Times
 from robot_client.topics import TypedTopic
+from robot_client.tracks import MAX_TOPICS
 
 GO = twist(1.0)
 ZERO = twist()
@@ -318,17 +319,119 @@ def test_other_type_of_an_idle_topic_takes_its_place(scene: Scene) -> None:
 
 
 def test_cycling_topics_cost_no_more_than_the_limit(scene: Scene) -> None:
-    """However many topics come and go, the guard has 64 at most; when that many are in use, more are refused."""
+    """However many topics come and go, or come and stay, the guard has 64 at most."""
     for number in range(3 * MAX_TOPICS):
         scene.open("cycle", f"/t{number}")
         scene.desk.close("cycle")
         assert len(scene.feed.topics) <= MAX_TOPICS
-    for number in range(MAX_TOPICS - 1):
+    for number in range(3 * MAX_TOPICS):
         scene.open(str(number), f"/u{number}")
-    with pytest.raises(Unavailable, match="64 topics"):
+        assert len(scene.feed.topics) <= MAX_TOPICS
+
+
+# --- places ------------------------------------------------------------------------------------------------
+
+CMD_VEL = TypedTopic("/cmd_vel", TWIST)
+
+
+def crowd(scene: Scene, moving: bool = False) -> None:
+    """As many topics as there are places, of somebody who holds no control; or of who does."""
+    for number in range(MAX_TOPICS):
+        source = f"crowd{number}"
+        scene.open(source, f"/crowd{number}")
+        assert scene.command(GO, source, by=DRIVER if moving else DRIVER + 1) == moving
+
+
+def test_who_only_advertises_takes_no_place_from_who_drives(scene: Scene) -> None:
+    """What was commanded by who may keeps its place, standing or not."""
+    scene.command(GO)
+    scene.command(ZERO)
+    scene.run(1)
+    crowd(scene)
+    crowd(scene)
+    assert CMD_VEL in scene.feed.topics
+    assert scene.command(GO)
+    crowd(scene)
+    assert CMD_VEL in scene.feed.topics
+
+
+def test_who_may_command_opens_a_topic_though_all_places_are_taken(scene: Scene) -> None:
+    """By somebody who has never moved the robot."""
+    crowd(scene)
+    scene.open("b", "/base")
+    assert TypedTopic("/base", TWIST) in scene.feed.topics
+    assert scene.command(GO, "b")
+
+
+def test_a_topic_that_lost_its_place_has_it_again_with_the_first_command(scene: Scene) -> None:
+    """But not by one of somebody who may not command. It moves when the guard is ready for it, as ever."""
+    crowd(scene)
+    assert CMD_VEL not in scene.feed.topics
+    assert not scene.command(GO, by=DRIVER + 1)
+    assert CMD_VEL not in scene.feed.topics
+    scene.feed.able = False
+    assert not scene.command(GO)
+    assert CMD_VEL in scene.feed.topics
+    crowd(scene)
+    scene.feed.able = True
+    assert scene.command(GO)
+    scene.run(1)
+    assert scene.sent == [GO] + [ZERO] * REPEATS
+
+
+def test_of_topics_that_were_commanded_the_latest_keep_their_places(scene: Scene) -> None:
+    """The one whose last command is the longest ago gives way."""
+    scene.command(ZERO)
+    for number in range(MAX_TOPICS):
+        scene.run(0.01)
+        scene.open(str(number), f"/t{number}")
+        scene.command(ZERO, str(number))
+        if number == 0:
+            scene.run(0.01)
+            scene.command(ZERO)
+    assert CMD_VEL in scene.feed.topics
+    assert TypedTopic("/t0", TWIST) not in scene.feed.topics
+
+
+def test_what_moves_keeps_its_place(scene: Scene) -> None:
+    """When all do, no more topics are opened, and what has no place can be told zero alone."""
+    crowd(scene, moving=True)
+    assert CMD_VEL not in scene.feed.topics
+    with pytest.raises(Unavailable, match="64 topics move the robot"):
         scene.open("more", "/more")
-    scene.desk.close("0")
-    scene.open("more", "/more")
+    assert not scene.command(GO)
+    assert scene.desk.unguarded_commands == 1
+    assert scene.command(ZERO)
+    assert scene.platform.published[-1] == ("/cmd_vel", ZERO)
+    scene.desk.close("crowd7")
+    scene.run(0.2)
+    assert scene.command(GO)
+
+
+def test_the_publisher_of_a_topic_without_a_place_goes_with_its_client(scene: Scene) -> None:
+    """There is nothing to be stopped."""
+    crowd(scene)
+    scene.desk.close("a")
+    assert len(scene.platform.sinks) == MAX_TOPICS
+
+
+def test_a_place_is_that_of_all_who_may_command_the_topic(scene: Scene) -> None:
+    """Whoever of them took it again: it goes when the last of them has left."""
+    scene.open("b")
+    crowd(scene)
+    assert CMD_VEL not in scene.feed.topics
+    scene.open("c")
+    scene.desk.close("c")
+    scene.clock.advance(KEPT + 1)
+    assert CMD_VEL in scene.feed.topics
+    assert scene.command(GO)
+    scene.run(1)
+    scene.desk.close("a")
+    scene.clock.advance(KEPT + 1)
+    assert CMD_VEL in scene.feed.topics
+    scene.desk.close("b")
+    scene.clock.advance(KEPT + 1)
+    assert CMD_VEL not in scene.feed.topics
 
 
 # --- limits, shapes, times of single topics ----------------------------------------------------------------
