@@ -248,6 +248,9 @@ LEAVING = {
     "second finger": "document.body.dispatchEvent(Object.assign(new Event('touchstart', { bubbles: true }), "
     "{ touches: [{}, {}] }))",
     "dialog": "(() => { const d = document.createElement('dialog'); document.body.append(d); d.showModal() })()",
+    "dragstart": "document.body.dispatchEvent(new DragEvent('dragstart', { bubbles: true }))",
+    "beforeprint": "window.dispatchEvent(new Event('beforeprint'))",
+    "fullscreenchange": "document.dispatchEvent(new Event('fullscreenchange', { bubbles: true }))",
     "visibilitychange": "Object.defineProperty(document, 'hidden', { value: true, configurable: true });"
     "document.dispatchEvent(new Event('visibilitychange'))",
 }
@@ -265,6 +268,64 @@ class TestLettingGo:
         page.mouse.move(640, 300, steps=5)
         ends_with_one_zero(page, relay)
         page.mouse.up()
+
+    def test_a_list_that_takes_the_keys(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A key that comes up while a list is open is heard by nobody: to open it has ended driving before."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        heard = "addEventListener('keyup', event => (document.body.dataset.up = event.code), true)"
+        page.evaluate(heard)
+        page.keyboard.down("w")
+        driving(relay)
+        page.get_by_label("Command topic").click()
+        ends_with_one_zero(page, relay)
+        expect(seen(page, "drive-words")).to_have_text("Stopped: a field or a list took the keys.")
+        page.keyboard.up("w")
+        page.keyboard.press("Escape")
+        expect(page.locator("body[data-up=Escape]")).to_be_attached()
+        ends_with_one_zero(page, relay)
+        expect(page.get_by_label("Command topic")).to_be_focused()
+        before = len(relay.commands())
+        page.keyboard.down("w")
+        driving(relay, before + 1)
+        page.keyboard.up("w")
+        ends_with_one_zero(page, relay)
+
+    def test_a_list_that_the_keyboard_opens_under_the_joystick(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """The keyboard goes to a field while the mouse holds the joystick."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        hold_joystick(page)
+        driving(relay)
+        page.get_by_label("Command topic").focus()
+        ends_with_one_zero(page, relay)
+        page.mouse.up()
+
+    def test_a_repeated_key_that_falls_silent(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Where the system repeats keys, one that is repeated no more came up unheard; it has to be pressed anew."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        page.keyboard.down("w")
+        driving(relay)
+        for _ in range(3):
+            page.keyboard.down("w")
+        expect(seen(page, "drive-words")).to_have_text(
+            "Stopped: the key is no longer told of. Press it again."
+        )
+        page.keyboard.down("w")
+        ends_with_one_zero(page, relay)
+        page.keyboard.up("w")
+
+    def test_a_key_that_is_never_repeated(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Who has repeating switched off can drive all the same, for longer than any silence."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        page.keyboard.down("w")
+        driving(relay, 30)
+        page.keyboard.up("w")
+        ends_with_one_zero(page, relay)
 
     def test_control_that_is_lost(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """Driving ends and nothing more is sent, not even a zero: it would take a robot that is free."""
@@ -308,6 +369,62 @@ class TestLettingGo:
         expect(seen(page, "stopped")).to_contain_text("By ann")
         ends_with_one_zero(page, relay)
         page.mouse.up()
+
+
+class TestKeys:
+    def test_drive_and_stop_after_the_mouse_was_used(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A slider, a list or a button that was clicked keeps no keys: letters and arrows drive, space stops."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        slider = seen(page, "limit-linear")
+        slider.click()
+        expect(slider).to_be_focused()
+        speed = slider.input_value()
+        expect(seen(page, "keys-hint")).to_contain_text("Space stops the robot for everybody.")
+        for key in ("w", "ArrowUp"):
+            before = len(relay.commands())
+            page.keyboard.down(key)
+            driving(relay, before + 3)
+            page.keyboard.up(key)
+            ends_with_one_zero(page, relay)
+        assert slider.input_value() == speed
+        seen(page, "input-gamepad").click()
+        page.keyboard.press("Space")
+        expect(seen(page, "stopped")).to_contain_text("By driver")
+        expect(seen(page, "input-gamepad")).to_have_count(0)
+
+    def test_belong_to_the_control_that_the_keyboard_led_to(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """Arrows move such a slider and space presses such a button; the page says so, and Esc gives the keys back."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        slider, button = seen(page, "limit-angular"), seen(page, "input-gamepad")
+        slider.focus()
+        speed = slider.input_value()
+        page.keyboard.press("ArrowUp")
+        assert slider.input_value() != speed and relay.commands() == []
+        page.keyboard.press("Tab")
+        expect(button).to_be_focused()
+        expect(seen(page, "keys-hint")).to_contain_text("they neither drive nor stop. Esc gives them back.")
+        page.keyboard.press("Space")
+        expect(button).to_have_attribute("aria-pressed", "true")
+        page.keyboard.press("Escape")
+        expect(seen(page, "keys-hint")).to_contain_text("Space stops the robot for everybody.")
+        page.keyboard.press("Space")
+        expect(seen(page, "stopped")).to_contain_text("By driver")
+
+    def test_letters_drive_whatever_is_worked_with_others(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """A slider to which the keyboard led needs no letters; a field that is typed into needs all."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        seen(page, "limit-linear").focus()
+        page.keyboard.down("w")
+        driving(relay)
+        page.keyboard.up("w")
+        ends_with_one_zero(page, relay)
 
 
 PADS = """

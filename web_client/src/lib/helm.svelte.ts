@@ -35,6 +35,8 @@ export class Helm {
   words = $state<string | null>(null)
   /** Changes when every input must let go of the hand that holds it. */
   letGo = $state(0)
+  /** Whether the control that has the focus takes keys that would else drive or stop. */
+  keysTaken = $state(false)
   chosen = $state<Limits>(USUAL)
   /** The order that is under way. */
   busy = $state<Order | null>(null)

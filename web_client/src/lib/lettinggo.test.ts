@@ -17,7 +17,10 @@ beforeEach(() => {
 })
 
 function happens(where: 'window' | 'document', name: string, more: object = {}): void {
-  page[where].dispatchEvent(Object.assign(new Event(name), more))
+  const { on, ...rest } = more as { on?: object }
+  const event = Object.assign(new Event(name), rest)
+  if (on !== undefined) Object.defineProperty(event, 'target', { value: on })
+  page[where].dispatchEvent(event)
 }
 
 const CASES: ['window' | 'document', string, object, StopReason][] = [
@@ -29,6 +32,12 @@ const CASES: ['window' | 'document', string, object, StopReason][] = [
   ['window', 'contextmenu', {}, 'menu_opened'],
   ['window', 'beforetoggle', { newState: 'open' }, 'dialog_opened'],
   ['window', 'touchstart', { touches: [1, 2] }, 'several_fingers'],
+  ['window', 'pointerdown', { on: { tagName: 'SELECT' } }, 'field_entered'],
+  ['window', 'focusin', { on: { tagName: 'INPUT', type: 'text' } }, 'field_entered'],
+  ['window', 'dragstart', {}, 'drag_began'],
+  ['window', 'beforeprint', {}, 'page_printed'],
+  ['document', 'fullscreenchange', {}, 'view_changed'],
+  ['document', 'pointerlockchange', {}, 'capture_lost'],
 ]
 
 describe('letting go', () => {
@@ -49,6 +58,9 @@ describe('letting go', () => {
     ['beforetoggle', { newState: 'closed' }],
     ['touchstart', { touches: [1] }],
     ['touchstart', {}],
+    ['pointerdown', { on: { tagName: 'INPUT', type: 'range' } }],
+    ['pointerdown', {}],
+    ['focusin', { on: { tagName: 'BUTTON' } }],
   ])('%s alone does not', (name, more) => {
     happens('window', name, more)
     expect(stops).toEqual([])

@@ -1,5 +1,6 @@
 /** What the browser does to a page that drives: each of these ends driving, whatever is held. */
 import type { StopReason } from './drive'
+import { type Control, isField } from './keys'
 
 type Where = 'window' | 'document'
 
@@ -21,14 +22,26 @@ export const SIGNS: readonly Sign[] = [
   { where: 'window', event: 'pointercancel', reason: always('pointer_cancelled'), down: true },
   { where: 'window', event: 'touchstart', reason: (event) => (fingers(event) > 1 ? 'several_fingers' : null), down: true },
   { where: 'window', event: 'beforetoggle', reason: (event) => (opens(event) ? 'dialog_opened' : null), down: true },
+  // The list of a select gets the keys that come up while it is open; the page hears nothing of them, nor a blur.
+  { where: 'window', event: 'pointerdown', reason: (event) => (isOnField(event) ? 'field_entered' : null), down: true },
+  { where: 'window', event: 'focusin', reason: (event) => (isOnField(event) ? 'field_entered' : null), down: true },
+  // While something is dragged the keys are the system's.
+  { where: 'window', event: 'dragstart', reason: always('drag_began'), down: true },
+  { where: 'window', event: 'beforeprint', reason: always('page_printed') },
   // A finger that rests on the joystick asks for a menu on some systems; the joystick declines.
   { where: 'window', event: 'contextmenu', reason: (event) => (event.defaultPrevented ? null : 'menu_opened') },
   { where: 'document', event: 'visibilitychange', reason: (event) => (isHidden(event) ? 'page_hidden' : null) },
   { where: 'document', event: 'freeze', reason: always('page_frozen') },
+  { where: 'document', event: 'fullscreenchange', reason: always('view_changed') },
+  { where: 'document', event: 'pointerlockchange', reason: always('capture_lost') },
 ]
 
 function opens(event: Event): boolean {
   return (event as ToggleEvent).newState === 'open'
+}
+
+function isOnField(event: Event): boolean {
+  return isField(event.target as Partial<Control> as Control | null)
 }
 
 function isHidden(event: Event): boolean {

@@ -3,7 +3,6 @@ import { refusal, robotSocket } from './api'
 import { pause } from './backoff'
 import { ending } from './closing'
 import { counts, select } from './fleet'
-import { direction, isDriveKey, takesKeys, takesSpace } from './keys'
 import type { Robot } from './types'
 
 it('waits longer after each attempt, within bounds', () => {
@@ -21,21 +20,6 @@ it('tells what a close code means and whether to try again', () => {
   })
   expect(ending(4404, '').after).toBe('give_up')
   for (const code of [1001, 1006, 1011, 4408, 4999]) expect(ending(code, '').after).toBe('retry')
-})
-
-it('adds up the keys held', () => {
-  expect(direction(new Set(['KeyW', 'ArrowLeft']))).toEqual({ turn: 1, ahead: 1 })
-  expect(direction(new Set(['KeyW', 'KeyS', 'KeyD']))).toEqual({ turn: -1, ahead: 0 })
-  expect(direction(new Set(['KeyW', 'ArrowUp']))).toEqual({ turn: 0, ahead: 1 })
-  expect(isDriveKey('KeyQ')).toBe(false)
-})
-
-it('leaves keys to the controls that need them', () => {
-  expect(takesKeys({ tagName: 'INPUT' })).toBe(true)
-  expect(takesKeys({ tagName: 'DIV', isContentEditable: true })).toBe(true)
-  expect(takesKeys({ tagName: 'BUTTON' })).toBe(false)
-  expect(takesSpace({ tagName: 'BUTTON' })).toBe(true)
-  expect(takesSpace(null)).toBe(false)
 })
 
 it('builds the address of a robot’s websocket', () => {
