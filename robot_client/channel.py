@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_protocol import link
@@ -151,10 +150,6 @@ class Channel:
     def cancel_goals(self, only_moving: bool) -> None:
         """The robot is to stop; see :meth:`robot_client.goals.Goals.cancel_all`."""
         self._goals.cancel_all(only_moving)
-
-    def standing(self) -> Deferred[None]:
-        """Fires when it pursues no goal that moves the robot; may be cancelled."""
-        return self._goals.standing()
 
     def _publish(self, publishing: _Publishing, frame: SampleFrame | CommandFrame, by: int) -> None:
         try:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from twisted.internet.defer import CancelledError, Deferred, DeferredList
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.protocol import Factory
 from twisted.internet.task import LoopingCall
 from twisted.logger import Logger
@@ -18,6 +18,7 @@ from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
 from robot_client.alerts import MODULE, AlertMemory
 from robot_client.authority import Authority
+from robot_client.body import Body
 from robot_client.camera.desk import CameraDesk
 from robot_client.channel import Channel
 from robot_client.clocks import now_ns
@@ -28,7 +29,7 @@ from robot_client.goal_topics import GoalTopics
 from robot_client.graph_parts import parts
 from robot_client.guard_feed import GuardFeed
 from robot_client.hardware import Hardware
-from robot_client.helm import LOOK_EVERY, Body, Helm
+from robot_client.helm import LOOK_EVERY, Helm
 from robot_client.lasting import Latch
 from robot_client.limits import limits_told
 from robot_client.link import ChannelLink, Commanded, Ended, Event, JoinedChannel, Said, Sampled
@@ -230,9 +231,14 @@ class Daemon(Body):
         for end in self._ends.values():
             end.channel.cancel_goals(only_moving)
 
-    def standing(self) -> Deferred[list[tuple[bool, None]]]:
-        """Fires when no goal that moves the robot is pursued on any channel, or with where it is when cancelled."""
-        return DeferredList([end.channel.standing() for end in self._ends.values()], consumeErrors=True)
+    def standing(self, seconds: float) -> Deferred[list[str]]:
+        """Fires when no goal that moves the robot is pursued, or in so many seconds; with the actions that still do."""
+        return self._pursuits.standing(seconds)
+
+    @property
+    def pursued(self) -> list[str]:
+        """The actions that pursue a goal that moves the robot."""
+        return self._pursuits.pursued
 
     def silence(self, topic: str) -> None:
         """A topic is to say nothing from now on, or something again."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from twisted.internet.defer import Deferred, succeed
 from twisted.python.failure import Failure
 
 from relay_protocol import link
@@ -41,8 +40,6 @@ class Goals(Part):
         self._goals: dict[str, Goal] = {}
         self._moving: set[str] = set()
         """Those whose actions move the robot."""
-        self._waiting: list[Deferred[None]] = []
-        """Who wants to know when none of them is left."""
         self._paused = False
         self._held: dict[str, link.ActionFeedback] = {}
         self._closed = False
@@ -98,14 +95,6 @@ class Goals(Part):
             except Exception:  # one that fails must not keep the next from its end
                 self._log.failure("a goal could not be cancelled")
 
-    def standing(self) -> Deferred[None]:
-        """Fires when no goal that moves the robot is left; may be cancelled."""
-        if not self._moving:
-            return succeed(None)
-        waiting: Deferred[None] = Deferred(self._waiting.remove)
-        self._waiting.append(waiting)
-        return waiting
-
     def pause(self) -> None:
         """The link takes nothing."""
         self._paused = True
@@ -125,7 +114,6 @@ class Goals(Part):
             goal.cancel()
         self._goals.clear()
         self._moving.clear()
-        self._tell_standing()
 
     def _feedback(self, id: str, action: str, body: bytes) -> None:
         if id not in self._goals:
@@ -158,7 +146,6 @@ class Goals(Part):
     def _say_end(self, id: str, status: int, cdr: str | None, reason: str) -> None:
         self._goals.pop(id, None)
         self._moving.discard(id)
-        self._tell_standing()
         feedback = self._held.pop(id, None)
         if self._closed:
             return
@@ -167,13 +154,6 @@ class Goals(Part):
         self._wire.say(
             link.ActionResult(id=id, status=status, result=cdr is not None, cdr=cdr, reason=reason)
         )
-
-    def _tell_standing(self) -> None:
-        if self._moving:
-            return
-        waiting, self._waiting = self._waiting, []
-        for each in waiting:
-            each.callback(None)
 
 
 def refusal(message: link.SendActionGoal, reason: str) -> link.ActionResult:

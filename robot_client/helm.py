@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.logger import Logger
@@ -14,50 +14,29 @@ from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailab
 from relay_protocol.limits import FACTS
 from relay_protocol.link.moving import Order
 from robot_client.authority import NOBODY, Authority, Suppression
+from robot_client.body import Body
 from robot_client.hardware import Hardware
 from robot_client.lasting import Latch
 from robot_client.motion import MotionDesk
 from robot_client.reactors import Timer
 from robot_client.safety import MILLI
-from robot_client.sweep import PATIENCE, Sweep
+from robot_client.sweep import HEARD_WITHIN, PATIENCE, Sweep
 from robot_client.telling import Inhibition, Telling, safety
 
 LOOK_EVERY = 1.0
-"""Seconds between looks for what a daemon that starts stopped has to stop again."""
+"""Seconds between looks for what is still to be stopped while the robot is."""
 
 LOOKS = 30
-"""How often it looks: nodes may start after it."""
+"""How often a daemon that starts stopped looks for the switch in the hardware: nodes may start after it."""
 
 
-class Body(Protocol):
-    """What the helm needs of the rest of the robot."""
-
-    def say(self, message: link.Message) -> None:
-        """Tell the relay, if it is there."""
-
-    def alert(self, level: str, text: str) -> None:
-        """Tell a person."""
-
-    def topic(self, name: str) -> tuple[str, list[str]]:
-        """The full name of a topic, and its types: none where it does not exist.
-
-        :raises Invalid: it is no name
-        """
-
-    def cancel_goals(self, only_moving: bool) -> None:
-        """Cancel what the robot's actions pursue for the relay."""
-
-    def standing(self) -> Deferred[list[tuple[bool, None]]]:
-        """Fires when they pursue nothing for it any more that moves the robot; when cancelled, with what they do."""
-
-    def silence(self, topic: str) -> None:
-        """What :attr:`Helm.silent` says of a topic has changed."""
+LATE = ("stop", "actions")
+"""Kind and part of the alert that goals go on though the robot is stopped."""
 
 
 class Helm:
     """Does what the relay orders.
 
-    :param clock: for timers
     :param clock: for timers
     :param now: clock of :mod:`robot_client.clocks`, nanoseconds
     :param wall: Unix time, seconds
@@ -99,10 +78,10 @@ class Helm:
         self._resuming: int | None = None
         self._looks = 0
         """How often to look again for what is to be stopped since before this start."""
-        self._swept: frozenset[str] = frozenset()
-        """Actions whose goals were cancelled in this."""
         self._unthrown = False
         """Whether the hardware is to be stopped in this."""
+        self._late: list[str] = []
+        """What a person was told that the stop has not achieved yet."""
         self._telling = Telling(clock, self._tell)
         self._log = Logger("helm")
         self._orders: dict[type, Callable[[Any], None]] = {
@@ -113,6 +92,7 @@ class Helm:
             link.Inhibit: self._inhibit,
         }
         motion.on_moving = self.changed
+        sweep.on_refused = self._refused
         self._load()
 
     def order(self, message: link.Message) -> bool:
@@ -147,22 +127,23 @@ class Helm:
         self._telling.changed()
 
     def look(self) -> None:
-        """Stop again what a daemon that was stopped before this start finds; to be called now and then."""
+        """Go on with what a stop, also one of before this start, has yet to achieve; to be called every second."""
         if self._authority.stopped is None:
             self._looks = 0
-        if not self._looks:
             return
-        self._looks -= 1
-        asked, _ = self._sweep.cancel_goals(self._swept)
-        self._swept |= asked
-        if self._unthrown and not self._stopping and self._resuming is None:
-            self._throw_again()
+        self._sweep.again()
+        if not self._stopping:
+            self._tell_late()
+        if self._looks:
+            self._looks -= 1
+            if self._unthrown and not self._stopping and self._resuming is None:
+                self._throw_again()
 
     # --- orders --------------------------------------------------------------------------------------------
 
     def _control(self, message: link.Control) -> None:
         failed: list[str] = []
-        goals: Deferred[Any] = succeed([])
+        goals: Deferred[list[str]] = succeed([])
         if self._authority.hold(message.holder, message.user, message.level, self._now()):
             self._log.info(
                 "control: {who} ({why})",
@@ -171,20 +152,17 @@ class Helm:
             )
             failed = self._motion.stop_all("control changes", gently=True)
             self._body.cancel_goals(True)
-            goals = self._body.standing().addTimeout(PATIENCE, self._clock).addCallback(self._ended)
+            goals = self._body.standing(PATIENCE)
         self.changed()
         stood = self._motion.standing()
         stood.addCallback(
-            lambda also: goals.addCallback(lambda _: self._controlled(message, failed + also)),
+            lambda also: goals.addCallback(lambda going: self._controlled(message, failed + also, going)),
         )
 
-    def _ended(self, ends: list[tuple[bool, None]]) -> None:
-        """The goals of the former one have ended, or have had the time to."""
-        if not all(good for good, _ in ends):
-            self._log.warn("goals that were cancelled have not ended within {time:g} s", time=PATIENCE)
-
-    def _controlled(self, message: link.Control, failed: list[str]) -> None:
-        """What the former one moved stands, or does not."""
+    def _controlled(self, message: link.Control, failed: list[str], going: list[str]) -> None:
+        """What the former one moved stands, or does not; his goals have ended, or have had the time to."""
+        if going:
+            self._log.warn("goals of {actions} were cancelled and have not ended", actions=", ".join(going))
         if failed and self._authority.holder == message.holder:
             self._authority.hold(NOBODY, "", "", self._now())
             self.changed()
@@ -210,16 +188,22 @@ class Helm:
     def _throw(self) -> Deferred[list[str]]:
         """Stop what commands of clients don't move; fires with what went wrong."""
         hardware = self._hardware.stop()
-        _, cancelled = self._sweep.cancel_goals()
+        cancelled = self._sweep.stop()
         self._sweep.zeros.say()
-        return hardware.addCallback(lambda problems: cancelled.addCallback(lambda also: problems + also))
+        ended = self._body.standing(HEARD_WITHIN)
+        return hardware.addCallback(
+            lambda problems: cancelled.addCallback(
+                lambda also: ended.addCallback(lambda _: problems + also),
+            ),
+        )
 
     def _throw_again(self) -> None:
         if self._looks and not self._reachable():
             return
         self._unthrown = False
         self._stopping.append(None)
-        self._throw().addCallback(self._stopped)
+        self._sweep.zeros.say()
+        self._hardware.stop().addCallback(self._stopped)
 
     def _reachable(self) -> bool:
         try:
@@ -242,10 +226,22 @@ class Helm:
         waiting, self._stopping, self._problems = self._stopping, [], []
         if problems:
             self._body.alert("error", f"the robot is stopped, but {'; '.join(problems)}")
+        self._tell_late()
         for id in waiting:
             if id is not None:
-                self._done(id, problems)
+                self._done(id, problems + self._late)
         return problems
+
+    def _tell_late(self) -> None:
+        """Tell a person what a stop has not achieved in time, and when it has."""
+        late, self._late = self._late, self._sweep.late(self._body.pursued)
+        if self._late and not late:
+            self._body.alert("error", f"the robot is stopped, but {'; '.join(self._late)}", *LATE)
+        elif late and not self._late:
+            self._body.alert("info", "all goals that moved the stopped robot are cancelled", *LATE, over=True)
+
+    def _refused(self, words: str) -> None:
+        self._body.alert("error", f"the robot is stopped, but {words}")
 
     def _resume(self, message: link.Resume) -> None:
         if self._authority.stopped is None:
@@ -272,8 +268,11 @@ class Helm:
         if problems:
             self._stay(message, problems, unkept=released)
             return
-        self._sweep.zeros.end()
+        self._sweep.end()
         self._authority.resume(self._now())
+        if self._late:
+            self._late = []
+            self._body.alert("info", "the robot is resumed", *LATE, over=True)
         self._log.info("resumed by {who} ({why})", who=message.by, why=message.why or "no reason given")
         self.changed()
         self._done(message.id, [])
@@ -346,6 +345,7 @@ class Helm:
         if stopped is not None:
             self._authority.stop(stopped, self._now())
             self._looks, self._unthrown = LOOKS, True
+            self._sweep.begin()
             self._log.warn(
                 "the robot is stopped since before this start, by {who} ({why})",
                 who=stopped.by,

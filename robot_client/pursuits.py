@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from fnmatch import fnmatchcase
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from twisted.internet.defer import Deferred, succeed
 from twisted.logger import Logger
 
 from relay_protocol.errors import Unavailable
@@ -18,7 +19,7 @@ from robot_client.guard_feed import GuardFeed
 from robot_client.guard_protocol import cancelling
 from robot_client.lasting import Latch
 from robot_client.platforms.base import Goal
-from robot_client.reactors import Clock, Timer
+from robot_client.reactors import Timer
 from robot_client.sweep import Sweep
 
 BEAT = 0.2
@@ -41,6 +42,7 @@ class Pursuits:
 
     :param everything: patterns of all actions that move the robot, for a note that can't be read
     :param latch: where the note is kept
+    :param clock: for timers
     :param now: clock of :mod:`robot_client.clocks`, nanoseconds
     """
 
@@ -50,7 +52,7 @@ class Pursuits:
         guard: GuardFeed,
         sweep: Sweep,
         latch: Latch,
-        clock: Clock,
+        clock: Any,
         now: Callable[[], int],
     ) -> None:
         self._guard = guard
@@ -60,6 +62,8 @@ class Pursuits:
         self._now = now
         self._running: dict[str, int] = {}
         """How many goals by action; none where the guard is only kept able to cancel them."""
+        self._waiting: list[Deferred[list[str]]] = []
+        """Who wants to know when none is left."""
         self._forgetting: dict[str, Timer] = {}
         self._beating: Timer | None = None
         self._log = Logger("pursuits")
@@ -83,6 +87,19 @@ class Pursuits:
         if not self._looks:
             self._left.clear()
             self._note()
+
+    @property
+    def pursued(self) -> list[str]:
+        """The actions that pursue goals, sorted."""
+        return sorted(action for action, goals in self._running.items() if goals)
+
+    def standing(self, seconds: float) -> Deferred[list[str]]:
+        """Fires with :attr:`pursued`, when no goal is left or in so many seconds."""
+        if not self.pursued:
+            return succeed([])
+        waiting: Deferred[list[str]] = Deferred(self._waiting.remove)
+        self._waiting.append(waiting)
+        return waiting.addTimeout(seconds, self._clock, lambda *_: self.pursued)
 
     def check(self, action: str) -> None:
         """See that a goal of an action may begin.
@@ -125,7 +142,15 @@ class Pursuits:
             self._guard.command(cancelling(action), False, self._now())
             self._forgetting[action] = self._clock.callLater(KEPT, self._forget, action)
             self._note()
+        self._tell_standing()
         return outcome
+
+    def _tell_standing(self) -> None:
+        if self.pursued:
+            return
+        waiting, self._waiting = self._waiting, []
+        for each in waiting:
+            each.callback([])
 
     def _forget(self, action: str) -> None:
         timer = self._forgetting.pop(action)
@@ -136,7 +161,7 @@ class Pursuits:
 
     def _beat(self) -> None:
         self._beating = None
-        running = [action for action, goals in self._running.items() if goals]
+        running = self.pursued
         for action in running:
             self._guard.command(cancelling(action), True, self._now())
         if running:
@@ -155,8 +180,7 @@ class Pursuits:
             self._note()
 
     def _note(self) -> None:
-        running = {action for action, goals in self._running.items() if goals}
         try:
-            self._latch.keep_goals(sorted(running | self._left))
+            self._latch.keep_goals(sorted({*self.pursued, *self._left}))
         except Unavailable as error:
             self._log.warn("{why}", why=str(error))

@@ -2,31 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from twisted.internet.defer import Deferred, DeferredList, maybeDeferred
+from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.link import MotionPolicy
 from robot_client.guard_protocol import CANCEL, CANCEL_TYPE
-from robot_client.platforms.base import GraphView, Platform
+from robot_client.platforms.base import Platform
 from robot_client.zeros import Zeros
 
 PATIENCE = 1.0
 """Seconds an action may take to cancel its goals."""
 
+HEARD_WITHIN = 2.0
+"""Seconds an order to stop waits for the actions: each is asked twice in this, for a first call has to find it."""
+
 MAX_ACTIONS = 64
-"""Actions that are told at a stop."""
+"""Actions that are being asked at a time."""
+
+MAX_HEARD = 1024
+"""Actions that are remembered to have answered, also when they are gone."""
+
+MAX_NAMES = 8
+"""Actions that are named in one sentence."""
 
 _HEADER = b"\0\1\0\0"
-_ALL_GOALS = _HEADER + bytes(16 + 4 + 4)
-"""No goal's id and no time: cancel all."""
+_TIME = bytes(4 + 4)
+"""No time: of what was given at any."""
+
+_ALL_GOALS = bytes(16)
 
 _NOTHING_TO_CANCEL = frozenset((2, 3))
 """What an action answers whose goals are unknown, or at their end already."""
+
+
+class _Round:
+    """What has been heard since one stop."""
+
+    def __init__(self) -> None:
+        self.heard: set[str] = set()
+        self.asking: set[str] = set()
+        self.tries: Counter[str] = Counter()
+        self.silent: set[str] = set()
+        """Actions that ought to have answered."""
+        self.refused: list[str] = []
+        self.waiting: Deferred[list[str]] | None = None
+        """Who gave the order."""
 
 
 class Sweep:
@@ -42,60 +68,151 @@ class Sweep:
     ) -> None:
         self.zeros = Zeros(policy, platform, clock, commanded)
         """For the topics of others."""
+        self.on_refused: Callable[[str], None] = lambda words: None
+        """Told what an action refused when nobody waits for it any more."""
         self._policy = policy
         self._platform = platform
         self._clock = clock
-        self._asked: set[str] = set()
-        """Actions that have not answered yet."""
+        self._round: _Round | None = None
+        self._unheard: set[str] = set()
+        """Actions of which the log says already that they don't answer."""
         self._log = Logger("sweep")
 
-    def cancel_goals(self, but: frozenset[str] = frozenset()) -> tuple[set[str], Deferred[list[str]]]:
-        """Cancel all goals of the actions that move the robot, whoever gave them.
+    def begin(self) -> None:
+        """The robot is stopped: :meth:`again` cancels what it finds."""
+        self._round = _Round()
 
-        An action that is still to answer is not asked again.
+    def stop(self) -> Deferred[list[str]]:
+        """Cancel all goals of the actions that move the robot, whoever gave them; :meth:`again` goes on with it.
 
-        :param but: actions that need not be asked
-        :return: the actions asked, and what fires within :data:`PATIENCE` with what they refused, in words
+        :return: fires when all there are have answered, or after :data:`HEARD_WITHIN`, with what they refused, in
+            words; which have not answered :meth:`late` says
         """
-        moving = (each for each in self.actions() if self._policy.moves_by_action(each))
-        asked = sorted(set(moving) - but - self._asked)[:MAX_ACTIONS]
-        answers = DeferredList([self.cancel(each) for each in asked], consumeErrors=True)
-        return set(asked), answers.addCallback(lambda ends: [words for good, words in ends if good and words])
+        self._round = round = _Round()
+        moving = self._moving()
+        if moving is None:
+            round.refused.append("which actions there are could not be found out")
+        round.silent.update(moving or ())
+        waiting: Deferred[list[str]] = Deferred(lambda _: self._told(round))
+        round.waiting = waiting
+        waiting.addTimeout(HEARD_WITHIN, self._clock)
+        waiting.addErrback(lambda _: round.refused)
+        self._ask(round, moving or [])
+        self._tell(round)
+        return waiting
+
+    def again(self) -> None:
+        """Ask those that have not answered since the stop, or are new; to be called every second."""
+        if self._round is not None:
+            self._ask(self._round, self._moving() or [])
+
+    def end(self) -> None:
+        """The robot is resumed."""
+        self._round = None
+        self.zeros.end()
+
+    def late(self, pursued: Iterable[str] = ()) -> list[str]:
+        """What the stop has not achieved yet, in words.
+
+        :param pursued: actions whose goals, given by the relay, have not ended
+        """
+        silent = set() if self._round is None else self._round.silent
+        words = []
+        if silent:
+            words.append(
+                f"no word came from {_names(silent)} that goals are cancelled; it is asked again every second"
+            )
+        going = set(pursued) - silent
+        if going:
+            words.append(f"goals of {_names(going)} have not ended yet")
+        return words
 
     def actions(self) -> list[str]:
         """The actions there are now."""
-        return list(self._graph().actions)
+        return self._actions() or []
 
-    def cancel(self, action: str) -> Deferred[str | None]:
-        """Cancel all goals of an action, whoever gave them.
+    def cancel(self, action: str, goal: bytes = _ALL_GOALS) -> Deferred[str | None]:
+        """Cancel one goal of an action, or all, whoever gave them.
 
+        :param goal: its id, 16 bytes
         :return: fires within :data:`PATIENCE` with what it refused, in words; ``None``: it was not reached
         """
-        self._asked.add(action)
-        answer = maybeDeferred(self._platform.call, action + CANCEL, CANCEL_TYPE, _ALL_GOALS, PATIENCE)
+        request = _HEADER + goal + _TIME
+        answer = maybeDeferred(self._platform.call, action + CANCEL, CANCEL_TYPE, request, PATIENCE)
         answer.addTimeout(PATIENCE, self._clock)
-        words = answer.addCallbacks(
-            lambda body: _refusal(action, body), lambda failure: self._unheard(action, failure)
+        return answer.addCallbacks(
+            lambda body: self._answered(action, body), lambda failure: self._missed(action, failure)
         )
-        return words.addCallback(self._answered, action)
 
-    def _answered(self, words: str | None, action: str) -> str | None:
-        self._asked.discard(action)
+    def _ask(self, round: _Round, moving: list[str]) -> None:
+        for gone in round.tries.keys() - set(moving):
+            del round.tries[gone]
+        if len(round.heard) > MAX_HEARD:
+            round.heard.intersection_update(moving)
+        left = set(moving) - round.heard - round.asking
+        # Those that never answer must not keep the others from being asked.
+        turn = sorted(left, key=lambda action: (round.tries[action], action))
+        for action in turn[: MAX_ACTIONS - len(round.asking)]:
+            round.asking.add(action)
+            round.tries[action] += 1
+            self.cancel(action).addCallback(self._heard, action, round)
+
+    def _heard(self, words: str | None, action: str, round: _Round) -> None:
+        round.asking.discard(action)
+        if words is None:
+            if round.tries[action] > 1:
+                round.silent.add(action)
+            return
+        round.heard.add(action)
+        round.silent.discard(action)
+        if words and round.waiting is not None:
+            round.refused.append(words)
+        elif words and round is self._round:
+            self.on_refused(words)
+        self._tell(round)
+
+    def _tell(self, round: _Round) -> None:
+        """Tell who gave the order, if all have answered."""
+        waiting = round.waiting
+        if waiting is not None and not round.silent:
+            self._told(round)
+            waiting.callback(round.refused)
+
+    def _told(self, round: _Round) -> None:
+        round.waiting = None
+
+    def _answered(self, action: str, body: bytes) -> str:
+        self._unheard.discard(action)
+        words = _refusal(action, body)
         if words:
             self._log.warn("{words}", words=words)
         return words
 
-    def _unheard(self, action: str, failure: Failure) -> None:
+    def _missed(self, action: str, failure: Failure) -> None:
+        if action in self._unheard:
+            return
+        self._unheard.add(action)
         self._log.warn(
             "the goals of {action} could not be cancelled: {why}", action=action, why=_words(failure)
         )
 
-    def _graph(self) -> GraphView:
+    def _moving(self) -> list[str] | None:
+        """The actions that move the robot; ``None``: nobody can tell."""
+        actions = self._actions()
+        return None if actions is None else [each for each in actions if self._policy.moves_by_action(each)]
+
+    def _actions(self) -> list[str] | None:
         try:
-            return self._platform.graph()
+            return list(self._platform.graph().actions)
         except Exception:  # the rest of the stop must not hang on it
             self._log.failure("the graph could not be read")
-            return GraphView()
+            return None
+
+
+def _names(actions: set[str]) -> str:
+    named = sorted(actions)
+    more = len(named) - MAX_NAMES
+    return " and ".join([", ".join(named[:MAX_NAMES]), *([f"{more} more"] if more > 0 else [])])
 
 
 def _words(failure: Failure) -> str:

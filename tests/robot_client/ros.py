@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -90,6 +91,15 @@ class Peer:
         self._process.kill()
         self._process.wait()
         self._finish()
+
+    @contextmanager
+    def frozen(self) -> Iterator[None]:
+        """Let it stand still for a while."""
+        self._process.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self._process.send_signal(signal.SIGCONT)
 
     def until(self, true: Callable[[], Any], timeout: float = PATIENCE) -> None:
         deadline = time.monotonic() + timeout

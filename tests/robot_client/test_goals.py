@@ -12,7 +12,7 @@ from relay_protocol import link
 from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, Outcome
 from robot_client.platforms.memory import MemoryGoal
 from robot_client.wire import MAX_OPEN
-from tests.robot_client.scene import DRIVER, Scene
+from tests.robot_client.scene import Scene
 
 BODY = b"\0\1\0\0body"
 CDR = link.to_base64(BODY)
@@ -162,27 +162,3 @@ def test_answer_too_large_for_the_link_is_told_in_words(scene: Scene) -> None:
     late.callback(bytes(2**24))
     assert scene.wire.said[-1].result is False
     assert "16777216 bytes" in scene.wire.said[-1].reason
-
-
-def test_who_waits_for_a_standstill_waits_for_the_goals_that_move_the_robot(scene: Scene) -> None:
-    """For the last of them and for no others; who gives up waiting is told nothing more."""
-    scene.platform.actions.add("/navigate_to_pose")
-    begin(scene, "other")
-    told: list[str] = []
-    scene.channel.standing().addCallback(lambda _: told.append("none"))
-    assert told == ["none"]
-    for id in "ab":
-        scene.channel.handle(
-            link.SendActionGoal(
-                id=id, action="/navigate_to_pose", type="pkg/action/Go", cdr=CDR, source=DRIVER
-            )
-        )
-    scene.channel.standing().addCallback(lambda _: told.append("all"))
-    impatient = scene.channel.standing()
-    impatient.addCallbacks(lambda _: told.append("late"), lambda _: None)
-    impatient.cancel()
-    first, second = scene.platform.goals[1:]
-    second.result.callback(Outcome(CANCELED, BODY))
-    assert told == ["none"]
-    first.result.callback(Outcome(CANCELED, BODY))
-    assert told == ["none", "all"]

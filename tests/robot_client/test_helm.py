@@ -14,13 +14,14 @@ from robot_client.hardware import PATIENCE, Switches
 from robot_client.lasting import MemoryLatch
 from robot_client.platforms.base import CANCELED, GraphView, Outcome
 from robot_client.platforms.memory import TWIST, twist
-from robot_client.sweep import CANCEL
+from robot_client.sweep import CANCEL, HEARD_WITHIN, MAX_ACTIONS, MAX_NAMES
 from robot_client.telling import TELL_EVERY
 from tests.robot_client.daemon_scene import DRIVER, Line, Scene
 
 GO, ZERO = twist(1.0), twist()
 OTHER = 8
 NAVIGATE = "/navigate_to_pose"
+ALL_GOALS = b"\0\1\0\0" + bytes(24)
 
 
 def said(line: Line, op: str) -> list[Any]:
@@ -87,7 +88,9 @@ def test_control_for_another_stops_what_moved_before_it_is_done(scene: Scene, co
 def test_goal_that_does_not_end_holds_up_a_change_of_control_for_a_second(
     scene: Scene, control: Line
 ) -> None:
-    """Then the next one has it all the same; the holder's own goals hold up nothing that is said of him."""
+    """Then the next one has it all the same, also where the channel is gone that the goal came by; the holder's own
+    goals hold up nothing that is said of him.
+    """
     scene.platform.actions = {NAVIGATE}
     line = scene.driving(control)
     line.say(link.SendActionGoal(id="g", action=NAVIGATE, type="a/action/B", source=DRIVER, cdr=""))
@@ -100,6 +103,8 @@ def test_goal_that_does_not_end_holds_up_a_change_of_control_for_a_second(
         assert said(control, "done") == [{"op": "done", "id": id}]
     control.say(link.Control(id=11))
     line.lose()
+    assert said(control, "done") == []
+    scene.platform.goals[0].result.callback(Outcome(CANCELED, None))
     assert said(control, "done") == [{"op": "done", "id": 11}]
 
 
@@ -494,56 +499,225 @@ class Acting:
 
     def __init__(self, latch: MemoryLatch | None = None) -> None:
         self.scene = Scene(latch)
-        actions = {each: link.Service(types=["a/action/B"]) for each in (NAVIGATE, "/count")}
-        self.scene.platform.view = GraphView(actions=actions)
         self.asked: list[bytes] = []
-        self.answer: Deferred[bytes] = Deferred()
+        self.answers: list[Deferred[bytes]] = []
+        """Those to come."""
+        self.show(NAVIGATE, "/count")
+        self.control = self.scene.register()
+        self.control.heard()
+
+    def show(self, *actions: str) -> None:
+        """Have these in the graph, and no others."""
+        self.scene.platform.view = GraphView(
+            actions={each: link.Service(types=["a/action/B"]) for each in actions}
+        )
         for each in actions:
             self.scene.platform.services[each + CANCEL] = self._called
 
     def _called(self, request: bytes) -> Deferred[bytes]:
         self.asked.append(request)
-        return self.answer
+        self.answers.append(Deferred())
+        return self.answers[-1]
+
+    def answer(self, code: int = 0) -> None:
+        """Answer all that still wait."""
+        answers, self.answers = self.answers, []
+        for each in answers:
+            if not each.called:
+                each.callback(b"\0\1\0\0" + bytes([code]) + bytes(7))
+
+    def pass_seconds(self, seconds: int) -> None:
+        for _ in range(seconds):
+            self.control.say(link.Ping(t=1))
+            self.scene.clock.advance(1)
+
+    def heard(self, op: str) -> list[dict[str, Any]]:
+        return said(self.control, op)
+
+
+@pytest.fixture
+def acting() -> Acting:
+    return Acting()
 
 
 @pytest.mark.parametrize(("code", "good"), [(0, True), (1, False), (2, True), (3, True)])
-def test_stop_cancels_every_goal_of_the_actions_that_move_the_robot(code: int, good: bool) -> None:
+def test_stop_cancels_every_goal_of_the_actions_that_move_the_robot(
+    acting: Acting, code: int, good: bool
+) -> None:
     """Also one of a daemon before this; only an action that refuses makes the answer bad."""
-    acting = Acting()
-    control = acting.scene.register()
-    control.heard()
-    control.say(stop())
-    assert acting.asked == [b"\0\1\0\0" + bytes(24)]
-    assert said(control, "done") == []
-    acting.answer.callback(b"\0\1\0\0" + bytes([code]) + bytes(7))
-    (done,) = said(control, "done")
+    acting.control.say(stop())
+    assert acting.asked == [ALL_GOALS]
+    assert acting.heard("done") == []
+    acting.answer(code)
+    (done,) = acting.heard("done")
     assert done.get("ok", True) is good
     assert good or NAVIGATE in done["reason"]
 
 
-def test_action_that_does_not_answer_delays_no_stop_for_long() -> None:
-    """After a second the robot counts as stopped."""
-    acting = Acting()
-    control = acting.scene.register()
-    control.heard()
-    control.say(stop())
-    acting.scene.clock.advance(1)
-    assert said(control, "done") == [{"op": "done", "id": 2}]
+def test_action_that_does_not_answer_delays_no_stop_for_long(acting: Acting) -> None:
+    """After two seconds the relay hears that the robot is stopped but for it, and so does a person."""
+    acting.control.say(stop())
+    acting.pass_seconds(round(HEARD_WITHIN) - 1)
+    assert acting.heard("done") == []
+    acting.pass_seconds(1)
+    heard = [each for each in acting.control.heard() if isinstance(each, dict)]
+    (done,) = [each for each in heard if each["op"] == "done"]
+    assert (done["id"], done["ok"], NAVIGATE in done["reason"]) == (2, False, True)
+    (alert,) = [each for each in heard if each["op"] == "alert"]
+    assert (alert["level"], alert["kind"], NAVIGATE in alert["text"]) == ("error", "stop", True)
+
+
+def test_action_that_does_not_answer_is_asked_every_second_until_it_does(acting: Acting) -> None:
+    """Then a person hears that it has, and what others have it do from then on is theirs."""
+    acting.control.say(stop())
+    acting.pass_seconds(10)
+    assert 9 <= len(acting.asked) <= 11
+    acting.control.heard()
+    acting.answer()
+    asked = len(acting.asked)
+    acting.pass_seconds(10)
+    assert len(acting.asked) == asked
+    (alert,) = acting.heard("alert")
+    assert (alert["kind"], alert["over"]) == ("stop", True)
+
+
+def test_resume_ends_the_asking(acting: Acting) -> None:
+    """Who drives again is not cancelled by a stop that is over, nor does the alert outlast it."""
+    acting.control.say(stop())
+    acting.pass_seconds(3)
+    acting.control.heard()
+    acting.control.say(resume())
+    (alert,) = acting.heard("alert")
+    assert alert["over"] is True
+    asked = len(acting.asked)
+    acting.pass_seconds(5)
+    assert len(acting.asked) == asked
+
+
+def test_action_that_appears_while_the_robot_is_stopped_is_asked_once(acting: Acting) -> None:
+    """It was out of reach at the stop, and may pursue what was given before; one that comes back is not asked again."""
+    acting.show()
+    assert order(acting.control, stop()) == {"op": "done", "id": 2}
+    acting.pass_seconds(60)
+    acting.show(NAVIGATE)
+    acting.pass_seconds(1)
+    acting.answer()
+    acting.show()
+    acting.pass_seconds(2)
+    acting.show(NAVIGATE)
+    acting.pass_seconds(5)
+    assert acting.asked == [ALL_GOALS]
+    assert acting.heard("alert") == []
+
+
+def test_each_stop_asks_anew(acting: Acting) -> None:
+    """Others may have given goals since the last one."""
+    for id in (2, 3):
+        acting.control.say(stop(id))
+        acting.answer()
+        acting.pass_seconds(3)
+    assert acting.asked == 2 * [ALL_GOALS]
+    assert acting.heard("done") == [{"op": "done", "id": 2}, {"op": "done", "id": 3}]
+
+
+def test_late_refusal_is_an_alert(acting: Acting) -> None:
+    """Nobody waits for the answer any more."""
+    acting.control.say(stop())
+    acting.pass_seconds(3)
+    acting.control.heard()
+    acting.answer(1)
+    (alert,) = acting.heard("alert")
+    assert f"{NAVIGATE} refuses" in alert["text"]
+
+
+def test_goal_of_a_client_that_has_not_ended_is_told(acting: Acting) -> None:
+    """The action has said that it cancels it, and goes on: the stop is not confirmed before its end."""
+    acting.scene.platform.actions = {NAVIGATE}
+    line = acting.scene.driving(acting.control)
+    for id in "ab":
+        line.say(link.SendActionGoal(id=id, action=NAVIGATE, type="a/action/B", source=DRIVER, cdr=""))
+    first, second = acting.scene.platform.goals
+    acting.control.heard()
+    acting.control.say(stop())
+    acting.answer()
+    first.result.callback(Outcome(CANCELED, None))
+    assert acting.heard("done") == []
+    acting.pass_seconds(2)
+    (done,) = acting.heard("done")
+    assert (done["ok"], NAVIGATE in done["reason"]) == (False, True)
+    second.result.callback(Outcome(CANCELED, None))
+    acting.pass_seconds(1)
+    (alert,) = acting.heard("alert")
+    assert (alert["kind"], alert["over"]) == ("stop", True)
+
+
+def test_stop_is_confirmed_when_the_last_goal_of_a_client_has_ended(acting: Acting) -> None:
+    """Not a moment later."""
+    acting.scene.platform.actions = {NAVIGATE}
+    line = acting.scene.driving(acting.control)
+    line.say(link.SendActionGoal(id="g", action=NAVIGATE, type="a/action/B", source=DRIVER, cdr=""))
+    acting.control.heard()
+    acting.control.say(stop())
+    acting.answer()
+    acting.scene.platform.goals[0].result.callback(Outcome(CANCELED, None))
+    assert acting.heard("done") == [{"op": "done", "id": 2}]
+
+
+def test_graph_that_can_not_be_read_makes_no_good_stop(
+    acting: Acting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which actions to ask is not known then; they are asked when it can be read."""
+
+    def broken() -> GraphView:
+        raise RuntimeError("no graph")
+
+    with monkeypatch.context() as broken_for_now:
+        broken_for_now.setattr(acting.scene.platform, "graph", broken)
+        done = order(acting.control, stop())
+    assert (done["ok"], "could not be found out" in done["reason"]) == (False, True)
+    acting.pass_seconds(1)
+    assert acting.asked == [ALL_GOALS]
+
+
+def test_many_silent_actions_are_asked_in_turn(acting: Acting) -> None:
+    """So many at a time, and each in the end."""
+    names = [f"/r{number:03}/spin" for number in range(MAX_ACTIONS + 10)]
+    acting.show(*names)
+    asked: dict[str, int] = dict.fromkeys(names, 0)
+
+    def call(service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
+        asked[service.removesuffix(CANCEL)] += 1
+        return Deferred()
+
+    acting.scene.platform.call = call  # type: ignore[method-assign]
+    acting.control.say(stop())
+    assert sum(asked.values()) == MAX_ACTIONS
+    acting.pass_seconds(2)
+    assert min(asked.values()) == 1
+    (done,) = acting.heard("done")
+    assert "/r000/spin" in done["reason"]
+    assert f"and {len(names) - MAX_NAMES} more" in done["reason"]
 
 
 def test_daemon_that_starts_stopped_cancels_the_goals_of_the_one_before() -> None:
-    """Once."""
+    """Until the action has answered, and not again."""
     acting = Acting(MemoryLatch(BEFORE))
-    for _ in range(40):
-        acting.scene.clock.advance(1)
-    assert acting.asked.count(b"\0\1\0\0" + bytes(24)) == 1
+    acting.pass_seconds(40)
+    assert len(acting.asked) >= 39
+    acting.answer()
+    asked = len(acting.asked)
+    acting.pass_seconds(40)
+    assert set(acting.asked) == {ALL_GOALS}
+    assert len(acting.asked) == asked
 
 
-def test_action_that_is_gone_does_not_fail_a_stop() -> None:
-    """It pursues nothing."""
-    acting = Acting()
+def test_action_that_can_not_be_called_is_no_good_stop(acting: Acting) -> None:
+    """It is in the graph, and may pursue what nobody can cancel now."""
     acting.scene.platform.services.clear()
-    assert order(acting.scene.register(), stop()) == {"op": "done", "id": 2}
+    acting.control.say(stop())
+    acting.pass_seconds(2)
+    (done,) = acting.heard("done")
+    assert (done["ok"], NAVIGATE in done["reason"]) == (False, True)
 
 
 def heard_by(*types: str) -> link.Topic:

@@ -55,9 +55,9 @@ class Errand:
     def run(self, *arguments: str) -> subprocess.Popen[str]:
         """Start a daemon whose client holds control, and wait until it has found the action."""
         process = self.robot.run(*arguments)
-        control = self.robot.relay.register(heartbeat=5.0)  # it outlasts what the tests do to the daemon
-        assert control.order(link.Control(id=1, holder=1, user="ann")).ok
-        self.channel: Peer = self.robot.relay.channel(control)
+        self.control = self.robot.relay.register(heartbeat=5.0)  # it outlasts what the tests do to the daemon
+        assert self.control.order(link.Control(id=1, holder=1, user="ann")).ok
+        self.channel: Peer = self.robot.relay.channel(self.control)
         return process
 
     def begin(self, id: str) -> None:
@@ -136,3 +136,17 @@ def test_goals_are_cancelled_by_the_next_daemon_at_the_latest(
     assert not errand.cancelled
     process.terminate()
     until(lambda: errand.cancelled)
+
+
+def test_stop_is_not_confirmed_while_an_action_is_frozen(robot: Robot, node: Node) -> None:
+    """SIGSTOP of the action: the stop is answered with its name, and it cancels its goal when it goes on."""
+    errand = Errand(robot, node)
+    with node.frozen():
+        done = errand.control.order(link.Stop(id=2, by="eve"))
+        assert (done.ok, SPIN in done.reason) == (False, True)
+    until(lambda: errand.cancelled)
+    told = errand.control.expect(link.Alert)
+    while not told.over:
+        told = errand.control.expect(link.Alert)
+    assert told.kind == "stop"
+    assert errand.control.order(link.Stop(id=3, by="eve")).ok

@@ -132,6 +132,25 @@ def test_the_last_of_an_actions_goals_counts(scene: Scene) -> None:
     assert scene.feed.topics == {cancelling(SPIN)}
 
 
+def test_who_waits_for_a_standstill_waits_for_the_last_goal(scene: Scene) -> None:
+    """Or for as long as he likes; then he is told which actions go on."""
+    told: list[tuple[str, list[str]]] = []
+
+    def wait(name: str, seconds: float) -> None:
+        scene.pursuits.standing(seconds).addCallback(lambda going: told.append((name, going)))
+
+    wait("none", 1.0)
+    first, second = scene.begin(), scene.begin("/left/spin")
+    wait("impatient", 1.0)
+    wait("patient", 3.0)
+    end(first)
+    scene.clock.advance(1.0)
+    assert told == [("none", []), ("impatient", ["/left/spin"])]
+    end(second)
+    scene.clock.advance(9.0)
+    assert told[2:] == [("patient", [])]
+
+
 def test_actions_with_goals_are_noted(scene: Scene) -> None:
     """As long as one is under way, so that a daemon that starts knows what was left."""
     left, right = scene.begin("/left/spin"), scene.begin("/right/spin")
