@@ -38,6 +38,13 @@ class Flow:
         """Whether anything has come since this began."""
         return self._count > self._base
 
+    def grows(self, count: int) -> bool:
+        """Whether something has come since the last look.
+
+        :param count: samples that have come so far
+        """
+        return count != self._count
+
     @property
     def period(self) -> float | None:
         """Seconds from one sample to the next, where that is known and regular."""
@@ -45,6 +52,15 @@ class Flow:
         if lasted < REGULAR_SECONDS or samples < SAMPLES or lasted > samples * PERIOD:
             return None
         return lasted / samples
+
+    def excuse(self, now: float) -> None:
+        """Nothing could have come since the last look: that time does not count.
+
+        :param now: not before the last look
+        """
+        if not self.stale:
+            self._since += now - self._grown
+            self._grown = now
 
     def look(self, now: float, count: int) -> bool:
         """See how many samples have come; whether the topic is stale.

@@ -26,6 +26,9 @@ CLOCKS_SECONDS = 1.0
 BATTERY_STEP = 0.05
 """The charge has to be so much above the threshold for a low battery to be over."""
 
+UNSURE = 2 / 3
+"""A robot that was silent for this part of what makes it offline may be away: its topics' pauses don't count then."""
+
 SETTLED_SECONDS = 5.0
 """What a robot has not said of itself for so long after it came, it does not say."""
 
@@ -82,6 +85,8 @@ class Senses:
         """When each was seen, by the wall's clock, and when that was looked at first, by the monotonic one."""
         self._looked: float | None = None
         """When robots were looked at last, by the monotonic clock."""
+        self._unsure: set[int] = set()
+        """Robots that may be away, as the links say."""
         self._flows: dict[tuple[int, str, int], Flow] = {}
 
     def look(self, now: float, wall: float) -> None:
@@ -119,7 +124,12 @@ class Senses:
             self._online.pop(robot.robot_id, None)
         elif self._online.get(robot.robot_id, (None, now))[0] != robot.session:
             self._online[robot.robot_id] = (robot.session, now)
-        silent = self._silence(robot, now, wall) >= self._thresholds.silent
+        silence = self._silence(robot, now, wall)
+        silent = silence >= self._thresholds.silent
+        if robot.control is None or silence >= UNSURE * self._thresholds.silent:
+            self._unsure.add(robot.robot_id)
+        else:
+            self._unsure.discard(robot.robot_id)
         if robot.control is not None and not silent:
             self._voice.over(robot, kinds.OFFLINE)
         elif silent and robot.last_seen is not None and self._voice.lasts(robot, kinds.OFFLINE) is None:
@@ -165,7 +175,9 @@ class Senses:
             key = (robot.robot_id, each.topic, each.number)
             flow = self._flows.get(key) or Flow(now, each.taken)
             was = flow.stale
-            if flow.look(now, each.taken) and not was:
+            if robot.robot_id in self._unsure and not flow.grows(each.taken):
+                flow.excuse(now)
+            elif flow.look(now, each.taken) and not was:
                 text = f"{each.topic} has come regularly, and comes no more"
                 self._voice.tell(robot, kinds.STALE, each.topic, "warning", text)
             yield key, flow

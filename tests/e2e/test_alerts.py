@@ -6,6 +6,7 @@ import http.client
 import json
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,14 @@ from switchboard_fake_robot import FakeRobot
 from switchboard_hook import Delivery, Hook, MailServer
 from switchboard_http import ask
 from switchboard_processes import running
+from switchboard_proxy import ChaosProxy
 from switchboard_relay import Relay
 from switchboard_robot import Robot
+from switchboard_threads import Driver
 from switchboard_waiting import wait_for
 
 from relay_protocol import identity, link
+from relay_server.alerts.flow import REGULAR_SECONDS
 
 WITHIN = 5.0
 """An alert is to arrive so many seconds after a robot's plug was pulled."""
@@ -94,16 +98,58 @@ def clean(house: House) -> Iterator[None]:
     assert "Traceback" not in house.relay.log
 
 
-def test_a_robot_whose_plug_is_pulled_is_told_once_within_seconds(house: House) -> None:
-    """A real daemon is killed: one message, signed; when it is back, one more."""
-    rule = house.rule(kinds=["offline"])
+@pytest.mark.parametrize("how", ["killed daemon", "swallowing link"])
+def test_a_robot_whose_plug_is_pulled_is_told_once_within_seconds(house: House, how: str) -> None:
+    """By a rule as it comes, while somebody drives the robot and watches it: other news does not hold it up."""
+    rule = house.ask("POST", "/rules", {"channel": "webhook", "url": house.hook.url})
+    proxy = ChaosProxy(house.relay.robots_port)
+    robot = Robot(house.relay, f"pulled-{how[:6]}", port=proxy.port)
+    with closing(proxy), running(robot), house.relay.connect(robot.name, house.admin) as client:
+        client.send(op="subscribe", topic="/scan", type="sensor_msgs/msg/LaserScan")
+        client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
+        driver = Driver(client)
+        with running(driver):
+            driver.start()
+            wait_for("it moves", robot.moving)
+            regular = time.monotonic() + REGULAR_SECONDS + 2
+            wait_for("its topics are expected to go on", lambda: time.monotonic() > regular)
+            house.hook.got.clear()
+            pulled = time.monotonic()
+            if how == "killed daemon":
+                robot.daemon.kill()
+            else:
+                proxy.black_hole()
+            delivery = wait_for("the webhook hears of it", lambda: offline(house, robot.name), 30)
+            print(f"\n{how} to webhook: {delivery.at - pulled:.2f} s")
+            assert delivery.at - pulled < WITHIN
+            assert delivery.signed_with(rule["secret"])
+            time.sleep(3)
+        words = [each for delivery in list(house.hook.got) for each in told(delivery, robot.name)]
+        assert words.count("offline begun") == 1
+        assert set(words) <= {"offline begun", "control begun"}
+        proxy.heal()
+
+
+def told(delivery: Delivery, robot: str) -> list[str]:
+    """What a message tells of a robot."""
+    alerts = delivery.json["alerts"]
+    return [f"{each['kind']} {each['event']}" for each in alerts if each["robot"] == robot]
+
+
+def offline(house: House, robot: str) -> Delivery | None:
+    """The message that told that a robot is offline."""
+    return next((each for each in house.hook.got if "offline begun" in told(each, robot)), None)
+
+
+def test_a_robot_that_is_back_is_told_once(house: House) -> None:
+    """A real daemon is killed, which is seen by who may, and begins anew."""
+    house.rule(kinds=["offline"], robots="rover")
     robot = Robot(house.relay, "rover")
     with running(robot):
         house.relay.cli("right", "grant", "viewer", "rover", "viewer")
         pulled = time.monotonic()
         robot.daemon.kill()
         delivery = told_in_time(house, pulled, "killed daemon")
-        assert delivery.signed_with(rule["secret"])
         assert abs(int(delivery.headers["switchboard-timestamp"]) - time.time()) < 60
         (alert,) = delivery.json["alerts"]
         assert (alert["robot"], alert["kind"], alert["event"]) == ("rover", "offline", "begun")

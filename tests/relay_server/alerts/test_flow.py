@@ -86,3 +86,25 @@ def test_what_came_since_the_beginning_is_known(scene: Scene) -> None:
     assert not flow.came
     flow.look(1.0, 8)
     assert flow.came
+
+
+def test_time_in_which_nothing_could_come_does_not_count(scene: Scene) -> None:
+    """Neither as a pause nor for the period; what does not come after it is stale in its time."""
+    scene.goes(1, 30)
+    period = scene.flow.period
+    for _ in range(60):
+        scene.now += 1
+        scene.flow.excuse(scene.now)
+    assert (scene.flow.stale, scene.flow.period) == (False, period)
+    assert scene.ceases() == 6
+
+
+def test_what_was_stale_before_stays_so(scene: Scene) -> None:
+    """Until it comes."""
+    scene.goes(10, 30)
+    scene.ceases()
+    scene.now += 10
+    scene.flow.excuse(scene.now)
+    assert scene.flow.stale
+    assert scene.flow.grows(scene.count + 1)
+    assert not scene.flow.grows(scene.count)

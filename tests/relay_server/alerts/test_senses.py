@@ -240,6 +240,32 @@ def test_the_topics_of_a_robot_that_is_away_are_not_stale(scene: Scene) -> None:
     assert scene.ear.told == ["offline error"]
 
 
+def test_while_the_link_is_silent_no_topic_is_stale(scene: Scene) -> None:
+    """The robot may be away, and then that is what there is to tell."""
+    scene.listens()
+    scene.goes_on(20, samples=10)
+    scene.mute = True
+    scene.goes_on(30)
+    assert scene.ear.told == ["offline error"]
+    scene.mute = False
+    scene.goes_on(3)
+    assert scene.ear.told == ["offline error", "offline over"]
+    scene.goes_on(1)
+    assert scene.ear.told == ["offline error", "offline over", "stale /chatter warning"]
+
+
+def test_a_link_that_was_silent_for_a_moment_makes_no_topic_stale(scene: Scene) -> None:
+    """What comes again with it never ceased."""
+    scene.listens()
+    scene.goes_on(20, samples=10)
+    scene.mute = True
+    scene.goes_on(5)
+    scene.mute = False
+    scene.goes_on(2)
+    scene.goes_on(20, samples=10)
+    assert scene.ear.told == []
+
+
 @pytest.mark.parametrize("how", ["latched", "throttled", "motion", "inhibited", "ours", "log"])
 def test_what_may_pause_is_never_stale(scene: Scene, how: str) -> None:
     """Latched, thinned out, commands, what is inhibited, what clients say themselves, logs."""
