@@ -1,4 +1,7 @@
-"""Zero on the topics that move the robot and that no client commands: other nodes of the robot may."""
+"""Zero on the topics that move the robot, for a while after a stop: other nodes of the robot may go on commanding them.
+
+The motion desk has said it on those that clients command, but is done with that sooner.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ class Zeros:
     """Says zero for a while, and leaves.
 
     :param policy: what counts as motion
-    :param commanded: whether clients may command a topic, which is stopped elsewhere
+    :param commanded: whether clients may command a topic; those come first
     """
 
     def __init__(
@@ -102,9 +105,9 @@ class Zeros:
         found = []
         for name, topic in sorted(topics.items()):
             type = next((each for each in topic.types if self._policy.moves_by_topic(name, each)), "")
-            if type and type not in SHAPED and topic.subscribers and not self._commanded(name):
+            if type and type not in SHAPED and topic.subscribers:
                 found.append((name, type))
-        return found
+        return sorted(found, key=lambda each: not self._commanded(each[0]))
 
     def _failed(self, topic: str, error: Exception) -> None:
         self._log.warn("zero could not be said on {topic}: {error}", topic=topic, error=str(error))
