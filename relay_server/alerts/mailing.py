@@ -20,6 +20,7 @@ from relay_protocol.errors import Invalid, Unavailable
 from relay_server.alerts import addresses, kinds, services
 from relay_server.alerts.addresses import Network
 from relay_server.alerts.message import Message, Undelivered
+from relay_server.alerts.names import SPECIAL, unreachable
 from relay_server.alerts.webhook import Resolve, parse
 from relay_server.store import Threads
 
@@ -105,7 +106,7 @@ class Mailing:
             if service is None:
                 raise Undelivered("apprise does not understand the URL any more", again=False)
             if place := services.server(_scheme(rule.url), service):
-                await self._judge(*place)
+                await self._judge(*place, rule.user_id)
             working = Deferred.fromCoroutine(
                 self._threads.run(_notify, service, message.title, message.text, _worst(message))
             )
@@ -118,16 +119,13 @@ class Mailing:
         if not arrived:
             raise Undelivered("the service did not take the message", again=True)
 
-    async def _judge(self, host: str, port: int) -> None:
+    async def _judge(self, host: str, port: int, user: int) -> None:
         plain = _plain(host)
         if plain is None:
             raise Undelivered("the URL names no server by a plain name or address", again=False)
-        found = await self._resolve(plain, port)
+        found = await self._resolve(plain, port, user)
         if not all(addresses.allowed(each, self._allowed) for each in found):
-            raise Undelivered(
-                f"{host} is in a network that this relay does not send to; its administrator can allow that",
-                again=False,
-            )
+            raise unreachable(plain, SPECIAL)
 
 
 def _worst(message: Message) -> str:

@@ -36,6 +36,7 @@ from relay_protocol.limits import KIB
 from relay_server.alerts import addresses
 from relay_server.alerts.addresses import Network
 from relay_server.alerts.message import Message, Undelivered
+from relay_server.alerts.names import SPECIAL, unreachable
 
 SECONDS = 10.0
 CONNECT_SECONDS = 4.0
@@ -51,8 +52,8 @@ AGAIN = frozenset({408, 425, 429})
 _PRINTABLE = re.compile(r"[\x21-\x7e]+\Z")
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?\.?\Z")
 
-Resolve = Callable[[str, int], Awaitable[list[str]]]
-"""All addresses of a host and port. Raises :class:`Undelivered`."""
+Resolve = Callable[[str, int, int], Awaitable[list[str]]]
+"""All addresses of a host and port, for a user. Raises :class:`Undelivered`."""
 
 
 class Place(NamedTuple):
@@ -154,7 +155,9 @@ class Webhooks:
         except Invalid as error:
             raise Undelivered(str(error), again=False) from None
         body = jsontext.encode(message.fields(self.relay, rule.id))
-        sending = Deferred.fromCoroutine(self._send(place, self._headers(rule, message, body), body))
+        sending = Deferred.fromCoroutine(
+            self._send(place, rule.user_id, self._headers(rule, message, body), body)
+        )
         try:
             status = await sending.addTimeout(SECONDS, self._reactor)
         except DeferTimeout:
@@ -175,15 +178,12 @@ class Webhooks:
             }
         )
 
-    async def _send(self, place: Place, headers: Headers, body: bytes) -> int:
+    async def _send(self, place: Place, user: int, headers: Headers, body: bytes) -> int:
         """The status of the answer."""
-        found = await self._resolve(place.host, place.port)
+        found = await self._resolve(place.host, place.port, user)
         good = [each for each in found if addresses.allowed(each, self._allowed)]
         if not good:
-            raise Undelivered(
-                f"{place.host} is in a network that this relay does not send to; its administrator can allow that",
-                again=False,
-            )
+            raise unreachable(place.host, SPECIAL)
         for address in good[:ADDRESSES]:
             endpoint = self._endpoint(place, address)
             agent = Agent.usingEndpointFactory(self._reactor, _Straight(endpoint))

@@ -207,7 +207,7 @@ def test_each_service_is_one_of_apprise_and_a_server_of_the_users_choice_is_know
 async def test_a_server_of_the_users_choice_is_judged_like_that_of_a_webhook(scene: Scene, form: str) -> None:
     """Whichever service it is, and however it is written."""
     error = await scene.fails(form.format(scene.place, port=scene.port.getHost().port))
-    assert ("does not send to" in str(error), error.again) == (True, False)
+    assert "does not send to" in str(error)
     assert scene.hook.got == []
 
 
