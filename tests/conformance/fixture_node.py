@@ -46,6 +46,7 @@ LARGE = 1_000_000
 SLOW_SECONDS = 1.0
 STEP_SECONDS = 0.05
 PATIENCE = 10.0
+SETTLE = 1.0
 PROFILES = {
     "reliable": QoSProfile(depth=100),
     "best_effort": QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT),
@@ -232,12 +233,20 @@ class Fixture(Node):
         return []
 
     def do_publish(self, topic: str, *texts: str) -> list[str]:
-        """Publish messages, given as JSON, as soon as somebody listens."""
+        """Publish messages, given as JSON, as soon as somebody listens.
+
+        Who came before the topic was known there may listen best effort at first, and miss what comes meanwhile.
+        """
         publisher = self._ends["publisher", topic]
-        wait_for(publisher.get_subscription_count)
+        if wait_for(publisher.get_subscription_count) and self._reliable(publisher):
+            wait_for(lambda: any(map(self._reliable, self.get_subscriptions_info_by_topic(topic))), SETTLE)
         for text in texts:
             publisher.publish(fill(publisher.msg_type(), json.loads(text)))
         return [str(publisher.get_subscription_count())]
+
+    @staticmethod
+    def _reliable(end: Any) -> bool:
+        return bool(end.qos_profile.reliability == ReliabilityPolicy.RELIABLE)
 
     def do_latch(self, topic: str, text: str) -> list[str]:
         """Publish at once, for those who come later."""

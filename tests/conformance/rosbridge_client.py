@@ -8,6 +8,7 @@ import itertools
 import json
 import time
 import zlib
+from collections.abc import Callable
 from typing import Any
 
 import cbor2
@@ -135,6 +136,26 @@ class Client:
             if _alike(message, op, like):
                 return message
             self._passed_over.append(message)
+
+    def formed(self, ask: Callable[[], object], seconds: float = PATIENCE) -> None:
+        """Ask until what comes is a PNG or fragments. It is kept for whoever waits for it.
+
+        A server may send plain JSON while a user's share of its processor is used up (SPEC 1.6).
+
+        :param ask: has one message sent
+        """
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            ask()
+            message = self.receive(seconds)
+            while message["op"] == "status":
+                self._passed_over.append(message)
+                message = self.receive(seconds)
+            self._passed_over.append(message)
+            if message["op"] in ("png", "fragment"):
+                return
+            time.sleep(0.1)
+        raise AssertionError(f"only plain JSON came within {seconds:g} s")
 
     def none(self, op: str, seconds: float = ABSENCE, **like: Any) -> None:
         """No such message has come, nor comes within this time."""
