@@ -92,35 +92,40 @@ class GoalTopics:
 
     def take(self, source: str, goal: Goal) -> None:
         """Publish a goal if it is allowed, fresh and sane, as soon as the link has proved itself; else count it."""
-        self._supersede(source)
-        self._judge(source, goal, self._now())
+        if self._authority.judge_request(goal.by) is Verdict.ALLOWED:
+            self._judge(source, goal, self._now())
 
-    def _supersede(self, source: str) -> None:
-        timer = self._waiting.pop(source, None)
-        if timer is not None:
-            timer.cancel()
-            self._motion.stale_commands += 1
-
-    def _judge(self, source: str, goal: Goal, came: int) -> None:
+    def _again(self, source: str, goal: Goal, came: int) -> None:
         """
         :param came: when it did, nanoseconds
         """
-        self._waiting.pop(source, None)
+        del self._waiting[source]
+        if self._authority.judge_request(goal.by, came) is Verdict.ALLOWED:
+            self._judge(source, goal, came)
+
+    def _judge(self, source: str, goal: Goal, came: int) -> None:
         on, sink = self._open[source]
-        if self._authority.judge_request(goal.by, came) is not Verdict.ALLOWED:
-            return
-        now = self._now()
-        deadline = self._motion.policy.deadline_ms
+        now, deadline = self._now(), self._motion.policy.deadline_ms
         fresh = freshness(goal.stamp, now, goal.offset, deadline) is Freshness.FRESH
         if not fresh or self._void(goal, now, now) <= now:
             self._motion.stale_commands += 1
             self._log.info("a goal on {topic} came too late, or in vain", topic=on.topic)
-        elif self._platform.judge(on.type, goal.body) is Motion.INVALID:
+            return
+        if self._platform.judge(on.type, goal.body) is Motion.INVALID:
             self._motion.invalid_commands += 1
-        elif self._void(goal, now, self._motion.proof()) <= now:
-            self._waiting[source] = self._clock.callLater(LOOK_EVERY, self._judge, source, goal, came)
+            return
+        self._supersede(source)
+        if self._void(goal, now, self._motion.proof()) <= now:
+            self._waiting[source] = self._clock.callLater(LOOK_EVERY, self._again, source, goal, came)
         else:
             self._publish(on, sink, goal.body)
+
+    def _supersede(self, source: str) -> None:
+        """Drop what waits."""
+        timer = self._waiting.pop(source, None)
+        if timer is not None:
+            timer.cancel()
+            self._motion.stale_commands += 1
 
     def _void(self, goal: Goal, now: int, proof: int) -> int:
         policy = self._motion.policy

@@ -220,6 +220,18 @@ def test_of_goals_that_wait_the_newest_goes(paced: Paced) -> None:
     assert paced.scene.daemon.motion.stale_commands == 1
 
 
+def test_what_must_not_be_published_takes_the_place_of_no_goal(paced: Paced) -> None:
+    """Neither what comes from somebody else nor what is too old or makes no sense."""
+    paced.live(0.9)
+    paced.advertise()
+    paced.say()
+    paced.say(DRIVER + 1, twist(2.0))
+    paced.say(body=twist(3.0), age=0.6)
+    paced.say(body=twist(float("nan")))
+    paced.live(0.2)
+    assert paced.heard() == [GOAL]
+
+
 def test_a_goal_that_waits_does_not_outlast_a_stop(paced: Paced) -> None:
     """Though the robot is resumed before the link has proved itself: a resume moves nothing."""
     paced.live(0.9)
