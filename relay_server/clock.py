@@ -6,10 +6,13 @@ Twisted's own interfaces say the same (``IReactorTime``, ``IDelayedCall``); thes
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, TypeVar, cast
 
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import LoopingCall
+
+T = TypeVar("T")
 
 
 class Timer(Protocol):
@@ -48,3 +51,15 @@ def looping(clock: Clock, call: Callable[[], object]) -> LoopingCall:
     loop = LoopingCall(call)
     loop.clock = as_twisted(clock)
     return loop
+
+
+def to_the_end(work: Deferred[T]) -> Deferred[T]:
+    """What is waited for in place of work that goes on when who waits gives up."""
+    waiting: Deferred[T] = Deferred()
+
+    def done(result: Any) -> Any:
+        # An error that nobody waits for any more is left to Twisted, which logs it.
+        return result if waiting.called else waiting.callback(result)
+
+    work.addBoth(done)
+    return waiting

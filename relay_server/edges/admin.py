@@ -12,7 +12,9 @@ from twisted.web.server import Request
 
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
+from relay_server.clock import to_the_end
 from relay_server.control import reason_in
+from relay_server.edges.fleet import is_stop
 from relay_server.edges.problems import problem_of
 
 
@@ -104,10 +106,10 @@ class AdminSocket:
 
     @app.route("/fleet", methods=["POST"])
     def fleet(self, request: Request) -> Deferred[bytes]:
+        lasts = is_stop(request)
         running = Deferred.fromCoroutine(self._carry_out(request))
-        # Ctrl-C at the command line ends the order.
-        request.notifyFinish().addErrback(lambda _: running.cancel())
-        return running
+        # Ctrl-C at the command line has klein end any other order.
+        return to_the_end(running) if lasts else running
 
     async def _carry_out(self, request: Request) -> bytes:
         try:

@@ -25,7 +25,7 @@ from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, 
 from relay_protocol.limits import NAME, TICKET_SECONDS
 from relay_server.access import Principal
 from relay_server.auth import SESSION_SECONDS, BadCredentials, Opening
-from relay_server.clock import Clock
+from relay_server.clock import Clock, to_the_end
 from relay_server.edges.problems import problem, problem_of
 from relay_server.edges.stream import EventStream, Source
 from relay_server.origins import Origins
@@ -263,14 +263,17 @@ class Api:
 
     # --- answering ----------------------------------------------------------------------------------------
 
-    def answer(self, request: Request, work: Any) -> Deferred[bytes]:
-        """Answer a request with what comes of a coroutine: JSON, nothing, :data:`STREAMED`, or an error in words."""
+    def answer(self, request: Request, work: Any, *, lasts: bool = False) -> Deferred[bytes]:
+        """Answer a request with what comes of a coroutine: JSON, nothing, :data:`STREAMED`, or an error in words.
+
+        :param lasts: the work goes on when the client leaves, which ends any other. The body has to be read before
+            anything is waited for: it is gone with the client
+        """
         request.setHeader(b"cache-control", b"no-store")
         running = Deferred.fromCoroutine(self._finish(request, work))
-        # A client that leaves early ends the work.
-        request.notifyFinish().addErrback(lambda _: running.cancel())
-        running.addErrback(self._unexpected, request)
-        return running
+        running.addErrback(self._unexpected, request, lasts)
+        # Whoever leaves has the Deferred that is returned here cancelled by klein.
+        return to_the_end(running) if lasts else running
 
     async def _finish(self, request: Request, work: Awaitable[Any]) -> bytes:
         try:
@@ -285,8 +288,8 @@ class Api:
         request.setHeader(b"content-type", b"application/json")
         return jsontext.encode(result)
 
-    def _unexpected(self, failure: Any, request: Request) -> bytes:
-        if request._disconnected:
+    def _unexpected(self, failure: Any, request: Request, lasts: bool) -> bytes:
+        if request._disconnected and not lasts:
             return b""
         self.log.failure("{method} {path} failed", failure, method=request.method, path=request.path)
         return problem(request, 500, "The relay failed on this request; its log tells more.")

@@ -122,11 +122,12 @@ class RobotControl:
             "suppress": self._suppress,
             "inhibit": self._inhibit,
         }
-        return self._api.answer(request, orders[self._part](request))
+        # Who stops a robot and leaves has it stopped all the same.
+        return self._api.answer(request, orders[self._part](request), lasts=self._part == "stop")
 
     async def _stop(self, request: Request) -> Any:
-        principal, robot, address = await self._asked(request)
         why = _reason(request)
+        principal, robot, address = await self._asked(request)
         try:
             outcome = await self._desk.stop(principal, robot, why, address)
         except NotDone as error:

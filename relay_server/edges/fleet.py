@@ -12,6 +12,7 @@ from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
 from relay_protocol import jsontext
+from relay_protocol.errors import SwitchboardError
 from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
@@ -48,12 +49,13 @@ class FleetApi:
 
     @app.route("/", methods=["POST"])
     def order(self, request: Request) -> Any:
-        return self._api.answer(request, self._order(request))
+        return self._api.answer(request, self._order(request), lasts=is_stop(request))
 
     async def _order(self, request: Request) -> Any:
+        order = body_of(request, Order)
         principal = await self._api.principal(request)
         address = getattr(request.getClientAddress(), "host", "local")
-        return await carry_out(self._clock, self._desk, request, principal, address)
+        return await _carry_out(self._clock, self._desk, request, order, principal, address)
 
     @app.route("/groups", methods=["GET"])
     def groups(self, request: Request) -> Any:
@@ -79,15 +81,25 @@ async def local(clock: Clock, desk: Desk, request: Request) -> Any:
 
     :raises SwitchboardError: it can't be begun, in words
     """
-    return await carry_out(clock, desk, request, LOCAL, "local")
+    return await _carry_out(clock, desk, request, body_of(request, Order), LOCAL, "local")
 
 
-async def carry_out(clock: Clock, desk: Desk, request: Request, asker: Principal, address: str) -> Any:
-    """Carry out the order a request brings, and tell of it line by line.
+def is_stop(request: Request) -> bool:
+    """Whether a request brings an order to stop, which goes on when the client leaves; the body stays to be read."""
+    try:
+        said = jsontext.decode_any(request.content.read())
+    except SwitchboardError:
+        return False
+    finally:
+        request.content.seek(0)
+    return isinstance(said, dict) and said.get("do") == "stop"
 
-    :raises SwitchboardError: it can't be begun, in words
-    """
-    plan = await desk.plan(asker, body_of(request, Order), address)
+
+async def _carry_out(
+    clock: Clock, desk: Desk, request: Request, order: Order, asker: Principal, address: str
+) -> Any:
+    """Carry out an order, and tell of it line by line as long as somebody listens."""
+    plan = await desk.plan(asker, order, address)
     lines = _Lines(clock, request, plan)
     try:
         await desk.carry_out(plan, lines.begin, lines.tell)
@@ -132,13 +144,18 @@ class _Lines:
 
     def close(self) -> None:
         """Whatever came of it."""
-        if self._open:
-            self._open = False
+        if self._open and not self._request._disconnected:
             self._request.unregisterProducer()
+        self._open = False
 
     def begin(self) -> None:
         """The order begins: the first line. One that can't be begun is told by its status instead."""
+        if self._request._disconnected:
+            return
         self._open = True
+        if self._plan.order.do == "stop":
+            # It goes on without its client, and must not wait for him to take its lines.
+            self._request.notifyFinish().addErrback(lambda _: self.resumeProducing())
         self._request.setHeader(b"content-type", b"application/x-ndjson")
         self._request.setHeader(b"cache-control", b"no-store")
         self._request.setHeader(b"x-accel-buffering", b"no")

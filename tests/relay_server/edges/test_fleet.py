@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import capturedLogs
 
 from relay_db.queries import RobotRecord
 from relay_protocol.errors import NotFound, Unavailable
@@ -22,6 +23,7 @@ from tests.relay_server.edges.http_client import HOST, Transport, World, parse
 HERE = "/api/v1/fleet"
 ANN = {"Authorization": "Bearer ann"}
 STOP = {"robots": ["*"], "do": "stop"}
+SET = {"robots": ["*"], "do": "set", "name": "/driver:speed", "value": 1}
 
 
 class Desk:
@@ -87,10 +89,10 @@ def world(tmp_path: Path, desk: Desk) -> World:
     return made
 
 
-def ordered(world: World) -> Transport:
-    """Somebody orders all robots to stop."""
+def ordered(world: World, order: dict[str, Any] = STOP) -> Transport:
+    """Somebody gives an order to all robots: to stop, where nothing else is said."""
     transport = world.connect()
-    body = json.dumps(STOP)
+    body = json.dumps(order)
     head = f"POST {HERE} HTTP/1.1\r\nHost: {HOST}\r\nConnection: close\r\nAuthorization: Bearer ann\r\n"
     head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
     world.send(transport, (head + body).encode())
@@ -138,13 +140,51 @@ def test_an_order_that_can_not_be_begun_is_told_by_its_status(world: World, desk
 
 def test_who_hangs_up_ends_the_order(world: World, desk: Desk) -> None:
     """What has not begun is not done."""
-    ordered(world).loseConnection()
+    ordered(world, SET).loseConnection()
     assert desk.ended == ["given up"]
+
+
+def test_a_stop_goes_on_whoever_hangs_up(world: World, desk: Desk) -> None:
+    """Its results are told to nobody then, and wait for nobody, though the client took none of them before."""
+    transport = ordered(world)
+    transport.producer.pauseProducing()
+    told = desk.tell("rover", True)
+    assert not told.called
+    transport.loseConnection()
+    assert told.called and desk.ended == []
+    assert desk.tell("tank", True).called
+    desk.over.callback(None)
+    assert desk.ended == ["done"]
+    assert not [each for each in world.clock.getDelayedCalls() if each.active()]
+
+
+def test_a_stop_begins_though_its_client_has_left(
+    world: World, desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever leaves while the relay still finds out who he is has them stopped all the same."""
+    known: Deferred[Principal] = Deferred()
+    for way in ("token", "urgent_token"):
+        monkeypatch.setattr(world.desk, way, lambda token: known, raising=False)
+    ordered(world).loseConnection()
+    assert desk.tells is None
+    known.callback(world.desk.tokens["ann"])
+    assert desk.orders[0][1].do == "stop"
+    assert desk.tell("rover", True).called
+    desk.over.callback(None)
+    assert desk.ended == ["done"]
+
+
+def test_a_stop_that_fails_unheard_is_logged(world: World, desk: Desk) -> None:
+    """Who operates the relay learns that it went wrong."""
+    ordered(world).loseConnection()
+    with capturedLogs() as logs:
+        desk.over.errback(ZeroDivisionError())
+    assert [each["log_failure"].type for each in logs if "log_failure" in each] == [ZeroDivisionError]
 
 
 def test_who_takes_nothing_holds_the_order_up_and_is_cut(world: World, desk: Desk) -> None:
     """Results wait where they come from, not in the relay's memory."""
-    transport = ordered(world)
+    transport = ordered(world, SET)
     transport.producer.pauseProducing()
     took: list[str] = []
     desk.tell("rover", True).addCallback(lambda _: took.append("rover"))
