@@ -6,8 +6,10 @@ compiled anew in place, and whoever holds one is told.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from sqlalchemy.orm import Session
 
@@ -16,6 +18,15 @@ from relay_db.queries import PrincipalRecord, RobotRecord
 from relay_protocol.errors import Refused
 from relay_protocol.rights import Grant, Operation, Rules, Verdict
 from relay_server.store import Store
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+PROVED = 256
+"""Credentials that are remembered; the longest unused are forgotten first."""
+
+ADMITTED = 4096
+"""Users on robots that are remembered, in the same way."""
 
 Changed = Callable[[], None]
 Revoked = Callable[[Refused], None]
@@ -84,6 +95,39 @@ class Access:
         self._permits: set[Permit] = set()
         self._robots: dict[int, list[tuple[RobotRecord, Rules]]] = {}
         self._refreshed = 0
+        self._proved: OrderedDict[str, Principal] = OrderedDict()
+        """By the hash of a token, who it proved. Kept in step with the database as permits are."""
+        self._admitted: OrderedDict[tuple[int, int], None] = OrderedDict()
+        """Users and robots, of late found to have a right on them."""
+
+    @property
+    def refreshed(self) -> int:
+        """How often changes in the database have been taken up; what was read before the latest may be outdated."""
+        return self._refreshed
+
+    def remember(self, token_hash: str, principal: Principal, refreshed: int) -> None:
+        """A token has proved somebody.
+
+        :param refreshed: as it was when that was asked for
+        """
+        if refreshed == self._refreshed:
+            _keep(self._proved, token_hash, principal, PROVED)
+
+    def remembered(self, token_hash: str) -> Principal | None:
+        """Who a token proves, as far as that is known without asking the database."""
+        principal = self._proved.get(token_hash)
+        if principal is not None and principal.expires is not None and principal.expires <= self._wall():
+            return None
+        return principal
+
+    def knows(self, principal: Principal, robot_id: int) -> bool:
+        """Whether the principal is known to have a right on a robot, without asking the database."""
+        user = principal.user_id
+        return (
+            (user, robot_id) in self._admitted
+            or any(record.id == robot_id for record, _ in self._robots.get(user, ()))
+            or any(each.robot_id == robot_id and each.principal.user_id == user for each in self._permits)
+        )
 
     async def permit(self, principal: Principal, robot_id: int) -> Permit | None:
         """A live permit, or ``None`` when the principal has no right at all on the robot.
@@ -102,6 +146,7 @@ class Access:
             return None
         permit = Permit(principal, robot_id, Rules(now.grants))
         self._permits.add(permit)
+        _keep(self._admitted, (principal.user_id, robot_id), None, ADMITTED)
         return permit
 
     async def robots(self, principal: Principal) -> list[tuple[RobotRecord, Rules]]:
@@ -133,6 +178,8 @@ class Access:
         """
         self._refreshed += 1
         self._robots.clear()
+        self._admitted.clear()
+        await self._refresh_proved()
         asked = list(self._permits)
         if not asked:
             return
@@ -149,10 +196,25 @@ class Access:
                 permit.rules = Rules(now.grants)
                 permit.on_change()
 
+    async def _refresh_proved(self) -> None:
+        asked = {principal.token_id for principal in self._proved.values()}
+        if asked:
+            live = await self._store.read(queries.live_tokens, asked, self._wall())
+            for token_hash, principal in list(self._proved.items()):
+                if principal.token_id in asked - live:
+                    del self._proved[token_hash]
+
     def _revoke(self, permit: Permit, error: Refused) -> None:
         self._permits.discard(permit)
         permit.rules = Rules()
         permit.on_revoke(error)
+
+
+def _keep(kept: OrderedDict[K, V], key: K, value: V, most: int) -> None:
+    kept[key] = value
+    kept.move_to_end(key)
+    if len(kept) > most:
+        kept.popitem(last=False)
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,15 @@ Twisted's own interfaces say the same (``IReactorTime``, ``IDelayedCall``); thes
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar, cast
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import LoopingCall
+from twisted.python.failure import Failure
+
+from relay_protocol.errors import Unavailable
 
 T = TypeVar("T")
 
@@ -51,6 +54,22 @@ def looping(clock: Clock, call: Callable[[], object]) -> LoopingCall:
     loop = LoopingCall(call)
     loop.clock = as_twisted(clock)
     return loop
+
+
+async def within(clock: Clock, seconds: float, work: Coroutine[Deferred[Any], Any, T], words: str) -> T:
+    """Do something that must not be waited for long; what is not done by then is given up.
+
+    :raises Unavailable: it is given up, in these words
+    """
+
+    def late(result: Any, _: float) -> Any:
+        if isinstance(result, Failure) and result.check(CancelledError):
+            raise Unavailable(words)
+        return result
+
+    running = Deferred.fromCoroutine(work)
+    running.addTimeout(seconds, as_twisted(clock), late)
+    return await running
 
 
 def to_the_end(work: Deferred[T]) -> Deferred[T]:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
+from twisted.internet.defer import Deferred
+
 from relay_db import queries
-from relay_protocol.errors import NotFound, Refused, SwitchboardError
+from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Level, Operation
-from relay_server.access import Principal
+from relay_server.access import Access, Principal
 from relay_server.channel import resolve
-from relay_server.control import Actor, Answer, Client, Desk, Desks, view
-from relay_server.frontdesk import Admission, FrontDesk
-from relay_server.registry import Registry
+from relay_server.clock import Clock, within
+from relay_server.control import Actor, Answer, Client, Desk, Desks, NotDone, view
+from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, FrontDesk
+from relay_server.registry import Presence, Registry
 from relay_server.store import Store
+
+NOT_ALL_KNOWN = f"the database has not told within {LOOKUP_SECONDS:g} s which robots there are"
 
 
 class Outcome(NamedTuple):
@@ -23,17 +29,34 @@ class Outcome(NamedTuple):
 
     :param done: whether the robot has done it; else it will as soon as it can be reached
     :param stopped: as :func:`relay_server.control.view.stopped` tells
+    :param failed: what the robot could not do, though it is stopped
     """
 
     done: bool
     stopped: dict[str, Any] | None
+    failed: str = ""
+
+
+class Halted(NamedTuple):
+    """What became of a stop of many.
+
+    :param robots: for each ``robot``, ``done`` and, where something failed, ``reason``
+    :param missed: why others that there may be were not stopped
+    """
+
+    robots: list[dict[str, Any]]
+    missed: str = ""
 
 
 class Console:
     """Control of robots for users who may have no connection to them, or several."""
 
-    def __init__(self, desk: FrontDesk, desks: Desks, registry: Registry, store: Store) -> None:
+    def __init__(
+        self, clock: Clock, desk: FrontDesk, access: Access, desks: Desks, registry: Registry, store: Store
+    ) -> None:
+        self._clock = clock
         self._desk = desk
+        self._access = access
         self._desks = desks
         self._registry = registry
         self._store = store
@@ -94,13 +117,24 @@ class Console:
         """Stop a robot; everybody with any right on it may.
 
         :raises NotFound: as :meth:`control`
-        :raises NotDone: it is stopped, but not all that belongs to it could be done
-        :raises Unavailable: it can't be reached, and the order can't be kept
+        :raises Unavailable: it can't be reached, and the order can't be kept; or nobody can say whether he may
         """
-        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
-            desk = self._of(admission)
-            done = await desk.stopping.stop(_actor(principal, address), why)
-            return Outcome(done, view.stopped(desk.standing))
+        desk = self._desks.of(await self._stoppable(principal, robot, address))
+        try:
+            done, failed = await desk.stopping.stop(_actor(principal, address), why), ""
+        except NotDone as error:
+            done, failed = False, str(error)
+        return Outcome(done, view.stopped(desk.standing), failed)
+
+    async def _stoppable(self, principal: Principal, robot: str, address: str) -> Presence:
+        """A robot the principal has any right on; the database is asked only where that is not known here."""
+        for there in self._registry:
+            named = (there.name, there.realm) == (robot, principal.realm)
+            if named and self._access.knows(principal, there.robot_id):
+                return there
+        looked_up = self._desk.admit(principal, robot, address)
+        with self._admitted(await within(self._clock, LOOKUP_SECONDS, looked_up, NOT_LOOKED_UP)) as admission:
+            return admission.robot
 
     async def resume(self, principal: Principal, robot: str, why: str, address: str) -> None:
         """Let a robot move again; for who controls it, and owners.
@@ -159,23 +193,33 @@ class Console:
 
     # --- on the relay's own machine -----------------------------------------------------------------------
 
-    async def stop_here(self, robot: str | None, why: str, by: str) -> list[dict[str, Any]]:
+    async def stop_here(self, robot: str | None, why: str, by: str) -> Halted:
         """Stop a robot, or all there are: side by side, since no robot must wait for another.
 
+        Those that have been here since the relay began are told before the database is asked for the others.
+
         :param by: who is at the machine
-        :returns: for each ``robot``, ``done`` and, where something failed, ``reason``
         :raises NotFound: no such robot
+        :raises Unavailable: the robot is not known here, and the database does not answer
         """
-        actor = _local(by)
-        desks = [self._desks.of(each) for each in await self._meant(robot)]
-        given = [(desk, desk.stopping.stop(actor, why)) for desk in desks]
-        told = []
-        for desk, waiting in given:
+        given: dict[int, tuple[str, Deferred[bool]]] = {}
+
+        def stop(robots: Iterable[Presence]) -> None:
+            for each in robots:
+                if each.robot_id not in given:
+                    stopping = self._desks.of(each).stopping
+                    given[each.robot_id] = (each.name, stopping.stop(_local(by), why))
+
+        stop([each for each in self._registry if robot in (None, each.name)])
+        missed = ""
+        if robot is None or not given:
             try:
-                told.append({"robot": desk.robot.name, "done": await waiting})
-            except SwitchboardError as error:
-                told.append({"robot": desk.robot.name, "done": False, "reason": str(error)})
-        return told
+                stop(await within(self._clock, LOOKUP_SECONDS, self._meant(robot), NOT_ALL_KNOWN))
+            except Unavailable as error:
+                if not given:
+                    raise
+                missed = str(error)
+        return Halted([await _told(*each) for each in sorted(given.values(), key=itemgetter(0))], missed)
 
     async def resume_here(self, robot: str, why: str, by: str) -> None:
         """Let a robot move again.
@@ -186,7 +230,7 @@ class Console:
         for each in await self._meant(robot):
             await self._desks.of(each).stopping.resume(_local(by), why)
 
-    async def _meant(self, robot: str | None) -> list[Any]:
+    async def _meant(self, robot: str | None) -> list[Presence]:
         records = await self._store.read(queries.list_robots)
         found = [record for record in records if robot is None or record.name == robot]
         if robot is not None and not found:
@@ -212,6 +256,13 @@ class Console:
         if not verdict.allowed:
             raise Refused(verdict.reason)
         return topic
+
+
+async def _told(robot: str, stopping: Deferred[bool]) -> dict[str, Any]:
+    try:
+        return {"robot": robot, "done": await stopping}
+    except SwitchboardError as error:
+        return {"robot": robot, "done": False, "reason": str(error)}
 
 
 _NOT_YOURS = Answer(False, "you have no control of this robot")

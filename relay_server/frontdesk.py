@@ -14,12 +14,12 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
-from relay_server import closing
+from relay_server import closing, passwords
 from relay_server.access import Access, Permit, Principal
 from relay_server.auth import Authenticator, BadCredentials, Opening, TooManyTries
 from relay_server.budget import Budgets
 from relay_server.channel import Channels
-from relay_server.clock import Clock
+from relay_server.clock import Clock, within
 from relay_server.control import Desks
 from relay_server.freshness import Freshness
 from relay_server.journal import Journal
@@ -33,6 +33,14 @@ from relay_server.session import ClientTransport, Session, Timing
 from relay_server.store import Store
 from relay_server.video import Videos
 from relay_server.watching import Screen, Watching, check_view, view
+
+LOOKUP_SECONDS = 3.0
+"""The database has so long to say that somebody may stop a robot."""
+
+NOT_LOOKED_UP = (
+    f"the database has not answered within {LOOKUP_SECONDS:g} s, and without it the relay can't say who may do what to "
+    "which robots. Stop those that move by their own switch, or by 'switchboard stop' on the relay's machine"
+)
 
 
 class GoingDown(Unavailable):
@@ -140,9 +148,22 @@ class FrontDesk:
 
     async def token(self, token: str) -> Principal:
         """The principal of an access token or session."""
-        return await self._auth.token(token)
+        seen = self._access.refreshed
+        principal = await self._auth.token(token)
+        self._access.remember(passwords.token_hash(token), principal, seen)
+        return principal
 
     bearer = token
+
+    async def urgent_token(self, token: str) -> Principal:
+        """The same for who stops robots: one that was proved before need not wait for the database.
+
+        :raises Unavailable: the database has to be asked, and does not answer soon
+        """
+        known = self._access.remembered(passwords.token_hash(token))
+        if known is not None:
+            return known
+        return await within(self._clock, LOOKUP_SECONDS, self.token(token), NOT_LOOKED_UP)
 
     async def ticket(self, ticket: str, asked: Opening, *, spend: bool = True) -> Principal:
         """The principal of a single-use ticket."""

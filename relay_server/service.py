@@ -175,7 +175,7 @@ class Relay:
         desk = self._desk
         metrics = registry_of(RelayCollector(self._registry, self._channels, self._videos, lambda: desk))
         keeper = RecordingDesk(desk, self._recordings, self._store, self._journal, time.time)
-        self._console = Console(desk, self._desks, self._registry, self._store)
+        self._console = Console(self._reactor, desk, self._access, self._desks, self._registry, self._store)
         below = {
             "recordings": partial(recordings.below, self._reactor, keeper),
             "people": partial(presence.below, desk.overview),

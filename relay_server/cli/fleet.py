@@ -147,7 +147,8 @@ def _give(app: App, robots: str, order: dict[str, Any], timeout: float, as_json:
         except Unavailable as error:
             done.broken = str(error)
     if as_json:
-        show_json({"results": done.results, "unmatched": done.unmatched, "whole": done.whole})
+        told = {"results": done.results, "unmatched": done.unmatched, "whole": done.whole}
+        show_json({**told, "missed": done.missed} if done.missed else told)
     else:
         done.show()
     if not done.well:
@@ -163,6 +164,7 @@ class _Done:
     def __init__(self, head: dict[str, Any]) -> None:
         self.meant = [str(each) for each in head.get("robots") or ()]
         self.unmatched = [str(each) for each in head.get("unmatched") or ()]
+        self.missed = str(head.get("missed") or "")
         self.results: list[dict[str, Any]] = []
         self.broken = "it has ended the answer"
 
@@ -174,7 +176,11 @@ class _Done:
     @property
     def well(self) -> bool:
         """Whether all that was asked for is done."""
-        return self.whole and not self.unmatched and all(each.get("ok") for each in self.results)
+        return (
+            self.whole
+            and not (self.unmatched or self.missed)
+            and all(each.get("ok") for each in self.results)
+        )
 
     def show(self) -> None:
         """For people."""
@@ -184,6 +190,8 @@ class _Done:
         if not self.whole:
             left = len(self.meant) - len(results)
             say(f"Of {left} nothing is known: the relay did not tell to the end ({self.broken}).")
+        if self.missed:
+            say(f"There may be more robots that are meant: {self.missed}.")
         for each in self.unmatched:
             say(f"No robot is meant by '{each}'.")
 

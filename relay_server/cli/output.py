@@ -28,6 +28,11 @@ def say(sentence: str) -> None:
     click.echo(inert(sentence))
 
 
+def say_aside(sentence: str) -> None:
+    """Print a line for people that is no outcome, to stderr."""
+    click.echo(inert(sentence), err=True)
+
+
 def tell(as_json: bool, value: object, *sentences: str) -> None:
     """Print the outcome of a command: JSON, or sentences."""
     if as_json:

@@ -6,7 +6,7 @@ import http.client
 import json
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,10 @@ _ASK_SECONDS = 5.0
 _ANSWER_BYTES = 16 * 1024 * 1024
 _LINE_SECONDS = 330.0
 """The longest a robot may take for an order, and some more."""
-_MOTION_SECONDS = 30.0
-"""Longer than a robot has to confirm that it stands."""
+_MOTION_SECONDS = 20.0
+"""Longer than the relay waits for its database, and a robot has to confirm that it stands."""
+_SURE_SECONDS = 5.0
+"""A relay that has not answered an order to stop by then may never do so."""
 
 _NO_RELAY = "no relay runs on this data folder; start one with 'switchboard serve', or give --data"
 _PATH_BYTES = 107
@@ -99,18 +101,28 @@ class NoRelay(Unavailable):
     """No relay runs on this data folder."""
 
 
-def order_motion(folder: Path, what: str, order: dict[str, Any]) -> dict[str, Any]:
+def order_motion(
+    folder: Path, what: str, order: dict[str, Any], unsure: Callable[[float], None] | None = None
+) -> dict[str, Any]:
     """Have the relay stop robots, or resume one.
 
     :param what: ``stop`` or ``resume``
+    :param unsure: called when no answer has come for some time, with the seconds; the answer is still waited for
     :raises NoRelay: none runs on this folder
     :raises Unavailable: it does not answer, or a robot does not
     :raises SwitchboardError: it says no, in its own words
     """
-    connection = _Connection(folder, _MOTION_SECONDS)
+    connection = _Connection(folder, _MOTION_SECONDS if unsure is None else _SURE_SECONDS)
     try:
-        connection.request("POST", f"/{what}", json.dumps(order), {"Content-Type": "application/json"})
-        answer = connection.getresponse()
+        try:
+            connection.request("POST", f"/{what}", json.dumps(order), {"Content-Type": "application/json"})
+            answer = connection.getresponse()
+        except TimeoutError:
+            if unsure is None or connection.sock is None:
+                raise
+            unsure(_SURE_SECONDS)
+            connection.sock.settimeout(_MOTION_SECONDS - _SURE_SECONDS)
+            answer = connection.getresponse()
         body = answer.read(_ANSWER_BYTES)
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
         raise NoRelay(_NO_RELAY) from None

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Collection
 from typing import Any
 
 import click
 
 from relay_db import queries
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.cli.app import App, examples, json_option, os_user, pass_app, why_option
-from relay_server.cli.failure import REFUSED
-from relay_server.cli.output import show_json, tell
+from relay_server.cli.failure import REFUSED, UNREACHABLE
+from relay_server.cli.output import say_aside, show_json, tell
 from relay_server.cli.relaysocket import NoRelay, order_motion
 
 
@@ -31,11 +32,12 @@ from relay_server.cli.relaysocket import NoRelay, order_motion
 def stop(app: App, robot: str | None, everything: bool, why: str, as_json: bool) -> None:
     """Stop ROBOT, and keep it stopped until somebody resumes it.
 
-    A robot that is offline is stopped before anything else when it comes back, also when no relay runs now.
+    A robot that is offline is stopped before anything else when it comes back, also when no relay runs now. An order
+    that the relay does not confirm within some seconds is kept in the same way.
     """
     if (robot is None) is not everything:
         raise click.UsageError("name a robot, or say --all")
-    told = _stop(app, robot, why)
+    told, unanswered = _Stop(app, robot, why).give()
     if as_json:
         show_json({"robots": told})
     else:
@@ -43,6 +45,8 @@ def stop(app: App, robot: str | None, everything: bool, why: str, as_json: bool)
             tell(False, each, _words(each))
         if not told:
             tell(False, told, "There is no robot.")
+    if unanswered:
+        sys.exit(UNREACHABLE)
     if any("reason" in each for each in told):
         sys.exit(REFUSED)
 
@@ -64,24 +68,72 @@ def resume(app: App, robot: str, why: str, as_json: bool) -> None:
     tell(as_json, {"robot": robot, "resumed": True}, f"Robot {robot} may move again.")
 
 
-def _stop(app: App, robot: str | None, why: str) -> list[dict[str, Any]]:
-    try:
-        answer = order_motion(app.data, "stop", {"robot": robot, "why": why, "by": os_user()})
-    except NoRelay:
-        return _keep(app, robot, why)
-    return [each for each in answer.get("robots") or () if isinstance(each, dict)]
+class _Stop:
+    """One order to stop: given to the relay, and kept in the database where that does not confirm it.
 
+    :param robot: its name, ``None`` for all
+    """
 
-def _keep(app: App, robot: str | None, why: str) -> list[dict[str, Any]]:
-    """No relay runs here: robots are told by the next that does, or by one on another machine at once."""
-    told = []
-    with app.change() as change:
-        robots = queries.list_robots(change.session) if robot is None else [change.robot(robot)]
-        for each in robots:
-            queries.order_stop(change.session, each.id, os_user(), why, time.time(), tell=True)
-            change.audit("robot.stopped", each.name, why=why)
-            told.append({"robot": each.name, "done": False})
-    return told
+    def __init__(self, app: App, robot: str | None, why: str) -> None:
+        self._app = app
+        self._robot = robot
+        self._why = why
+        self._kept: list[dict[str, Any]] = []
+
+    def give(self) -> tuple[list[dict[str, Any]], bool]:
+        """What became of it on each robot, and whether somebody who should have answered did not.
+
+        :raises SwitchboardError: it could be neither given nor kept
+        """
+        order = {"robot": self._robot, "why": self._why, "by": os_user()}
+        try:
+            answer = order_motion(self._app.data, "stop", order, self._unsure)
+        except NoRelay:
+            return self._keep(), False
+        except Unavailable as error:
+            return self._unconfirmed(error), True
+        told = [each for each in answer.get("robots") or () if isinstance(each, dict)]
+        missed = answer.get("missed")
+        if not missed:
+            return told, False
+        say_aside(f"Not all robots are told yet: {missed}. Their orders are kept now.")
+        return told + self._keep({str(each.get("robot")) for each in told}), False
+
+    def _unsure(self, seconds: float) -> None:
+        """The relay has not answered for so long."""
+        try:
+            self._kept = self._keep()
+        except Unavailable as error:
+            say_aside(f"The relay has not answered for {seconds:g} s, and the order can't be kept: {error}")
+        else:
+            say_aside(
+                f"The relay has not answered for {seconds:g} s. The order is kept until it is confirmed."
+            )
+
+    def _unconfirmed(self, error: Unavailable) -> list[dict[str, Any]]:
+        try:
+            kept = self._kept or self._keep()
+        except SwitchboardError:
+            raise error from None
+        reason = f"not confirmed: {error}. The order is kept, and told by the next relay that runs"
+        return [{**each, "reason": reason} for each in kept]
+
+    def _keep(self, told: Collection[str] = ()) -> list[dict[str, Any]]:
+        """Robots are told by the next relay that runs, or by one on another machine at once.
+
+        :param told: names of those that need not be
+        """
+        kept = []
+        with self._app.change() as change:
+            robots = (
+                queries.list_robots(change.session) if self._robot is None else [change.robot(self._robot)]
+            )
+            for each in robots:
+                if each.name not in told:
+                    queries.order_stop(change.session, each.id, os_user(), self._why, time.time(), tell=True)
+                    change.audit("robot.stopped", each.name, why=self._why)
+                    kept.append({"robot": each.name, "done": False})
+        return kept
 
 
 def _take_back(app: App, robot: str, why: str) -> None:

@@ -13,6 +13,7 @@ from twisted.web.server import Request
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
 from relay_server.clock import to_the_end
+from relay_server.console import Halted
 from relay_server.control import reason_in
 from relay_server.edges.fleet import is_stop
 from relay_server.edges.problems import problem_of
@@ -21,7 +22,7 @@ from relay_server.edges.problems import problem_of
 class Stopping(Protocol):
     """Who stops robots; see :class:`relay_server.console.Console`."""
 
-    async def stop_here(self, robot: str | None, why: str, by: str) -> list[dict[str, Any]]:
+    async def stop_here(self, robot: str | None, why: str, by: str) -> Halted:
         """Stop a robot, or all."""
 
     async def resume_here(self, robot: str, why: str, by: str) -> None:
@@ -85,7 +86,8 @@ class AdminSocket:
 
     async def _stop(self, request: Request) -> Any:
         order = jsontext.decode(_order_decoder, request.content.read())
-        return {"robots": await self._stopping.stop_here(order.robot, reason_in(order.why), order.by)}
+        halted = await self._stopping.stop_here(order.robot, reason_in(order.why), order.by)
+        return halted._asdict()
 
     @app.route("/resume", methods=["POST"])
     def resume(self, request: Request) -> Deferred[bytes]:

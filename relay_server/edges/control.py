@@ -127,12 +127,10 @@ class RobotControl:
 
     async def _stop(self, request: Request) -> Any:
         why = _reason(request)
-        principal, robot, address = await self._asked(request)
-        try:
-            outcome = await self._desk.stop(principal, robot, why, address)
-        except NotDone as error:
-            told = await self._desk.control(principal, robot, address)
-            request.write(problem(request, 409, str(error), stopped=told["stopped"]))
+        principal, robot, address = await self._asked(request, urgent=True)
+        outcome = await self._desk.stop(principal, robot, why, address)
+        if outcome.failed:
+            request.write(problem(request, 409, outcome.failed, code=NotDone.code, stopped=outcome.stopped))
             return STREAMED
         if not outcome.done:
             request.setResponseCode(202)
@@ -159,9 +157,9 @@ class RobotControl:
         if self._part not in parts:
             raise NothingHere
 
-    async def _asked(self, request: Request) -> tuple[Principal, str, str]:
+    async def _asked(self, request: Request, *, urgent: bool = False) -> tuple[Principal, str, str]:
         """Who asks, about which robot, from where."""
-        principal = await self._api.principal(request)
+        principal = await self._api.principal(request, urgent=urgent)
         return principal, self._robot, getattr(request.getClientAddress(), "host", "local")
 
     @app.handle_errors(HTTPException)

@@ -53,7 +53,8 @@ class FleetApi:
 
     async def _order(self, request: Request) -> Any:
         order = body_of(request, Order)
-        principal = await self._api.principal(request)
+        # Whatever is ordered: rights are judged anew when a robot has its turn.
+        principal = await self._api.principal(request, urgent=True)
         address = getattr(request.getClientAddress(), "host", "local")
         return await _carry_out(self._clock, self._desk, request, order, principal, address)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
@@ -18,16 +18,16 @@ from relay_db.queries import RobotRecord
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Access, Permit, Principal
-from relay_server.clock import Clock, as_twisted
+from relay_server.clock import Clock, as_twisted, within
 from relay_server.control import Actor, Desks
 from relay_server.fleet.client import OrderClient
 from relay_server.fleet.errand import Errand
 from relay_server.fleet.halting import Halting
-from relay_server.fleet.matching import meant
+from relay_server.fleet.matching import GROUP, meant
 from relay_server.fleet.order import Order
 from relay_server.fleet.rank import side_by_side
 from relay_server.fleet.result import Outcome, Result
-from relay_server.frontdesk import Admission, FrontDesk, GoingDown
+from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, FrontDesk, GoingDown
 from relay_server.journal import Journal
 from relay_server.registry import Registry
 from relay_server.store import Store
@@ -48,22 +48,21 @@ OWNS = Rules([Grant(Level.OWNER, source=LOCAL.name)])
 """What he may do on every robot."""
 
 
-class Meant(NamedTuple):
-    """A robot, and the asker's rights on it."""
-
-    record: RobotRecord
-    rules: Rules
-
-
 @dataclass(frozen=True)
 class Plan:
-    """An order, and which robots it means."""
+    """An order, and which robots it means.
+
+    :param missed: why it may mean others, which nobody could look up
+    :param stopping: those that are being stopped already, and what comes of it
+    """
 
     order: Order
     asker: Principal
     address: str
-    robots: dict[str, Meant]
+    robots: dict[str, RobotRecord]
     unmatched: list[str]
+    missed: str = ""
+    stopping: Mapping[str, Deferred[Result]] = field(default_factory=dict)
 
     @property
     def actor(self) -> Actor:
@@ -74,7 +73,8 @@ class Plan:
 
     def told(self) -> dict[str, Any]:
         """The first line of the answer."""
-        return {"do": self.order.do, "robots": list(self.robots), "unmatched": self.unmatched}
+        head = {"do": self.order.do, "robots": list(self.robots), "unmatched": self.unmatched}
+        return {**head, "missed": self.missed} if self.missed else head
 
 
 class FleetDesk:
@@ -112,7 +112,7 @@ class FleetDesk:
 
     async def groups(self, asker: Principal) -> list[dict[str, Any]]:
         """Groups of robots, with those the asker has a right on; the others are not told of."""
-        mine = {each.record.name for each in await self._mine(asker)}
+        mine = {each.name for each in await self._mine(asker)}
         groups = await self._store.read(queries.list_robot_groups, asker.realm)
         told = (
             {"name": each.name, "robots": [name for name in each.robots if name in mine]} for each in groups
@@ -122,18 +122,61 @@ class FleetDesk:
     async def plan(self, asker: Principal, order: Order, address: str) -> Plan:
         """Find out which robots an order means.
 
+        A stop is on its way to those that are here, and known to be the asker's, before the database is asked for the
+        others; where that does not answer these are all that are meant.
+
         :raises Invalid: the order makes no sense, or means too many
         :raises NotFound: it means no robot the asker has a right on
+        :raises Unavailable: the database does not answer
         """
         order.check()
-        mine = {each.record.name: each for each in await self._mine(asker)}
-        groups = await self._store.read(queries.list_robot_groups, asker.realm)
-        found = meant(order.robots, mine, {each.name: each.robots for each in groups})
+        told = self._at_once(asker, order, address) if order.do == "stop" else {}
+        mine = {name: robot for name, (robot, _) in told.items()}
+        groups: dict[str, Collection[str]] = {}
+        missed = ""
+        try:
+            looked_up = within(self._clock, LOOKUP_SECONDS, self._looked_up(asker, order), NOT_LOOKED_UP)
+            others, groups = await looked_up
+            mine |= {each.name: each for each in others}
+        except Unavailable as error:
+            if not told:
+                raise
+            missed = str(error)
+            self.log.error("an order to stop goes to those that are here alone: {reason}", reason=missed)
+        found = meant(order.robots, mine, groups)
         if not found.robots:
             raise NotFound("the order means no robot that you have a right on")
         if order.do != "stop" and len(found.robots) > ROBOTS:
             raise Invalid(f"the order means {len(found.robots)} robots; it may mean {ROBOTS} at most")
-        return Plan(order, asker, address, {name: mine[name] for name in found.robots}, found.unmatched)
+        robots = {name: mine[name] for name in found.robots}
+        stopping = {name: stopping for name, (_, stopping) in told.items()}
+        return Plan(order, asker, address, robots, found.unmatched, missed, stopping)
+
+    def _at_once(
+        self, asker: Principal, order: Order, address: str
+    ) -> dict[str, tuple[RobotRecord, Deferred[Result]]]:
+        """Stop what an order means by names and patterns, is here, and is known to be the asker's."""
+        here = {
+            each.name: RobotRecord(each.robot_id, each.name, each.realm, "")
+            for each in self._registry
+            if each.control is not None
+            and each.realm == asker.realm
+            and (asker is LOCAL or self._access.knows(asker, each.robot_id))
+        }
+        robots = {name: here[name] for name in meant(order.robots, here, {}).robots}
+        plan = Plan(order, asker, address, robots, [])
+        return {
+            name: (robot, Deferred.fromCoroutine(self._one(plan, robot))) for name, robot in robots.items()
+        }
+
+    async def _looked_up(
+        self, asker: Principal, order: Order
+    ) -> tuple[list[RobotRecord], dict[str, Collection[str]]]:
+        robots = await self._mine(asker)
+        if not any(each.startswith(GROUP) for each in order.robots):
+            return robots, {}
+        groups = await self._store.read(queries.list_robot_groups, asker.realm)
+        return robots, {each.name: each.robots for each in groups}
 
     async def carry_out(
         self, plan: Plan, begin: Callable[[], None], tell: Callable[[Result], Awaitable[None]]
@@ -147,7 +190,8 @@ class FleetDesk:
         counted: Counter[bool] = Counter()
 
         async def one(name: str) -> None:
-            result = await self._one(plan, plan.robots[name])
+            told = plan.stopping.get(name)
+            result = await (self._one(plan, plan.robots[name]) if told is None else told)
             counted[result.outcome.ok] += 1
             await tell(result)
 
@@ -168,7 +212,9 @@ class FleetDesk:
 
     async def _stop(self, plan: Plan, one: Callable[[str], Awaitable[None]]) -> None:
         """Nothing is as urgent: whoever can be told is told at once, and only then it is put on record."""
-        told = [name for name, each in plan.robots.items() if self._halting.online(each.record)]
+        told = [
+            name for name, each in plan.robots.items() if name in plan.stopping or self._halting.online(each)
+        ]
         # These by the rights of this moment, which the plan has just looked up; the others are judged in their turn.
         stopping = Deferred.fromCoroutine(side_by_side(told, one, at_once=len(told)))
         try:
@@ -181,7 +227,7 @@ class FleetDesk:
             await stopping
         await side_by_side([name for name in plan.robots if name not in set(told)], one)
 
-    async def _one(self, plan: Plan, robot: Meant) -> Result:
+    async def _one(self, plan: Plan, robot: RobotRecord) -> Result:
         began = self._clock.seconds()
         running = Deferred.fromCoroutine(self._done(plan, robot))
         order = plan.order
@@ -195,17 +241,17 @@ class FleetDesk:
             running.cancel()
             raise
         except Exception:
-            self.log.failure("an order failed on {robot}", robot=robot.record.name)
+            self.log.failure("an order failed on {robot}", robot=robot.name)
             outcome = Outcome(False, "the relay failed on this order; its log tells more")
-        return Result(robot.record.name, outcome, self._clock.seconds() - began)
+        return Result(robot.name, outcome, self._clock.seconds() - began)
 
-    async def _done(self, plan: Plan, robot: Meant) -> Outcome:
+    async def _done(self, plan: Plan, robot: RobotRecord) -> Outcome:
         order = plan.order
-        if order.do == "stop" and self._halting.online(robot.record):
-            return await self._halting.stop(robot.record, plan.actor, order.why)
+        if order.do == "stop" and self._halting.online(robot):
+            return await self._halting.stop(robot, plan.actor, order.why)
         if order.do in ("stop", "resume"):
-            return await self._halted(plan, robot.record)
-        return await self._errand(plan, robot.record)
+            return await self._halted(plan, robot)
+        return await self._errand(plan, robot)
 
     async def _halted(self, plan: Plan, record: RobotRecord) -> Outcome:
         """Stop a robot or let it move again, by the asker's rights as they stand when its turn comes."""
@@ -243,12 +289,10 @@ class FleetDesk:
         robot = self._registry.presence(record.id, record.name, record.realm)
         return Admission(Permit(LOCAL, record.id, OWNS), robot, plan.address)
 
-    async def _mine(self, asker: Principal) -> list[Meant]:
+    async def _mine(self, asker: Principal) -> list[RobotRecord]:
         if asker is LOCAL:
-            return [
-                Meant(record, OWNS) for record in await self._store.read(queries.list_robots, asker.realm)
-            ]
-        return [Meant(record, rules) for record, rules in await self._access.robots(asker)]
+            return await self._store.read(queries.list_robots, asker.realm)
+        return [record for record, _ in await self._access.robots(asker)]
 
     @contextmanager
     def _place(self, asker: Principal) -> Iterator[None]:

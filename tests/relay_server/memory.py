@@ -225,7 +225,7 @@ class World:
             wall_ns=lambda: self.now_ns() + 10**18,
         )
         self.videos = Videos(self.clock, new_ticket=lambda: f"ticket-{next(tickets)}")
-        self.robot = self.registry.presence(1, "rover", "main")
+        self.robot = self.registry.presence(1, "rover", "default")
         self.record = MemoryRecord()
         self.desks = Desks(
             self.clock,
@@ -306,7 +306,7 @@ class World:
         name: str = "ann",
     ) -> Person:
         """A client with a right on the robot, its session begun."""
-        principal = Principal(user, name, "main", False, next(self._tokens), None)
+        principal = Principal(user, name, "default", False, next(self._tokens), None)
         permit = Permit(principal, 1, Rules([Grant(level, allow, deny)]))
         client = MemoryClient()
         session = Session(

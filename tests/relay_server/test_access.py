@@ -12,6 +12,7 @@ from twisted.internet.defer import Deferred
 
 from relay_db import queries
 from relay_protocol.rights import Level, Operation
+from relay_server import access as module
 from relay_server.access import Access, BadCredentials, Permit, Principal
 from relay_server.store import Store
 
@@ -202,3 +203,62 @@ async def test_robots_are_listed_with_the_right_on_each(store: Store) -> None:
     await hall.access.refresh()
     ((_, rules),) = await hall.access.robots(hall.principal)
     assert rules.level is Level.OWNER
+
+
+@pytest.mark.parametrize("ended", ["token", "user", "time", "nothing"])
+@pytest_twisted.ensureDeferred
+async def test_a_token_is_remembered_while_it_counts(store: Store, ended: str) -> None:
+    """Changes in the database are taken up as for what is open."""
+    hall = await Hall(store).open()
+    hall.access.remember(HASH, hall.principal, hall.access.refreshed)
+    assert hall.access.remembered(HASH) == hall.principal
+    if ended == "token":
+        await store.write(queries.revoke_token, hall.principal.token_id)
+    elif ended == "user":
+        await store.write(queries.set_disabled, hall.user.id, True)
+    elif ended == "time":
+        hall.now = 5000.0
+    await hall.access.refresh()
+    assert hall.access.remembered(HASH) == (hall.principal if ended == "nothing" else None)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_token_that_was_looked_up_before_a_change_is_not_remembered(store: Store) -> None:
+    """The change may have been about just that."""
+    hall = await Hall(store).open()
+    before = hall.access.refreshed
+    await hall.access.refresh()
+    hall.access.remember(HASH, hall.principal, before)
+    assert hall.access.remembered(HASH) is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_remembered_is_bounded(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The longest unused is forgotten."""
+    monkeypatch.setattr(module, "PROVED", 2)
+    hall = await Hall(store).open()
+    for token_hash in ("a", "b", "a", "c"):
+        hall.access.remember(token_hash, hall.principal, hall.access.refreshed)
+    assert [token_hash for token_hash in "abc" if hall.access.remembered(token_hash)] == ["a", "c"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_has_a_right_is_known_without_the_database(store: Store) -> None:
+    """From what is open, from what was looked up since the last change, and from nothing else."""
+    hall = await Hall(store).open()
+    access, robot = hall.access, hall.robot.id
+    assert not access.knows(hall.principal, robot)
+    permit = await hall.permit()
+    await access.refresh()
+    assert access.knows(hall.principal, robot)
+    access.release(permit)
+    assert not access.knows(hall.principal, robot)
+    access.release(await hall.permit())
+    assert access.knows(hall.principal, robot)
+    await access.refresh()
+    await access.robots(hall.principal)
+    assert access.knows(hall.principal, robot)
+    assert not access.knows(hall.principal, robot + 1)
+    await store.write(queries.revoke_right, robot, user_id=hall.user.id)
+    await access.refresh()
+    assert not access.knows(hall.principal, robot)

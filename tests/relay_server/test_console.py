@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import pytest_twisted
+from twisted.internet.defer import Deferred
 
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Principal
-from relay_server.console import Console
+from relay_server.console import NOT_ALL_KNOWN, Console
 from relay_server.control import Answer
+from relay_server.frontdesk import LOOKUP_SECONDS
 from relay_server.store import Store
+from tests.relay_server.steering import outcome, result
 from tests.relay_server.test_frontdesk import HERE, Desk
 
 ROBOT = "rover"
@@ -26,7 +30,9 @@ class Place:
     def __init__(self, store: Store) -> None:
         self.made = Desk(store)
         self.world = self.made.world
-        self.console = Console(self.made.desk, self.world.desks, self.world.registry, store)
+        self.console = Console(
+            self.world.clock, self.made.desk, self.made.access, self.world.desks, self.world.registry, store
+        )
         with store.database.begin() as s:
             self.users = {}
             for name, level in (("olga", "owner"), ("vic", "viewer"), ("eve", "")):
@@ -183,16 +189,98 @@ async def test_on_the_relays_own_machine_all_robots_are_stopped(place: Place) ->
     """Those that are there at once, the others when they come; what was not told is taken back."""
     place.robot_comes()
     told = await place.console.stop_here(None, "fire", "root")
-    assert told == [{"robot": "hidden", "done": False}, {"robot": ROBOT, "done": True}]
+    assert told == ([{"robot": "hidden", "done": False}, {"robot": ROBOT, "done": True}], "")
     assert place.world.record.notes[0][1] == "root"
     await place.console.resume_here("hidden", "", "root")
     assert place.world.record.stops == {}
     with pytest.raises(NotFound, match="there is no robot 'mule'"):
         await place.console.stop_here("mule", "", "root")
     place.world.record.fails = Unavailable("the database is locked")
-    (failed,) = await place.console.stop_here("hidden", "", "root")
+    ((failed,), _) = await place.console.stop_here("hidden", "", "root")
     assert failed["done"] is False
     assert "can't be kept" in failed["reason"]
+
+
+class Hung:
+    """A database that answers nothing more."""
+
+    def __init__(self, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+        async def never(*_: Any, **__: Any) -> Any:
+            await Deferred()
+
+        monkeypatch.setattr(place.made.store, "read", never)
+        monkeypatch.setattr(place.made.store, "write", never)
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_is_known_stops_a_robot_without_the_database(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Known is who was let in to it since something last changed, or has it open."""
+    place.robot_comes()
+    vic = await place.principal("vic")
+    await place.console.control(vic, ROBOT, HERE)
+    ann = await place.principal("ann")
+    session, _ = await place.made.opens(ann)
+    await place.made.access.refresh()
+    await place.console.control(vic, ROBOT, HERE)
+    Hung(place, monkeypatch)
+    for who in (vic, ann):
+        assert result(place.console.stop(who, ROBOT, "smoke", HERE)).done
+    assert [order.by for order in place.world.control.all(link.Stop)] == ["vic", "ann"]
+    session.end()
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_is_not_known_is_told_soon_that_nobody_can_say(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In words, and nothing is stopped; a right that may have been revoked counts no more."""
+    place.robot_comes()
+    vic, eve = await place.principal("vic"), await place.principal("eve")
+    await place.console.control(vic, ROBOT, HERE)
+    await place.made.access.refresh()
+    Hung(place, monkeypatch)
+    asked = [outcome(place.console.stop(who, ROBOT, "", HERE)) for who in (vic, eve)]
+    place.world.clock.advance(LOOKUP_SECONDS - 0.1)
+    assert asked == [[], []]
+    place.world.clock.advance(0.1)
+    for (error,) in asked:
+        assert isinstance(error, Unavailable)
+        assert "by 'switchboard stop' on the relay's machine" in str(error)
+    assert not place.world.control.all(link.Stop)
+    assert not place.made.access._permits
+
+
+@pytest_twisted.ensureDeferred
+async def test_on_the_relays_own_machine_no_robot_that_is_here_waits_for_the_database(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither one that is named, nor all; that others could not be looked up is told."""
+    place.robot_comes()
+    Hung(place, monkeypatch)
+    assert result(place.console.stop_here(ROBOT, "fire", "root")) == ([{"robot": ROBOT, "done": True}], "")
+    asked = outcome(place.console.stop_here(None, "fire", "root"))
+    assert len(place.world.control.all(link.Stop)) == 2
+    place.world.clock.advance(LOOKUP_SECONDS)
+    assert asked == [([{"robot": ROBOT, "done": True}], NOT_ALL_KNOWN)]
+    unknown = outcome(place.console.stop_here("mule", "", "root"))
+    place.world.clock.advance(LOOKUP_SECONDS)
+    assert isinstance(unknown[0], Unavailable)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stop_that_is_not_all_done_says_how_the_robot_stands(place: Place) -> None:
+    """With what it could not do."""
+    place.robot_comes()
+    vic = await place.principal("vic")
+    desk = place.world.desks.of(place.world.robot)
+    place.world.control.obeys = lambda order: desk.told(
+        link.Done(id=order.id, ok=False, reason="no contactor")
+    )
+    stopped = await place.console.stop(vic, ROBOT, "smoke", HERE)
+    assert (stopped.done, stopped.failed) == (False, "robot rover could not do it: no contactor")
+    assert stopped.stopped is not None
 
 
 @pytest_twisted.ensureDeferred

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import pytest_twisted
 from twisted.internet import reactor
+from twisted.internet.defer import Deferred
 
 from relay_db import queries
 from relay_protocol import link
@@ -15,13 +16,14 @@ from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_server import closing, limiter, passwords
 from relay_server.access import Access, BadCredentials, Principal
 from relay_server.auth import Authenticator, Opening, TooManyTries
-from relay_server.frontdesk import NO_ROBOT, FrontDesk
+from relay_server.frontdesk import LOOKUP_SECONDS, NO_ROBOT, NOT_LOOKED_UP, FrontDesk
 from relay_server.journal import Journal
 from relay_server.origins import Origins
 from relay_server.session import Session, Timing
 from relay_server.store import Store
 from relay_server.video import Picture
 from tests.relay_server.memory import MemoryClient, World
+from tests.relay_server.steering import outcome, result
 
 PASSWORD = "correct horse"
 HERE = "192.0.2.1"
@@ -256,3 +258,24 @@ async def test_health_is_whether_the_database_answers(front: Desk, monkeypatch: 
         patch.setattr(front.store._readers, "_most", 0)
         assert not await front.desk.healthy()
     assert await front.desk.healthy()
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_stops_robots_need_not_wait_for_the_database(
+    front: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where his token has proved him before and has not ended since; else that is told soon."""
+
+    async def never(*_: Any) -> None:
+        await Deferred()
+
+    principal, token = await front.logged_in()
+    ended, other = await front.logged_in()
+    await front.desk.logout(ended)
+    monkeypatch.setattr(front.store, "read", never)
+    assert result(front.desk.urgent_token(token)) == principal
+    asked = [outcome(front.desk.urgent_token(each)) for each in (other, "unknown")]
+    front.world.clock.advance(LOOKUP_SECONDS - 0.1)
+    assert asked == [[], []]
+    front.world.clock.advance(0.1)
+    assert [str(error) for (error,) in asked] == [NOT_LOOKED_UP] * 2

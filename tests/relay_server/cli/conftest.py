@@ -67,7 +67,9 @@ class FakeRelay(socketserver.ThreadingUnixStreamServer):
     :ivar answer: status code and body for ``GET /status``
     :ivar ordered: bodies of ``POST /fleet``, ``/stop`` and ``/resume`` so far
     :ivar lines: status code and body for the first of these
-    :ivar motion: the same for the others
+    :ivar motion: the same for the others; status 0 hangs up
+    :ivar may_answer: while this is not set the others have no answer
+    :ivar gone: nobody is there any more to have one
     """
 
     daemon_threads = True
@@ -79,6 +81,9 @@ class FakeRelay(socketserver.ThreadingUnixStreamServer):
         self.ordered: list[Any] = []
         self.lines: tuple[int, bytes] = (200, b"")
         self.motion: tuple[int, bytes] = (200, b"{}")
+        self.may_answer = threading.Event()
+        self.may_answer.set()
+        self.gone = False
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -97,6 +102,9 @@ class _Handler(BaseHTTPRequestHandler):
             length = int(self.headers["Content-Length"])
             self.server.ordered.append(json.loads(self.rfile.read(length)))
             status, body = self.server.lines if self.path == "/fleet" else self.server.motion
+            self.server.may_answer.wait(30)
+            if not status or self.server.gone:
+                return
         self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
@@ -121,6 +129,8 @@ def start_relay() -> Iterator[Callable[[Path], FakeRelay]]:
 
     yield start
     for relay, thread in running:
+        relay.gone = True
+        relay.may_answer.set()
         relay.shutdown()
         thread.join(timeout=30)
         relay.server_close()

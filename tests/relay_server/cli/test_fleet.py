@@ -85,6 +85,16 @@ def test_each_robot_is_told_of(live: Any, relay: Any) -> None:
     assert (told["whole"], told["unmatched"], len(told["results"])) == (True, [], 2)
 
 
+def test_a_stop_that_may_have_missed_robots_says_so(live: Any, relay: Any) -> None:
+    """And fails, as one that failed on a robot."""
+    head = {"do": "stop", "robots": ["rover"], "unmatched": [], "missed": "the database has not answered"}
+    relay.lines = 200, b"\n".join(json.dumps(each).encode() for each in (head, {"robot": "rover", **OK}))
+    result = live("robot", "stop", "*")
+    assert result.exit_code == 1
+    assert "There may be more robots that are meant: the database has not answered." in result.stdout
+    assert json.loads(live("robot", "stop", "*", "--json").stdout)["missed"] == head["missed"]
+
+
 def test_what_failed_anywhere_is_exit_code_1(live: Any, relay: Any) -> None:
     """And so is a pattern that means nothing, and an answer that is not whole."""
     cases = [

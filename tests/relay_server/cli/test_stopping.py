@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
+
 from relay_db import queries
 from relay_db.engine import Database
+from relay_server.cli import relaysocket, stopping
 from relay_server.cli.app import os_user
 
 
@@ -105,3 +108,60 @@ def test_a_reason_that_is_no_text_does_not_hold_up_a_stop(live: Any, relay: Any)
     relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}]}')
     assert live.ok("stop", "rover", "--why", b"sm\xffke".decode("utf-8", "surrogateescape"))
     assert [order["why"] for order in relay.ordered] == ["sm?ke"]
+
+
+def test_a_stop_that_a_relay_does_not_confirm_is_kept(
+    live: Any, relay: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And that is told, on each robot: nobody knows whether it stands."""
+    monkeypatch.setattr(relaysocket, "_SURE_SECONDS", 0.05)
+    monkeypatch.setattr(relaysocket, "_MOTION_SECONDS", 0.3)
+    live.ok("robot", "add", "rover")
+    relay.may_answer.clear()
+    result = live("stop", "--all", "--why", "smoke")
+    assert result.exit_code == 3
+    assert "has not answered for 0.05 s. The order is kept" in result.stderr
+    assert "Robot rover: not confirmed: the relay on this data folder does not answer" in result.stdout
+    assert pending(live) == [(1, os_user(), "smoke")]
+
+
+def test_an_answer_that_comes_late_is_told_all_the_same(
+    live: Any, relay: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The order was kept meanwhile; the relay knows what to do with it."""
+    monkeypatch.setattr(relaysocket, "_SURE_SECONDS", 0.05)
+    live.ok("robot", "add", "rover")
+    relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}]}')
+    relay.may_answer.clear()
+    said: list[str] = []
+
+    def tell(sentence: str) -> None:
+        said.append(sentence)
+        relay.may_answer.set()
+
+    monkeypatch.setattr(stopping, "say_aside", tell)
+    assert live.ok("stop", "rover") == "Robot rover is stopped.\n"
+    assert "The order is kept" in said[0]
+    assert [robot for robot, *_ in pending(live)] == [1]
+
+
+def test_a_stop_is_kept_when_the_relay_hangs_up_or_can_not_say(live: Any, relay: Any) -> None:
+    """It may have died of the order, or have lost its database."""
+    live.ok("robot", "add", "rover")
+    for number, motion in enumerate([(0, b""), (503, b'{"detail": "in its own words"}'), (200, b"<html>")]):
+        relay.motion = motion
+        result = live("stop", "rover", "--why", f"the {number}")
+        assert (result.exit_code, "The order is kept" in result.stdout) == (3, True), result.output
+        assert pending(live) == [(1, os_user(), f"the {number}")]
+
+
+def test_robots_that_the_relay_could_not_look_up_are_kept_to_be_stopped(live: Any, relay: Any) -> None:
+    """Those it has told are not told again."""
+    live.ok("robot", "add", "rover")
+    live.ok("robot", "add", "mule")
+    relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}], "missed": "it did not answer"}')
+    result = live("stop", "--all")
+    assert result.exit_code == 0, result.output
+    assert "Not all robots are told yet: it did not answer" in result.stderr
+    assert result.stdout.startswith("Robot rover is stopped.\nRobot mule can't be reached now")
+    assert [robot for robot, *_ in pending(live)] == [2]

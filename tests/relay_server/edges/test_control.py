@@ -60,6 +60,8 @@ class Console:
 
     async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
         """Keep it."""
+        if isinstance(self.fails, NotDone):
+            return Outcome(False, STOPPED, str(self.fails))
         self._keep("stop", principal, robot, why, address)
         return Outcome(self.done, {**STOPPED, "told": self.done})
 
@@ -152,6 +154,14 @@ def test_what_goes_wrong_is_told_in_words(site: Site, error: Exception, status: 
         assert answer.headers["content-type"] == "application/problem+json"
     if status == 409:
         assert site.post("stop").json["stopped"] == STOPPED
+
+
+def test_who_is_known_stops_a_robot_though_the_database_is_gone(site: Site) -> None:
+    """Nothing else is done for him."""
+    site.desk.up = False
+    assert site.post("stop").status == 200
+    assert site.post("resume").status == 503
+    assert site.post("stop", Authorization="Bearer nobody").status == 401
 
 
 def test_topics_are_suppressed_and_inhibited(site: Site) -> None:

@@ -20,11 +20,13 @@ from relay_server.fleet import desk as module
 from relay_server.fleet.desk import Plan
 from relay_server.fleet.errand import MATCHING_SECONDS, SUBSCRIBER_SECONDS
 from relay_server.fleet.result import VALUES_BYTES
+from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP
 from relay_server.journal import Journal
 from relay_server.session import Session
 from relay_server.store import Store
 from tests.relay_server.edges.robot_ends import until
 from tests.relay_server.memory import MOTION, STRING, TRIGGER, MemoryClient
+from tests.relay_server.steering import outcome
 from tests.relay_server.test_frontdesk import HERE, Desk
 
 
@@ -439,6 +441,66 @@ async def test_a_stop_stands_before_everything(fleet: Fleet) -> None:
     assert not fleet.desk._halting.online(queries.RobotRecord(99, "nowhere", "default", ""))
     for each in orders:
         each.running.cancel()
+
+
+@pytest.mark.parametrize("who", ["ann", "local"])
+@pytest_twisted.ensureDeferred
+async def test_no_robot_that_is_here_waits_for_the_database_to_be_stopped(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, who: str
+) -> None:
+    """Where the asker is known; once it has not answered for some seconds, these are all that are meant."""
+
+    async def never(*_: object, **__: object) -> None:
+        await Deferred()
+
+    fleet.world.robot_comes()
+    asker = await fleet.ann() if who == "ann" else LOCAL
+    if who == "ann":
+        await fleet.desk.groups(asker)
+        fleet.front.access._robots.clear()
+        fleet.front.access.release(await fleet.front.access.permit(asker, 1))  # type: ignore[arg-type]
+    monkeypatch.setattr(fleet.front.store, "read", never)
+    asked = outcome(fleet.desk.plan(asker, order("stop", "*", "group:all", why="fire"), HERE))
+    assert [each.why for each in fleet.world.control.all(link.Stop)] == ["fire"]
+    assert asked == []
+    fleet.world.clock.advance(LOOKUP_SECONDS)
+    (plan,) = asked
+    assert plan.told() == {
+        "do": "stop",
+        "robots": ["rover"],
+        "unmatched": ["group:all"],
+        "missed": NOT_LOOKED_UP,
+    }
+    results: list[Result] = []
+
+    async def tell(each: Result) -> None:
+        results.append(each)
+
+    given = outcome(fleet.desk.carry_out(plan, lambda: None, tell))
+    await until(lambda: bool(given))
+    assert [each.outcome.ok for each in results] == [True]
+    assert len(fleet.world.control.all(link.Stop)) == 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_is_not_known_stops_nothing_without_the_database(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which he is told soon; and an order to do something else stops nobody."""
+
+    async def never(*_: object) -> None:
+        await Deferred()
+
+    fleet.world.robot_comes()
+    ann = await fleet.ann()
+    monkeypatch.setattr(fleet.front.store, "read", never)
+    asked = [
+        outcome(fleet.desk.plan(ann, order("stop", "*"), HERE)),
+        outcome(fleet.desk.plan(LOCAL, order("resume", "*"), HERE)),
+    ]
+    fleet.world.clock.advance(LOOKUP_SECONDS)
+    assert [str(error) for (error,) in asked] == [NOT_LOOKED_UP] * 2
+    assert not fleet.world.control.all(link.Stop)
 
 
 async def nothing() -> None:
