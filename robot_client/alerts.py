@@ -8,6 +8,9 @@ from typing import NamedTuple, Protocol
 
 from relay_protocol import link
 
+HEARING_NS = 5_000_000_000
+"""A daemon has so long to hear what is wrong before it says that it has told all: diagnostics come once a second."""
+
 KEPT = 300
 """Most alerts that are remembered while they last, and most words that may have to be said again."""
 
@@ -68,12 +71,15 @@ class AlertMemory:
         self._now = now
         self._lasting: dict[tuple[str, str], link.Alert] = {}
         self._doubtful: deque[_Word] = deque(maxlen=KEPT)
+        self._began = now()
+        self._owes = False
+        """Whether the relay is still to be told, in this registration, that this was all."""
         self._whole = True
         """Whether all that lasts is remembered."""
 
     def tell(self, message: link.Alert) -> None:
         """Say it now if the relay is there, and later if it was not."""
-        self.look()
+        self._forget()
         if message.kind:
             self._remember(message)
         registered = self._reach.registered
@@ -82,7 +88,11 @@ class AlertMemory:
             self._reach.say(message)
 
     def look(self) -> None:
-        """Forget what has arrived; to be called now and then."""
+        """Forget what has arrived, and say what is due; to be called now and then."""
+        self._forget()
+        self._say_that_is_all()
+
+    def _forget(self) -> None:
         answered = self._reach.answered
         while answered is not None and self._doubtful:
             said = self._doubtful[0].said
@@ -98,7 +108,14 @@ class AlertMemory:
         for message in (*lasting, *doubtful):
             self._doubtful.append(_Word(message, self._now()))
             self._reach.say(message)
-        if self._whole:
+        self._owes = self._whole
+        self._say_that_is_all()
+
+    def _say_that_is_all(self) -> None:
+        """Not before what is wrong can have been heard: what is not told by then is over for the relay."""
+        heard = self._now() - self._began >= HEARING_NS
+        if self._owes and heard and self._reach.registered:
+            self._owes = False
             self._reach.say(link.AlertsTold())
 
     def _remember(self, message: link.Alert) -> None:

@@ -1,12 +1,14 @@
 """All alerts that last, and those that were over a moment ago: what is told again joins what is there.
 
-Pure: no clock, no database. Who calls says what time it is, and takes what has changed to be written.
+Pure: no clock, no database. Who calls says what time it is, and takes what has changed to be written. What is shown
+to people has the wall clock's time, which may be set; how long something lasts is measured by the monotonic one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from math import inf
 from typing import NamedTuple
 
 from relay_db.queries import AlertRecord
@@ -20,6 +22,24 @@ KEPT = 1000
 """Most alerts of one robot that are remembered after they were over."""
 
 
+class Moment(NamedTuple):
+    """A point in time.
+
+    :param wall: Unix seconds
+    :param tick: seconds of the monotonic clock
+    """
+
+    wall: float
+    tick: float
+
+    def ago(self, wall: float) -> float:
+        """When something was, by the monotonic clock; what seems to lie ahead is now.
+
+        :param wall: Unix seconds, of an earlier relay
+        """
+        return self.tick - max(0.0, self.wall - wall)
+
+
 class Change(NamedTuple):
     """Something worth telling."""
 
@@ -28,15 +48,31 @@ class Change(NamedTuple):
 
 
 @dataclass
+class _Marks:
+    """What is remembered of an alert beside its record; times by the monotonic clock.
+
+    :param since: it was told last, or it is over
+    :param news: people were told that it began or became worse
+    :param severity: how bad it was then
+    :param told: people know that it lasts
+    """
+
+    since: float
+    news: float = -inf
+    severity: int = -1
+    told: bool = False
+
+
+@dataclass
 class _Robot:
-    """The alerts of one robot."""
+    """The alerts of one robot.
+
+    :param filled: monotonic seconds
+    """
 
     open: dict[Key, AlertRecord] = field(default_factory=dict)
     over: dict[Key, AlertRecord] = field(default_factory=dict)
-    news: dict[Key, float] = field(default_factory=dict)
-    """When there was news of each, Unix seconds."""
-    told: set[Key] = field(default_factory=set)
-    """Of which people were told that they last."""
+    marks: dict[Key, _Marks] = field(default_factory=dict)
     tokens: float = kinds.BURST
     filled: float = 0.0
     full: int = 0
@@ -62,14 +98,18 @@ class Book:
             yield from robot.open.values()
             yield from robot.over.values()
 
-    def load(self, records: list[AlertRecord]) -> None:
+    def load(self, records: list[AlertRecord], now: Moment) -> None:
         """Take up what an earlier relay kept."""
         for each in sorted(records, key=lambda record: record.last):
-            robot = self._robots.setdefault(each.robot_id, _Robot())
-            (robot.open if each.over is None else robot.over)[each.kind, each.about] = each
-            robot.news[each.kind, each.about] = each.last
-            if each.over is None:
-                robot.told.add((each.kind, each.about))
+            robot = self._robots.setdefault(each.robot_id, _Robot(filled=now.tick))
+            key = (each.kind, each.about)
+            (robot.open if each.over is None else robot.over)[key] = each
+            robot.marks[key] = _Marks(
+                now.ago(each.last if each.over is None else each.over),
+                now.ago(each.last),
+                kinds.severity(each.level),
+                each.over is None,
+            )
 
     def take_changed(self) -> list[AlertRecord]:
         """What is to be written, each once."""
@@ -104,20 +144,19 @@ class Book:
     # --- what happens -------------------------------------------------------------------------------------
 
     def tell(
-        self, robot_id: int, name: str, kind: str, about: str, level: str, text: str, now: float
+        self, robot_id: int, name: str, kind: str, about: str, level: str, text: str, now: Moment
     ) -> list[Change]:
         """Something is wrong: it joins what is known of the same, or is a new alert.
 
         :param name: of the robot
-        :param now: Unix seconds
         """
-        robot = self._robots.setdefault(robot_id, _Robot(filled=now))
+        robot = self._robots.setdefault(robot_id, _Robot(filled=now.tick))
         key, text = (kind, about), text[: kinds.TEXT]
         before = robot.open.get(key)
         if before is not None:
             return self._again(robot, before, level, text, now)
         back = robot.over.get(key)
-        if back is not None and back.over is not None and now - back.over < kinds.REJOIN_SECONDS:
+        if back is not None and now.tick - robot.marks[key].since < kinds.REJOIN_SECONDS:
             return self._back(robot, back, level, text, now)
         if kind != kinds.FLOOD and kind not in kinds.SINGLE and not self._room(robot, now):
             robot.full += 1
@@ -125,93 +164,122 @@ class Book:
             words = f"{robot.full} more alerts of {name} are not kept one by one"
             return self.tell(robot_id, name, kinds.FLOOD, "", "warning", words, now)
         made = AlertRecord(
-            self._new_id(), robot_id, name, kind, about, level, text, now, now, 1, 1, None, None, None
+            self._new_id(),
+            robot_id,
+            name,
+            kind,
+            about,
+            level,
+            text,
+            now.wall,
+            now.wall,
+            1,
+            1,
+            None,
+            None,
+            None,
         )
         robot.over.pop(key, None)
+        robot.marks[key] = _Marks(now.tick)
         return [self._news(robot, made, Event.BEGUN, now)]
 
-    def over(self, robot_id: int, kind: str, about: str, now: float) -> list[Change]:
+    def over(self, robot_id: int, kind: str, about: str, now: Moment) -> list[Change]:
         """It is well again."""
         robot = self._robots.get(robot_id)
         lasts = None if robot is None else robot.open.get((kind, about))
         return [] if robot is None or lasts is None else self._end(robot, lasts, now)
 
-    def acknowledge(self, alert_id: str, by: str, now: float) -> tuple[AlertRecord | None, list[Change]]:
+    def acknowledge(
+        self, alert_id: str, by: str, at: float, now: Moment
+    ) -> tuple[AlertRecord | None, list[Change]]:
         """Somebody looks after it; the alert, if there is one, and what that changes.
 
-        What nobody will tell the end of is over by it.
+        What nobody will tell the end of is over by it, also where that was kept while no relay ran.
+
+        :param at: since when, Unix seconds
         """
         found = self.find(alert_id)
-        if found is None or found.over is not None or found.ack_at is not None:
+        if found is None or found.over is not None:
             return found, []
         robot = self._robots[found.robot_id]
-        found = self._keep(robot, found._replace(ack_by=by, ack_at=now))
-        self.states += 1
+        if found.ack_at is None:
+            found = self._keep(robot, found._replace(ack_by=by, ack_at=at))
+            self.states += 1
         changes = self._end(robot, found, now) if kinds.endless(found.kind) else []
         return self.find(alert_id), changes
 
-    def sweep(self, now: float) -> list[Change]:
+    def sweep(self, now: Moment) -> list[Change]:
         """Tell what came back and stayed; end what nobody tells the end of; forget what was over long ago."""
         changes: list[Change] = []
         for robot_id, robot in list(self._robots.items()):
-            for each in list(robot.open.values()):
-                if now - each.last >= _patience(each.kind):
+            for key, each in list(robot.open.items()):
+                marks = robot.marks[key]
+                if now.tick - marks.since >= _patience(each.kind):
                     changes += self._end(robot, each, now)
-                elif (each.kind, each.about) not in robot.told:
+                elif not marks.told:
                     changes += self._come_back(robot, each, now)
             _forget_old(robot, now)
-            if not robot.open and not robot.over and now - robot.filled > kinds.BURST / kinds.RATE:
+            if not robot.open and not robot.over and now.tick - robot.filled > kinds.BURST / kinds.RATE:
                 del self._robots[robot_id]
         return changes
 
     # --- how ----------------------------------------------------------------------------------------------
 
-    def _again(self, robot: _Robot, before: AlertRecord, level: str, text: str, now: float) -> list[Change]:
+    def _again(self, robot: _Robot, before: AlertRecord, level: str, text: str, now: Moment) -> list[Change]:
+        marks = robot.marks[before.kind, before.about]
+        marks.since = now.tick
         worse = kinds.severity(level) > kinds.severity(before.level)
         now_it_is = before._replace(
-            text=text, level=level if worse else before.level, last=now, times=before.times + 1
+            text=text, level=level if worse else before.level, last=now.wall, times=before.times + 1
         )
         if not worse:
             self._keep(robot, now_it_is)
             return []
-        fresh = now_it_is._replace(ack_by=None, ack_at=None, news=before.news + 1)
-        return [self._news(robot, fresh, Event.WORSE, now)]
+        self.states += 1
+        fresh = self._keep(robot, now_it_is._replace(ack_by=None, ack_at=None))
+        if not marks.told:
+            return self._come_back(robot, fresh, now)
+        return [self._news(robot, fresh._replace(news=before.news + 1), Event.WORSE, now)]
 
-    def _back(self, robot: _Robot, before: AlertRecord, level: str, text: str, now: float) -> list[Change]:
+    def _back(self, robot: _Robot, before: AlertRecord, level: str, text: str, now: Moment) -> list[Change]:
         del robot.over[before.kind, before.about]
+        robot.marks[before.kind, before.about].since = now.tick
         back = before._replace(
-            level=level, text=text, last=now, times=before.times + 1, over=None, ack_by=None, ack_at=None
+            level=level, text=text, last=now.wall, times=before.times + 1, over=None, ack_by=None, ack_at=None
         )
         self.states += 1
         return self._come_back(robot, self._keep(robot, back), now)
 
-    def _come_back(self, robot: _Robot, back: AlertRecord, now: float) -> list[Change]:
-        """Tell of it, unless there was news of it a moment ago."""
-        if now - robot.news.get((back.kind, back.about), -kinds.NEWS_SECONDS) < kinds.NEWS_SECONDS:
-            return []
-        return [self._news(robot, back._replace(news=back.news + 1), Event.BEGUN, now)]
+    def _come_back(self, robot: _Robot, back: AlertRecord, now: Moment) -> list[Change]:
+        """Tell of it, unless people were told of it a moment ago, and as bad."""
+        marks = robot.marks[back.kind, back.about]
+        event = Event.BEGUN
+        if now.tick - marks.news < kinds.NEWS_SECONDS:
+            if kinds.severity(back.level) <= marks.severity:
+                return []
+            event = Event.WORSE
+        return [self._news(robot, back._replace(news=back.news + 1), event, now)]
 
-    def _end(self, robot: _Robot, lasts: AlertRecord, now: float) -> list[Change]:
+    def _end(self, robot: _Robot, lasts: AlertRecord, now: Moment) -> list[Change]:
         key = (lasts.kind, lasts.about)
         del robot.open[key]
         if lasts.kind == kinds.FLOOD:
             robot.full = 0
-        told = key in robot.told
-        robot.told.discard(key)
-        robot.over[key] = over = lasts._replace(over=now, news=lasts.news + told)
+        marks = robot.marks[key]
+        told, marks.told, marks.since = marks.told, False, now.tick
+        robot.over[key] = over = lasts._replace(over=now.wall, news=lasts.news + told)
         self._changed[over.id] = over
         self.states += 1
         while len(robot.over) > KEPT:
             oldest = next(iter(robot.over))
-            del robot.over[oldest]
-            robot.news.pop(oldest, None)
+            del robot.over[oldest], robot.marks[oldest]
         # The end of what was told is told, however soon it came: nobody shall go on worrying.
         return [Change(over, Event.OVER)] if told else []
 
-    def _news(self, robot: _Robot, alert: AlertRecord, event: Event, now: float) -> Change:
+    def _news(self, robot: _Robot, alert: AlertRecord, event: Event, now: Moment) -> Change:
         self.states += 1
-        robot.news[alert.kind, alert.about] = now
-        robot.told.add((alert.kind, alert.about))
+        marks = robot.marks[alert.kind, alert.about]
+        marks.news, marks.severity, marks.told = now.tick, kinds.severity(alert.level), True
         return Change(self._keep(robot, alert), event)
 
     def _keep(self, robot: _Robot, alert: AlertRecord) -> AlertRecord:
@@ -220,9 +288,9 @@ class Book:
         return alert
 
     @staticmethod
-    def _room(robot: _Robot, now: float) -> bool:
-        robot.tokens = min(kinds.BURST, robot.tokens + max(0.0, now - robot.filled) * kinds.RATE)
-        robot.filled = now
+    def _room(robot: _Robot, now: Moment) -> bool:
+        robot.tokens = min(kinds.BURST, robot.tokens + (now.tick - robot.filled) * kinds.RATE)
+        robot.filled = now.tick
         if len(robot.open) >= kinds.OPEN or robot.tokens < 1:
             return False
         robot.tokens -= 1
@@ -236,8 +304,7 @@ def _patience(kind: str) -> float:
     return kinds.ENDLESS_SECONDS if kinds.endless(kind) else float("inf")
 
 
-def _forget_old(robot: _Robot, now: float) -> None:
-    for key, each in list(robot.over.items()):
-        if each.over is not None and now - each.over > kinds.SHOWN_SECONDS:
-            del robot.over[key]
-            robot.news.pop(key, None)
+def _forget_old(robot: _Robot, now: Moment) -> None:
+    for key in list(robot.over):
+        if now.tick - robot.marks[key].since > kinds.SHOWN_SECONDS:
+            del robot.over[key], robot.marks[key]

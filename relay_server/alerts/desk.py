@@ -113,13 +113,10 @@ class AlertDesk:
         if kept is not None and kept[0] == version and kept[1] is known:
             return kept[2]
         rights = {record.id: each for record, each in known}
-        now = self._wall()
         found = [
             each
             for each in self._alerts.book
-            if each.robot_id in rights
-            and (each.over is None or now - each.over < kinds.SHOWN_SECONDS)
-            and rules.visible(rights[each.robot_id], each.kind, each.about)
+            if each.robot_id in rights and rules.visible(rights[each.robot_id], each.kind, each.about)
         ]
         found.sort(key=lambda each: (each.over is None, each.last), reverse=True)
         shown = [self._view(principal, each, rights[each.robot_id]) for each in found[: kinds.SHOWN]]

@@ -15,7 +15,7 @@ from relay_protocol.errors import SwitchboardError
 from relay_protocol.rights import Rules
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds, rules
-from relay_server.alerts.book import Book, Change, Key
+from relay_server.alerts.book import Book, Change, Key, Moment
 from relay_server.alerts.delivery import Office, Send
 from relay_server.alerts.senses import LOOK_SECONDS, Senses, Thresholds, stopped_by
 from relay_server.alerts.tellers import Tellers
@@ -33,6 +33,9 @@ TIDY_EVERY = 40
 
 ABSENT_SECONDS = 30.0
 """A robot that was not there when the relay began has so long to come."""
+
+AGAIN_SECONDS = 10.0
+"""A daemon that began anew has so long to hear what is still wrong, and to tell it."""
 
 BATCH = 200
 """Alerts written in one transaction."""
@@ -82,11 +85,11 @@ class Alerts:
         self._began = clock.seconds()
         self._absent: dict[int, tuple[str, str]] = {}
         self._came: dict[int, float] = {}
-        """Unix time of each robot's latest registration."""
+        """When each robot's latest registration was, monotonic seconds."""
         self._daemons: dict[int, float] = {}
         """When each robot's daemon began, as it says itself."""
         self._untold: dict[int, set[Key]] = {}
-        """What each robot told before its latest registration and not since, where it has an end of its own."""
+        """What each robot told before its latest registration and not since."""
         self._rights: dict[int, tuple[object, dict[int, Rules]]] = {}
         """By user: the list that :meth:`Access.robots` gave last, and what that says by robot."""
         self._takers: dict[str, Callable[[Presence, dict[str, Any]], None]] = {
@@ -103,7 +106,7 @@ class Alerts:
     async def start(self) -> None:
         """Take up what an earlier relay kept, and look from now on."""
         since = self._wall() - kinds.SHOWN_SECONDS
-        self.book.load(await self._store.read(queries.recent_alerts, since))
+        self.book.load(await self._store.read(queries.recent_alerts, since), self._moment())
         self._absent = {
             each.id: (each.name, each.realm) for each in await self._store.read(queries.enrolled_robots)
         }
@@ -150,13 +153,13 @@ class Alerts:
 
     def tell(self, robot: Presence, kind: str, about: str, level: str, text: str) -> None:
         """Something is wrong with a robot."""
-        told = self.book.tell(robot.robot_id, robot.name, kind, about, level, text, self._wall())
+        told = self.book.tell(robot.robot_id, robot.name, kind, about, level, text, self._moment())
         self._changed(told)
 
     def over(self, robot: Presence, kind: str, about: str = "") -> None:
         """It is well again."""
         if self.book.lasts(robot.robot_id, kind, about) is not None:
-            self._changed(self.book.over(robot.robot_id, kind, about, self._wall()))
+            self._changed(self.book.over(robot.robot_id, kind, about, self._moment()))
 
     def lasts(self, robot: Presence, kind: str, about: str = "") -> str | None:
         """The level of this alert while it lasts."""
@@ -169,9 +172,12 @@ class Alerts:
 
     def acknowledge(self, alert_id: str, by: str, at: float) -> AlertRecord | None:
         """Somebody looks after an alert; the alert, if there is one."""
-        found, changes = self.book.acknowledge(alert_id, by, at)
+        found, changes = self.book.acknowledge(alert_id, by, at, self._moment())
         self._changed(changes)
         return found
+
+    def _moment(self) -> Moment:
+        return Moment(self._wall(), self._clock.seconds())
 
     def _changed(self, changes: Collection[Change]) -> None:
         if self._states != self.book.states:
@@ -187,11 +193,11 @@ class Alerts:
             take(robot, data)
 
     def _came_online(self, robot: Presence, data: dict[str, Any]) -> None:
-        self._came[robot.robot_id] = self._wall()
+        self._came[robot.robot_id] = self._clock.seconds()
         self._untold[robot.robot_id] = {
             (each.kind, each.about)
             for each in self.book.open_of(robot.robot_id)
-            if each.kind not in kinds.OURS and not kinds.endless(each.kind)
+            if each.kind not in kinds.OURS
         }
         self.over(robot, kinds.OFFLINE)
 
@@ -210,8 +216,10 @@ class Alerts:
             self.tell(robot, kind, about, level, str(data.get("text", "")))
 
     def _all_told(self, robot: Presence, data: dict[str, Any]) -> None:
-        """What the robot has not told again is over."""
-        for kind, about in self._untold.pop(robot.robot_id, ()):
+        """What the robot has not told again is over, where it has an end of its own."""
+        untold = self._untold.get(robot.robot_id, set())
+        for kind, about in [each for each in untold if not kinds.endless(each[0])]:
+            untold.discard((kind, about))
             self.over(robot, kind, about)
 
     def _control_lost(self, robot: Presence, data: dict[str, Any]) -> None:
@@ -232,11 +240,11 @@ class Alerts:
         self._looks += 1
         self._senses.look(now, wall)
         for robot in self._registry:
-            self._end_what_is_forgotten(robot)
+            self._end_what_is_forgotten(robot, now)
         if self._looks % TOPICS_EVERY == 0:
             self._senses.look_at_topics(now)
         if self._looks % TIDY_EVERY == 0:
-            self._changed(self.book.sweep(wall))
+            self._changed(self.book.sweep(self._moment()))
             self.version += 1
         if self._absent and now - self._began >= ABSENT_SECONDS:
             self._miss()
@@ -245,17 +253,16 @@ class Alerts:
             self._shown = self.version
             self._registry.changed()
 
-    def _end_what_is_forgotten(self, robot: Presence) -> None:
+    def _end_what_is_forgotten(self, robot: Presence, now: float) -> None:
         """A daemon that began anew does not know what it told before; it tells again what is still wrong."""
-        began = robot.description.started
-        if robot.control is None or began == self._daemons.get(robot.robot_id):
+        began, before = robot.description.started, self._daemons.get(robot.robot_id)
+        if robot.control is None or began == before:
             return
-        before = self._daemons.get(robot.robot_id)
+        if before and now - self._came.get(robot.robot_id, now) < AGAIN_SECONDS:
+            return
         self._daemons[robot.robot_id] = began
-        since = self._came.get(robot.robot_id, 0.0)
-        for each in self.book.open_of(robot.robot_id) if before else ():
-            if each.kind not in kinds.OURS and each.last < since:
-                self.over(robot, each.kind, each.about)
+        for kind, about in self._untold.pop(robot.robot_id, ()) if before else ():
+            self.over(robot, kind, about)
 
     def _miss(self) -> None:
         """Robots that were there before the relay began, and are not since."""

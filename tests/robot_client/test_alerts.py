@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol import link
-from robot_client.alerts import KEPT, AlertMemory
+from robot_client.alerts import HEARING_NS, KEPT, AlertMemory
 
 
 class Relay:
@@ -64,8 +64,38 @@ class Scene:
 def scene() -> Scene:
     """The relay knows the robot; nothing is wrong."""
     made = Scene()
+    made.now = HEARING_NS
     assert made.comes() == ["that is all"]
     return made
+
+
+def test_a_daemon_that_has_just_begun_hears_before_it_says_that_is_all() -> None:
+    """In the registration that lasts then, once; what it hears until then comes first."""
+    scene = Scene()
+    assert scene.comes() == []
+    scene.now = HEARING_NS // 2
+    scene.goes()
+    scene.memory.look()
+    assert scene.comes() == []
+    scene.now = HEARING_NS
+    scene.tell("arm")
+    assert scene.takes() == ["arm broken"]
+    for _ in range(2):
+        scene.memory.look()
+    assert scene.takes() == ["that is all"]
+    scene.goes()
+    assert scene.comes() == ["arm broken", "that is all"]
+
+
+def test_a_daemon_that_is_away_when_it_has_heard_says_so_when_it_is_back() -> None:
+    """Not into a link that is none."""
+    scene = Scene()
+    scene.comes()
+    scene.goes()
+    scene.now = HEARING_NS
+    scene.memory.look()
+    assert scene.takes() == []
+    assert scene.comes() == ["that is all"]
 
 
 def test_what_lasts_is_told_at_each_registration(scene: Scene) -> None:

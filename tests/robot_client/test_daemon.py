@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import frames, link
+from robot_client.alerts import HEARING_NS
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, twist
 from tests.robot_client.daemon_scene import DRIVER, Scene
@@ -214,7 +215,8 @@ def test_alert_waits_for_the_relay(scene: Scene) -> None:
 
 
 def test_alert_said_into_a_dead_link_is_told_by_the_next(scene: Scene) -> None:
-    """And that there is no other; what lasts is told by each link after it."""
+    """And that there is no other, once the daemon has had time to hear; what lasts is told by each link after it."""
+    scene.run(HEARING_NS / 1e9)
     scene.register().heard()
     scene.daemon.alert("error", "the motor is hot", "diagnostics", "motor")
     for _ in range(2):

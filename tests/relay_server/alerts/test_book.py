@@ -8,7 +8,7 @@ import pytest
 
 from relay_db.queries import AlertRecord
 from relay_server.alerts import kinds
-from relay_server.alerts.book import Book, Change
+from relay_server.alerts.book import Book, Change, Moment
 from relay_server.alerts.kinds import Event
 
 ROBOT = 1
@@ -21,20 +21,27 @@ class Scene:
         numbers = itertools.count(1)
         self.book = Book(lambda: f"a{next(numbers)}")
         self.now = 1000.0
+        """By the wall clock, and by the monotonic one but for what the first was set."""
+        self.set = 0.0
+
+    @property
+    def moment(self) -> Moment:
+        """By both clocks."""
+        return Moment(self.now + self.set, self.now)
 
     def tell(
         self, kind: str = "offline", about: str = "", level: str = "error", text: str = "x"
     ) -> list[str]:
         """Something is wrong; what is worth telling of it."""
-        return events(self.book.tell(ROBOT, "rover", kind, about, level, text, self.now))
+        return events(self.book.tell(ROBOT, "rover", kind, about, level, text, self.moment))
 
     def over(self, kind: str = "offline", about: str = "") -> list[str]:
         """It is well again."""
-        return events(self.book.over(ROBOT, kind, about, self.now))
+        return events(self.book.over(ROBOT, kind, about, self.moment))
 
     def sweep(self) -> list[str]:
         """The book is tidied."""
-        return events(self.book.sweep(self.now))
+        return events(self.book.sweep(self.moment))
 
     @property
     def only(self) -> AlertRecord:
@@ -68,14 +75,14 @@ def test_another_part_or_kind_is_another_alert(scene: Scene) -> None:
     scene.tell("diagnostics", "motor")
     scene.tell("diagnostics", "camera")
     scene.tell("module", "camera")
-    scene.book.tell(2, "other", "module", "camera", "error", "x", scene.now)
+    scene.book.tell(2, "other", "module", "camera", "error", "x", scene.moment)
     assert len(list(scene.book)) == 4
 
 
 def test_what_becomes_worse_is_news_and_needs_looking_after_anew(scene: Scene) -> None:
     """And it does not become better by a milder word."""
     scene.tell("battery", level="warning")
-    scene.book.acknowledge("a1", "ann", scene.now)
+    scene.book.acknowledge("a1", "ann", scene.now, scene.moment)
     assert scene.only.ack_by == "ann"
     assert scene.tell("battery", level="error") == ["battery worse"]
     assert (scene.only.level, scene.only.ack_by, scene.only.news) == ("error", None, 2)
@@ -121,21 +128,97 @@ def test_what_flaps_is_news_once_a_minute(scene: Scene) -> None:
     assert scene.over() == ["offline over"]
 
 
+@pytest.mark.parametrize("step", [3600.0, -3600.0])
+def test_a_wall_clock_that_is_set_holds_up_nothing(scene: Scene, step: float) -> None:
+    """What came back is told in its time, and what is over, floods as well, is forgotten in its time."""
+    scene.tell()
+    scene.over()
+    scene.tell("flood")
+    scene.now += 1
+    scene.set = step
+    assert scene.tell() == []
+    scene.now += kinds.NEWS_SECONDS
+    assert sorted(scene.sweep()) == ["flood over", "offline begun"]
+    assert scene.over() == ["offline over"]
+    scene.now += kinds.REJOIN_SECONDS - 1
+    assert scene.tell() == ["offline begun"]
+    assert {each.id for each in scene.book if each.kind == "offline"} == {"a1"}
+    scene.over()
+    scene.now += kinds.SHOWN_SECONDS + 1
+    scene.sweep()
+    assert list(scene.book) == []
+
+
+def test_what_was_kept_before_the_clock_was_set_back_is_of_now(scene: Scene) -> None:
+    """It is forgotten as late as what is over now, not an hour later."""
+    scene.tell()
+    scene.over()
+    later = Scene()
+    later.set = -3600.0
+    later.book.load(scene.book.take_changed(), later.moment)
+    assert [each.id for each in later.book] == ["a1"]
+    later.now += kinds.SHOWN_SECONDS + 1
+    later.sweep()
+    assert list(later.book) == []
+
+
+def test_what_comes_back_worse_is_news_at_once(scene: Scene) -> None:
+    """Than what people were told within the minute; but what changes to and fro is not."""
+    scene.tell("diagnostics", level="warning")
+    scene.over("diagnostics")
+    scene.now += 1
+    assert scene.tell("diagnostics", level="error") == ["diagnostics worse"]
+    assert (scene.only.id, scene.only.level) == ("a1", "error")
+    told = []
+    for _ in range(20):
+        scene.now += 1
+        told += scene.over("diagnostics")
+        told += scene.tell("diagnostics", level="warning")
+        told += scene.tell("diagnostics", level="error")
+    assert told == ["diagnostics over"]
+    scene.now += kinds.NEWS_SECONDS
+    assert scene.sweep() == ["diagnostics begun"]
+
+
+def test_what_came_back_as_bad_and_gets_worse_is_news(scene: Scene) -> None:
+    """Though its coming back was none."""
+    scene.tell("diagnostics", level="warning")
+    scene.over("diagnostics")
+    assert scene.tell("diagnostics", level="warning") == []
+    assert scene.tell("diagnostics", level="error") == ["diagnostics worse"]
+    assert scene.over("diagnostics") == ["diagnostics over"]
+
+
+def test_what_was_acknowledged_while_no_relay_ran_is_over_by_that(scene: Scene) -> None:
+    """If nobody will tell its end; else it lasts, and its keeper is known."""
+    scene.tell("robot")
+    scene.tell("module", "arm")
+    kept = [each._replace(ack_by="cli:root", ack_at=1001.0) for each in scene.book.take_changed()]
+    later = Scene()
+    later.book.load(kept, later.moment)
+    ended = [later.book.acknowledge(each.id, "cli:root", 1001.0, later.moment)[1] for each in kept]
+    assert [events(each) for each in ended] == [["robot over"], []]
+    assert {each.kind: (each.ack_by, each.over) for each in later.book} == {
+        "robot": ("cli:root", later.now),
+        "module": ("cli:root", None),
+    }
+
+
 def test_an_acknowledged_alert_names_who_looks_after_it(scene: Scene) -> None:
     """The first counts; it lasts until it is over."""
     scene.tell()
-    found, changes = scene.book.acknowledge("a1", "ann", 1001.0)
+    found, changes = scene.book.acknowledge("a1", "ann", 1001.0, scene.moment)
     assert (found, changes) == (scene.only, [])
-    scene.book.acknowledge("a1", "bob", 1002.0)
+    scene.book.acknowledge("a1", "bob", 1002.0, scene.moment)
     assert (scene.only.ack_by, scene.only.ack_at, scene.only.over) == ("ann", 1001.0, None)
-    assert scene.book.acknowledge("zz", "bob", 1002.0) == (None, [])
+    assert scene.book.acknowledge("zz", "bob", 1002.0, scene.moment) == (None, [])
 
 
 @pytest.mark.parametrize("kind", ["control", "robot", "gripper"])
 def test_what_nobody_tells_the_end_of_is_over_when_it_is_acknowledged(scene: Scene, kind: str) -> None:
     """Or a day after it was told last."""
     scene.tell(kind)
-    found, changes = scene.book.acknowledge("a1", "ann", scene.now)
+    found, changes = scene.book.acknowledge("a1", "ann", scene.now, scene.moment)
     assert events(changes) == [f"{kind} over"]
     assert found is not None
     assert found.over == scene.now
@@ -174,7 +257,7 @@ def test_new_alerts_of_a_robot_come_at_a_bounded_rate(scene: Scene) -> None:
         scene.tell("diagnostics", f"part {each}")
         scene.over("diagnostics", f"part {each}")
     assert len(list(scene.book)) <= kinds.OPEN + 52
-    other = scene.book.tell(2, "other", "offline", "", "error", "x", scene.now)
+    other = scene.book.tell(2, "other", "offline", "", "error", "x", scene.moment)
     assert events(other) == ["offline begun"]
 
 
@@ -206,7 +289,7 @@ def test_an_earlier_relays_alerts_go_on(scene: Scene) -> None:
     scene.tell()
     kept = scene.book.take_changed()
     later = Scene()
-    later.book.load(kept)
+    later.book.load(kept, later.moment)
     later.now += 60
     assert later.tell() == []
     assert later.only.id == "a1"

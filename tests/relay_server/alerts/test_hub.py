@@ -14,7 +14,7 @@ from relay_protocol.errors import NotFound, Refused
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds
 from relay_server.alerts.desk import AlertDesk, TooOften
-from relay_server.alerts.hub import ABSENT_SECONDS, TIDY_EVERY, Alerts
+from relay_server.alerts.hub import ABSENT_SECONDS, AGAIN_SECONDS, TIDY_EVERY, Alerts
 from relay_server.alerts.message import Message
 from relay_server.alerts.rules import Ask
 from relay_server.alerts.senses import Thresholds
@@ -34,6 +34,7 @@ class Scene:
         self.world = world
         self.store = store
         self.sent: list[Message] = []
+        self.step = 0.0
         self.access = Access(store, self.wall)
         self.journal = Journal(store, self.wall)
         with store.database.begin() as s:
@@ -56,7 +57,7 @@ class Scene:
 
     def wall(self) -> float:
         """Unix time."""
-        return 1.7e9 + self.world.clock.seconds()
+        return 1.7e9 + self.world.clock.seconds() + self.step
 
     def begin(self) -> Alerts:
         """A relay's alerts."""
@@ -203,8 +204,36 @@ async def test_a_daemon_that_began_anew_has_forgotten_what_it_told(scene: Scene)
     scene.says("robot.online")
     scene.robot.description = link.Describe(started=2.0)
     scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about="arm", over=False)
-    scene.world.clock.advance(0.25)
+    scene.world.clock.pump([0.25] * int(4 * AGAIN_SECONDS + 1))
     assert scene.alerts.lasting(scene.robot, "diagnostics") == ["arm"]
+    await scene.alerts.stop()
+
+
+@pytest.mark.parametrize("says_so", [False, True])
+@pytest_twisted.ensureDeferred
+async def test_a_daemon_that_begins_anew_while_a_part_is_in_error_is_no_news(
+    scene: Scene, says_so: bool
+) -> None:
+    """It hears of it seconds later and tells it again: nobody is told that it was over, also if clocks are set."""
+    told = {"level": "error", "text": "x", "alert_kind": "diagnostics", "about": "motor", "over": False}
+    await scene.alerts.start()
+    scene.world.robot_comes()
+    scene.robot.description = link.Describe(started=1.0)
+    scene.says("robot.online")
+    scene.says("robot.alert", **told)
+    scene.says("robot.alert", **{**told, "alert_kind": "gripper"})
+    scene.world.clock.advance(1)
+    scene.step = -3600.0
+    scene.says("robot.online")
+    scene.robot.description = link.Describe(started=2.0)
+    scene.world.clock.pump([0.25] * 24)
+    scene.says("robot.alert", **told)
+    if says_so:
+        scene.journal.tell("robot.alerts_told", scene.number)
+    scene.world.clock.pump([0.25] * int(4 * AGAIN_SECONDS))
+    (motor,) = [each for each in scene.alerts.book if each.kind == "diagnostics"]
+    assert (motor.over, motor.news, motor.times) == (None, 1, 2)
+    assert scene.alerts.lasting(scene.robot, "gripper") == []
     await scene.alerts.stop()
 
 
