@@ -91,8 +91,8 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     :param deadline_ms: no command older than this is executed
     :param guard: whether a second process stops the robot when the daemon can't
     :param stop_call: service of the robot that stops its hardware: ``std_srvs/srv/Trigger``, called when somebody stops
-        the robot, or ``std_srvs/srv/SetBool``, called with true then, and with false when somebody resumes it. No client
-        may call it
+        the robot, or ``std_srvs/srv/SetBool``, called with true then, and with false when somebody resumes it; by
+        no client
     :param stop_command: program and arguments to run when somebody stops the robot, without a shell
     :param resume_command: the same for when somebody resumes it
     :param ramp_ms: how long what is left moving takes to come to a standstill, within ``stop_within_ms``; 0: none.
