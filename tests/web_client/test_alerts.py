@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 from switchboard_browser import seen
+
+from relay_server.fleet.order import Order
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -210,6 +214,57 @@ class TestOrders:
         seen(page, "order-send").click()
         expect(seen(page, "order-progress")).to_have_text("1 of 1 robots, done")
         expect(seen(page, "order-unmatched")).to_have_text("No robot of yours is meant by rovr-2.")
+
+    @pytest.mark.parametrize("do", ["call", "publish", "set", "stop"])
+    def test_only_what_is_shown_is_sent(self, open_page: OpenPage, relay: FakeRelay, do: str) -> None:
+        """What was typed for another kind of order goes with none that does not have it: the relay would refuse it."""
+        page = open_page("/fleet", user="admin")
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill("rover-1")
+        seen(page, "order-why").fill("wet floor")
+        seen(page, "order-do").select_option("call")
+        for field, typed in {"name": "/it", "type": "std_msgs/Empty", "body": "{}"}.items():
+            seen(page, f"order-{field}").fill(typed)
+        seen(page, "order-do").select_option(do)
+        fields = {"name", "type", "body", "why"}
+        shown = {each for each in fields if seen(page, f"order-{each}").count()}
+        seen(page, "order-send").click()
+        expect(seen(page, "order-progress")).to_have_text("1 of 1 robots, done")
+        [asked] = relay.log(op="POST fleet")
+        del asked["user"], asked["op"]
+        order = msgspec.json.decode(json.dumps(asked), type=Order)
+        order.check()
+        as_sent = {"service": "name", "topic": "name", "args": "body", "msg": "body", "value": "body"}
+        assert {as_sent.get(key, key) for key in asked.keys() - {"robots", "do"}} == shown
+
+    def test_a_stop_without_an_answer_is_not_known_to_be_one(self, open_page: OpenPage) -> None:
+        """An answer that ends before it began says nothing of any robot; the page says what to do."""
+        page = open_page("/fleet", user="admin")
+        page.route("**/api/v1/fleet", lambda route: route.fulfill(status=200, body=""))
+        page.get_by_role("button", name="Stop all robots").click()
+        toast = seen(page, "toast")
+        expect(toast).to_contain_text(
+            "No robot is known to be stopped: the answer broke off. Press STOP again"
+        )
+        expect(toast).to_have_attribute("role", "alert")
+
+    def test_a_stop_can_not_be_ended_half_way(self, open_page: OpenPage) -> None:
+        """While it goes on there is no button that ends it, and to leave the page does not."""
+        page = open_page("/fleet", user="admin")
+        ended: list[str] = []
+        page.on("requestfailed", lambda request: ended.append(request.url))
+        held: list[Route] = []
+        page.route("**/api/v1/fleet", lambda route: held.append(route))
+        seen(page, "fleet-order").click()
+        seen(page, "order-pattern").fill("rover-1")
+        seen(page, "order-send").click()
+        expect(page.get_by_text("Stopping. It goes on when you leave.")).to_be_visible()
+        expect(page.get_by_role("button", name="End it")).to_have_count(0)
+        seen(page, "alerts-link").click()
+        expect(seen(page, "alerts-empty")).to_be_visible()
+        with page.expect_response("**/api/v1/fleet"):
+            held[0].fulfill(status=200, body="")
+        assert ended == []
 
     def test_a_long_order_fits_a_phone(self, open_page: OpenPage) -> None:
         """However many robots are named, the button that names them is no wider than the window."""

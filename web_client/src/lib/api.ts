@@ -117,10 +117,11 @@ export async function acknowledge(id: string): Promise<Alert> {
 
 /** Gives one order to many robots and hands on each line of the answer as it comes.
  *
- * @param signal ends it: what has not begun is not done
+ * @param signal ends it: what has not begun is not done; of an order to stop only the listening ends
  */
-export async function giveOrder(order: Order, take: (line: object) => void, signal: AbortSignal): Promise<void> {
-  const answer = await request('POST', '/api/v1/fleet', order, { signal })
+export async function giveOrder(order: Order, take: (line: object) => void, signal?: AbortSignal): Promise<void> {
+  // An order to stop goes out even when the page is left in the same moment.
+  const answer = await request('POST', '/api/v1/fleet', order, { signal: signal ?? null, keepalive: order.do === 'stop' })
   const lines = new Lines()
   const words = new TextDecoder()
   const reader = answer.body?.getReader()

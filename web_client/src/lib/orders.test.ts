@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest'
-import { after, Lines, NOTHING_YET, type Order, orderOf, stopWords, table, targets, unmatchedWords } from './orders'
+import { after, type Do, Lines, NOTHING_YET, type Order, orderOf, stopWords, table, targets, unmatchedWords } from './orders'
 
 const ANSWER =
   '{"do":"stop","robots":["a","b"]}\n{"robot":"b","ok":true,"message":"","values":null,"pending":true,"seconds":0.1}\n' +
@@ -60,6 +60,18 @@ describe('the form', () => {
     expect(orderOf(['a'], { ...form, do: 'set', body: '"fast"' })).toMatchObject({ name: '/start', value: 'fast' })
   })
 
+  it.each<[Do, string[]]>([
+    ['stop', ['why']],
+    ['resume', ['why']],
+    ['call', ['args', 'service', 'type', 'why']],
+    ['publish', ['msg', 'topic', 'type']],
+    ['set', ['name', 'value']],
+  ])('sends with %s what goes with it, whatever was typed for another', (kind, fields) => {
+    const typed = { do: kind, name: '/it', type: 'std_msgs/Empty', body: '{"a": 1}', why: 'wet floor' }
+    const order = orderOf(['a'], typed)
+    expect(Object.keys(order).sort()).toEqual(['do', 'robots', ...fields].sort())
+  })
+
   it('says what is missing', () => {
     expect(orderOf([], form)).toContain('Choose robots')
     expect(orderOf(Array.from({ length: 65 }, (_, i) => `r${i}`), form)).toContain('At most 64')
@@ -76,6 +88,14 @@ it('says what became of a stop: who is stopped, who will be, and who may not be'
   expect(words(result('a', true), result('b', true, true)).words).toBe(
     '1 robot is stopped. 1 robot is away, and will be stopped when back.',
   )
-  expect(words(result('a', true), result('b', false))).toEqual({ kind: 'error', words: 'Not confirmed to be stopped: b.' })
-  expect(words(result('a', true)).kind).toBe('error')
+  const failed = { kind: 'error', words: expect.stringContaining('Not confirmed to be stopped: b.') as string }
+  expect(words(result('a', true), result('b', false))).toEqual(failed)
+  expect(words(result('a', true))).toEqual(failed)
+})
+
+it('says that nothing is known of a stop whose answer ends before it began', () => {
+  const { kind, words } = stopWords(NOTHING_YET)
+  expect(kind).toBe('error')
+  expect(words).toContain('No robot is known to be stopped')
+  expect(words).toContain('Press STOP again')
 })

@@ -99,31 +99,44 @@ export interface Form {
   why: string
 }
 
+/** What an order is about, as the relay calls it; with that, whatever else a kind of order may have (SPEC 1.11). */
+const SUBJECTS = { call: 'service', publish: 'topic', set: 'name' } as const
+const BODIES = { call: 'args', publish: 'msg', set: 'value' } as const
+
+/** The fields of the form that go with each kind of order: these are shown, and no others sent. */
+export const FIELDS: Record<Do, readonly (keyof Omit<Form, 'do'>)[]> = {
+  stop: ['why'],
+  resume: ['why'],
+  call: ['name', 'type', 'body', 'why'],
+  publish: ['name', 'type', 'body'],
+  set: ['name', 'body'],
+}
+
 /** The order a form asks for, or what is missing in words. */
 export function orderOf(robots: string[], form: Form): Order | string {
   if (robots.length === 0) return 'Choose robots, or write their names or a pattern.'
   if (robots.length > 64) return 'At most 64 names and patterns go into one order.'
-  const base: Order = { robots, do: form.do, ...(form.why.trim() === '' ? {} : { why: form.why.trim() }) }
-  if (form.do === 'stop' || form.do === 'resume') return base
-  const name = form.name.trim()
+  const said = (field: 'name' | 'type' | 'body' | 'why') => (FIELDS[form.do].includes(field) ? form[field].trim() : '')
+  const [name, type, why] = [said('name'), said('type'), said('why')]
+  const order: Order = { robots, do: form.do, ...(type === '' ? {} : { type }), ...(why === '' ? {} : { why }) }
+  if (form.do === 'stop' || form.do === 'resume') return order
   if (name === '') return { call: 'Which service?', publish: 'Which topic?', set: 'Which parameter?' }[form.do]
-  let body: unknown
+  if (form.do === 'set' && said('body') === '') return 'Which value?'
   try {
-    body = JSON.parse(form.body.trim() || (form.do === 'set' ? 'null' : '{}'))
+    return { ...order, [SUBJECTS[form.do]]: name, [BODIES[form.do]]: JSON.parse(said('body') || '{}') as unknown }
   } catch {
     return 'That is no JSON.'
   }
-  if (form.do === 'set') return form.body.trim() === '' ? 'Which value?' : { ...base, name, value: body }
-  const type = form.type.trim()
-  const typed = { ...base, ...(type === '' ? {} : { type }) }
-  return form.do === 'call' ? { ...typed, service: name, args: body } : { ...typed, topic: name, msg: body }
 }
+
+const AGAIN = 'Press STOP again, or stop them where they are.'
 
 /** What became of an order to stop, in a sentence. */
 export function stopWords(progress: Progress): { kind: 'info' | 'error'; words: string } {
   const rows = table(progress)
+  if (rows.length === 0) return { kind: 'error', words: `No robot is known to be stopped: the answer broke off. ${AGAIN}` }
   const failed = rows.filter(({ result }) => result?.ok !== true).map(({ robot }) => robot)
-  if (failed.length > 0) return { kind: 'error', words: `Not confirmed to be stopped: ${people(failed, 5)}.` }
+  if (failed.length > 0) return { kind: 'error', words: `Not confirmed to be stopped: ${people(failed, 5)}. ${AGAIN}` }
   const later = rows.filter(({ result }) => result?.pending === true).length
   const now = rows.length - later
   const robots = (count: number) => (count === 1 ? '1 robot is' : `${count} robots are`)

@@ -1,5 +1,5 @@
-import { expect, it } from 'vitest'
-import { refusal, robotSocket } from './api'
+import { expect, it, vi } from 'vitest'
+import { giveOrder, refusal, robotSocket } from './api'
 import { pause } from './backoff'
 import { ending } from './closing'
 import { counts, select } from './fleet'
@@ -33,6 +33,19 @@ it('hands on the relay’s own words of refusal', async () => {
   expect(told).toMatchObject({ status: 429, message: 'Wait a little.', retryAfter: 7 })
   const dumb = await refusal(new Response('<html>', { status: 502 }))
   expect(dumb).toMatchObject({ status: 502, message: 'The relay answered with error 502.', retryAfter: null })
+})
+
+it.each([
+  ['stop', true],
+  ['set', false],
+] as const)('an order to %s outlives the page that gave it: %s', async (kind, outlives) => {
+  const asked = vi.fn(async (_: string, init: RequestInit) => new Response(`{"do":"${init.method}"}\n{"done":true}\n`))
+  vi.stubGlobal('fetch', asked)
+  const lines: object[] = []
+  await giveOrder({ robots: ['*'], do: kind }, (line) => lines.push(line))
+  vi.unstubAllGlobals()
+  expect(asked.mock.calls[0]?.[1].keepalive).toBe(outlives)
+  expect(lines).toEqual([{ do: 'POST' }, { done: true }])
 })
 
 const robot = (name: string, state: Robot['state'], description = ''): Robot => ({
