@@ -81,6 +81,7 @@ class Settings:
     :param refresh: seconds between looks at the database's revision counter
     :param explicit_control: no command takes control of a robot: it is taken by asking for it
     :param control_grace: seconds who has control has to answer a request, before an owner may take over
+    :param control_request: seconds who has control has to answer a request, before it lapses
     :param control_idle: seconds without a command, after which control is free again
     :param recordings: bytes all recordings together may have
     :param alerts: what people are told of, and where that may go
@@ -104,6 +105,7 @@ class Settings:
     recordings: int = 10 * 10**9
     explicit_control: bool = False
     control_grace: float = 30.0
+    control_request: float = 60.0
     control_idle: float = 600.0
     alerts: AlertSettings = field(default_factory=AlertSettings)
 

@@ -94,7 +94,12 @@ class Relay:
         self._desks = Desks(
             reactor,
             DatabaseRecord(self._store, self._journal, time.time),
-            ControlRules(settings.explicit_control, settings.control_grace, settings.control_idle),
+            ControlRules(
+                settings.explicit_control,
+                settings.control_grace,
+                settings.control_idle,
+                settings.control_request,
+            ),
             self._registry.changed,
             time.time,
         )

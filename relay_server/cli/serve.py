@@ -72,6 +72,12 @@ DAY = 86400.0
     help="Seconds who has control has to answer a request; then an owner may take over.",
 )
 @click.option(
+    "--control-request",
+    default=60.0,
+    show_default=True,
+    help="Seconds who has control has to answer a request; then it lapses, and others may ask.",
+)
+@click.option(
     "--control-idle",
     default=600.0,
     show_default=True,
@@ -114,6 +120,7 @@ def serve(
     recordings_gb: float,
     explicit_control: bool,
     control_grace: float,
+    control_request: float,
     control_idle: float,
     webhook_networks: str,
     apprise_schemes: str,
@@ -141,6 +148,10 @@ def serve(
         raise Invalid("--recordings-gb must not be less than 0")
     if not (0 <= control_grace <= DAY and 0 < control_idle <= DAY):
         raise Invalid("--control-grace and --control-idle are seconds: more than 0, at most a day")
+    if not control_grace < control_request <= DAY:
+        raise Invalid(
+            "--control-request must be more than --control-grace and at most a day: in between owners take over"
+        )
     if battery_low == 0:
         battery_critical = 0.0
     if not 0 <= battery_critical <= battery_low <= 100:
@@ -159,6 +170,7 @@ def serve(
         recordings=round(recordings_gb * 10**9),
         explicit_control=explicit_control,
         control_grace=control_grace,
+        control_request=control_request,
         control_idle=control_idle,
         alerts=AlertSettings(
             _listed(webhook_networks), _listed(apprise_schemes), battery_low / 100, battery_critical / 100

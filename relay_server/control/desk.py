@@ -219,6 +219,7 @@ class Desk(Steering):
         if request is not None and (owns(request.client) or not owns(client)):
             return Answer(False, f"{holder.name} has control, and {request.client.name} asks for it already")
         self._due = self._clock.seconds() + self.rules.grace
+        self._note_lapsed(request, f"{client.name} asks for it before")
         self._become(lease.requested(Request(client, now, now + self.rules.grace, why)))
         self._note("control.requested", client, why, holder=holder.name)
         if request is not None:
@@ -233,12 +234,14 @@ class Desk(Steering):
         :param by: who does it, where that is not the client
         """
         why = why[:WHY]
+        whose = {} if by is None or by.user == client.user else {"of": client.name}
         if self.lease.requested_by(client):
+            self._note("control.withdrawn", client, why, by, **whose)
             self._become(self.lease.withdrawn())
             return Answer(True, "you ask for control no more")
         if not (self.lease.held_by(client) or self.lease.coming_to(client)):
             return Answer(False, "you have no control of this robot")
-        self._note("control.released", client, why, **({} if by is None else {"by": by.name}))
+        self._note("control.released", client, why, by, **whose)
         if by is not None:
             self._bereft[client] = self._clock.seconds()
         self._let_go(f"given back by {client.name if by is None else by.name}")

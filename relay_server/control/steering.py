@@ -11,13 +11,13 @@ from twisted.logger import Logger
 from relay_protocol import link
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
-from relay_server.clock import Clock
+from relay_server.clock import Clock, Timer, cancel
 from relay_server.control.detached import detached
 from relay_server.control.idling import Idling
 from relay_server.control.lease import FREE, Client, Lease, Request, Tenure
 from relay_server.control.orders import Orders
 from relay_server.control.pushing import Pushing
-from relay_server.control.record import Record
+from relay_server.control.record import Actor, Record
 from relay_server.control.stopping import Stopping
 from relay_server.control.subsuming import Subsuming
 from relay_server.control.terms import ROBOT, ControlRules, Standing, actor_of
@@ -56,6 +56,8 @@ class Steering:
         self._idling = Idling(clock, rules.idle, self._latest_command, self._idle_over)
         self._due = 0.0
         """The monotonic moment from which an owner who asks again takes over."""
+        self._lapsing: Timer | None = None
+        """Ends a request that nobody answers."""
         self._bereft: dict[Client, float] = {}
         """Who may not get control by a command before he has let go, and the moment of his latest one."""
         self._settling: list[Deferred[SwitchboardError | None]] = []
@@ -92,6 +94,7 @@ class Steering:
         request = self.lease.request
         if tenure is not None:
             self._note_lost(tenure, why)
+        self._note_lapsed(request, why)
         # What it said of itself is over, but for the stop, which it keeps.
         self.robot.safety = link.Safety(stopped=self.robot.safety.stopped)
         self._become(self.lease.lost())
@@ -119,6 +122,7 @@ class Steering:
     def _lose(self, client: Client, why: str) -> None:
         tenure = self.lease.holder or self.lease.coming
         if self.lease.requested_by(client):
+            self._note_lapsed(self.lease.request, why)
             self._become(self.lease.withdrawn())
         elif tenure is not None and tenure.client is client:
             self._note_lost(tenure, why)
@@ -137,6 +141,7 @@ class Steering:
     def _let_go(self, why: str) -> None:
         """Nobody is to have control: the robot stops what moves before anybody else gets it."""
         request = self.lease.request
+        self._note_lapsed(request, why)
         lease = self.lease.free()
         self._become(lease)
         if self.lease is lease:
@@ -147,6 +152,22 @@ class Steering:
     def _tell_request(self, request: Request | None, why: str) -> None:
         if request is not None:
             request.client.tell("warning", f"control of {self.robot.name} is free: {why}")
+
+    def _note_lapsed(self, request: Request | None, why: str) -> None:
+        """Somebody asks for control no more, without having taken that back or having been answered."""
+        if request is not None:
+            self._note("control.lapsed", request.client, why)
+
+    def _unanswered(self) -> None:
+        """The holder has not answered a request in time: others may ask now."""
+        holder, request = self.lease.holder, self.lease.request
+        assert holder is not None and request is not None
+        why = f"no answer within {self.rules.request:g} s"
+        self._note_lapsed(request, why)
+        self._become(self.lease.withdrawn())
+        robot = self.robot.name
+        request.client.tell("warning", f"you ask for control of {robot} no more: {why}; ask again to go on")
+        holder.client.tell("warning", f"{request.client.name} asks for control of {robot} no more: {why}")
 
     def _latest_command(self) -> float:
         holder = self.lease.holder
@@ -160,9 +181,15 @@ class Steering:
 
     def _hand_to(self, client: Client, why: str, how: str) -> Deferred[SwitchboardError | None]:
         """Have the robot obey this client and nobody else; what comes back is that of :meth:`_settled`."""
+        request = self.lease.request
+        ousted = request if request is not None and request.client is not client else None
+        gone = f"{client.name} gets it"
+        self._note_lapsed(ousted, gone)
         lease = self.lease.give(client, self._wall())
         self._become(lease)
         waiting = self._settled()
+        if ousted is not None:
+            ousted.client.tell("warning", f"you ask for control of {self.robot.name} no more: {gone}")
         # Whoever was told of it may have left by that.
         if self.lease is lease:
             detached(self._settle(lease, self._order_control(client, why), why, how))
@@ -210,6 +237,10 @@ class Steering:
             self._idling.begin()
         elif lease.holder is None:
             self._idling.end()
+        if lease.request is not before.request:
+            cancel(self._lapsing)
+            asked = lease.request is not None
+            self._lapsing = self._clock.callLater(self.rules.request, self._unanswered) if asked else None
         for tenure in (before.coming, before.holder):
             if tenure is not None:
                 tenure.client.control_changed()
@@ -243,8 +274,12 @@ class Steering:
             self._settling.append(waiting)
         return waiting
 
-    def _note(self, kind: str, client: Client, why: str, **data: Any) -> None:
-        self._record.note(kind, self.robot, actor_of(client), why, **data)
+    def _note(self, kind: str, client: Client, why: str, by: Actor | None = None, **data: Any) -> None:
+        """Put something on record.
+
+        :param by: who does it, where that is not the client, who is named in the data then
+        """
+        self._record.note(kind, self.robot, by or actor_of(client), why, **data)
 
 
 def _unheard(failure: Any) -> None:

@@ -35,11 +35,13 @@ class ControlRules(NamedTuple):
     :param explicit: no command takes a free robot; control is taken by ``/relay/take_control`` alone
     :param grace: seconds the holder has to answer a request, before an owner may take over
     :param idle: seconds without a command, after which control is free again
+    :param request: seconds the holder has to answer a request, before it lapses: others may ask then
     """
 
     explicit: bool = False
     grace: float = 30.0
     idle: float = 600.0
+    request: float = 60.0
 
 
 class Answer(NamedTuple):

@@ -20,6 +20,8 @@ class MemoryRecord:
 
     def __init__(self) -> None:
         self.notes: list[tuple[str, str, str, dict[str, Any]]] = []
+        self.actors: list[Actor] = []
+        """Whose doing each of these was."""
         self.stops: dict[int, StopRecord] = {}
         self.fails: SwitchboardError | None = None
         self.hold = False
@@ -31,6 +33,7 @@ class MemoryRecord:
     ) -> None:
         """Keep it."""
         self.notes.append((kind, actor.name, why, data))
+        self.actors.append(actor)
 
     @property
     def kinds(self) -> list[str]:

@@ -132,7 +132,8 @@ async def test_an_owner_takes_control_from_anybody(place: Place) -> None:
     assert not (await console.release(vic, ROBOT, "", HERE)).success
     assert (await console.release(olga, ROBOT, "enough", HERE)).success
     assert desk.lease.holder is None
-    assert place.world.record.notes[-1] == ("control.released", "ann", "enough", {"by": "olga"})
+    assert place.world.record.notes[-1] == ("control.released", "olga", "enough", {"of": "ann"})
+    assert place.world.record.actors[-1] == ("olga", "user:olga", olga.user_id, HERE, 0)
 
 
 @pytest_twisted.ensureDeferred

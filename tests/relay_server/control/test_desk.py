@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from relay_protocol import link
@@ -11,7 +13,7 @@ from relay_server.control import ControlRules, State
 from relay_server.control import desk as module
 from relay_server.control.orders import WAITING
 from relay_server.control.record import Actor
-from tests.relay_server.steering import Place, outcome, result
+from tests.relay_server.steering import Connection, Place, outcome, result
 
 
 @pytest.fixture
@@ -205,6 +207,94 @@ def test_a_request_ends_with_its_connection_or_is_taken_back(place: Place) -> No
         end(bob)
         assert place.desk.lease.request is None
         assert place.desk.passes(ann, "/cmd_vel")
+
+
+def test_every_end_of_a_request_is_on_record(place: Place) -> None:
+    """With whose it was and why; nobody is asked for anything afterwards."""
+    ann = place.holding("ann")
+    olga = place.connection("olga", Level.OWNER)
+
+    def asks() -> Connection:
+        place.clock.advance(5)
+        bob = place.connection("bob")
+        assert not result(place.desk.take(bob, "")).success
+        return bob
+
+    def ended() -> tuple[str, str, str, dict[str, Any]]:
+        (note,) = [each for each in place.record.notes if each[0] in ("control.lapsed", "control.withdrawn")]
+        place.record.notes.clear()
+        return note
+
+    place.desk.release(asks(), "changed my mind")
+    assert ended() == ("control.withdrawn", "bob", "changed my mind", {})
+    place.desk.release(asks(), "enough", Actor("olga", "user:olga", olga.user))
+    assert ended() == ("control.withdrawn", "olga", "enough", {"of": "bob"})
+    place.desk.left(asks())
+    assert ended() == ("control.lapsed", "bob", "the connection has ended", {})
+    asks()
+    result(place.desk.take(olga, ""))
+    assert ended() == ("control.lapsed", "bob", "olga asks for it before", {})
+    place.desk.left(olga)
+    assert ended()[:2] == ("control.lapsed", "olga")
+    bob = asks()
+    second = place.connection("ann")
+    second.permit = ann.permit
+    assert result(place.desk.take(second, "")).success
+    assert ended() == ("control.lapsed", "bob", "ann gets it", {})
+    assert bob.told == ["you ask for control of rover no more: ann gets it"]
+    asks()
+    place.desk.left(second)
+    assert ended() == ("control.lapsed", "bob", "the connection has ended", {})
+    assert result(place.desk.take(ann, "")).success
+    asks()
+    place.offline()
+    assert ended() == ("control.lapsed", "bob", "the robot's link was lost", {})
+    assert place.desk.lease.request is None
+
+
+def test_an_answer_to_a_request_is_no_lapse(place: Place) -> None:
+    """Neither yes nor no, nor what an owner takes after the grace time."""
+    ann, bob, olga = place.holding("ann"), place.connection("bob"), place.connection("olga", Level.OWNER)
+    result(place.desk.take(bob, ""))
+    place.desk.refuse(ann, "")
+    result(place.desk.take(bob, ""))
+    place.desk.grant(ann, "")
+    result(place.desk.take(olga, ""))
+    place.clock.advance(31)
+    assert result(place.desk.take(olga, "")).success
+    assert "control.lapsed" not in place.record.kinds
+
+
+def test_a_request_that_nobody_answers_lapses(place: Place) -> None:
+    """Both are told, it is on record, and somebody else may ask; the holder holds on."""
+    ann, bob, eve = place.holding("ann"), place.connection("bob"), place.connection("eve")
+    result(place.desk.take(bob, "my turn"))
+    place.clock.advance(59.9)
+    assert not result(place.desk.take(bob, "")).success
+    assert "bob asks for it already" in result(place.desk.take(eve, "")).message
+    place.clock.advance(0.1)
+    assert place.desk.lease.request is None
+    assert bob.told == ["you ask for control of rover no more: no answer within 60 s; ask again to go on"]
+    assert ann.told[-1] == "bob asks for control of rover no more: no answer within 60 s"
+    assert place.record.notes[-1] == ("control.lapsed", "bob", "no answer within 60 s", {})
+    assert place.desk.passes(ann, "/cmd_vel")
+    result(place.desk.take(eve, ""))
+    assert place.desk.lease.requested_by(eve)
+
+
+def test_an_idle_owners_request_blocks_no_other_owner_for_long(place: Place) -> None:
+    """Who asks next has the grace time and the time of a request anew."""
+    place.holding("ann")
+    olga, otto = place.connection("olga", Level.OWNER), place.connection("otto", Level.OWNER)
+    result(place.desk.take(olga, ""))
+    place.clock.advance(60)
+    assert not result(place.desk.take(otto, "")).success
+    assert place.desk.lease.requested_by(otto)
+    place.clock.advance(30)
+    assert not result(place.desk.take(olga, "")).success
+    assert result(place.desk.take(otto, "")).success
+    place.clock.advance(120)
+    assert place.desk.passes(otto, "/cmd_vel")
 
 
 # --- how it ends ------------------------------------------------------------------------------------------
