@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
-from sqlalchemy import and_, case, delete, func, insert, literal, or_, select, update
+from sqlalchemy import and_, case, delete, func, insert, literal, or_, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from relay_db.models import Alert, AlertRule, Realm, Robot, User
@@ -81,16 +82,28 @@ def list_alerts(
     *,
     open: bool | None = None,
     limit: int = 100,
-    offset: int = 0,
+    after: AlertRecord | None = None,
+    kinds_but: Mapping[str, Collection[int]] = MappingProxyType({}),
+    but: Collection[tuple[int, str, str]] = (),
 ) -> list[AlertRecord]:
     """Alerts, the latest first.
 
     :param robots: of these robots only; ``None`` for all
     :param open: only those that last, or only those that are over
+    :param after: only those that come after this one
+    :param kinds_but: by kind, robots of which none of it is wanted
+    :param but: robot, kind and part of those that are not wanted
     """
-    query = _alerts().order_by(Alert.last_at.desc(), Alert.id).limit(limit).offset(offset)
+    query = _alerts().order_by(Alert.last_at.desc(), Alert.id).limit(limit)
     if robots is not None:
         query = query.where(Alert.robot_id.in_(list(robots)))
+    if after is not None:
+        later = and_(Alert.last_at == after.last, Alert.id > after.id)
+        query = query.where(or_(Alert.last_at < after.last, later))
+    for kind, of in kinds_but.items():
+        query = query.where(or_(Alert.kind != kind, Alert.robot_id.not_in(list(of))))
+    if but:
+        query = query.where(tuple_(Alert.robot_id, Alert.kind, Alert.about).not_in(list(but)))
     if open is not None:
         query = query.where(Alert.over_at.is_(None) if open else Alert.over_at.is_not(None))
     return [AlertRecord(*row) for row in s.execute(query)]

@@ -35,7 +35,8 @@ def test_an_alert_is_written_again_in_its_place(database: Database) -> None:
         assert [each.id for each in queries.list_alerts(s, open=True)] == ["b2"]
         assert [each.id for each in queries.list_alerts(s, [robot], open=False)] == ["a1"]
         assert queries.list_alerts(s, [robot + 1]) == queries.list_alerts(s, []) == []
-        assert [each.id for each in queries.list_alerts(s, limit=1, offset=1)] == ["a1"]
+        (latest,) = queries.list_alerts(s, limit=1)
+        assert [each.id for each in queries.list_alerts(s, after=latest)] == ["a1"]
         assert queries.get_alert(s, "nothing\x00") is None
 
 
@@ -57,6 +58,27 @@ def test_what_a_relay_begins_with_is_what_lasts_or_was_over_of_late(database: Da
             s, [an_alert(robot), an_alert(robot, "b2", over=20.0), an_alert(robot, "c3", over=30.0)]
         )
         assert sorted(each.id for each in queries.recent_alerts(s, 25.0)) == ["a1", "c3"]
+
+
+def test_alerts_are_listed_on_from_where_a_list_ended_without_what_is_not_wanted(database: Database) -> None:
+    """Also where several were told at the same time; a kind of some robots, and single parts."""
+    with database.begin() as s:
+        rover, digger = queries.add_robot(s, "rover").id, queries.add_robot(s, "digger").id
+        queries.save_alerts(
+            s,
+            [
+                *(an_alert(rover, f"a{each}", kind="stale", about=f"/t{each % 2}") for each in range(4)),
+                an_alert(rover, "d1", kind="diagnostics", about="arm"),
+                an_alert(digger, "d2", kind="diagnostics", about="arm"),
+                an_alert(digger, "d3", kind="stale", about="/t0"),
+            ],
+        )
+        whole = queries.list_alerts(s)
+        assert [each.id for each in whole] == ["a0", "a1", "a2", "a3", "d1", "d2", "d3"]
+        for number, each in enumerate(whole):
+            assert queries.list_alerts(s, after=each) == whole[number + 1 :]
+        wanted = queries.list_alerts(s, kinds_but={"diagnostics": [rover]}, but=[(rover, "stale", "/t0")])
+        assert [each.id for each in wanted] == ["a1", "a3", "d2", "d3"]
 
 
 def test_an_acknowledgement_is_seen_by_who_looks_for_changes(database: Database) -> None:

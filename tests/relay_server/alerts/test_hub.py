@@ -10,10 +10,10 @@ from twisted.internet.defer import Deferred
 
 from relay_db import queries
 from relay_protocol import link
-from relay_protocol.errors import NotFound, Refused
+from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds
-from relay_server.alerts.desk import AlertDesk, TooOften
+from relay_server.alerts.desk import PAGE, REFUSED, AlertDesk, TooOften
 from relay_server.alerts.hub import ABSENT_SECONDS, AGAIN_SECONDS, TIDY_EVERY, Alerts
 from relay_server.alerts.message import Message
 from relay_server.alerts.rules import Ask
@@ -22,6 +22,7 @@ from relay_server.alerts.ways import Ways
 from relay_server.journal import Journal
 from relay_server.registry import Presence
 from relay_server.store import Store
+from tests.relay_server.alerts.made_up import alert
 from tests.relay_server.alerts.receiver import REACTOR
 from tests.relay_server.edges.robot_ends import until
 from tests.relay_server.memory import World
@@ -110,6 +111,52 @@ async def test_events_become_alerts_of_their_kind(scene: Scene) -> None:
     scene.says("control.taken")
     lasting = await scene.desk.all(scene.people["ann"], open=True)
     assert sorted(each["kind"] for each in lasting) == ["diagnostics", "robot"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_somebody_may_not_see_hides_nothing_from_him(scene: Scene) -> None:
+    """However much of it there is, and of whatever part: he gets what is older. One who may sees all."""
+    rover = scene.number
+    topics = REFUSED + 50
+    rows = [
+        *(alert(f"d{each}", robot_id=rover, kind="diagnostics", last=9e9) for each in range(2 * PAGE)),
+        *(
+            alert(f"s{each}", robot_id=rover, kind="stale", about=f"/secret/{each % topics}", last=8e9)
+            for each in range(2 * PAGE)
+        ),
+        alert("gone", robot_id=rover, last=7e9),
+    ]
+    with scene.store.database.begin() as s:
+        denied = ["subscribe:/diagnostics", "subscribe:/secret/**"]
+        queries.grant_right(s, rover, "viewer", user_id=scene.people["vic"].user_id, deny=denied)
+        queries.save_alerts(s, rows)
+    await scene.access.refresh()
+    for lasts in (True, None):
+        found = await scene.desk.all(scene.people["vic"], "rover", lasts, 1)
+        assert [each["id"] for each in found] == ["gone"]
+    assert len(await scene.desk.all(scene.people["ann"], limit=500)) == 500
+    assert await scene.desk.all(scene.people["vic"], "rover", False) == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_rule_that_was_written_is_made_though_it_counts_later(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its secret is not lost, and nobody makes it twice; one that is removed is gone."""
+
+    async def fails() -> None:
+        raise Unavailable("the database is locked")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scene.alerts, "refresh", fails)
+        made = await scene.desk.add_rule(
+            scene.people["ann"], Ask("webhook", url="https://example.org/x"), "192.0.2.9"
+        )
+        assert len(made["secret"]) >= 32
+        (listed,) = (await scene.desk.rules(scene.people["ann"]))["rules"]
+        assert listed["id"] == made["id"]
+        await scene.desk.remove_rule(scene.people["ann"], made["id"], "192.0.2.9")
+    assert (await scene.desk.rules(scene.people["ann"]))["rules"] == []
 
 
 @pytest_twisted.ensureDeferred
