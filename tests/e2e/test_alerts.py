@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -15,7 +16,7 @@ import pytest
 from switchboard_fake_robot import FakeRobot
 from switchboard_hook import Delivery, Hook, MailServer
 from switchboard_http import ask
-from switchboard_processes import running
+from switchboard_processes import Process, ros_environment, running
 from switchboard_proxy import ChaosProxy
 from switchboard_relay import Relay
 from switchboard_robot import Robot
@@ -24,6 +25,7 @@ from switchboard_waiting import wait_for
 
 from relay_protocol import identity, link
 from relay_server.alerts.flow import REGULAR_SECONDS
+from relay_server.alerts.hub import AGAIN_SECONDS
 
 WITHIN = 5.0
 """An alert is to arrive so many seconds after a robot's plug was pulled."""
@@ -312,7 +314,7 @@ def test_what_is_well_again_by_the_time_relay_and_robot_begin_anew_is_over(house
         for about in ("arm", "leg"):
             robot.send(link.Alert(level="error", text="gone", kind="module", about=about))
         wait_for("both are seen", lambda: len(house.modules("anew")) == 2, 10)
-    wait_for("the rule tells", lambda: house.hook.told, 10)
+    wait_for("both are told", lambda: len(house.hook.told) == 2, 20)
     house.relay.kill()
     house.relay.start()
     with house.robot("anew") as robot:
@@ -321,8 +323,46 @@ def test_what_is_well_again_by_the_time_relay_and_robot_begin_anew_is_over(house
         wait_for("one is over", lambda: len(house.modules("anew")) == 1, 10)
     (alert,) = house.modules("anew")
     assert (alert["about"], alert["count"]) == ("leg", 2)
-    wait_for("its end is told", lambda: house.hook.told[-1] == "module over", 10)
-    assert house.hook.told.count("module begun") <= 2
+    wait_for("its end is told", lambda: house.hook.told[-1] == "module over", 20)
+    alerts = [each for delivery in house.hook.got for each in delivery.json["alerts"]]
+    told = sorted(f"{each['about']} {each['event']}" for each in alerts)
+    assert told == ["arm begun", "arm over", "leg begun"]
+
+
+FAULT = """
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+rclpy.init()
+node = rclpy.create_node("fault")
+publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+fault = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="arm", message="the motor is hot")
+node.create_timer(1.0, lambda: publisher.publish(DiagnosticArray(status=[fault])))
+print("READY", flush=True)
+rclpy.spin(node)
+"""
+
+
+def test_a_daemon_that_begins_anew_while_a_part_is_in_error_tells_nothing_twice(house: House) -> None:
+    """The part goes on saying so once a second, the new daemon hears it; nobody is told that it was over."""
+    house.rule(kinds=["diagnostics"], robots="sick")
+    robot = Robot(house.relay, "sick")
+    fault = Process([sys.executable, "-c", FAULT], robot.folder, "fault", ros_environment(robot.domain))
+
+    def arm() -> dict[str, Any]:
+        seen = house.alerts(query="?robot=sick&open=true")
+        return next((each for each in seen if each["about"] == "arm"), {})
+
+    with running(robot, fault):
+        fault.wait_to_say("READY")
+        wait_for("it is told", lambda: house.hook.told == ["diagnostics begun"], 30)
+        before = arm()["count"]
+        robot.daemon.kill()
+        robot.start_daemon()
+        wait_for("the new daemon tells it, too", lambda: arm().get("count") == before + 1, 30)
+        # Until the relay has ended all that a daemon which began anew did not tell.
+        time.sleep(AGAIN_SECONDS + 2)
+        assert arm()["news"] == 1
+    assert house.hook.told == ["diagnostics begun"]
 
 
 def test_a_running_relay_takes_up_what_is_changed_at_the_command_line(house: House) -> None:
