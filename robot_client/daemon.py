@@ -21,6 +21,7 @@ from robot_client.authority import Authority
 from robot_client.body import Body
 from robot_client.camera.desk import CameraDesk
 from robot_client.channel import Channel
+from robot_client.channel_end import ChannelEnd
 from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection, Dial
@@ -32,62 +33,17 @@ from robot_client.hardware import Hardware
 from robot_client.helm import LOOK_EVERY, Helm
 from robot_client.lasting import Latch
 from robot_client.limits import limits_told
-from robot_client.link import ChannelLink, Commanded, Ended, Event, JoinedChannel, Said, Sampled
+from robot_client.link import ChannelLink
 from robot_client.monitor import Machine, operating_system
 from robot_client.motion import MotionDesk
 from robot_client.platforms.base import GraphView, Platform, difference, whole
-from robot_client.pursuits import Pursuits
+from robot_client.pursuits import FAREWELL, Pursuits
 from robot_client.rules import rules_of
 from robot_client.sweep import Sweep
 from robot_client.tls import explain
 from robot_client.transport import LinkLost, LinkProtocol
-from robot_client.wire import Wire
 
 MAX_CHANNELS = 64
-
-
-class ChannelEnd(Wire):
-    """Joins a channel to its connection."""
-
-    def __init__(self, name: str, protocol: LinkProtocol, on_gone: Callable[[ChannelEnd, str], None]) -> None:
-        self.name = name
-        self.protocol = protocol
-        self.channel: Channel
-        self._on_gone = on_gone
-
-    def say(self, message: link.Message) -> None:
-        """Send a message."""
-        self.protocol.link.say(message)
-        self.protocol.flush()
-
-    def write(self, frames: list[bytes]) -> None:
-        """Send sample frames."""
-        self.protocol.write(frames)
-
-    def on_event(self, event: Event) -> None:
-        """The relay said something."""
-        if isinstance(event, Sampled):
-            self.channel.sample(event.frame)
-        elif isinstance(event, Commanded):
-            self.channel.command(event.frame)
-        elif isinstance(event, Said):
-            self.channel.handle(event.message)
-        elif isinstance(event, JoinedChannel) and event.channel != self.name:
-            self.protocol.end(LinkLost(f"the relay joined us to '{event.channel}' instead of '{self.name}'"))
-        elif isinstance(event, Ended):
-            self.protocol.end(LinkLost(f"the relay closed the channel: {event.reason}"), gently=True)
-
-    def on_lost(self, reason: SwitchboardError) -> None:
-        """The connection is gone."""
-        self._on_gone(self, str(reason))
-
-    def on_pause(self) -> None:
-        """The transport is full."""
-        self.channel.pause()
-
-    def on_resume(self) -> None:
-        """The transport has room."""
-        self.channel.resume()
 
 
 class Daemon(Body):
@@ -167,8 +123,14 @@ class Daemon(Body):
             if loop.running:
                 loop.stop()
         self._close_channels("the robot's daemon is leaving")
+        settled = self.settled()
         gone = self._connection.stop("the robot's daemon is leaving")
-        return gone.addBoth(lambda result: self.motion.finish().addCallback(lambda _: result))
+        return gone.addBoth(lambda result: settled.addCallback(lambda _: result))
+
+    def settled(self) -> Deferred[Any]:
+        """Fires when every zero is said and every goal has ended, or has had the time to."""
+        goals = self._pursuits.standing(FAREWELL)
+        return self.motion.finish().addCallback(lambda _: goals)
 
     def alert(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
         """Tell a person, now or when the relay can be reached again; again at each registration while it lasts."""

@@ -108,7 +108,7 @@ class Guard:
             self._stops.pop(line.on, None)
             self._watchdog.command(line.on, "daemon", line.moving, line.at)
         elif isinstance(line, Leave):
-            self._watchdog.everything()
+            self._begin(self._watchdog.everything())
             self.leaving = True
         return isinstance(line, Probe)
 

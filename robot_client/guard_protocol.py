@@ -60,7 +60,7 @@ class Probe(msgspec.Struct, array_like=True, tag_field="line", tag="probe", froz
 
 
 class Leave(msgspec.Struct, array_like=True, tag_field="line", tag="leave", frozen=True):
-    """The daemon ends in order, the robot stands; go."""
+    """The daemon ends in order; stop what it could not, and go."""
 
 
 class Alive(msgspec.Struct, array_like=True, tag_field="line", tag="alive", frozen=True):

@@ -3,6 +3,9 @@
 The guard hears of them as of commands on topics: of each action by the service that cancels its goals, again and again
 as long as one is under way. When that ceases, or the daemon is gone, it has them cancelled. And a note of those actions
 lies on the disk, so that a daemon whose guard died with it finds at its next start what was left.
+
+A goal that was given up though its action may go on with it is *adrift*: it counts as under way for guard and note
+until its action, seen again, has answered that it cancels it.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from relay_protocol.errors import Unavailable
 from robot_client.guard_feed import GuardFeed
 from robot_client.guard_protocol import cancelling
 from robot_client.lasting import Latch
-from robot_client.platforms.base import Goal
+from robot_client.platforms.base import Goal, Outcome
 from robot_client.reactors import Timer
 from robot_client.sweep import Sweep
 
@@ -31,10 +34,31 @@ KEPT = 30.0
 LOOKS = 30
 """How often to look for actions that were left goals, a second apart: nodes may be found after the daemon's start."""
 
+ADRIFT = 600.0
+"""Seconds in which an action that was lost with a goal is looked for."""
+
+MAX_ADRIFT = 64
+"""Goals adrift that are remembered."""
+
+FAREWELL = 1.5
+"""Seconds a daemon that leaves waits for the goals it has cancelled to end."""
+
 Ended = TypeVar("Ended")
 
 MAX_ACTIONS = 64
 """Actions that are had pursue goals at a time."""
+
+
+class _Adrift:
+    """A goal that may go on.
+
+    :param until: when it is forgotten, seconds
+    """
+
+    def __init__(self, action: str, until: float) -> None:
+        self.action = action
+        self.until = until
+        self.asking = False
 
 
 class Pursuits:
@@ -61,7 +85,10 @@ class Pursuits:
         self._clock = clock
         self._now = now
         self._running: dict[str, int] = {}
-        """How many goals by action; none where the guard is only kept able to cancel them."""
+        """How many goals by action, also adrift; none where the guard is only kept able to cancel them."""
+        self._under_way: set[Goal] = set()
+        self._adrift: dict[bytes, _Adrift] = {}
+        """By the goal's id, the oldest first."""
         self._waiting: list[Deferred[list[str]]] = []
         """Who wants to know when none is left."""
         self._forgetting: dict[str, Timer] = {}
@@ -77,7 +104,9 @@ class Pursuits:
             self._log.warn("a daemon before this left goals of {names}; they are cancelled", names=names)
 
     def look(self) -> None:
-        """Cancel what a daemon before this left; to be called every second."""
+        """Cancel what a daemon before this left, and what is adrift; to be called every second."""
+        if self._adrift:
+            self._look_for_adrift()
         if not self._looks:
             return
         self._looks -= 1
@@ -90,13 +119,13 @@ class Pursuits:
 
     @property
     def pursued(self) -> list[str]:
-        """The actions that pursue goals, sorted."""
+        """The actions that pursue goals, or may do so, sorted."""
         return sorted(action for action, goals in self._running.items() if goals)
 
     def standing(self, seconds: float) -> Deferred[list[str]]:
-        """Fires with :attr:`pursued`, when no goal is left or in so many seconds."""
-        if not self.pursued:
-            return succeed([])
+        """Fires with :attr:`pursued`, when none is under way but what is adrift, or in so many seconds."""
+        if not self._under_way:
+            return succeed(self.pursued)
         waiting: Deferred[list[str]] = Deferred(self._waiting.remove)
         self._waiting.append(waiting)
         return waiting.addTimeout(seconds, self._clock, lambda *_: self.pursued)
@@ -134,23 +163,60 @@ class Pursuits:
             self._note()
         if self._beating is None:
             self._beating = self._clock.callLater(BEAT, self._beat)
-        goal.result.addBoth(self._ended, action)
+        self._under_way.add(goal)
+        goal.result.addBoth(self._ended, action, goal)
 
-    def _ended(self, outcome: Ended, action: str) -> Ended:
+    def _ended(self, outcome: Ended, action: str, goal: Goal) -> Ended:
+        self._under_way.discard(goal)
+        if isinstance(outcome, Outcome) and outcome.certain:
+            self._over(action)
+        else:
+            self._drift(action, goal)
+        self._tell_standing()
+        return outcome
+
+    def _over(self, action: str) -> None:
         self._running[action] -= 1
         if not self._running[action]:
             self._guard.command(cancelling(action), False, self._now())
             self._forgetting[action] = self._clock.callLater(KEPT, self._forget, action)
             self._note()
-        self._tell_standing()
-        return outcome
 
     def _tell_standing(self) -> None:
-        if self.pursued:
+        if self._under_way:
             return
         waiting, self._waiting = self._waiting, []
         for each in waiting:
-            each.callback([])
+            each.callback(self.pursued)
+
+    def _drift(self, action: str, goal: Goal) -> None:
+        if len(self._adrift) >= MAX_ADRIFT:
+            self._lose(next(iter(self._adrift)))
+        self._adrift[goal.id] = _Adrift(action, self._clock.seconds() + ADRIFT)
+        self._log.warn(
+            "a goal of {action} may go on; it is cancelled when that is there again", action=action
+        )
+
+    def _look_for_adrift(self) -> None:
+        there = set(self._sweep.actions())
+        now = self._clock.seconds()
+        for id, each in list(self._adrift.items()):
+            if now >= each.until:
+                self._lose(id)
+            elif each.action in there and not each.asking:
+                each.asking = True
+                self._sweep.cancel(each.action, id).addCallback(self._caught, id, each)
+
+    def _caught(self, words: str | None, id: bytes, each: _Adrift) -> None:
+        """An action was asked to cancel a goal that was adrift."""
+        each.asking = False
+        if words is not None and self._adrift.pop(id, None) is not None:
+            self._over(each.action)
+
+    def _lose(self, id: bytes) -> None:
+        action = self._adrift.pop(id).action
+        self._log.warn("a goal of {action} may go on, and is looked for no longer", action=action)
+        self._over(action)
 
     def _forget(self, action: str) -> None:
         timer = self._forgetting.pop(action)

@@ -150,9 +150,9 @@ class Runner:
         self._notifier.stop()
         leaving: list[Deferred[Any]] = [self.daemon.stop(), self.cameras.stop()]
         if self.keeper is not None:
-            # It watches until the last zero is said.
+            # It watches until the last zero is said, and ends the goals that are left then.
             leave = self.keeper.stop
-            leaving.append(self.daemon.motion.finish().addCallback(lambda _: leave()))
+            leaving.append(self.daemon.settled().addCallback(lambda _: leave()))
         gone = DeferredList(leaving, consumeErrors=True)
         gone.addTimeout(LEAVE_SECONDS, self.reactor)
         return gone.addBoth(lambda _: self.platform.stop())

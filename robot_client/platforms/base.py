@@ -121,16 +121,20 @@ class Outcome(NamedTuple):
     :param status: one of the four above
     :param body: the result, ``None`` if there is none
     :param reason: why there is none
+    :param certain: whether the action has ended it, or never got it; else it may go on though nobody hears of it
     """
 
     status: int
     body: bytes | None
     reason: str = ""
+    certain: bool = True
 
 
 class Goal(Protocol):
     """A goal that an action of the robot pursues for us."""
 
+    id: bytes
+    """What the action knows it by, 16 bytes."""
     result: Deferred[Outcome]
     """Fires once in every case."""
 

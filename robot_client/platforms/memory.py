@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import uuid
 from collections.abc import Callable
 
 from twisted.internet.defer import Deferred, fail, succeed
@@ -160,6 +161,7 @@ class MemoryGoal:
     """A goal of ours; what becomes of it is set by :meth:`feed` and :attr:`result`."""
 
     def __init__(self, action: str, body: bytes, on_feedback: OnSample | None) -> None:
+        self.id = uuid.uuid4().bytes
         self.result: Deferred[Outcome] = Deferred()
         self.action = action
         self.body = body

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import enum
+import uuid
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.action import ActionClient
 from rclpy.serialization import serialize_message
 from twisted.internet.defer import Deferred
+from unique_identifier_msgs.msg import UUID
 
 from relay_protocol.errors import Unavailable
 from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, OnSample, Outcome
@@ -158,6 +160,7 @@ class RosGoal:
     """One goal, from looking for its server to its end; see :class:`robot_client.platforms.base.Goal`."""
 
     def __init__(self, goals: Goals, client: _Client, message: Any, on_feedback: OnSample | None) -> None:
+        self.id = uuid.uuid4().bytes
         self.result: Deferred[Outcome] = Deferred()
         self._goals = goals
         self._client = client
@@ -169,6 +172,9 @@ class RosGoal:
         self._servers: frozenset[bytes] = frozenset()
         self._since = self._seen = goals.clock.seconds()
         self._pending: list[Any] = []
+        self._given: Any = None
+        self._abandoned = False
+        """These two are of the executor's thread: when it is abandoned nothing comes to the reactor's any more."""
 
     def begin(self) -> None:
         """Look for the server; give it the goal once it is there."""
@@ -197,9 +203,10 @@ class RosGoal:
             self._goals.spinner.do(self._handle.cancel_goal_async)
 
     def abandon(self, reason: str) -> None:
-        """Cancel it and don't wait."""
-        self.cancel()
-        self._end(NEVER_BEGAN if self._handle is None else ABORTED, reason)
+        """Cancel it, once more if it was, and don't wait."""
+        self._goals.spinner.do(self._leave)
+        certain = self._state is _State.LOOKING
+        self._end(NEVER_BEGAN if self._handle is None else ABORTED, reason, certain=certain)
 
     def check(self, servers: frozenset[bytes]) -> None:
         """Give up when the server it was given to has gone, even if another one has come.
@@ -213,18 +220,22 @@ class RosGoal:
             self._seen = now
         if now - self._seen > GONE:
             if self._state is _State.ASKED:
-                self._end(NEVER_BEGAN, f"the action {action} vanished before it took the goal")
+                self._lose(NEVER_BEGAN, f"the action {action} vanished before it took the goal")
             else:
-                self._end(ABORTED, f"the action {action} vanished before the goal ended")
+                self._lose(ABORTED, f"the action {action} vanished before the goal ended")
         elif self._unwanted and self._state is _State.ASKED and now - self._since > UNHEARD:
-            self._end(NEVER_BEGAN, f"the action {action} did not answer, and the goal was cancelled")
+            self._lose(NEVER_BEGAN, f"the action {action} did not answer, and the goal was cancelled")
+
+    def _lose(self, status: int, reason: str) -> None:
+        """Give up a goal that may go on."""
+        self._end(status, reason, certain=False)
 
     # --- in the executor's thread
 
     def _send(self) -> None:
         tell = self._fed if self._on_feedback is not None else None
         try:
-            future = self._client.ros.send_goal_async(self._message, feedback_callback=tell)
+            future = self._client.ros.send_goal_async(self._message, tell, UUID(uuid=list(self.id)))
         except Exception as error:
             self._goals.hop.put(self._failed, in_words(error))
             return
@@ -237,7 +248,15 @@ class RosGoal:
             result = handle.get_result_async()
             self._pending.append(result)
             result.add_done_callback(self._guarded(self._done))
+            self._given = handle
+            if self._abandoned:
+                handle.cancel_goal_async()
         self._goals.hop.put(self._answered, handle)
+
+    def _leave(self) -> None:
+        self._abandoned = True
+        if self._given is not None:
+            self._given.cancel_goal_async()
 
     def _done(self, future: Any) -> None:
         response = future.result()
@@ -295,9 +314,9 @@ class RosGoal:
 
     def _failed(self, reason: str) -> None:
         status = NEVER_BEGAN if self._handle is None else ABORTED
-        self._end(status, f"the goal for {self._client.action} failed: {reason}")
+        self._end(status, f"the goal for {self._client.action} failed: {reason}", certain=not self._pending)
 
-    def _end(self, status: int, reason: str, body: bytes | None = None) -> None:
+    def _end(self, status: int, reason: str, body: bytes | None = None, certain: bool = True) -> None:
         if self._state is _State.ENDED:
             return
         waiting = self._state is _State.ASKED
@@ -306,4 +325,4 @@ class RosGoal:
         self._client.used = self._goals.clock.seconds()
         if not waiting:  # else it is heard out, to be cancelled if it is taken after all
             self._goals.spinner.do(self._forget)
-        self.result.callback(Outcome(status, body, reason))
+        self.result.callback(Outcome(status, body, reason, certain))

@@ -108,6 +108,8 @@ class Scene:
         self.listening = True
         self.dialled: list[tuple[float, str]] = []
         self.lines: list[Line] = []
+        self.left: list[Any] = []
+        """What came of the daemon's end."""
         self.platform = MemoryPlatform(GraphView(nodes=frozenset({"/talker"})))
         self.connection = (Answered if answers else Connection)(
             self.dial,

@@ -109,10 +109,10 @@ def act(action: str, kind: str) -> None:
         while len(sequence) < goal.request.order:
             sequence.append(sequence[-1] + sequence[-2])
             goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
-        canceled = kind == "forever"
+        canceled = kind.endswith("forever")
         if kind == "abort":
             goal.abort()
-        elif kind == "forever":
+        elif canceled:
             while not goal.is_cancel_requested:
                 time.sleep(0.02)  # the pace of its feedback
                 goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
@@ -123,7 +123,7 @@ def act(action: str, kind: str) -> None:
         return Fibonacci.Result(sequence=sequence)
 
     def judge(goal: object) -> GoalResponse:
-        if kind == "late":
+        if kind.startswith("late"):
             time.sleep(1.0)  # a server that thinks before it takes a goal
         return GoalResponse.REJECT if kind == "reject" else GoalResponse.ACCEPT
 
@@ -192,7 +192,7 @@ def main() -> None:
     global node
     rclpy.init()
     node = rclpy.create_node("peer", namespace="/robot")
-    executor = MultiThreadedExecutor(4)
+    executor = MultiThreadedExecutor(12)  # a goal that goes on holds one
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
     tell(ready=True)

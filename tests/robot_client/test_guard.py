@@ -135,9 +135,20 @@ def test_orphan_does_not_stay(scene: Scene) -> None:
 
 def test_leaving_in_order_says_nothing(scene: Scene) -> None:
     """A daemon that leaves in order has stopped the robot itself."""
+    scene.move()
+    scene.move(False)
     scene.guard.take(Leave())
     assert scene.guard.done
     assert scene.outlets.zeros == []
+
+
+def test_what_still_moves_when_the_daemon_leaves_is_stopped(scene: Scene) -> None:
+    """It could not do that itself."""
+    scene.move()
+    scene.guard.take(Leave())
+    scene.run(1000)
+    assert len(scene.outlets.zeros) == 5
+    assert scene.guard.done
 
 
 @pytest.mark.parametrize(

@@ -150,3 +150,17 @@ def test_stop_is_not_confirmed_while_an_action_is_frozen(robot: Robot, node: Nod
         told = errand.control.expect(link.Alert)
     assert told.kind == "stop"
     assert errand.control.order(link.Stop(id=3, by="eve")).ok
+
+
+def test_goal_that_does_not_end_with_the_daemon_is_noted(robot: Robot, node: Node) -> None:
+    """SIGTERM of the daemon while the action is frozen: the note outlasts it, and the next daemon leaves none."""
+    errand = Errand(robot, node)
+    with node.frozen():
+        errand.process.terminate()
+        assert errand.process.wait(10) == 0
+        assert (robot.state / GOALS).exists()
+    process = errand.run()
+    until(lambda: errand.cancelled)
+    until(lambda: not (robot.state / GOALS).exists())
+    process.terminate()
+    assert process.wait(5) == 0

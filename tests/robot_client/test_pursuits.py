@@ -14,9 +14,9 @@ from relay_protocol.link import MotionPolicy
 from robot_client.guard_feed import NoGuard
 from robot_client.guard_protocol import CANCEL, GOALS_WITHIN_MS, cancelling
 from robot_client.lasting import MemoryLatch
-from robot_client.platforms.base import CANCELED, GraphView, Outcome
+from robot_client.platforms.base import ABORTED, CANCELED, GraphView, Outcome
 from robot_client.platforms.memory import MemoryGoal, MemoryPlatform
-from robot_client.pursuits import BEAT, KEPT, LOOKS, MAX_ACTIONS, Pursuits
+from robot_client.pursuits import ADRIFT, BEAT, FAREWELL, KEPT, LOOKS, MAX_ACTIONS, MAX_ADRIFT, Pursuits
 from robot_client.sweep import PATIENCE, Sweep
 from robot_client.topics import TypedTopic
 from tests.robot_client.daemon_scene import DRIVER
@@ -61,6 +61,8 @@ class Scene:
         self.latch.noted = None if left is None else list(left)
         self.platform = MemoryPlatform(GraphView())
         self.asked: list[str] = []
+        self.wished: list[bytes] = []
+        """The ids of the goals to be cancelled."""
         policy = MotionPolicy(actions=["*/spin"])
         sweep = Sweep(policy, self.platform, self.clock, lambda topic: False)
         self.pursuits = Pursuits(policy.actions, self.feed, sweep, self.latch, self.clock, self.now)
@@ -79,6 +81,7 @@ class Scene:
 
         def cancel(request: bytes) -> bytes | Deferred[bytes]:
             self.asked.append(action)
+            self.wished.append(request[4:20])
             return Deferred() if answer is None else answer
 
         self.platform.services[action + CANCEL] = cancel
@@ -98,6 +101,10 @@ def scene() -> Scene:
 
 def end(goal: MemoryGoal) -> None:
     goal.result.callback(Outcome(CANCELED, None, "as you wish"))
+
+
+def lose(goal: MemoryGoal) -> None:
+    goal.result.callback(Outcome(ABORTED, None, "its action vanished", certain=False))
 
 
 def test_the_guard_hears_of_a_goal_as_long_as_it_goes_on(scene: Scene) -> None:
@@ -275,3 +282,90 @@ def test_a_daemon_that_starts_looks_for_what_was_left() -> None:
     scene.run(3.0)
     assert len(asked) == 1
     assert latch.noted == []
+
+
+def test_a_goal_adrift_is_cancelled_when_its_action_is_seen_again(scene: Scene) -> None:
+    """It alone, and once; guard and note have it until then."""
+    lost, other = scene.begin(), scene.begin()
+    lose(lost)
+    end(other)
+    scene.look(3)
+    assert scene.asked == []
+    assert scene.latch.noted == [SPIN]
+    assert scene.feed.commands[-1][1] is True
+    scene.appear(SPIN)
+    scene.look(3)
+    assert scene.wished == [lost.id]
+    assert scene.latch.noted == []
+    assert scene.feed.commands[-1][1] is False
+
+
+def test_a_goal_adrift_holds_up_no_new_one(scene: Scene) -> None:
+    """It does not make a change of control wait, and what begins meanwhile goes on."""
+    lose(scene.begin())
+    told: list[list[str]] = []
+    scene.pursuits.standing(1.0).addCallback(told.append)
+    assert told == [[SPIN]]
+    scene.begin()
+    scene.appear(SPIN)
+    scene.look(2)
+    assert len(scene.asked) == 1
+    assert scene.latch.noted == [SPIN]
+    assert scene.feed.commands[-1][1] is True
+
+
+def test_an_action_that_does_not_answer_for_a_goal_adrift_is_asked_again(scene: Scene) -> None:
+    """Every second, until it does; one that refuses has answered."""
+    lose(scene.begin())
+    scene.appear(SPIN, None)
+    scene.look(5)
+    assert len(scene.asked) == 5
+    scene.appear(SPIN, REJECTED)
+    scene.look(3)
+    assert len(scene.asked) == 6
+    assert scene.latch.noted == []
+
+
+def test_goals_adrift_are_forgotten_in_time_and_number(scene: Scene) -> None:
+    """The oldest for one too many, the others after ten minutes."""
+    for number in range(MAX_ADRIFT + 1):
+        lose(scene.begin(f"/r{number % 40}/spin"))
+    assert len(scene.latch.noted or ()) == 40
+    scene.appear("/r0/spin")
+    scene.look()
+    assert len(scene.asked) == 1  # of two, but the first was forgotten
+    scene.look(round(ADRIFT))
+    assert scene.latch.noted == []
+
+
+def leave(scene: DaemonScene) -> MemoryGoal:
+    """End a daemon in order while it has a goal pursued."""
+    scene.platform.actions = {"/spin"}
+    control = scene.register()
+    control.say(link.Control(id=1, holder=DRIVER, user="ann", level="operator"))
+    channel = scene.channel(control)
+    channel.say(link.SendActionGoal(id="g", action="/spin", type="t", source=DRIVER, cdr=""))
+    scene.daemon.stop().addCallback(scene.left.append)
+    return scene.platform.goals[0]
+
+
+def test_a_daemon_that_leaves_waits_for_the_ends_of_goals() -> None:
+    """It is told of the last, and leaves no note."""
+    scene = DaemonScene()
+    goal = leave(scene)
+    assert goal.cancelled
+    scene.run(0.5)
+    assert scene.left == []
+    end(goal)
+    assert len(scene.left) == 1
+    assert scene.latch.noted == []
+
+
+def test_a_daemon_that_leaves_notes_what_does_not_end() -> None:
+    """It waits for a moment only; the next daemon finds the note."""
+    scene = DaemonScene()
+    goal = leave(scene)
+    scene.run(FAREWELL)
+    assert len(scene.left) == 1
+    lose(goal)  # as the platform does when it is stopped
+    assert scene.latch.noted == ["/spin"]

@@ -10,6 +10,7 @@ from twisted.internet import reactor, task
 
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.link import MotionPolicy
+from robot_client.platforms import ros2
 from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, Outcome
 from robot_client.platforms.ros2 import Ros2Platform
 from robot_client.platforms.ros2_goals import RosGoal
@@ -52,7 +53,7 @@ async def test_goal_succeeds(ros: Ros2Platform, peer: Peer) -> None:
     await serve(ros, peer, "/count", "count")
     for type in (FIBONACCI, "example_interfaces/Fibonacci", ""):
         wanted = Wanted(ros, "/count", 5, type=type)
-        status, body, reason = await wanted.end()
+        status, body, reason, _ = await wanted.end()
         assert (status, reason) == (SUCCEEDED, "")
         assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1, 2, 3]
         assert all(each == [0, 1, 1, 2, 3][: len(each)] for each in wanted.fed)
@@ -80,7 +81,7 @@ async def test_cancelled_goal_ends_with_its_result(ros: Ros2Platform, peer: Peer
     await until(lambda: wanted.fed)
     wanted.goal.cancel()
     wanted.goal.cancel()
-    status, body, _ = await wanted.end()
+    status, body, _, _ = await wanted.end()
     assert status == CANCELED
     assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1]
 
@@ -135,7 +136,7 @@ async def test_rejected_goal_never_began(ros: Ros2Platform, peer: Peer) -> None:
 async def test_aborted_goal_has_its_result(ros: Ros2Platform, peer: Peer) -> None:
     """An aborted goal comes with the result the server gave."""
     await serve(ros, peer, "/abort", "abort")
-    status, body, _ = await Wanted(ros, "/abort", 4).end()
+    status, body, _, _ = await Wanted(ros, "/abort", 4).end()
     assert status == ABORTED
     assert list(deserialize_message(body, Fibonacci.Result).sequence) == [0, 1, 1, 2]
 
@@ -143,7 +144,7 @@ async def test_aborted_goal_has_its_result(ros: Ros2Platform, peer: Peer) -> Non
 @pytest_twisted.ensureDeferred
 async def test_action_that_is_not_there_is_not_waited_for(ros: Ros2Platform) -> None:
     """A goal for an action nobody serves ends in words after a second; without a type it can't even begin."""
-    status, body, reason = await Wanted(ros, "/nowhere").end()
+    status, body, reason, _ = await Wanted(ros, "/nowhere").end()
     assert (status, body) == (NEVER_BEGAN, None)
     assert "/nowhere can't be reached" in reason
     with pytest.raises(NotFound, match="no action /unheard"):
@@ -158,8 +159,8 @@ async def test_server_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: P
     wanted = Wanted(ros, "/doomed", 3)
     await until(lambda: wanted.fed)
     peer.do("unact", "/doomed")
-    status, body, reason = await wanted.end()
-    assert (status, body) == (ABORTED, None)
+    status, body, reason, certain = await wanted.end()
+    assert (status, body, certain) == (ABORTED, None, False)
     assert "/doomed vanished" in reason
 
 
@@ -210,5 +211,52 @@ async def test_leaving_cancels_what_is_under_way(
     finally:
         ros.stop()
     assert wanted.outcomes[0].status == ABORTED
+    assert not wanted.outcomes[0].certain
     peer.until(lambda: peer.told("ended", "/forever"))
     assert peer.told("ended", "/forever")[0]["canceled"] is True
+
+
+@pytest.mark.parametrize("executor", ["events", "single"])
+@pytest_twisted.ensureDeferred
+async def test_leaving_cancels_what_is_taken_meanwhile(
+    executor: str, environment: dict[str, str], peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A goal that its server takes while the daemon says goodbye is cancelled; nobody can know whether it was."""
+    monkeypatch.setattr(ros2, "FAREWELL", 2.0)
+    ros = Ros2Platform(reactor, "switchboard_brief", executor=executor)
+    ros.start()
+    try:
+        await serve(ros, peer, "/later", "late_forever")
+        began = len(peer.told("began", "/later"))
+        ended = len(peer.told("ended", "/later"))
+        wanted = Wanted(ros, "/later", 3)
+        await until(lambda: wanted.goal._state.name == "ASKED")
+        assert len(peer.told("began", "/later")) == began
+    finally:
+        ros.stop()
+    assert (wanted.outcomes[0].status, wanted.outcomes[0].certain) == (NEVER_BEGAN, False)
+    peer.until(lambda: len(peer.told("ended", "/later")) > ended)
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_of_a_server_that_was_out_of_reach_can_still_be_cancelled(
+    ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is given up when the server is not seen for a second, goes on there, and is known by its id; others go on."""
+    await serve(ros, peer, "/forever", "forever")
+    other, lost = Wanted(ros, "/forever", 3), Wanted(ros, "/forever", 4)
+    await until(lambda: other.fed and lost.fed)
+    before = len(peer.told("ended", "/forever"))
+    with monkeypatch.context() as unseen:
+        unseen.setattr(ros._goals, "servers", lambda action: frozenset())
+        monkeypatch.setattr(other.goal, "check", lambda servers: None)
+        assert (await lost.end()).certain is False
+    assert len(peer.told("ended", "/forever")) == before
+    sweep = Sweep(MotionPolicy(actions=["/forever"]), ros, reactor, lambda topic: False)
+    assert await sweep.cancel("/forever", lost.goal.id) == ""
+    await until(lambda: len(peer.told("ended", "/forever")) == before + 1)
+    fed = len(other.fed)
+    await until(lambda: len(other.fed) > fed)
+    assert await sweep.cancel("/forever", lost.goal.id) == ""
+    other.goal.cancel()
+    assert (await other.end()).status == CANCELED
