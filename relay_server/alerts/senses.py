@@ -86,7 +86,7 @@ class Senses:
         self._looked: float | None = None
         """When robots were looked at last, by the monotonic clock."""
         self._unsure: set[int] = set()
-        """Robots that may be away, as the links say."""
+        """Robots that may be away."""
         self._flows: dict[tuple[int, str, int], Flow] = {}
 
     def look(self, now: float, wall: float) -> None:
@@ -126,7 +126,7 @@ class Senses:
             self._online[robot.robot_id] = (robot.session, now)
         silence = self._silence(robot, now, wall)
         silent = silence >= self._thresholds.silent
-        if robot.control is None or silence >= UNSURE * self._thresholds.silent:
+        if silence >= UNSURE * self._thresholds.silent:
             self._unsure.add(robot.robot_id)
         else:
             self._unsure.discard(robot.robot_id)

@@ -471,6 +471,20 @@ def test_a_delivery_that_is_closed_tells_nothing_more(scene: Scene) -> None:
     assert scene.places.tokens == 2
 
 
+def test_a_delivery_that_is_closed_asks_nothing_more(scene: Scene) -> None:
+    """Neither who may know of what, while the database does not answer."""
+    way = scene.delivery()
+    scene.dumb = True
+    way.offer(begun("a1"))
+    scene.wait(1)
+    way.close()
+    scene.dumb = False
+    asks = scene.asks
+    scene.wait(100)
+    assert (scene.got, scene.asks, way.waiting) == ([], asks, 0)
+    assert scene.clock.getDelayedCalls() == []
+
+
 def test_one_user_has_two_messages_under_way_at_most(scene: Scene) -> None:
     """However many rules he has; the others wait their turn."""
     scene.hangs = True

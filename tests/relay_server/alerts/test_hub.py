@@ -213,6 +213,29 @@ async def test_a_rule_tells_its_user_what_he_may_know(scene: Scene) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_rule_tells_nothing_of_a_robot_its_user_has_lost(scene: Scene) -> None:
+    """As soon as rights are taken up; of what is his again he is told."""
+    await scene.desk.add_rule(
+        scene.people["ann"], Ask("webhook", url="https://example.org/hook"), "192.0.2.9"
+    )
+    scene.alerts.tell(scene.robot, "module", "one", "error", "x")
+    scene.world.clock.advance(1)
+    await until(lambda: len(scene.sent) == 1)
+    for about, level in (("two", None), ("three", "operator")):
+        with scene.store.database.begin() as s:
+            if level is None:
+                queries.revoke_right(s, scene.number, user_id=scene.people["ann"].user_id)
+            else:
+                queries.grant_right(s, scene.number, level, user_id=scene.people["ann"].user_id)
+        await scene.access.refresh()
+        await scene.access.robots(scene.people["ann"])
+        scene.alerts.tell(scene.robot, "module", about, "error", "x")
+        scene.world.clock.advance(1)
+    await until(lambda: len(scene.sent) == 2)
+    assert [[each.alert.about for each in message.notices] for message in scene.sent] == [["one"], ["three"]]
+
+
+@pytest_twisted.ensureDeferred
 async def test_rules_are_not_tested_without_end(scene: Scene) -> None:
     """Five at once, then one each twelve seconds."""
     made = await scene.desk.add_rule(scene.people["ann"], Ask("portal"), "192.0.2.9")
