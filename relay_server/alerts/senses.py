@@ -115,9 +115,12 @@ class Senses:
     # --- links, batteries, stops --------------------------------------------------------------------------
 
     def _forgive(self, now: float) -> None:
-        """Robots that had a link before the relay stood still count as just heard, also if it was cut for that."""
+        """Robots that had a link before the relay stood still count as just heard, also if it was cut for that;
+        and what did not come meanwhile did not cease."""
         for robot_id in self._online:
             self._heard[robot_id] = (self._heard.get(robot_id, (None, 0.0))[0], now)
+        for flow in self._flows.values():
+            flow.excuse(now)
 
     def _presence(self, robot: Presence, now: float, wall: float) -> None:
         if robot.control is None:

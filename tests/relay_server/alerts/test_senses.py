@@ -254,6 +254,17 @@ def test_while_the_link_is_silent_no_topic_is_stale(scene: Scene) -> None:
     assert scene.ear.told == ["offline error", "offline over", "stale /chatter warning"]
 
 
+def test_a_relay_that_stood_still_takes_no_topic_for_stale(scene: Scene) -> None:
+    """What came meanwhile is not read yet; what does not come then is."""
+    scene.listens()
+    scene.goes_on(20, samples=10)
+    scene.world.wait(10, *scene.people)
+    scene.goes_on(3)
+    assert scene.ear.told == []
+    scene.goes_on(2)
+    assert scene.ear.told == ["stale /chatter warning"]
+
+
 def test_a_link_that_was_silent_for_a_moment_makes_no_topic_stale(scene: Scene) -> None:
     """What comes again with it never ceased."""
     scene.listens()
