@@ -82,7 +82,7 @@ class Settings:
     :param explicit_control: no command takes control of a robot: it is taken by asking for it
     :param control_grace: seconds who has control has to answer a request, before an owner may take over
     :param control_request: seconds who has control has to answer a request, before it lapses
-    :param control_idle: seconds without a command, after which control is free again
+    :param control_idle: seconds without a command that moves, after which control is free again
     :param recordings: bytes all recordings together may have
     :param alerts: what people are told of, and where that may go
     """

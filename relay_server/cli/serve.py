@@ -81,7 +81,7 @@ DAY = 86400.0
     "--control-idle",
     default=600.0,
     show_default=True,
-    help="Seconds without a command, after which control is free again.",
+    help="Seconds without a command that moves, after which control is free again.",
 )
 @click.option(
     "--webhook-networks",

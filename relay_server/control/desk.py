@@ -12,7 +12,7 @@ from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.bucket import TokenBucket
 from relay_server.clock import Clock
-from relay_server.control.lease import Client, Request, owns
+from relay_server.control.lease import Client, Request, Tenure, owns
 from relay_server.control.record import WHY, Actor, Record
 from relay_server.control.steering import Steering
 from relay_server.control.terms import (
@@ -72,9 +72,7 @@ class Desk(Steering):
         self._see_let_go(client)
         tenure = lease.holder or lease.coming
         if tenure is not None and (self.rules.explicit or not self._deserted(client)):
-            raise Refused(
-                f"robot {name} is controlled by {tenure.client.name}; ask for it with /relay/take_control"
-            )
+            raise self._held_by(tenure)
         if not lease.settled:
             raise Refused(f"control of robot {name} is just being given back; try again in a moment")
         if self.rules.explicit:
@@ -84,6 +82,20 @@ class Desk(Steering):
         self._count_take(client)
         self._succeed(client, IMPLICIT, "taken", "the same user commands from another connection")
         return False
+
+    def zero(self, client: Client) -> None:
+        """A zero of a client that does not move the robot: it takes no control, and there is nothing it could stop.
+
+        :raises Refused: somebody else moves the robot
+        """
+        tenure = self.lease.holder or self.lease.coming
+        if tenure is not None:
+            raise self._held_by(tenure)
+
+    def _held_by(self, tenure: Tenure) -> Refused:
+        return Refused(
+            f"robot {self.robot.name} is controlled by {tenure.client.name}; ask for it with /relay/take_control"
+        )
 
     def _count_take(self, client: Client) -> None:
         """Bound how often a user takes control.
@@ -281,7 +293,7 @@ class Desk(Steering):
         """A connection has ended."""
         self.pushing.forget(client)
         # Not the moment at which the connection ended: who did not command any more has let go.
-        since = max(self._bereft.get(client, 0.0), client.driving_since())
+        since = max(self._bereft.get(client, 0.0), client.commanding_since())
         self._lose(client, "the connection has ended")
         if self._bereft.pop(client, None) is not None:
             self._remember_cut_off(client.user, since)

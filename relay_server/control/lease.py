@@ -85,7 +85,10 @@ class Client(Hashable, Protocol):
         """Report something in words, to clients that want to hear it."""
 
     def driving_since(self) -> float:
-        """The relay's clock at its latest command; now, while something it asked for moves the robot."""
+        """The relay's clock at its latest command that moves; now, while something it asked for moves the robot."""
+
+    def commanding_since(self) -> float:
+        """The same for its latest command, were it a zero or one that did not pass."""
 
     def control_changed(self) -> None:
         """Who moves the robot has changed: what waited for it goes, or never will."""

@@ -34,7 +34,7 @@ class ControlRules(NamedTuple):
 
     :param explicit: no command takes a free robot; control is taken by ``/relay/take_control`` alone
     :param grace: seconds the holder has to answer a request, before an owner may take over
-    :param idle: seconds without a command, after which control is free again
+    :param idle: seconds without a command that moves, after which control is free again
     :param request: seconds the holder has to answer a request, before it lapses: others may ask then
     """
 

@@ -324,10 +324,15 @@ class Session:
         self.listening.judge_again()
 
     def driving_since(self) -> float:
-        """The clock's time of its latest command; now, while something it asked for moves the robot."""
-        if self.pursuing.moving:
-            return self._clock.seconds()
-        return self._clock.seconds() - self.publishing.idle_ns / 1e9
+        """The clock's time of its latest command that moves; now, while something it asked for moves the robot."""
+        return self._ago(self.publishing.idle_ns)
+
+    def commanding_since(self) -> float:
+        """The same for its latest command, were it a zero or one that did not pass."""
+        return self._ago(self.publishing.silent_ns)
+
+    def _ago(self, nanoseconds: int) -> float:
+        return self._clock.seconds() - (0 if self.pursuing.moving else nanoseconds / 1e9)
 
     def control_changed(self) -> None:
         """Who moves the robot has changed."""

@@ -26,6 +26,9 @@ NO_DEADLINE = round(HELD_SECONDS * 1e9)
 ROUTES = 256
 """Topics of which one client's routes are kept."""
 
+DROVE_NS = 250_000_000
+"""Nanoseconds after a command that moves in which no other is looked at for whether it does: that takes time."""
+
 WAITING_TOPICS = 16
 WAITING_BYTES = 64 * KIB
 """Commands of one client that wait for control: the newest to each of so many topics, none larger than this."""
@@ -87,6 +90,7 @@ class Publishing:
         "_session",
         "_waiting",
         "commanded",
+        "drove",
         "stale_commands",
     )
 
@@ -104,6 +108,8 @@ class Publishing:
         self.stale_commands = 0
         self.commanded = 0
         """The relay's monotonic nanoseconds before which the latest command can't have been sent."""
+        self.drove = 0
+        """The same for the latest one that passed and was no zero, give or take :data:`DROVE_NS`."""
 
     def advertise(self, ask: rosbridge.Advertise) -> None:
         """The client is going to publish."""
@@ -153,6 +159,8 @@ class Publishing:
             self.commanded = freshness.not_before
             if not route.passes and not self._let_by(route, ask):
                 return
+            if freshness.not_before - self.drove > DROVE_NS:
+                self._drives(route, ask)
         publication = route.publication
         send, body, stamp = publication.send, bytes(ask.msg), freshness.not_before
         if send is None:
@@ -203,6 +211,11 @@ class Publishing:
         """
         topic = route.publication.topic
         if not self._desk.passes(self._session, topic):
+            if self._is_mere_zero(route, ask):
+                # The robot judges it, as it does all commands.
+                self._grips.let_go(topic)
+                self._desk.zero(self._session)
+                return True
             self._claim(route, ask)
             return False
         if self._must_let_go(topic):
@@ -214,6 +227,20 @@ class Publishing:
             )
         route.passes = True
         return True
+
+    def _is_mere_zero(self, route: Route, ask: rosbridge.Publish) -> bool:
+        """Whether a command has nothing to stop: it takes no control.
+
+        One that comes while control is being taken does: by it the one that waits is taken back. Where the robot counts
+        a topic as motion by its name, all zeros may be a goal.
+        """
+        commands = route.publication.type in self._robot.description.motion.types
+        return commands and not self._desk.lease.coming_to(self._session) and _is_still(route, ask)
+
+    def _drives(self, route: Route, ask: rosbridge.Publish) -> None:
+        """A command has passed: one that moves keeps control from idling, while the robot is not stopped."""
+        if route.standing.stopped is None and not _is_still(route, ask):
+            self.drove = self._freshness.not_before
 
     def _in_vain(self, route: Route, still: bool) -> None:
         """A command was refused, held back or too old.
@@ -263,7 +290,7 @@ class Publishing:
 
     def commands(self) -> None:
         """The client moves the robot by something else than a message."""
-        self.commanded = self._freshness.not_before
+        self.commanded = self.drove = self._freshness.not_before
 
     def judge_age(self, what: str, stamp: int) -> None:
         """See that something else than a message that moves the robot is not too old by now; what is, is counted.
@@ -299,9 +326,14 @@ class Publishing:
             self._session.refuse(waiting.ask, error)
 
     @property
-    def idle_ns(self) -> int:
+    def silent_ns(self) -> int:
         """Nanoseconds since the latest command."""
-        return self._freshness.not_before + self._freshness.age() - self.commanded
+        return self._now() - self.commanded
+
+    @property
+    def idle_ns(self) -> int:
+        """Nanoseconds since the latest command that moves."""
+        return self._now() - self.drove
 
     def _stale(self, route: Route, age: int, id: rosbridge.Id) -> None:
         self.stale_commands += 1

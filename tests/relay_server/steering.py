@@ -97,6 +97,10 @@ class Connection:
         """When it last commanded."""
         return self.commanded
 
+    def commanding_since(self) -> float:
+        """The same."""
+        return self.commanded
+
     def control_changed(self) -> None:
         """Count it."""
         self.changes += 1

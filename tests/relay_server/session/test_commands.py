@@ -91,7 +91,7 @@ def test_the_newest_command_waits_until_the_robot_has_agreed(world: World) -> No
     at_work(world)
     ordered = silent(world)
     ann = driver(world, "ann", 1)
-    drive(ann, STOP)
+    drive(ann, {"linear": {"x": 0.4}})
     drive(ann, GO)
     assert world.link.commands == []
     assert len(ordered) == 1
@@ -194,7 +194,7 @@ def test_a_zero_is_letting_go(world: World) -> None:
     drive(ann, STOP)
     take(ann)
     drive(ann)
-    assert passed(world) == [ann.session.number]
+    assert len(passed(world)) == 2
 
 
 def test_who_holds_on_until_control_is_granted_lets_go_first(world: World) -> None:
@@ -259,6 +259,87 @@ def test_who_suppresses_a_topic_need_not_let_go_of_it(world: World) -> None:
     world.desks.of(world.robot).subsuming.suppress(by, [olga.session.number], "/cmd_vel", 200)
     drive(olga)
     assert passed(world) == [ann.session.number, olga.session.number]
+
+
+def test_a_zero_takes_no_free_robot(world: World) -> None:
+    """It is passed on, as the robot has the last word; the first command that moves takes it."""
+    at_work(world)
+    ann = driver(world, "ann", 1)
+    for _ in range(3):
+        drive(ann, STOP)
+    assert world.control.all(link.Control) == []
+    assert passed(world) == [ann.session.number] * 3
+    assert ann.told() == []
+    drive(ann)
+    assert [each.holder for each in world.control.all(link.Control)] == [ann.session.number]
+
+
+def test_a_zero_takes_back_a_command_that_waits_for_control(world: World) -> None:
+    """The hand has let go meanwhile."""
+    at_work(world)
+    ordered = silent(world)
+    ann = driver(world, "ann", 1)
+    drive(ann)
+    drive(ann, STOP)
+    obey(world, ordered[0])
+    assert [body for *_, body in world.link.commands] == [b'{"linear": {"x": 0.0}}']
+
+
+def test_a_zero_takes_nothing_from_anybody(world: World) -> None:
+    """Nor from the user's own other connection, which a command would take it from."""
+    at_work(world)
+    ann, second, bob = driver(world, "ann", 1), driver(world, "ann", 1), driver(world, "bob", 2)
+    drive(ann)
+    world.wait(3, ann, second, bob)
+    for each in (second, bob):
+        drive(each, STOP)
+        assert "controlled by ann" in each.told()[0]
+    assert passed(world) == [ann.session.number]
+    drive(second)
+    assert passed(world) == [second.session.number]
+
+
+def test_what_moves_by_its_name_may_be_a_goal_when_all_is_zero(world: World) -> None:
+    """So it takes control as any command does."""
+    at_work(world)
+    describe(world, topics=["/goal_pose"])
+    ann = driver(world, "ann", 1)
+    ann.says("publish", topic="/goal_pose", type=STRING, msg={"data": ""})
+    assert [each.holder for each in world.control.all(link.Control)] == [ann.session.number]
+
+
+@pytest.mark.parametrize(
+    ("msg", "stopped", "held"), [(GO, False, True), (STOP, False, False), (GO, True, False)]
+)
+def test_only_commands_that_move_the_robot_keep_control_of_it(
+    world: World, msg: Any, stopped: bool, held: bool
+) -> None:
+    """A program that says zero all day has it no longer than one that is silent; nor who commands a stopped robot."""
+    at_work(world)
+    ann = driver(world, "ann", 1)
+    take(ann)
+    if stopped:
+        world.desks.of(world.robot).told(link.Safety(stopped=link.Stopped(by="bob", since=1.0)))
+    for _ in range(61):
+        world.wait(10, ann)
+        drive(ann, msg)
+    lost = [why for kind, _, why, _ in world.record.notes if kind == "control.lost"]
+    assert lost == ([] if held else ["no command for 600 s"])
+    assert len(passed(world)) >= 59
+
+
+def test_who_has_gone_on_commanding_a_stopped_robot_has_not_let_go_by_leaving(world: World) -> None:
+    """What keeps no control is a hand on the stick all the same."""
+    at_work(world)
+    ann = driver(world, "ann", 1)
+    drive(ann)
+    world.desks.of(world.robot).told(link.Safety(stopped=link.Stopped(by="bob", since=1.0)))
+    world.wait(5, ann)
+    drive(ann)
+    ann.session.end()
+    again = driver(world, "ann", 1)
+    drive(again)
+    assert "let go for 0.5 s" in again.told()[-1]
 
 
 def test_control_ends_with_the_session(world: World) -> None:

@@ -11,7 +11,7 @@ from relay_protocol.rights import Grant, Level, Rules
 from relay_server.session import publishing as module
 from tests.relay_server.memory import MOTION, STRING, TWIST, Person, World
 
-STOP = {"linear": {"x": 0.0}}
+GO = {"linear": {"x": 0.5}}
 
 
 def driving(world: World) -> Person:
@@ -32,7 +32,7 @@ def drive(person: Person, **more: Any) -> None:
     """A fresh command."""
     person.session._pinging.ping()
     person.answers_pings()
-    person.says("publish", topic="/cmd_vel", msg=STOP, **more)
+    person.says("publish", topic="/cmd_vel", msg=GO, **more)
 
 
 def found(monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -51,8 +51,8 @@ def test_a_route_is_found_once(world: World, monkeypatch: pytest.MonkeyPatch) ->
     looked = found(monkeypatch)
     for _ in range(3):
         drive(person)
-    person.says("publish", topic="cmd_vel", msg=STOP)
-    person.says("publish", topic="cmd_vel", msg=STOP)
+    person.says("publish", topic="cmd_vel", msg=GO)
+    person.says("publish", topic="cmd_vel", msg=GO)
     assert looked == ["cmd_vel"]
     assert len(world.link.samples) == 5
 
@@ -93,13 +93,13 @@ def test_what_the_robot_says_of_motion_counts_for_the_very_next_message(world: W
     person = driving(world)
     world.robot.description = link.Describe()
     world.clock.advance(3)
-    person.says("publish", topic="/cmd_vel", msg=STOP)
+    person.says("publish", topic="/cmd_vel", msg=GO)
     assert len(world.link.samples) == 1, "what is no motion is not judged by age"
     world.robot.description = MOTION
-    person.says("publish", topic="/cmd_vel", msg=STOP)
+    person.says("publish", topic="/cmd_vel", msg=GO)
     assert len(world.link.samples) == 1
     world.robot.description = link.Describe(motion=link.MotionPolicy(types=[TWIST], deadline_ms=70_000))
-    person.says("publish", topic="/cmd_vel", msg=STOP)
+    person.says("publish", topic="/cmd_vel", msg=GO)
     assert len(world.link.samples) == 2
 
 
@@ -108,10 +108,10 @@ def test_age_is_judged_for_each_message(world: World) -> None:
     person = driving(world)
     deadline = MOTION.motion.deadline_ms / 1000
     world.clock.pump([deadline])
-    person.says("publish", topic="/cmd_vel", msg=STOP)
+    person.says("publish", topic="/cmd_vel", msg=GO)
     assert len(world.link.samples) == 1
     world.clock.pump([0.01])
-    person.says("publish", topic="/cmd_vel", msg=STOP, id="late")
+    person.says("publish", topic="/cmd_vel", msg=GO, id="late")
     assert len(world.link.samples) == 1
     assert person.session.stale_commands == 1
     (status,) = person.hears("status")
