@@ -76,8 +76,9 @@ class Daemon(Body):
         self.helm = Helm(self.authority, self.motion, latch, hardware, sweep, self, clock, now, time.time)
         self.helm.limits = limits_told(settings)
         self._pursuits = Pursuits(policy.actions, guard, sweep, latch, clock, now)
-        self.motion.proof = lambda: connection.answered or 0
+        self.motion.proof = self._pursuits.proof = lambda: connection.answered or 0
         self.motion.on_commanded = connection.prove
+        self._pursuits.on_pursuing = self._goals_pursued
         self._gate = Gate(policy, platform, self.authority, now, settings.safety.stop_call)
         self._goal_topics = GoalTopics(
             settings.safety.goal_topics, platform, self.authority, self.motion, clock, now
@@ -201,6 +202,12 @@ class Daemon(Body):
     def pursued(self) -> list[str]:
         """The actions that pursue a goal that moves the robot."""
         return self._pursuits.pursued
+
+    def _goals_pursued(self, pursued: bool) -> None:
+        if pursued:
+            self.motion.attend("goals")
+        else:
+            self.motion.leave("goals")
 
     def silence(self, topic: str) -> None:
         """A topic is to say nothing from now on, or something again."""

@@ -34,6 +34,9 @@ KEPT = 30.0
 LOOKS = 30
 """How often to look for actions that were left goals, a second apart: nodes may be found after the daemon's start."""
 
+UNPROVEN = 2_000_000_000
+"""Nanoseconds without proof of the relay after which goals are cancelled: nobody who gave one could end it then."""
+
 ADRIFT = 600.0
 """Seconds in which an action that was lost with a goal is looked for."""
 
@@ -86,7 +89,14 @@ class Pursuits:
         self._now = now
         self._running: dict[str, int] = {}
         """How many goals by action, also adrift; none where the guard is only kept able to cancel them."""
-        self._under_way: set[Goal] = set()
+        self.proof: Callable[[], int] = now
+        """When the latest ping that the relay has answered was sent."""
+        self.on_pursuing: Callable[[bool], None] = lambda pursuing: None
+        """Called when a goal is under way, and when none is any more."""
+        self._under_way: dict[Goal, int] = {}
+        """Goals and when they began, nanoseconds."""
+        self._doubted: set[Goal] = set()
+        """Those that were cancelled for want of proof."""
         self._adrift: dict[bytes, _Adrift] = {}
         """By the goal's id, the oldest first."""
         self._waiting: list[Deferred[list[str]]] = []
@@ -163,11 +173,14 @@ class Pursuits:
             self._note()
         if self._beating is None:
             self._beating = self._clock.callLater(BEAT, self._beat)
-        self._under_way.add(goal)
+        self._under_way[goal] = self._now()
+        if len(self._under_way) == 1:
+            self.on_pursuing(True)
         goal.result.addBoth(self._ended, action, goal)
 
     def _ended(self, outcome: Ended, action: str, goal: Goal) -> Ended:
-        self._under_way.discard(goal)
+        del self._under_way[goal]
+        self._doubted.discard(goal)
         if isinstance(outcome, Outcome) and outcome.certain:
             self._over(action)
         else:
@@ -185,6 +198,7 @@ class Pursuits:
     def _tell_standing(self) -> None:
         if self._under_way:
             return
+        self.on_pursuing(False)
         waiting, self._waiting = self._waiting, []
         for each in waiting:
             each.callback(self.pursued)
@@ -227,11 +241,28 @@ class Pursuits:
 
     def _beat(self) -> None:
         self._beating = None
+        self._cancel_unproven()
         running = self.pursued
         for action in running:
             self._guard.command(cancelling(action), True, self._now())
         if running:
             self._beating = self._clock.callLater(BEAT, self._beat)
+
+    def _cancel_unproven(self) -> None:
+        least = self._now() - UNPROVEN
+        if self.proof() >= least:
+            return
+        for goal in [each for each, began in self._under_way.items() if began < least]:
+            if goal in self._doubted:
+                continue
+            self._doubted.add(goal)
+            self._log.warn(
+                "the relay has not answered for {time:g} s: a goal is cancelled", time=UNPROVEN / 1e9
+            )
+            try:
+                goal.cancel()
+            except Exception:  # one that fails must not keep the next from its end
+                self._log.failure("a goal could not be cancelled")
 
     def _is_left(self, action: str) -> bool:
         return action not in self._swept and any(fnmatchcase(action, each) for each in self._left)

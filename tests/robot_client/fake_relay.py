@@ -33,6 +33,8 @@ class Peer:
         self.skipped: list[Any] = []
         self.takes = True
         """Whether pictures are answered at once."""
+        self.answers = True
+        """Whether pings are."""
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
@@ -63,7 +65,8 @@ class Peer:
         elif isinstance(message, link.Join):
             self.read = link.robot_channel_decoder
         if isinstance(message, link.Ping):
-            self.say(link.Pong(t=message.t, at=time.monotonic_ns()))
+            if self.answers:
+                self.say(link.Pong(t=message.t, at=time.monotonic_ns()))
         else:
             self._inbox.put(message)
 

@@ -164,3 +164,11 @@ def test_goal_that_does_not_end_with_the_daemon_is_noted(robot: Robot, node: Nod
     until(lambda: not (robot.state / GOALS).exists())
     process.terminate()
     assert process.wait(5) == 0
+
+
+def test_goals_of_a_silent_relay_are_cancelled(robot: Robot, node: Node) -> None:
+    """It answers no pings; the link lasts for longer than the goal."""
+    errand = Errand(robot, node)
+    errand.control.answers = False
+    assert errand.channel.expect(link.ActionResult).status == CANCELED
+    until(lambda: errand.cancelled)

@@ -16,10 +16,20 @@ from robot_client.guard_protocol import CANCEL, GOALS_WITHIN_MS, cancelling
 from robot_client.lasting import MemoryLatch
 from robot_client.platforms.base import ABORTED, CANCELED, GraphView, Outcome
 from robot_client.platforms.memory import MemoryGoal, MemoryPlatform
-from robot_client.pursuits import ADRIFT, BEAT, FAREWELL, KEPT, LOOKS, MAX_ACTIONS, MAX_ADRIFT, Pursuits
+from robot_client.pursuits import (
+    ADRIFT,
+    BEAT,
+    FAREWELL,
+    KEPT,
+    LOOKS,
+    MAX_ACTIONS,
+    MAX_ADRIFT,
+    UNPROVEN,
+    Pursuits,
+)
 from robot_client.sweep import PATIENCE, Sweep
 from robot_client.topics import TypedTopic
-from tests.robot_client.daemon_scene import DRIVER
+from tests.robot_client.daemon_scene import DRIVER, Line
 from tests.robot_client.daemon_scene import Scene as DaemonScene
 
 SPIN = "/robot1/spin"
@@ -338,13 +348,70 @@ def test_goals_adrift_are_forgotten_in_time_and_number(scene: Scene) -> None:
     assert scene.latch.noted == []
 
 
-def leave(scene: DaemonScene) -> MemoryGoal:
-    """End a daemon in order while it has a goal pursued."""
-    scene.platform.actions = {"/spin"}
+def pursue(scene: DaemonScene, *actions: str) -> tuple[Line, Line]:
+    """Have actions pursue goals; the control link and the channel."""
+    scene.platform.actions = set(actions)
     control = scene.register()
     control.say(link.Control(id=1, holder=DRIVER, user="ann", level="operator"))
     channel = scene.channel(control)
-    channel.say(link.SendActionGoal(id="g", action="/spin", type="t", source=DRIVER, cdr=""))
+    for action in actions:
+        channel.say(link.SendActionGoal(id=action, action=action, type="t", source=DRIVER, cdr=""))
+    return control, channel
+
+
+def answer_pings(scene: DaemonScene, control: Line, seconds: float) -> int:
+    """Let time pass with a relay that answers; how many pings came."""
+    pings = 0
+    for _ in range(round(seconds * 50)):
+        scene.clock.advance(0.02)
+        for each in control.heard():
+            if isinstance(each, dict) and each["op"] == "ping":
+                pings += 1
+                control.say(link.Pong(t=each["t"], at=scene.now()))
+    return pings
+
+
+def test_goals_are_cancelled_when_the_relay_is_silent() -> None:
+    """After two seconds, long before the link counts as lost; those that move nothing go on."""
+    scene = DaemonScene(answers=False)
+    control, channel = pursue(scene, "/spin", "/look")
+    spin, look = scene.platform.goals
+    answer_pings(scene, control, 3)
+    assert not spin.cancelled
+    scene.run(UNPROVEN / 1e9 - 0.3)
+    assert not spin.cancelled
+    scene.run(0.6)
+    assert (spin.cancelled, look.cancelled) == (True, False)
+    assert channel.transport.connected and control.transport.connected
+
+
+def test_link_is_proven_as_long_as_a_goal_is_under_way() -> None:
+    """Ten pings a second, and as agreed again when it has ended, or is adrift."""
+    scene = DaemonScene(answers=False)
+    control, _ = pursue(scene, "/spin")
+    assert 16 <= answer_pings(scene, control, 2) <= 21
+    lose(scene.platform.goals[0])
+    answer_pings(scene, control, 0.1)
+    assert answer_pings(scene, control, 4) <= 2
+
+
+def test_a_goal_that_has_just_begun_has_its_two_seconds(scene: Scene) -> None:
+    """Before it began nobody may have asked for proof; then it is cancelled once."""
+    scene.clock.advance(100)
+    scene.pursuits.proof = lambda: 0
+    goal = scene.begin()
+    scene.clock.pump([BEAT] * round(UNPROVEN / 1e9 / BEAT))
+    assert not goal.cancelled
+    scene.clock.pump([BEAT] * 2)
+    assert goal.cancelled
+    goal.cancelled = False
+    scene.clock.pump([BEAT] * 20)
+    assert not goal.cancelled
+
+
+def leave(scene: DaemonScene) -> MemoryGoal:
+    """End a daemon in order while it has a goal pursued."""
+    pursue(scene, "/spin")
     scene.daemon.stop().addCallback(scene.left.append)
     return scene.platform.goals[0]
 
