@@ -42,7 +42,9 @@ class TestAlerts:
     def test_what_is_not_wanted_is_only_listed(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """The user's rules say what is shown by itself."""
         page = open_page("/alerts", user="driver")
-        expect(seen(page, "alerts-empty")).to_contain_text("No alert stands open on your robots.")
+        expect(seen(page, "alerts-empty")).to_contain_text(
+            "No alert stands open that you may see on your robots."
+        )
         alert(relay, "quiet", notify=False)
         expect(seen(page, "alert")).to_contain_text("quiet")
         expect(seen(page, "toast")).to_have_count(0)
@@ -54,7 +56,7 @@ class TestAlerts:
         # Between two of the fake relay's events all of these come together, or in two lots.
         for i in range(12):
             alert(relay, f"number {i}")
-        toast = seen(page, "toast").filter(has_text=re.compile(r"\d+ new alerts of rover-1\."))
+        toast = seen(page, "toast").filter(has_text=re.compile(r"rover-1: number 11, and 1?\d more"))
         toast.first.get_by_role("link", name="Alerts").click()
         expect(seen(page, "alert")).to_have_count(12)
 
@@ -103,10 +105,10 @@ class TestAlerts:
     ) -> None:
         """The page says that it is out of date, and asks again when the relay is back."""
         page = open_page("/alerts", user="driver")
-        expect(seen(page, "alerts-empty")).to_contain_text("Nothing is wrong")
+        expect(seen(page, "alerts-empty")).to_contain_text("No open alert")
         relay.do(broken=True)
         expect(page.get_by_text("No connection to the relay.")).to_be_visible()
-        expect(seen(page, "alerts-empty")).not_to_contain_text("Nothing is wrong")
+        expect(seen(page, "alerts-empty")).to_contain_text("Nothing is known")
         alert(relay, "low", old=True)
         relay.do(broken=False)
         expect(seen(page, "alert")).to_contain_text("low")
@@ -140,11 +142,47 @@ class TestAlerts:
         alert(relay, "low")
         expect(seen(page, "toast")).to_be_visible()
         assert page.evaluate("shown") == ["rover-1: low"]
-        for i in range(12):
-            alert(relay, f"number {i}")
-        expect(seen(page, "alerts-count")).to_have_text("13")
-        # Between two of the fake relay's events all of these come together, or in two lots.
-        assert len(page.evaluate("shown")) < 6
+
+    def test_a_robot_that_tells_something_again_and_again_is_told_of_now_and_then(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """The first alert at once, what comes soon after in one toast; what is worse waits for nothing."""
+        page = open_page("/login")
+        page.clock.install()
+        page.request.post(
+            "/api/v1/session",
+            data={"user": "driver", "password": "correct horse"},
+            headers={"X-Requested-With": "switchboard"},
+        )
+        page.goto("/fleet")
+        expect(seen(page, "robot-card")).to_have_count(2)
+        toast = seen(page, "toast")
+        for i in range(4):
+            alert(relay, f"part {i} is hot")
+            expect(seen(page, "alerts-count")).to_have_text(f"{i + 1}")
+            expect(toast).to_have_count(1)
+            expect(toast).to_contain_text("rover-1: part 0 is hot")
+        page.clock.fast_forward(10_000)
+        expect(toast).to_contain_text("rover-1: part 3 is hot, and 2 more")
+        alert(relay, "it is offline", level="error")
+        expect(toast.last).to_contain_text("rover-1: it is offline")
+        expect(toast).to_have_count(2)
+
+    def test_those_that_find_no_room_in_the_stream_are_no_news_later(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """The stream tells of a hundred; when one of them is over, the one that takes its place is nothing new."""
+        for i in range(101):
+            alert(relay, f"number {i}", id=f"{i}", first=1000.0 + i, last=1000.0 + i, old=i == 0)
+        page = open_page("/fleet", user="driver")
+        expect(seen(page, "alerts-count")).to_have_text("99+")
+        alert(relay, "number 0", id="0", old=False)
+        alert(relay, "number 1", id="1", old=True)
+        alert(relay, "a new one", id="new")
+        expect(seen(page, "toast")).to_contain_text("a new one")
+        expect(seen(page, "toast")).not_to_contain_text("more")
+        alert(relay, "number 1", id="1", old=False, state="over", over=time.time(), news=2)
+        expect(seen(page, "toast").last).to_contain_text("rover-1: over: number 1")
 
 
 class TestOrders:

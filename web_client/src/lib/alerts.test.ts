@@ -1,5 +1,5 @@
-import { expect, it } from 'vitest'
-import { type Alert, leftOpen, line, lines, merged, News, STREAMED, waiting, worst } from './alerts'
+import { describe, expect, it } from 'vitest'
+import { type Alert, isWorse, leftOpen, line, merged, News, REMEMBERED, STREAMED, summary, waiting, worst } from './alerts'
 
 function alert(id: string, more: Partial<Alert> = {}): Alert {
   return {
@@ -54,11 +54,53 @@ it('tells at the end of quiet hours what began in them and still stands', () => 
   expect(ids(alert('c'), alert('a', over), alert('e', over))).toEqual([])
 })
 
-it('remembers no more than what it was shown last', () => {
+describe('a list that is full', () => {
+  /** `count` open alerts that began one after the other from a time on, the latest first. */
+  function open(from: number, count: number): Alert[] {
+    return Array.from({ length: count }, (_, i) => alert(`${from + i}`, { first: from + i, last: from + i })).reverse()
+  }
+  const ids = (alerts: Alert[]) => alerts.map(({ id }) => id)
+
+  it('tells nothing of those that come into it because others are over', () => {
+    const news = new News()
+    news.take(open(20, STREAMED))
+    expect(ids(news.take(open(10, STREAMED)))).toEqual([])
+    expect(ids(news.take(open(0, 50)))).toEqual([])
+  })
+
+  it('tells of those that begin', () => {
+    const news = new News()
+    news.take(open(20, STREAMED))
+    expect(ids(news.take(open(23, STREAMED)))).toEqual(['120', '121', '122'])
+    expect(ids(news.take(open(23, STREAMED)))).toEqual([])
+  })
+
+  it('tells nothing of one that it left out for a while, but that it is over or worse', () => {
+    const news = new News()
+    news.take(open(0, 3))
+    news.take(open(1000, STREAMED))
+    const [two, one, zero] = open(0, 3) as [Alert, Alert, Alert]
+    const back = [two, { ...one, news: 2, state: 'over' as const, over: 2000 }, { ...zero, news: 2 }]
+    expect(ids(news.take([...open(1000, 97), ...back]))).toEqual(['0', '1'])
+  })
+
+  it('that was so before leaves out none', () => {
+    const news = new News()
+    news.take(open(20, STREAMED))
+    news.take(open(20, 99))
+    expect(ids(news.take([...open(20, 99), alert('late', { first: 3 })]))).toEqual(['late'])
+  })
+})
+
+it('remembers alerts that are told no more, within bounds', () => {
   const news = new News()
-  news.take([alert('a')])
+  const many = Array.from({ length: REMEMBERED }, (_, i) => alert(`${i}`))
   news.take([])
-  expect(news.take([alert('a', { news: 2 })])).toHaveLength(1)
+  news.take([alert('a')])
+  for (let i = 0; i + 50 < REMEMBERED; i += 50) news.take(many.slice(i, i + 50))
+  expect(news.take([alert('a')])).toEqual([])
+  for (let i = 0; i < REMEMBERED; i += 50) news.take(many.slice(i, i + 50))
+  expect(news.take([alert('a')])).toHaveLength(1)
 })
 
 it('counts those that stand and nobody looks after', () => {
@@ -66,17 +108,26 @@ it('counts those that stand and nobody looks after', () => {
   expect(waiting([alert('a'), alert('b', { state: 'over' }), alert('c', { acknowledged })])).toBe(1)
 })
 
-it('says few alerts in their own words, and of many how many', () => {
+it('says one alert in its own words, and of many the worst that stands and how many', () => {
   expect(line(alert('a'))).toBe('rover: it is offline')
   expect(line(alert('a', { state: 'over' }))).toBe('rover: over: it is offline')
-  expect(lines([alert('a'), alert('b')])).toHaveLength(2)
-  expect(lines([alert('a'), alert('b'), alert('c')])).toEqual(['3 new alerts of rover.'])
-  expect(lines([alert('a'), alert('b'), alert('c', { robot: 'other' })])).toEqual(['3 new alerts of 2 robots.'])
+  const over = alert('o', { state: 'over', text: 'it was away' })
+  const low = alert('l', { level: 'warning', text: 'low' })
+  expect(summary([low])).toBe('rover: low')
+  expect(summary([low, alert('a'), alert('b', { text: 'it is hot' }), over])).toBe('rover: it is hot, and 3 more')
+  expect(summary([low, over])).toBe('rover: low, and 1 more')
+  expect(summary([over, over])).toBe('rover: over: it was away, and 1 more')
 })
 
 it('finds the worst', () => {
   expect(worst([])).toBeNull()
   expect(worst([alert('a', { level: 'info' }), alert('b', { level: 'warning' })])).toBe('warning')
+  expect([isWorse('error', 'warning'), isWorse('info', null), isWorse('info', 'info'), isWorse(null, 'info')]).toEqual([
+    true,
+    true,
+    false,
+    false,
+  ])
 })
 
 it('puts what is told meanwhile into the list, the latest first and only what fits', () => {

@@ -26,25 +26,47 @@ export interface Filter {
   state: 'all' | 'open' | 'over'
 }
 
-/** Which alerts are news to this page: told of none twice, and of none that stood when it was opened. */
+/** How many alerts a page knows that it has told of. */
+export const REMEMBERED = 2000
+
+/** Which alerts are news to this page: told of none twice, and of none that stood when it was opened.
+ *
+ * The stream tells of no more than a hundred, so one that stands may leave it, and come back when others are over.
+ */
 export class News {
-  /** How much of the news of each alert was shown, or need not be. */
+  /** How much of the news of each alert was shown, or need not be; the one that was seen last is the last. */
   private told: Map<string, number> | null = null
+  /** Unix seconds when the newest of all began; of what began before, some may have been left out of a full list. */
+  private newest = -Infinity
+  private wasFull = false
 
   /** Takes the list as it is now, and tells what the user should be told of, the oldest first. */
   take(alerts: readonly Alert[]): Alert[] {
     const before = this.told
-    this.told = new Map(alerts.map((alert) => [alert.id, settled(alert, before)]))
-    if (before === null) return []
-    return alerts.filter(({ id, news, notify }) => notify && news > (before.get(id) ?? 0)).reverse()
+    const fresh = before === null ? [] : alerts.filter((alert) => alert.notify && alert.news > this.known(alert)).reverse()
+    const told = new Map(before)
+    for (const alert of [...alerts].reverse()) {
+      const { id } = alert
+      told.delete(id)
+      told.set(id, settled(alert, before === null ? null : this.known(alert)))
+    }
+    for (const id of [...told.keys()].slice(0, Math.max(0, told.size - REMEMBERED))) told.delete(id)
+    this.told = told
+    this.newest = alerts.reduce((newest, { first }) => Math.max(newest, first), this.newest)
+    this.wasFull = alerts.length >= STREAMED
+    return fresh
+  }
+
+  /** Up to where the news of an alert need not be told. */
+  private known({ id, first, news }: Alert): number {
+    return this.told?.get(id) ?? (this.wasFull && first <= this.newest ? news : 0)
   }
 }
 
 /** What is not wanted now is wanted at the end of quiet hours, unless it was over before anybody was told of it. */
-function settled({ id, news, notify, state }: Alert, before: ReadonlyMap<string, number> | null): number {
-  const known = before?.get(id) ?? 0
-  const toCome = before !== null && !notify && (state === 'open' || known > 0)
-  return toCome ? known : Math.max(news, known)
+function settled({ news, notify, state }: Alert, known: number | null): number {
+  const toCome = known !== null && !notify && (state === 'open' || known > 0)
+  return toCome ? known : Math.max(news, known ?? 0)
 }
 
 /** How many a person has to look at: they stand, and nobody said that he looks after them. */
@@ -57,22 +79,34 @@ export function line({ robot, text, state }: Pick<Alert, 'robot' | 'text' | 'sta
   return state === 'over' ? `${robot}: over: ${text}` : `${robot}: ${text}`
 }
 
-/** Whether so few are new that each is told in its own words. */
-export function isFew(alerts: readonly Alert[]): boolean {
-  return alerts.length <= 2
+/** The one of several, the oldest first, that is told in its own words: the latest of the worst that stand. */
+export function leading(alerts: readonly Alert[]): Alert {
+  const level = worst(standing(alerts))
+  return alerts.findLast((alert) => alert.state === 'open' && alert.level === level) ?? alerts.at(-1)!
 }
 
-/** Several alerts in lines: each of a few, else how many. */
-export function lines(alerts: readonly Alert[]): string[] {
-  if (isFew(alerts)) return alerts.map(line)
-  const robots = new Set(alerts.map(({ robot }) => robot)).size
-  return [`${alerts.length} new alerts of ${robots === 1 ? alerts[0]!.robot : `${robots} robots`}.`]
+/** Several alerts in a line, the oldest first. */
+export function summary(alerts: readonly Alert[]): string {
+  const words = line(leading(alerts))
+  return alerts.length === 1 ? words : `${words}, and ${alerts.length - 1} more`
 }
+
+/** Those that are open. */
+export function standing(alerts: readonly Alert[]): Alert[] {
+  return alerts.filter(({ state }) => state === 'open')
+}
+
+const LEVELS: readonly AlertLevel[] = ['info', 'warning', 'error']
 
 /** The worst level there is; null without alerts. */
 export function worst(alerts: readonly Pick<Alert, 'level'>[]): AlertLevel | null {
-  const levels: AlertLevel[] = ['error', 'warning', 'info']
-  return levels.find((level) => alerts.some((alert) => alert.level === level)) ?? null
+  return LEVELS.findLast((level) => alerts.some((alert) => alert.level === level)) ?? null
+}
+
+/** Whether a level is worse than another; any is worse than none. */
+export function isWorse(level: AlertLevel | null, than: AlertLevel | null): boolean {
+  const rank = (each: AlertLevel | null) => (each === null ? -1 : LEVELS.indexOf(each))
+  return rank(level) > rank(than)
 }
 
 /** A list that was asked for, with what was told since put in; the latest first. */

@@ -1,5 +1,5 @@
 /** The browser's own notifications, for who is not looking at the page. Asked for by a click, never by itself. */
-import { type Alert, isFew, line, lines } from './alerts'
+import { type Alert, leading, summary } from './alerts'
 import { recall, remember } from './storage'
 
 const KEY = 'notify'
@@ -34,7 +34,7 @@ export async function turn(on: boolean, place: Place = globalThis): Promise<bool
   return granted
 }
 
-/** Shows alerts outside of the page, many of them as one, where that is wanted and the page is not in front.
+/** Shows alerts outside of the page, all of them as one, where that is wanted and the page is not in front.
  *
  * @param alerts the oldest first
  */
@@ -42,8 +42,8 @@ export function notify(alerts: readonly Alert[], place: Place = globalThis, isIn
   const Shown = place.Notification
   if (!isOn(place) || Shown === undefined || isInFront()) return false
   try {
-    if (isFew(alerts)) for (const alert of alerts) new Shown(line(alert), { tag: alert.id, body: alert.kind })
-    else new Shown(lines(alerts).join(' '), { tag: alerts.at(-1)!.id })
+    const { id, kind } = leading(alerts)
+    new Shown(summary(alerts), { tag: id, body: kind })
     return true
   } catch {
     // Some phones allow this to installed pages only; the toast in the page has to do.

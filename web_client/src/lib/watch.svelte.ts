@@ -1,7 +1,8 @@
 /** The user's robots and their alerts, followed for as long as he is logged in, whatever page is shown. */
 import { currentSession, watchFleet } from './api'
-import { type Alert, lines, News, waiting, worst } from './alerts'
+import { type Alert, News, standing, summary, waiting, worst } from './alerts'
 import { app } from './app.svelte'
+import { Lots } from './lots'
 import { notify } from './notify'
 import { ALERTS } from './route'
 import type { Robot } from './types'
@@ -23,6 +24,10 @@ class Watch {
   readonly waiting = $derived(waiting(this.alerts))
 
   private news = new News()
+  private readonly lots = new Lots((lot) => {
+    app.tell(TONES[worst(standing(lot)) ?? 'info'], summary(lot), { path: ALERTS, label: 'Show alerts' })
+    notify(lot)
+  })
   private end: () => void = () => {}
   private retry: ReturnType<typeof setTimeout> | undefined
 
@@ -33,6 +38,7 @@ class Watch {
     return () => {
       this.end()
       clearTimeout(this.retry)
+      this.lots.end()
       this.robots = null
       this.alerts = []
       this.lostSince = null
@@ -73,12 +79,7 @@ class Watch {
 
   private take(list: Alert[]): void {
     this.alerts = list
-    const fresh = this.news.take(list)
-    if (fresh.length === 0) return
-    const open = fresh.filter(({ state }) => state === 'open')
-    const tone = TONES[worst(open) ?? 'info']
-    for (const words of lines(fresh)) app.tell(tone, words, { path: ALERTS, label: 'Alerts' })
-    notify(fresh)
+    this.lots.add(this.news.take(list))
   }
 }
 
