@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 
 
 class TokenBucket:
@@ -40,3 +41,28 @@ class TokenBucket:
         now = self._seconds()
         self._tokens = min(self._burst, self._tokens + max(0.0, now - self._at) * self._rate)
         self._at = now
+
+
+class Buckets:
+    """A bucket for each of those who take from one; the longest unused are forgotten first.
+
+    :param rate: as of :class:`TokenBucket`, for each
+    :param most: buckets that are kept
+    """
+
+    def __init__(self, rate: float, burst: float, most: int, seconds: Callable[[], float]) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._most = most
+        self._seconds = seconds
+        self._buckets: OrderedDict[Hashable, TokenBucket] = OrderedDict()
+
+    def take(self, who: Hashable) -> bool:
+        """As :meth:`TokenBucket.take`."""
+        bucket = self._buckets.get(who)
+        if bucket is None:
+            bucket = self._buckets[who] = TokenBucket(self._rate, self._burst, self._seconds)
+        self._buckets.move_to_end(who)
+        while len(self._buckets) > self._most:
+            self._buckets.popitem(last=False)
+        return bucket.take()

@@ -10,7 +10,7 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
-from relay_server.bucket import TokenBucket
+from relay_server.bucket import Buckets
 from relay_server.clock import Clock
 from relay_server.control.lease import Client, Request, Tenure, owns
 from relay_server.control.record import WHY, Actor, Record
@@ -46,7 +46,7 @@ class Desk(Steering):
         wall: Callable[[], float],
     ) -> None:
         super().__init__(clock, robot, record, rules, changed, wall)
-        self._takes: OrderedDict[int, TokenBucket] = OrderedDict()
+        self._takes = Buckets(TAKES_A_SECOND, TAKES_AT_ONCE, USERS, clock.seconds)
         """By user, how often he may take control still."""
         self._cut_off: OrderedDict[int, float] = OrderedDict()
         """By user, the moment of the latest command of a connection that ended before he had let go."""
@@ -102,14 +102,7 @@ class Desk(Steering):
 
         :raises Refused: he has done so too often
         """
-        bucket = self._takes.get(client.user)
-        if bucket is None:
-            bucket = TokenBucket(TAKES_A_SECOND, TAKES_AT_ONCE, self._clock.seconds)
-            self._takes[client.user] = bucket
-        self._takes.move_to_end(client.user)
-        while len(self._takes) > USERS:
-            self._takes.popitem(last=False)
-        if not bucket.take():
+        if not self._takes.take(client.user):
             raise Refused(
                 f"you take control of robot {self.robot.name} too often: {TAKES_A_SECOND:g} times a second at most; "
                 "try again in a moment"

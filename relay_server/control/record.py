@@ -69,9 +69,10 @@ class Record(Protocol):
     ) -> None:
         """Something has happened; nobody waits for it to be written."""
 
-    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor) -> None:
+    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor, *, audit: bool = True) -> None:
         """Keep an order to stop until it is told, with its audit entry.
 
+        :param audit: false for one of many that need no entry of their own
         :raises SwitchboardError: it can't be kept
         """
 
@@ -129,11 +130,11 @@ class DatabaseRecord:
             )
         ).addBoth(self._written)
 
-    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor) -> None:
+    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor, *, audit: bool = True) -> None:
         """The order and its audit entry, both or neither."""
         self._event("robot.stopped", robot, actor, order.why)
         entry = self._entry("robot.stopped", robot, actor, {"why": order.why})
-        await self._store.write(_order, order, entry)
+        await self._store.write(_order, order, entry if audit else None)
 
     async def told(self, robot: Presence, at: float | None = None) -> bool:
         """See :class:`Record`."""
@@ -173,6 +174,7 @@ class DatabaseRecord:
         self._waiting -= 1
 
 
-def _order(s: Session, order: StopRecord, entry: dict[str, Any]) -> None:
+def _order(s: Session, order: StopRecord, entry: dict[str, Any] | None) -> None:
     queries.order_stop(s, order.robot_id, order.by, order.why, order.at)
-    queries.append_audit(s, **entry)
+    if entry is not None:
+        queries.append_audit(s, **entry)

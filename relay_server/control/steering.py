@@ -49,7 +49,7 @@ class Steering:
         self._changed = changed
         self._wall = wall
         self.orders = Orders(clock, robot)
-        self.stopping = Stopping(robot, self.orders, record, self._stand, wall)
+        self.stopping = Stopping(robot, self.orders, record, self._stand, wall, clock.seconds)
         self.subsuming = Subsuming(clock, robot, self.orders, record, self._stand)
         self.pushing = Pushing(clock)
         self.standing = Standing(FREE, {}, None)

@@ -13,6 +13,7 @@ from twisted.logger import Logger
 from relay_db.queries import StopRecord
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_server.bucket import Buckets
 from relay_server.control.detached import detached
 from relay_server.control.orders import NotDone, Orders
 from relay_server.control.record import WHY, Actor, Record
@@ -27,6 +28,13 @@ queue. The robot is told all the same; where it can't be, whoever comes then is 
 
 KNOWN = 256
 """Orders to stop one robot that are remembered: a slow database may still tell of them."""
+
+AGAIN_A_SECOND = 3 / 60
+AGAIN_AT_ONCE = 3
+"""Of the stops of a robot that is stopped already, how many of one user are in the audit log. The robot gets all."""
+
+AGAIN_USERS = 256
+"""Users remembered for that; the longest quiet are forgotten first."""
 
 AT_ONCE = 64
 """Orders to stop one robot that are under way at a time; whoever comes then is stopping it already."""
@@ -50,6 +58,7 @@ class Stopping:
 
     :param changed: called when it is another
     :param wall: Unix time in seconds
+    :param seconds: a monotonic clock
     """
 
     log = Logger()
@@ -61,12 +70,14 @@ class Stopping:
         record: Record,
         changed: Callable[[], None],
         wall: Callable[[], float],
+        seconds: Callable[[], float],
     ) -> None:
         self._robot = robot
         self._orders = orders
         self._record = record
         self._changed = changed
         self._wall = wall
+        self._again = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, seconds)
         self._pending: StopRecord | None = None
         self._known: deque[float] = deque(maxlen=KNOWN)
         """The moments that name the orders seen here, whatever has become of them. They are compared for being the
@@ -96,16 +107,17 @@ class Stopping:
         """
         order = StopRecord(self._robot.robot_id, actor.name, why[:WHY], self._wall())
         self._known.append(order.at)
+        audit = self.stopped is None or self._again.take(actor.source)
         if self._pending is None or self._keeping < KEEPING:
             # Else those stand that are being written.
             self._pending = order
         self._changed()
-        return detached(self._stop(order, actor))
+        return detached(self._stop(order, actor, audit))
 
-    async def _stop(self, order: StopRecord, actor: Actor) -> bool:
+    async def _stop(self, order: StopRecord, actor: Actor, audit: bool) -> bool:
         # Before anything is written: nothing is as urgent.
         given = self._tell(order)
-        keeping = detached(self._keep(order, actor))
+        keeping = detached(self._keep(order, actor, audit))
         outcome = await _outcome(given)
         # Whoever asked is not kept waiting by a database that hangs.
         if outcome is None:
@@ -121,12 +133,12 @@ class Stopping:
             raise Unavailable(f"{outcome}; and the order can't be kept for when it is back: {kept}")
         return False
 
-    async def _keep(self, order: StopRecord, actor: Actor) -> None:
+    async def _keep(self, order: StopRecord, actor: Actor, audit: bool) -> None:
         if self._keeping >= KEEPING:
             raise Unavailable(f"{KEEPING} orders to stop {self._robot.name} are being written already")
         self._keeping += 1
         try:
-            await self._record.ordered(self._robot, order, actor)
+            await self._record.ordered(self._robot, order, actor, audit=audit)
         finally:
             self._keeping -= 1
 

@@ -18,6 +18,7 @@ from relay_db.queries import RobotRecord
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Access, Permit, Principal
+from relay_server.bucket import Buckets
 from relay_server.clock import Clock, as_twisted, within
 from relay_server.control import Actor, Desks
 from relay_server.fleet.client import OrderClient
@@ -37,6 +38,13 @@ ROBOTS = 1000
 
 ORDERS = 4
 """Orders of one user at a time."""
+
+STOPS_A_SECOND = 3 / 60
+STOPS_AT_ONCE = 10
+"""Orders to stop of one user that are in the audit log. What they stop is there by itself, robot by robot."""
+
+STOP_USERS = 256
+"""Users remembered for that; the longest quiet are forgotten first."""
 
 STOP_SECONDS = 15.0
 """What a stop and a resume have, whatever the order says: they are given up by who carries them out before that."""
@@ -109,6 +117,7 @@ class FleetDesk:
         self._clock_ns = clock_ns
         self._wall = wall
         self._orders: Counter[int] = Counter()
+        self._stops = Buckets(STOPS_A_SECOND, STOPS_AT_ONCE, STOP_USERS, clock.seconds)
 
     async def groups(self, asker: Principal) -> list[dict[str, Any]]:
         """Groups of robots, with those the asker has a right on; the others are not told of."""
@@ -218,7 +227,8 @@ class FleetDesk:
         # These by the rights of this moment, which the plan has just looked up; the others are judged in their turn.
         stopping = Deferred.fromCoroutine(side_by_side(told, one, at_once=len(told)))
         try:
-            await self._record(plan)
+            if self._stops.take(plan.asker.user_id):
+                await self._record(plan)
         except SwitchboardError as error:
             # Each stop is on record by itself, too.
             self.log.error("an order to stop is not on record: {reason}", reason=str(error))

@@ -40,14 +40,15 @@ class MemoryRecord:
         """What has happened."""
         return [kind for kind, *_ in self.notes]
 
-    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor) -> None:
+    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor, *, audit: bool = True) -> None:
         """Keep an order to stop."""
         self._check()
         if self.hold:
             self.held.append(Deferred())
             await self.held[-1]
         self.stops[robot.robot_id] = order
-        self.note("robot.stopped", robot, actor, order.why)
+        if audit:
+            self.note("robot.stopped", robot, actor, order.why)
 
     async def told(self, robot: Presence, at: float | None = None) -> bool:
         """It need not be told any more."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.internet.task import Clock
 
-from relay_server.bucket import TokenBucket
+from relay_server.bucket import Buckets, TokenBucket
 
 
 def test_what_is_taken_comes_back_with_time() -> None:
@@ -20,3 +20,14 @@ def test_what_is_taken_comes_back_with_time() -> None:
     assert [bucket.take(), bucket.take()] == [True, False]
     clock.advance(1000)
     assert [bucket.take() for _ in range(3)] == [True, True, False]
+
+
+def test_each_takes_from_a_bucket_of_his_own() -> None:
+    """Of so many; who has taken none for the longest time begins anew."""
+    clock = Clock()
+    buckets = Buckets(1, 1, 2, clock.seconds)
+    assert [buckets.take(who) for who in ("ann", "ann", "bob", "ann")] == [True, False, True, False]
+    assert buckets.take("eve")
+    assert [buckets.take("ann"), buckets.take("bob")] == [False, True]
+    clock.advance(1)
+    assert buckets.take("ann")

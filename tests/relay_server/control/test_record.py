@@ -98,7 +98,8 @@ async def test_an_order_to_stop_is_kept_with_its_entry(store: Store, time: Time)
     assert await record.pending(robot) is None
     for number in range(2 * BURST):
         await record.ordered(robot, order._replace(at=2000.0 + number), ANN)
-    assert await record.told(robot)
+    await record.ordered(robot, order._replace(at=3000.0), ANN, audit=False)
+    assert await record.told(robot, 3000.0)
     events, audit = await written(store)
     assert {each.kind for each in events} == {"robot.stopped"}
     assert len(audit) == 2 * BURST + 1

@@ -247,3 +247,34 @@ def test_who_stops_a_robot_again_and_again_does_not_fill_the_databases_queue() -
     assert len(place.link.orders(link.Stop)) == 3 * module.KEEPING
     assert len(place.record.held) == module.KEEPING
     assert len(place.link.orders(link.Stop)[0].why) == 500
+
+
+def test_who_stops_a_stopped_robot_again_and_again_does_not_fill_the_record() -> None:
+    """The robot is told each time; others, and what stops a robot that may move, are on record all the same."""
+    place = Place().online()
+    ann, bob = Actor("ann", "user:ann", 1), Actor("bob", "user:bob", 2)
+    for _ in range(50):
+        assert result(place.desk.stopping.stop(ann, "smoke"))
+    assert len(place.link.orders(link.Stop)) == 50
+    assert place.record.kinds == ["robot.stopped"] * (1 + module.AGAIN_AT_ONCE)
+    result(place.desk.stopping.stop(bob, "fire"))
+    assert place.record.notes[-1][1:3] == ("bob", "fire")
+    place.clock.advance(20)
+    result(place.desk.stopping.stop(ann, ""))
+    result(place.desk.stopping.stop(ann, ""))
+    assert place.record.kinds == ["robot.stopped"] * (3 + module.AGAIN_AT_ONCE)
+    for _ in range(5):
+        result(place.desk.stopping.resume(bob, ""))
+        result(place.desk.stopping.stop(ann, "again"))
+        assert place.record.notes[-1][:3] == ("robot.stopped", "ann", "again")
+    assert place.record.stops == {}
+
+
+def test_a_stop_that_waits_for_its_robot_is_on_record_a_few_times_a_minute() -> None:
+    """The latest one is kept."""
+    place = Place()
+    ann = Actor("ann", "user:ann", 1)
+    for number in range(50):
+        assert not result(place.desk.stopping.stop(ann, f"the {number}"))
+    assert place.record.kinds == ["robot.stopped"] * (1 + module.AGAIN_AT_ONCE)
+    assert place.record.stops[1].why == "the 49"

@@ -58,13 +58,17 @@ class Fleet:
         self.front = Desk(store)
         self.world = self.front.world
         self.journal = Journal(store, self.front.wall)
-        self.desk = FleetDesk(
+        self.desk = self.new_desk()
+
+    def new_desk(self) -> FleetDesk:
+        """One that has carried out nothing so far."""
+        return FleetDesk(
             self.world.clock,
             self.front.desk,
             self.front.access,
             self.world.registry,
             self.world.desks,
-            store,
+            self.front.store,
             self.journal,
             clock_ns=self.world.now_ns,
             wall=self.front.wall,
@@ -480,6 +484,22 @@ async def test_no_robot_that_is_here_waits_for_the_database_to_be_stopped(
     await until(lambda: bool(given))
     assert [each.outcome.ok for each in results] == [True]
     assert len(fleet.world.control.all(link.Stop)) == 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_stops_all_again_and_again_does_not_fill_the_record(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What each order stops is on record by itself; the robots get them all."""
+    monkeypatch.setattr(module, "STOPS_AT_ONCE", 2)
+    fleet.desk = fleet.new_desk()
+    fleet.world.robot_comes()
+    for _ in range(5):
+        given = await fleet.give(LOCAL, order("stop", "rover"))
+        await until(lambda given=given: given.running.called)
+    audit = await fleet.front.store.read(queries.list_audit)
+    assert [each.action for each in audit].count("fleet.stop") == 2
+    assert len(fleet.world.control.all(link.Stop)) == 5
 
 
 @pytest_twisted.ensureDeferred
