@@ -114,14 +114,21 @@ async def test_events_become_alerts_of_their_kind(scene: Scene) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_somebody_may_not_see_hides_nothing_from_him(scene: Scene) -> None:
+async def test_what_somebody_may_not_see_hides_nothing_from_him(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """However much of it there is, and of whatever part: he gets what is older. One who may sees all."""
     rover = scene.number
     topics = REFUSED + 50
+    stale = {"kind": "stale", "last": 8e9}
     rows = [
-        *(alert(f"d{each}", robot_id=rover, kind="diagnostics", last=9e9) for each in range(2 * PAGE)),
+        *(alert(f"m{each}", robot_id=rover, kind="module", about=f"{each}", last=9.5e9) for each in range(3)),
         *(
-            alert(f"s{each}", robot_id=rover, kind="stale", about=f"/secret/{each % topics}", last=8e9)
+            alert(f"d{each}", robot_id=rover, kind="diagnostics", about=f"part {each}", last=9e9)
+            for each in range(3 * PAGE)
+        ),
+        *(
+            alert(f"s{each}", robot_id=rover, about=f"/secret/{each % topics}", **stale)
             for each in range(2 * PAGE)
         ),
         alert("gone", robot_id=rover, last=7e9),
@@ -131,9 +138,20 @@ async def test_what_somebody_may_not_see_hides_nothing_from_him(scene: Scene) ->
         queries.grant_right(s, rover, "viewer", user_id=scene.people["vic"].user_id, deny=denied)
         queries.save_alerts(s, rows)
     await scene.access.refresh()
+    reads = 0
+    read = scene.store.read
+
+    async def counted(*what: Any, **how: Any) -> Any:
+        nonlocal reads
+        reads += what[0] is queries.list_alerts
+        return await read(*what, **how)
+
+    monkeypatch.setattr(scene.store, "read", counted)
     for lasts in (True, None):
-        found = await scene.desk.all(scene.people["vic"], "rover", lasts, 1)
-        assert [each["id"] for each in found] == ["gone"]
+        found = await scene.desk.all(scene.people["vic"], "rover", lasts)
+        assert [each["id"] for each in found] == ["m0", "m1", "m2", "gone"]
+    # Two of each: of what is refused the database gives little.
+    assert reads == 4
     assert len(await scene.desk.all(scene.people["ann"], limit=500)) == 500
     assert await scene.desk.all(scene.people["vic"], "rover", False) == []
 
