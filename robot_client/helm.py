@@ -249,7 +249,7 @@ class Helm:
             return
         if self._stopping or self._resuming is not None:
             raise Unavailable(
-                "a switch in the robot's hardware is being thrown; resume again when it is done"
+                "the robot is still being stopped or resumed; resume it again when that is done"
             )
         self._resuming = message.id
         self._hardware.resume().addCallback(lambda problems: self._resumed(message, problems))

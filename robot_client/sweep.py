@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.internet.defer import CancelledError, Deferred, maybeDeferred
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
@@ -46,7 +46,7 @@ class _Round:
 
     def __init__(self) -> None:
         self.heard: set[str] = set()
-        self.asking: set[str] = set()
+        self.asking: dict[str, Deferred[str | None]] = {}
         self.tries: Counter[str] = Counter()
         self.silent: set[str] = set()
         """Actions that ought to have answered."""
@@ -107,8 +107,10 @@ class Sweep:
             self._ask(self._round, self._moving() or [])
 
     def end(self) -> None:
-        """The robot is resumed."""
-        self._round = None
+        """The robot is resumed: what has not been asked yet must not be, for goals may come that are to go on."""
+        round, self._round = self._round, None
+        for asked in list(round.asking.values()) if round is not None else []:
+            asked.cancel()
         self.zeros.end()
 
     def late(self, pursued: Iterable[str] = ()) -> list[str]:
@@ -149,16 +151,16 @@ class Sweep:
             del round.tries[gone]
         if len(round.heard) > MAX_HEARD:
             round.heard.intersection_update(moving)
-        left = set(moving) - round.heard - round.asking
+        left = set(moving) - round.heard - round.asking.keys()
         # Those that never answer must not keep the others from being asked.
         turn = sorted(left, key=lambda action: (round.tries[action], action))
         for action in turn[: MAX_ACTIONS - len(round.asking)]:
-            round.asking.add(action)
             round.tries[action] += 1
-            self.cancel(action).addCallback(self._heard, action, round)
+            round.asking[action] = asked = self.cancel(action)
+            asked.addCallback(self._heard, action, round)
 
     def _heard(self, words: str | None, action: str, round: _Round) -> None:
-        round.asking.discard(action)
+        round.asking.pop(action, None)
         if words is None:
             if round.tries[action] > 1:
                 round.silent.add(action)
@@ -189,7 +191,7 @@ class Sweep:
         return words
 
     def _missed(self, action: str, failure: Failure) -> None:
-        if action in self._unheard:
+        if action in self._unheard or failure.check(CancelledError):
             return
         self._unheard.add(action)
         self._log.warn(

@@ -502,6 +502,8 @@ class Acting:
         self.asked: list[bytes] = []
         self.answers: list[Deferred[bytes]] = []
         """Those to come."""
+        self.given_up = 0
+        """Calls whose answer nobody waits for any more."""
         self.show(NAVIGATE, "/count")
         self.control = self.scene.register()
         self.control.heard()
@@ -515,8 +517,11 @@ class Acting:
             self.scene.platform.services[each + CANCEL] = self._called
 
     def _called(self, request: bytes) -> Deferred[bytes]:
+        def give_up(answer: Deferred[bytes]) -> None:
+            self.given_up += 1
+
         self.asked.append(request)
-        self.answers.append(Deferred())
+        self.answers.append(Deferred(give_up))
         return self.answers[-1]
 
     def answer(self, code: int = 0) -> None:
@@ -586,7 +591,10 @@ def test_resume_ends_the_asking(acting: Acting) -> None:
     acting.control.say(stop())
     acting.pass_seconds(3)
     acting.control.heard()
+    given_up = acting.given_up
+    assert given_up == len(acting.asked) - 1
     acting.control.say(resume())
+    assert acting.given_up == given_up + 1
     (alert,) = acting.heard("alert")
     assert alert["over"] is True
     asked = len(acting.asked)
