@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 
 import psutil
 import pytest
-from switchboard_drive import Drive
+from switchboard_drive import LET_GO_SECONDS, Drive
+from switchboard_threads import Driver, Returning
 from switchboard_waiting import wait_for
 
 
@@ -56,6 +57,48 @@ def test_the_robot_stands_when_its_link_is_lost(drive: Drive, fault: str) -> Non
     drive.stands_within_limit(since)
     driver.stop()
     drive.robot_side.heal()
+    drive.again()
+
+
+def moves_only_after_letting_go(drive: Drive, driver: Driver, since: int) -> None:
+    """Whoever has driven on across a fault moves nothing, however long; half a second of silence is letting go."""
+    drive.robot.wait_online()
+    # For six seconds: within five the robot takes the first command it hears for the going on of those before it.
+    enough = driver.sent + 60
+    wait_for("it has been commanded on and on", lambda: driver.sent >= enough)
+    assert [each for each in drive.robot.events("command", since) if each["v"] or each["w"]] == []
+    assert drive.robot.events("moving", since) == []
+    driver.let_go(LET_GO_SECONDS)
+    wait_for("the robot moves for who has let go", lambda: drive.robot.events("moving", since))
+    driver.stop()
+    drive.stands()
+
+
+def test_who_drives_on_across_a_lost_robot_link_moves_nothing_before_he_lets_go(drive: Drive) -> None:
+    """His connection never broke; when the robot is back, control is taken anew."""
+    driver = drive.start_driving()
+    broken = time.monotonic_ns()
+    drive.robot_side.black_hole()
+    drive.stands_within_limit(broken)
+    wait_for("its link is lost", lambda: drive.relay.state_of("rover") == "offline")
+    healed = time.monotonic_ns()
+    drive.robot_side.heal()
+    moves_only_after_letting_go(drive, driver, healed)
+    assert driver.broken is None
+    drive.again()
+
+
+def test_who_drives_on_across_a_restart_of_the_relay_moves_nothing_before_he_lets_go(drive: Drive) -> None:
+    """By a new connection, without a pause: the relay knows nothing of before, but the robot does."""
+    driver = Returning(lambda: drive.relay.connect_by(drive.client_side.port, "rover", drive.token))
+    drive.start_driving(driver)
+    killed = time.monotonic_ns()
+    drive.relay.kill()
+    drive.stands_within_limit(killed)
+    stood = time.monotonic_ns()
+    drive.relay.start()
+    wait_for("the driver is back", lambda: driver.connections > 1)
+    moves_only_after_letting_go(drive, driver, stood)
     drive.again()
 
 

@@ -4,38 +4,76 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 from switchboard_client import Client
 
 
 class Driver(threading.Thread):
-    """Keeps driving at 10 Hz until told to stop, or until the connection breaks."""
+    """Keeps driving at 10 Hz until told to stop, or until the connection breaks.
+
+    :ivar sent: how many commands have been sent
+    """
 
     def __init__(self, client: Client, v: float = 0.2, w: float = 0.6) -> None:
         super().__init__(daemon=True)
         self._client = client
         self._v, self._w = v, w
         self._end = threading.Event()
+        self._silent = threading.Event()
+        self.sent = 0
         self.broken: str | None = None
 
     def run(self) -> None:
         """Send, and read what comes so that nothing piles up."""
-        self._client.send(op="advertise", topic="/cmd_vel", type="geometry_msgs/msg/Twist")
+        try:
+            self._drive(self._client)
+        except Exception as error:
+            self.broken = repr(error)
+
+    def _drive(self, client: Client) -> None:
+        client.send(op="advertise", topic="/cmd_vel", type="geometry_msgs/msg/Twist")
         while not self._end.is_set():
-            try:
-                self._client.drive(self._v, self._w)
-                with contextlib.suppress(TimeoutError):
-                    self._client.receive(0.1)
-            except Exception as error:
-                self.broken = repr(error)
-                return
+            if not self._silent.is_set():
+                client.drive(self._v, self._w)
+                self.sent += 1
+            with contextlib.suppress(TimeoutError):
+                client.receive(0.1)
+
+    def let_go(self, seconds: float) -> None:
+        """Say nothing for so long, and then drive on."""
+        self._silent.set()
+        time.sleep(seconds)
+        self._silent.clear()
 
     def stop(self) -> None:
         """Let go, without a zero."""
         self._end.set()
         self.join(10)
+
+
+class Returning(Driver):
+    """Connects again as soon as its connection breaks, and commands at once.
+
+    :param connect: makes a connection
+    :ivar connections: how many there have been so far
+    """
+
+    def __init__(self, connect: Callable[[], Client]) -> None:
+        super().__init__(connect())
+        self._connect = connect
+        self.connections = 1
+
+    def run(self) -> None:
+        """Drive by one connection after the other."""
+        super().run()
+        while not self._end.wait(0.01):
+            with contextlib.suppress(Exception), self._connect() as client:
+                self.connections += 1
+                self._drive(client)
 
 
 class Listener(threading.Thread, ABC):
