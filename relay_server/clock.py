@@ -56,7 +56,9 @@ def looping(clock: Clock, call: Callable[[], object]) -> LoopingCall:
     return loop
 
 
-async def within(clock: Clock, seconds: float, work: Coroutine[Deferred[Any], Any, T], words: str) -> T:
+async def within(
+    clock: Clock, seconds: float, work: Coroutine[Deferred[Any], Any, T] | Deferred[T], words: str
+) -> T:
     """Do something that must not be waited for long; what is not done by then is given up.
 
     :raises Unavailable: it is given up, in these words
@@ -67,7 +69,7 @@ async def within(clock: Clock, seconds: float, work: Coroutine[Deferred[Any], An
             raise Unavailable(words)
         return result
 
-    running = Deferred.fromCoroutine(work)
+    running = work if isinstance(work, Deferred) else Deferred.fromCoroutine(work)
     running.addTimeout(seconds, as_twisted(clock), late)
     return await running
 

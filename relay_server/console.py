@@ -21,6 +21,14 @@ from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, Fro
 from relay_server.registry import Presence, Registry
 from relay_server.store import Store
 
+CONFIRM_SECONDS = 15.0
+"""So long it is waited for a stop: longer than a robot has to confirm that it stands. The stop itself goes on."""
+
+NOT_CONFIRMED = (
+    f"the stop is not confirmed: within {CONFIRM_SECONDS:g} s the robot has not answered, and the database has not kept "
+    "the order for when it does"
+)
+
 NOT_ALL_KNOWN = f"the database has not told within {LOOKUP_SECONDS:g} s which robots there are"
 
 
@@ -120,8 +128,9 @@ class Console:
         :raises Unavailable: it can't be reached, and the order can't be kept; or nobody can say whether he may
         """
         desk = self._desks.of(await self._stoppable(principal, robot, address))
+        stopping = desk.stopping.stop(_actor(principal, address), why)
         try:
-            done, failed = await desk.stopping.stop(_actor(principal, address), why), ""
+            done, failed = await within(self._clock, CONFIRM_SECONDS, stopping, NOT_CONFIRMED), ""
         except NotDone as error:
             done, failed = False, str(error)
         return Outcome(done, view.stopped(desk.standing), failed)
@@ -202,13 +211,14 @@ class Console:
         :raises NotFound: no such robot
         :raises Unavailable: the robot is not known here, and the database does not answer
         """
-        given: dict[int, tuple[str, Deferred[bool]]] = {}
+        given: dict[int, tuple[str, Deferred[dict[str, Any]]]] = {}
 
         def stop(robots: Iterable[Presence]) -> None:
             for each in robots:
                 if each.robot_id not in given:
                     stopping = self._desks.of(each).stopping
-                    given[each.robot_id] = (each.name, stopping.stop(_local(by), why))
+                    told = self._told(each.name, stopping.stop(_local(by), why))
+                    given[each.robot_id] = (each.name, Deferred.fromCoroutine(told))
 
         stop([each for each in self._registry if robot in (None, each.name)])
         missed = ""
@@ -219,7 +229,16 @@ class Console:
                 if not given:
                     raise
                 missed = str(error)
-        return Halted([await _told(*each) for each in sorted(given.values(), key=itemgetter(0))], missed)
+        return Halted([await told for _, told in sorted(given.values(), key=itemgetter(0))], missed)
+
+    async def _told(self, robot: str, stopping: Deferred[bool]) -> dict[str, Any]:
+        try:
+            return {
+                "robot": robot,
+                "done": await within(self._clock, CONFIRM_SECONDS, stopping, NOT_CONFIRMED),
+            }
+        except SwitchboardError as error:
+            return {"robot": robot, "done": False, "reason": str(error)}
 
     async def resume_here(self, robot: str, why: str, by: str) -> None:
         """Let a robot move again.
@@ -256,13 +275,6 @@ class Console:
         if not verdict.allowed:
             raise Refused(verdict.reason)
         return topic
-
-
-async def _told(robot: str, stopping: Deferred[bool]) -> dict[str, Any]:
-    try:
-        return {"robot": robot, "done": await stopping}
-    except SwitchboardError as error:
-        return {"robot": robot, "done": False, "reason": str(error)}
 
 
 _NOT_YOURS = Answer(False, "you have no control of this robot")

@@ -14,7 +14,7 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Principal
-from relay_server.console import NOT_ALL_KNOWN, Console
+from relay_server.console import CONFIRM_SECONDS, NOT_ALL_KNOWN, NOT_CONFIRMED, Console
 from relay_server.control import Answer
 from relay_server.frontdesk import LOOKUP_SECONDS
 from relay_server.store import Store
@@ -268,6 +268,33 @@ async def test_on_the_relays_own_machine_no_robot_that_is_here_waits_for_the_dat
     unknown = outcome(place.console.stop_here("mule", "", "root"))
     place.world.clock.advance(LOOKUP_SECONDS)
     assert isinstance(unknown[0], Unavailable)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stop_that_nobody_confirms_and_nobody_keeps_is_told_to_be_none(place: Place) -> None:
+    """Rather than to be waited for as long as a database hangs."""
+    vic = await place.principal("vic")
+    await place.console.control(vic, ROBOT, HERE)
+    place.world.record.hold = True
+    asked = outcome(place.console.stop(vic, ROBOT, "", HERE))
+    place.world.clock.advance(CONFIRM_SECONDS)
+    assert [str(error) for error in asked] == [NOT_CONFIRMED]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_does_not_come_to_an_end_holds_up_no_answer_about_the_others(place: Place) -> None:
+    """One that is away, whose order a database that hangs does not keep."""
+    hidden = place.world.registry.presence(2, "hidden", "default")
+    assert hidden.control is None
+    place.robot_comes()
+    place.world.record.hold = True
+    asked = outcome(place.console.stop_here(None, "fire", "root"))
+    await place.made.store.write(queries.revision)
+    place.world.clock.advance(CONFIRM_SECONDS - 0.1)
+    assert asked == []
+    place.world.clock.advance(0.1)
+    late = {"robot": "hidden", "done": False, "reason": NOT_CONFIRMED}
+    assert asked == [([late, {"robot": ROBOT, "done": True}], "")]
 
 
 @pytest_twisted.ensureDeferred
