@@ -25,8 +25,8 @@ CONFIRM_SECONDS = 15.0
 """So long it is waited for a stop: longer than a robot has to confirm that it stands. The stop itself goes on."""
 
 NOT_CONFIRMED = (
-    f"the stop is not confirmed: within {CONFIRM_SECONDS:g} s the robot has not answered, and the database has not kept "
-    "the order for when it does"
+    f"the stop is not confirmed: within {CONFIRM_SECONDS:g} s the robot has not answered, and the database has not "
+    "kept the order for when it does"
 )
 
 NOT_ALL_KNOWN = f"the database has not told within {LOOKUP_SECONDS:g} s which robots there are"
