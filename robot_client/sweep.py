@@ -126,7 +126,7 @@ class Sweep:
             )
         going = set(pursued) - silent
         if going:
-            words.append(f"goals of {_names(going)} have not ended yet")
+            words.append(f"goals of {_names(going)} are not known to have ended")
         return words
 
     def actions(self) -> list[str]:
