@@ -211,12 +211,13 @@ class Publishing:
         """
         topic = route.publication.topic
         if not self._desk.passes(self._session, topic):
-            if self._is_mere_zero(route, ask):
+            still = _is_still(route, ask)
+            if still and self._is_mere_zero(route):
                 # The robot judges it, as it does all commands.
                 self._grips.let_go(topic)
                 self._desk.zero(self._session)
                 return True
-            self._claim(route, ask)
+            self._claim(route, ask, still)
             return False
         if self._must_let_go(topic):
             self._in_vain(route, _is_still(route, ask))
@@ -228,14 +229,14 @@ class Publishing:
         route.passes = True
         return True
 
-    def _is_mere_zero(self, route: Route, ask: rosbridge.Publish) -> bool:
-        """Whether a command has nothing to stop: it takes no control.
+    def _is_mere_zero(self, route: Route) -> bool:
+        """Whether a zero has nothing to stop: it takes no control.
 
         One that comes while control is being taken does: by it the one that waits is taken back. Where the robot counts
         a topic as motion by its name, all zeros may be a goal.
         """
         commands = route.publication.type in self._robot.description.motion.types
-        return commands and not self._desk.lease.coming_to(self._session) and _is_still(route, ask)
+        return commands and not self._desk.lease.coming_to(self._session)
 
     def _drives(self, route: Route, ask: rosbridge.Publish) -> None:
         """A command has passed: one that moves keeps control from idling, while the robot is not stopped."""
@@ -257,26 +258,27 @@ class Publishing:
         """The relay's monotonic nanoseconds."""
         return self._freshness.not_before + self._freshness.age()
 
-    def _claim(self, route: Route, ask: rosbridge.Publish) -> None:
+    def _claim(self, route: Route, ask: rosbridge.Publish, still: bool) -> None:
         """A command of who does not command the robot: it waits if the robot is being told that it now does.
 
+        :param still: whether it says zero
         :raises Refused: somebody else commands the robot, or control must be taken first
         """
         topic = route.publication.topic
         if len(bytes(ask.msg)) > WAITING_BYTES or (
             topic not in self._waiting and len(self._waiting) >= WAITING_TOPICS
         ):
-            self._ask_for_control(route, ask)
+            self._ask_for_control(route, still)
             raise Refused(f"control is just being taken; a command to {topic} can't wait for it")
         # Before it is asked for, since the answer may be there at once.
         self._waiting[topic] = _Waiting(ask, self._freshness.not_before)
         try:
-            self._ask_for_control(route, ask)
+            self._ask_for_control(route, still)
         except SwitchboardError:
             self._waiting.pop(topic, None)
             raise
 
-    def _ask_for_control(self, route: Route, ask: rosbridge.Publish) -> None:
+    def _ask_for_control(self, route: Route, still: bool) -> None:
         grips = self._grips
         if not self._desk.lease.coming_to(self._session):
             # A command that takes a free robot moves it: programs that know nothing of control begin so.
@@ -285,7 +287,7 @@ class Publishing:
             self._desk.claim(self._session)
         except SwitchboardError:
             self._grips = grips
-            self._in_vain(route, _is_still(route, ask))
+            self._in_vain(route, still)
             raise
 
     def commands(self) -> None:
