@@ -5,6 +5,7 @@ Arguments: what to do: ``serve`` (until it is killed), ``call`` a service, or ``
 
 import json
 import sys
+import time
 
 import rclpy
 from builtin_interfaces.msg import Time
@@ -40,6 +41,8 @@ def serve(node: object, name: str) -> None:
         return response
 
     def pursue(goal: object) -> EverythingAction.Result:
+        while not node.count_subscribers(f"{name}/_action/feedback"):
+            time.sleep(0.01)  # who asked may not have been found yet; what is said before that is lost
         for step in range(goal.request.steps):
             goal.publish_feedback(EverythingAction.Feedback(step=step, feedback=goal.request.goal))
         goal.succeed()
