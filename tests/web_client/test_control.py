@@ -342,6 +342,16 @@ class TestLettingGo:
         assert relay.commands() == before
         page.mouse.up()
 
+    def test_control_that_another_one_gets(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Free for a moment only: what the driver reads says who has control, and no more that it can be taken."""
+        page, other = open_page(COCKPIT, user="driver"), open_page(COCKPIT, user="admin")
+        ready_to_drive(page)
+        stands(other, "held")
+        relay.do(robot=ROBOT, take_away=True)
+        expect(seen(page, "drive-words")).to_contain_text("It is free")
+        take_control(other)
+        expect(seen(page, "drive-words")).to_have_text("admin has control now.")
+
     def test_a_command_topic_that_is_gone(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """The zero goes to the topic that was driven; another one is driven only by taking hold anew."""
         page = open_page(COCKPIT, user="driver")

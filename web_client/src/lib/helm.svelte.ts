@@ -59,6 +59,7 @@ export class Helm {
 
   private readonly drive: Drive
   private givingAway = false
+  private lossTold: string | null = null
 
   constructor(private readonly bridge: Bridge) {
     this.chosen = recall<Limits>(`limits:${bridge.name}`, USUAL)
@@ -146,6 +147,7 @@ export class Helm {
     // What was said when it was stopped here is over, whoever resumed it.
     if (before?.stopped && told.stopped === null) this.words = null
     if (control.isYours(before) && !this.isMine) this.lost()
+    else if (this.lossTold !== null && this.words === this.lossTold) this.tellLoss(told)
     if (this.isMine !== control.isYours(before) || told.request?.you) this.answer = null
   }
 
@@ -159,8 +161,13 @@ export class Helm {
   private lost(): void {
     this.drive.stop('control_lost')
     this.letGo += 1
-    if (!this.givingAway && this.control !== null) this.words = control.whyLost(this.control, this.bridge.offline)
+    if (!this.givingAway && this.control !== null) this.tellLoss(this.control)
     this.givingAway = false
+  }
+
+  /** Between two who have control the robot is free for a moment; what is told of the loss goes with the present. */
+  private tellLoss(after: control.Control): void {
+    this.words = this.lossTold = control.isYours(after) ? null : control.whyLost(after, this.bridge.offline)
   }
 
   takeControl(why = ''): Promise<void> {
