@@ -131,9 +131,13 @@ class AlertDesk:
             for each in self._alerts.book
             if each.robot_id in rights and rules.visible(rights[each.robot_id], each.kind, each.about)
         ]
-        found.sort(key=lambda each: (each.over is None, each.last), reverse=True)
-        shown = [self._view(principal, each, rights[each.robot_id]) for each in found[: kinds.SHOWN]]
-        shown.sort(key=lambda each: each["last"], reverse=True)
+        lasting = [each for each in found if each.over is None]
+        over = [each for each in found if each.over is not None]
+        over.sort(key=lambda each: each.over or 0.0, reverse=True)
+        over = over[: max(kinds.SHOWN_OVER, kinds.SHOWN - len(lasting))]
+        lasting.sort(key=lambda each: each.last, reverse=True)
+        chosen = sorted(over + lasting[: kinds.SHOWN - len(over)], key=lambda each: each.last, reverse=True)
+        shown = [self._view(principal, each, rights[each.robot_id]) for each in chosen]
         if kept is not None and kept[2] == shown:
             shown = kept[2]
         self._pages[principal.user_id] = (version, known, shown)

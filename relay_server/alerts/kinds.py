@@ -45,6 +45,9 @@ SHOWN_SECONDS = 600.0
 SHOWN = 100
 """What is over is told to pages for so long, and so many alerts at most."""
 
+SHOWN_OVER = 25
+"""So many of these are what was over last, however much lasts."""
+
 ENDLESS_SECONDS = 86400.0
 """What nobody tells the end of is over so long after it was told last."""
 

@@ -208,6 +208,26 @@ async def test_a_page_gets_the_same_list_until_something_changes(scene: Scene) -
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_page_is_told_what_is_over_however_much_lasts(scene: Scene) -> None:
+    """The latest ends keep places in a full list; the rest are the latest of what lasts."""
+
+    def part(number: int, over: bool) -> None:
+        about = f"part {number}"
+        scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about=about, over=over)
+        scene.step += 1.0
+
+    for number in range(150):
+        part(number, over=False)
+    for number in range(30):
+        part(number, over=True)
+    shown = await scene.desk.shown(scene.people["ann"])
+    over = {each["about"] for each in shown if each["state"] == "over"}
+    assert len(shown) == 100
+    assert over == {f"part {number}" for number in range(5, 30)}
+    assert {each["about"] for each in shown} - over == {f"part {number}" for number in range(75, 150)}
+
+
+@pytest_twisted.ensureDeferred
 async def test_a_rule_tells_its_user_what_he_may_know(scene: Scene) -> None:
     """Rules of both; only who may hear diagnostics is told of them. Secrets are shown once."""
     ask = Ask("webhook", url="https://example.org/hook")
