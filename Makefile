@@ -20,7 +20,7 @@ demo: ## run a relay with two simulated robots and print how to log in (options:
 	@exec $(BIN)/switchboard demo $(DEMO)
 
 test: setup ## all tests: Python, ROS 2, browser, portal (options: PYTEST='-k drive')
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST)
+	$(BIN)/python -m pytest -n 3 --dist loadfile $(PYTEST)
 	$(NPM) run test
 
 CASES := $(BIN)/python -m pytest -q --no-header -r N --tb=short --table

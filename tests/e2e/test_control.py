@@ -14,13 +14,13 @@ from typing import Any
 
 import pytest
 from switchboard_client import Client
+from switchboard_drive import LATE_MS
 from switchboard_http import Answer, ask
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_waiting import wait_for
 
 CLIENTS = Path(__file__).parent / "clients"
-LIMIT_MS = 500
 LET_GO_SECONDS = 0.6
 """Silence of half a second is letting go."""
 LEVELS = {"olga": "owner", "ann": "operator", "bob": "operator", "vic": "viewer"}
@@ -148,7 +148,7 @@ def test_a_viewer_stops_who_drives_and_may_not_resume(place: Place) -> None:
         assert vic.call("/relay/stop", {"why": "somebody is in the way"})["values"]["success"]
         place.stands()
         took_ms = (place.robot.events("standstill", since)[0]["t"] - since) / 1e6
-        assert took_ms < LIMIT_MS
+        assert took_ms < LATE_MS
         refused = vic.call("/relay/resume")
         assert refused["result"] is False
         assert "only who has control" in refused["values"]

@@ -8,6 +8,9 @@ from conformance_suite import case, not_offered
 from link_relay import LinkRelay
 from robot_tasks import CDR, DRIVER, Wheels
 
+LATE = 0.75
+"""Seconds over its promise that a robot is forgiven on a computer that runs other things beside it."""
+
 
 @case("motion", "SPEC 2.5 advertised, motion")
 def test_motion_is_known(drive: Wheels) -> None:
@@ -30,7 +33,7 @@ def test_stops_when_commands_cease(drive: Wheels) -> None:
     for _ in range(3):
         drive.command(0.2)
     took = drive.stands(moving)
-    assert took <= drive.stop_within + 0.25, f"it took {took * 1000:.0f} ms"
+    assert took <= drive.stop_within + LATE, f"it took {took * 1000:.0f} ms"
 
 
 @case("motion", "SPEC 2.5, Clocks and deadline, 6")
@@ -110,7 +113,7 @@ def test_cut_channel_stops(drive: Wheels) -> None:
     moving = drive.start()
     drive.driving.cut()
     took = drive.stands(moving)
-    assert took <= drive.stop_within + 0.25, f"it took {took * 1000:.0f} ms"
+    assert took <= drive.stop_within + LATE, f"it took {took * 1000:.0f} ms"
 
 
 @case("motion", "SPEC 2.5, Clocks and deadline, 7")
