@@ -26,6 +26,9 @@ from bench.report import Options, Row
 
 TOPIC = "/cmd_vel"
 TWIST = "geometry_msgs/msg/Twist"
+PACE = 0.25
+"""Seconds between two hand-overs: nobody may take control more than five times a second."""
+
 COMMANDS = 3
 """Each gives in a round."""
 TURN = 1e-4
@@ -142,6 +145,7 @@ class Race:
     async def handed_over(self) -> float:
         """One hands control to another; milliseconds from its word to the first command of the other."""
         giver, taker = self._racers[:2]
+        await asyncio.sleep(PACE)
         await giver.call("/relay/take_control")
         await giver.drive(0)
         await taker.call("/relay/take_control")
