@@ -27,7 +27,7 @@ from bench.report import Options, Row
 TOPIC = "/cmd_vel"
 TWIST = "geometry_msgs/msg/Twist"
 PACE = 0.25
-"""Seconds between two hand-overs: nobody may take control more than five times a second."""
+"""Seconds between two rounds or hand-overs: nobody may ask for control more than five times a second."""
 
 COMMANDS = 3
 """Each gives in a round."""
@@ -126,6 +126,7 @@ class Race:
 
     async def round(self) -> None:
         """All ask, one drives, the others try to."""
+        await asyncio.sleep(PACE)
         number, asked = len(self.winners), time.monotonic_ns()
         said = await asyncio.gather(*(self._ask(each) for each in self._racers))
         winners = [(racer, at) for racer, at in zip(self._racers, said, strict=True) if at]
