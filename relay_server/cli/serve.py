@@ -146,12 +146,7 @@ def serve(
         raise Invalid("--heartbeat must be more than 0 s")
     if recordings_gb < 0:
         raise Invalid("--recordings-gb must not be less than 0")
-    if not (0 <= control_grace <= DAY and 0 < control_idle <= DAY):
-        raise Invalid("--control-grace and --control-idle are seconds: more than 0, at most a day")
-    if not control_grace < control_request <= DAY:
-        raise Invalid(
-            "--control-request must be more than --control-grace and at most a day: in between owners take over"
-        )
+    _check_control(control_grace, control_request, control_idle)
     if battery_low == 0:
         battery_critical = 0.0
     if not 0 <= battery_critical <= battery_low <= 100:
@@ -192,3 +187,16 @@ def _ready(relay: Relay, link: str | None) -> None:
         )
     click.echo(f"READY http={relay.http_port} robots={relay.robots_port}")
     sys.stdout.flush()
+
+
+def _check_control(grace: float, request: float, idle: float) -> None:
+    """See that the times of control make sense, seconds.
+
+    :raises Invalid: they don't
+    """
+    if not (0 <= grace <= DAY and 0 < idle <= DAY):
+        raise Invalid("--control-grace and --control-idle are seconds: more than 0, at most a day")
+    if not grace < request <= DAY:
+        raise Invalid(
+            "--control-request must be more than --control-grace and at most a day: in between owners take over"
+        )
