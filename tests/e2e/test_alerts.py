@@ -127,7 +127,7 @@ def test_a_robot_whose_plug_is_pulled_is_told_once_within_seconds(house: House, 
             print(f"\n{how} to webhook: {delivery.at - pulled:.2f} s")
             assert delivery.at - pulled < WITHIN
             assert delivery.signed_with(rule["secret"])
-            time.sleep(3)
+            time.sleep(3)  # to see that it does not come twice
         words = [each for delivery in list(house.hook.got) for each in told(delivery, robot.name)]
         assert words.count("offline begun") == 1
         assert set(words) <= {"offline begun", "control begun"}

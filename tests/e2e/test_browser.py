@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from playwright.sync_api import Browser, Page, expect
-from switchboard_browser import hold_joystick, hold_resume, portal, ready_to_drive, seen, sound_pages
+from switchboard_browser import hold_joystick, hold_resume, lived_in, ready_to_drive, seen, sound_pages
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_waiting import wait_for
@@ -53,12 +53,7 @@ class House:
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     """One house for all; the tests that restart its relay leave it whole."""
-    portal()
-    house = House(tmp_path_factory.mktemp("browser"))
-    try:
-        yield house
-    finally:
-        house.stop()
+    yield from lived_in(House, tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture

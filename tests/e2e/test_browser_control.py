@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Page, WebSocketRoute, expect
 from switchboard_browser import (
     hold_joystick,
     hold_resume,
-    portal,
+    lived_in,
     ready_to_drive,
     seen,
     sound_pages,
@@ -72,12 +72,7 @@ class House:
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     """One house for all; each test leaves the robot free, and able to move."""
-    portal()
-    house = House(tmp_path_factory.mktemp("control"))
-    try:
-        yield house
-    finally:
-        house.stop()
+    yield from lived_in(House, tmp_path_factory.mktemp("control"))
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
-from switchboard_browser import portal, sound_pages
+from switchboard_browser import lived_in, sound_pages
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_video import CAMERA, decoded, get
@@ -100,12 +100,7 @@ class House:
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     """One house for all; each test leaves its robot online."""
-    portal()
-    house = House(tmp_path_factory.mktemp("browser"))
-    try:
-        yield house
-    finally:
-        house.stop()
+    yield from lived_in(House, tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture

@@ -62,7 +62,7 @@ class Place:
     @contextmanager
     def driving(self, name: str, v: float = 0.2) -> Iterator[Client]:
         """Somebody who has let go drives, at 20 Hz, and hears nothing meanwhile."""
-        time.sleep(LET_GO_SECONDS)
+        time.sleep(LET_GO_SECONDS)  # so long he must say nothing
         with self.connect(name) as client:
             client.send(op="set_level", level="none")
             end = threading.Event()
@@ -182,7 +182,7 @@ def test_a_stop_survives_the_relay_and_the_daemon(place: Place) -> None:
     since = time.monotonic_ns()
     with place.driving("ann"):
         wait_for("he has control", lambda: place.control()["holder"], 10)
-        time.sleep(0.5)
+        time.sleep(0.5)  # he drives on: nothing may come of it
     assert not [each for each in place.robot.events("command", since) if each["v"]]
     assert place.http("POST", "resume", "olga", {"why": "it was toast"}).json == {"stopped": None}
     with place.driving("ann"):
@@ -237,7 +237,7 @@ def test_an_owner_suppresses_who_drives(place: Place) -> None:
                 since = time.monotonic_ns()
             olga.send(op="call_service", service="/relay/suppress", args={"resource": "/cmd_vel", "ms": 200})
             olga.drive(-0.1)
-            time.sleep(0.05)
+            time.sleep(0.05)  # the pace of a driver
         commands = [each["v"] for each in place.robot.events("command", since)]
         assert min(commands) < 0
         assert max(commands) <= 0, "the driver's commands came through"

@@ -131,7 +131,7 @@ def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_whe
         drive.stands_within_limit(since)
         time.sleep(1.0)  # the client goes on sending into the frozen relay's socket
         driver.stop()
-        time.sleep(0.6)
+        time.sleep(0.6)  # the last command grows older than its deadline
     finally:
         woken = time.monotonic_ns()
         drive.relay.thaw()
@@ -173,7 +173,7 @@ def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
     try:
         drive.stands_within_limit(since)
         driver.stop()
-        time.sleep(0.6)
+        time.sleep(0.6)  # the last command grows older than its deadline
     finally:
         woken = time.monotonic_ns()
         drive.robot.daemon.signal(signal.SIGCONT)

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
@@ -22,6 +22,26 @@ def portal() -> Path:
     if not (relay_server.PORTAL / "index.html").is_file():
         pytest.fail("The portal is not built. Run 'make web', then the tests again.")
     return relay_server.PORTAL
+
+
+class House(Protocol):
+    """What a module's tests share, with a relay in it."""
+
+    def stop(self) -> None:
+        """End everything."""
+
+
+H = TypeVar("H", bound=House)
+
+
+def lived_in(house: Callable[[Path], H], folder: Path) -> Iterator[H]:
+    """A house for the portal, ended when its tests are over."""
+    portal()
+    made = house(folder)
+    try:
+        yield made
+    finally:
+        made.stop()
 
 
 @contextmanager

@@ -72,7 +72,7 @@ class Drive:
     def again(self) -> None:
         """All is back by itself: who has let go can drive by a new connection, and lets go."""
         self.robot.wait_online()
-        time.sleep(LET_GO_SECONDS)
+        time.sleep(LET_GO_SECONDS)  # so long he must say nothing
         self.start_driving().stop()
         self.stands()
 
