@@ -66,6 +66,17 @@ _NEEDED = {
     Operation.MANAGE: Level.OWNER,
 }
 
+
+def needed(operation: Operation) -> Level:
+    """The least level that includes an operation without patterns."""
+    return _NEEDED[operation]
+
+
+def includes(level: Level, other: Level) -> bool:
+    """Whether a level goes as far as another."""
+    return _RANK[level] >= _RANK[other]
+
+
 _ALL = "*"
 
 _PARTS = "/_action/"
@@ -76,14 +87,15 @@ _OF_ACTION = {Operation.PUBLISH: Operation.PROVIDE}
 
 
 class Grant(NamedTuple):
-    """One right as it stands in the database.
+    """One right as it stands in the database, or as a token's scope names it.
 
+    :param level: ``None`` where there is nothing but patterns, as in a scope
     :param allow: patterns ``operation:resource``, e.g. ``call:/reset`` or ``*:/arm/*`` (shell wildcards)
     :param deny: patterns of the same form
     :param source: whom the right was given to, for the reason: ``user ann`` or ``group lab``
     """
 
-    level: Level
+    level: Level | None
     allow: tuple[str, ...] = ()
     deny: tuple[str, ...] = ()
     source: str = ""
@@ -122,19 +134,27 @@ class Rules:
     """All rights of one principal on one robot, compiled.
 
     No grants at all means no channel: :attr:`level` is ``None`` and every question is answered with no.
+
+    :param scope: what the token in use may be used for on this robot; ``None`` for all that its user may
     """
 
-    def __init__(self, grants: Iterable[Grant] = ()) -> None:
+    def __init__(self, grants: Iterable[Grant] = (), scope: Iterable[Grant] | None = None) -> None:
         self.grants = tuple(grants)
-        self.level: Level | None = max(
-            (grant.level for grant in self.grants), key=_RANK.__getitem__, default=None
-        )
+        self.scope = None if scope is None else tuple(scope)
+        self._within = None if self.scope is None else Rules(self.scope)
+        self._own = _highest(self.grants)
+        self.level: Level | None = _lower(self._own, self.scope)
         self._allow = [pattern for grant in self.grants for pattern in map(_compile, grant.allow)]
         self._deny = [pattern for grant in self.grants for pattern in map(_compile, grant.deny)]
         self._verdicts: dict[tuple[Operation, str], Verdict] = {}
 
     def __bool__(self) -> bool:
         return self.level is not None
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Equal for rules that judge alike."""
+        return (self.grants, self.scope)
 
     def judge(self, operation: Operation, resource: str) -> Verdict:
         """May the principal do this to that resource of the robot? Answers are kept: names recur."""
@@ -147,11 +167,21 @@ class Rules:
         return verdict
 
     def _decide(self, operation: Operation, resource: str) -> Verdict:
-        if self.level is None:
+        verdict = self._decide_own(operation, resource)
+        if (
+            verdict.allowed
+            and self._within is not None
+            and not self._within.judge(operation, resource).allowed
+        ):
+            return Verdict(False, f"{operation} on {resource} is outside the scope of your token")
+        return verdict
+
+    def _decide_own(self, operation: Operation, resource: str) -> Verdict:
+        if self._own is None and not self._allow:
             return Verdict(False, "you have no right on this robot")
         action, part, _ = resource.partition(_PARTS)
         if part:
-            whole = self._decide(_OF_ACTION.get(operation, operation), action)
+            whole = self._decide_own(_OF_ACTION.get(operation, operation), action)
             if not whole.allowed:
                 return whole
         for pattern in self._deny:
@@ -161,16 +191,30 @@ class Rules:
             if pattern.matches(operation, resource):
                 return Verdict(True, f"allowed by '{pattern.text}'")
         if operation is Operation.VIEW:
-            return self._decide(Operation.SUBSCRIBE, resource)
+            return self._decide_own(Operation.SUBSCRIBE, resource)
         needed = _NEEDED[operation]
-        if _RANK[self.level] >= _RANK[needed]:
-            return Verdict(True, f"allowed to {self.level}")
+        if self._own is not None and _RANK[self._own] >= _RANK[needed]:
+            return Verdict(True, f"allowed to {self._own}")
         return Verdict(
-            False, f"{operation} on {resource} needs the level {needed}; you are {self.level} on this robot"
+            False, f"{operation} on {resource} needs the level {needed}; you are {self._own} on this robot"
         )
 
 
 _VERDICTS_KEPT = 4096
+
+
+def _highest(grants: tuple[Grant, ...]) -> Level | None:
+    levels = [grant.level for grant in grants if grant.level is not None]
+    return max(levels, key=_RANK.__getitem__, default=None)
+
+
+def _lower(own: Level | None, scope: tuple[Grant, ...] | None) -> Level | None:
+    """The level one acts with: what a scope of mere patterns opens, it opens to a viewer."""
+    if own is None or scope is None:
+        return own
+    if not scope:
+        return None
+    return min(own, _highest(scope) or Level.VIEWER, key=_RANK.__getitem__)
 
 
 class _Pattern(NamedTuple):

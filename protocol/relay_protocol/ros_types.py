@@ -7,13 +7,14 @@ numbers are typed arrays (RFC 8746). For the relay only; a robot passes CDR on u
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from typing import Any
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
 from relay_protocol.limits import KIB, MIB, TYPE_TEXTS
 from relay_protocol.ros.compiled import Compiled, Reader, Writer
-from relay_protocol.ros.definition import normalise, parts_of, text_of
+from relay_protocol.ros.definition import Definition, normalise, parts_of, text_of
 from relay_protocol.ros.typedefs import typedef
 
 __all__ = ["Body", "Reader", "TypeRegistry", "Writer"]
@@ -220,6 +221,13 @@ class TypeRegistry:
                 contained = [each.type.base for each in definition.fields if each.type.primitive is None]
                 waiting += reversed(contained)
         return list(found.values())
+
+    def definitions(self, type_name: str) -> Mapping[str, Definition]:
+        """The definition of a message, and of all others that came with it, by their full names.
+
+        :raises NotFound: the type is not registered
+        """
+        return self._find(type_name)[1].definitions
 
     def _asked(self, type_name: str) -> str:
         """The message that asks, of a service or an action; any other name as it is."""

@@ -110,6 +110,7 @@ class Health(Message, frozen=True, kw_only=True):
     :param memory: memory in use, 0 to 1
     :param rtt_ms: round trip to the relay as the robot measures it, milliseconds
     :param stale_commands: motion commands dropped because they were too old, since start
+    :param invalid_commands: motion commands and goals dropped because they make no sense, since start
     :param unguarded_commands: motion commands dropped because the guard could not have stopped them, since start
     :param refused_commands: motion commands dropped because their source does not move the robot now, since start
     :param limited_commands: motion commands made slower, since start
@@ -122,6 +123,7 @@ class Health(Message, frozen=True, kw_only=True):
     memory: float | None = None
     rtt_ms: float | None = None
     stale_commands: int = 0
+    invalid_commands: int = 0
     unguarded_commands: int = 0
     refused_commands: int = 0
     limited_commands: int = 0

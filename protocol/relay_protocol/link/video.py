@@ -128,6 +128,7 @@ class Playing(Message, frozen=True, kw_only=True):
     :param delay_ms: from the picture's arrival at the robot's daemon to the relay's word that it is there
     :param encoding: of the camera's own pictures
     :param source_fps: pictures per second the camera gives
+    :param latched: its publisher keeps the latest picture for those who come later, however old it is
     """
 
     width: Shown
@@ -138,6 +139,7 @@ class Playing(Message, frozen=True, kw_only=True):
     delay_ms: Annotated[float, Meta(ge=0, le=1e9)] | None = None
     encoding: Label = ""
     source_fps: Rate = 0.0
+    latched: bool = False
 
 
 class NotPlaying(Reasoned, frozen=True, kw_only=True):
