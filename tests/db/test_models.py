@@ -26,6 +26,11 @@ def filled(database: Database) -> Database:
 RIGHT = "INSERT INTO robot_right (robot_id, user_id, group_id, level, allow, deny) VALUES "
 TOKEN = "INSERT INTO access_token (user_id, token_hash, kind, label, created) VALUES "
 
+ENTRY = (
+    "INSERT INTO directory_entry "
+    "(id, realm_id, user_id, kind, name, address, description, data, ttl, registered, expires) VALUES "
+)
+
 
 @pytest.mark.parametrize(
     "statement",
@@ -67,6 +72,9 @@ TOKEN = "INSERT INTO access_token (user_id, token_hash, kind, label, created) VA
             id="key without bytes",
         ),
         pytest.param("INSERT INTO membership (group_id, user_id) VALUES (1, 9)", id="member that is nobody"),
+        pytest.param(ENTRY + "('a', 1, 1, '', 'x', '', '', '', 1, 1, 2)", id="entry of no kind"),
+        pytest.param(ENTRY + "('a', 1, 1, 'x', 'x', '', '', '', 0, 1, 2)", id="entry for no time"),
+        pytest.param(ENTRY + "('a', 1, 9, 'x', 'x', '', '', '', 1, 1, 2)", id="entry of nobody"),
     ],
 )
 def test_the_tables_refuse(filled: Database, statement: str) -> None:

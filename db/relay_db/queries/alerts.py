@@ -24,6 +24,8 @@ ALERTS = 100_000
 
 _RECENT = 10_000
 _PAGE = 1000
+_BY_ROBOT = 8
+"""Of no more robots alerts are looked up by robot."""
 
 
 def save_alerts(s: Session, records: Iterable[AlertRecord]) -> None:
@@ -82,7 +84,7 @@ def list_alerts(
     *,
     open: bool | None = None,
     limit: int = 100,
-    after: AlertRecord | None = None,
+    after: tuple[float, str] | None = None,
     kinds_but: Mapping[str, Collection[int]] = MappingProxyType({}),
     but: Collection[tuple[int, str, str]] = (),
 ) -> list[AlertRecord]:
@@ -90,16 +92,19 @@ def list_alerts(
 
     :param robots: of these robots only; ``None`` for all
     :param open: only those that last, or only those that are over
-    :param after: only those that come after this one
+    :param after: only those that come after the one with this ``last`` and ``id``, whether it is there or not
     :param kinds_but: by kind, robots of which none of it is wanted
     :param but: robot, kind and part of those that are not wanted
     """
     query = _alerts().order_by(Alert.last_at.desc(), Alert.id).limit(limit)
     if robots is not None:
-        query = query.where(Alert.robot_id.in_(list(robots)))
+        # Of many robots by time: by robot, all they ever told would be sorted for one page.
+        of: Any = Alert.robot_id if len(robots) <= _BY_ROBOT else Alert.robot_id + 0
+        query = query.where(of.in_(list(robots)))
     if after is not None:
-        later = and_(Alert.last_at == after.last, Alert.id > after.id)
-        query = query.where(or_(Alert.last_at < after.last, later))
+        last, id = after
+        # The first condition says nothing new: by it an index is read from there on, which by an 'or' it is not.
+        query = query.where(Alert.last_at <= last, or_(Alert.last_at < last, Alert.id > recorded(id, 32)))
     for kind, of in kinds_but.items():
         query = query.where(or_(Alert.kind != kind, Alert.robot_id.not_in(list(of))))
     if but:

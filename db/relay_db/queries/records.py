@@ -84,7 +84,10 @@ class RightRecord(NamedTuple):
 
 
 class PrincipalRecord(NamedTuple):
-    """Who a token stands for; ``expires`` is the token's end, None for never."""
+    """Who a token stands for; ``expires`` is the token's end, None for never.
+
+    :param scope: what it may be used for; ``None`` for all that its user may
+    """
 
     user_id: int
     name: str
@@ -92,6 +95,7 @@ class PrincipalRecord(NamedTuple):
     admin: bool
     token_id: int
     expires: float | None
+    scope: str | None = None
 
 
 class TokenRecord(NamedTuple):
@@ -104,6 +108,44 @@ class TokenRecord(NamedTuple):
     label: str
     created: float
     expires: float | None
+    scope: str | None = None
+
+
+class ProgramRecord(NamedTuple):
+    """A program that proves itself by key and secret.
+
+    :param verifier: H(A1) of RFC 7616 by SHA-256, in hex
+    :param scope: what its tokens may be used for at most; ``None`` for all that its user may
+    """
+
+    id: int
+    user_id: int
+    user: str
+    realm: str
+    key: str
+    verifier: str
+    scope: str | None
+    label: str
+    created: float
+
+
+class IssuedRecord(NamedTuple):
+    """What a token stands for that somebody asks about or goes on with.
+
+    :param kind: ``access`` or ``refresh``
+    :param program: key of the program it was given to
+    :param family_id: what it belongs to, if it can be refreshed
+    """
+
+    kind: str
+    user_id: int
+    user: str
+    realm: str
+    scope: str | None
+    program: str | None
+    created: float
+    expires: float | None
+    family_id: int | None
 
 
 class StopRecord(NamedTuple):
@@ -177,6 +219,86 @@ class EventRecord(NamedTuple):
     robot_id: int | None
     user_id: int | None
     data: dict[str, Any]
+
+
+class NewMemory(NamedTuple):
+    """An event for the short-term memory.
+
+    :param data: a JSON object as text, in ASCII, as :func:`relay_db.base.canonical_json` writes it
+    """
+
+    realm: str
+    at: float
+    source: str
+    kind: str
+    robot_id: int | None
+    user: str | None
+    data: str
+
+
+class MemoryRecord(NamedTuple):
+    """An event of the short-term memory.
+
+    :param number: within its realm, in the order in which they were written
+    :param used: how often a query has given it
+    """
+
+    number: int
+    realm: str
+    at: float
+    source: str
+    kind: str
+    robot_id: int | None
+    user: str | None
+    data: str
+    used: int
+
+
+class NameIs(NamedTuple):
+    """A name, or what it begins with."""
+
+    text: str
+    prefix: bool = False
+
+    def fits(self, name: str) -> bool:
+        """Whether a name is meant."""
+        return name.startswith(self.text) if self.prefix else name == self.text
+
+
+class MemoryPlace(NamedTuple):
+    """A place among events that are told from the newest on."""
+
+    at: float
+    number: int
+
+
+class MemoryAsk(NamedTuple):
+    """What is asked of a realm's memory, and what of it may be seen.
+
+    :param robots: robots about which events are wanted and may be seen
+    :param general: whether those about no robot are wanted
+    :param insider: whether of these also the relay's own, and logins, may be seen
+    :param since: Unix seconds; ``until`` is the first moment after
+    :param data: top-level fields of the data, and their values as text
+    """
+
+    realm: str
+    robots: frozenset[int]
+    general: bool
+    insider: bool = False
+    source: NameIs | None = None
+    kind: NameIs | None = None
+    user: str | None = None
+    since: float | None = None
+    until: float | None = None
+    data: tuple[tuple[str, str], ...] = ()
+
+
+class MemoryPage(NamedTuple):
+    """Events that were found, and where to go on, ``None`` where there are no more."""
+
+    events: list[MemoryRecord]
+    place: MemoryPlace | None
 
 
 class AuditRecord(NamedTuple):

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Literal
 
-from sqlalchemy import ColumnElement, delete, insert, or_, select
+from sqlalchemy import ColumnElement, Select, delete, insert, or_, select
 from sqlalchemy.orm import Session
 
-from relay_db.models import AccessToken, EnrolmentCode, Realm, User
+from relay_db.models import AccessToken, EnrolmentCode, Realm, TokenFamily, User
 from relay_db.names import findable_hex
 from relay_db.names import label as checked_label
 from relay_db.queries.records import PrincipalRecord, TokenRecord
 from relay_db.queries.state import bump
-from relay_protocol.errors import NotFound, Refused
+from relay_db.queries.users import check_unchanged
+from relay_protocol.errors import NotFound
 
 TokenKind = Literal["access", "session", "login"]
 _LOGIN: tuple[TokenKind, ...] = ("login",)
@@ -28,11 +29,17 @@ def create_token(
     label: str = "",
     expires: float | None,
     now: float,
+    scope: str | None = None,
+    program_id: int | None = None,
+    family_id: int | None = None,
 ) -> int:
     """Keep a new token and return its number, which is never given out again.
 
     :param token_hash: SHA-256 in hex
     :param expires: Unix seconds, None for never
+    :param scope: what it may be used for; ``None`` for all that its user may
+    :param program_id: the program it is given to, which it ends with
+    :param family_id: the refresh token it comes of, which it ends with
     :raises NotFound: no such user
     :raises Invalid: the label can't be kept
     """
@@ -45,6 +52,9 @@ def create_token(
         "label": checked_label(label, "label of a token"),
         "created": now,
         "expires": expires,
+        "scope": scope,
+        "program_id": program_id,
+        "family_id": family_id,
     }
     return s.scalars(insert(AccessToken).values(**values).returning(AccessToken.id)).one()
 
@@ -57,10 +67,7 @@ def open_session(
     :param password_hash: what was stored when the user was proved
     :raises Refused: another is stored now, or the user was disabled or removed
     """
-    standing = select(User.password_hash, User.disabled).where(User.id == user_id).with_for_update()
-    user = s.execute(standing).one_or_none()
-    if user is None or user.disabled or user.password_hash != password_hash:
-        raise Refused("the account was changed while you logged in; log in again")
+    check_unchanged(s, user_id, password_hash)
     return create_token(s, user_id, token_hash, kind="session", label="portal", expires=expires, now=now)
 
 
@@ -72,17 +79,16 @@ def principal_by_token(
     None if it is unknown, revoked, expired or of another kind, or if its user is disabled.
     """
     row = s.execute(
-        select(User.id, User.name, Realm.name, User.admin, AccessToken.id, AccessToken.expires)
-        .join(User, User.id == AccessToken.user_id)
-        .join(Realm, Realm.id == User.realm_id)
-        .where(
-            AccessToken.token_hash == findable_hex(token_hash),
-            AccessToken.kind.in_(tuple(kinds)),
-            User.disabled.is_(False),
-            _unexpired(now),
+        _principals(now).where(
+            AccessToken.token_hash == findable_hex(token_hash), AccessToken.kind.in_(tuple(kinds))
         )
     ).one_or_none()
     return None if row is None else PrincipalRecord(*row)
+
+
+def principals_by_ids(s: Session, token_ids: Collection[int], now: float) -> list[PrincipalRecord]:
+    """Whom tokens of these numbers stand for, of those that :func:`token_is_live` is true of."""
+    return [PrincipalRecord(*row) for row in s.execute(_principals(now).where(AccessToken.id.in_(token_ids)))]
 
 
 def consume_login(s: Session, token_hash: str, now: float) -> PrincipalRecord | None:
@@ -113,6 +119,7 @@ def list_tokens(s: Session, user_id: int | None = None) -> list[TokenRecord]:
             AccessToken.label,
             AccessToken.created,
             AccessToken.expires,
+            AccessToken.scope,
         )
         .join(User, User.id == AccessToken.user_id)
         .order_by(AccessToken.id)
@@ -132,25 +139,37 @@ def token_is_live(s: Session, token_id: int, now: float) -> bool:
     return s.scalar(live) is not None
 
 
-def live_tokens(s: Session, token_ids: Collection[int], now: float) -> set[int]:
-    """Which of these :func:`token_is_live` is true of."""
-    live = (
-        select(AccessToken.id)
-        .join(User, User.id == AccessToken.user_id)
-        .where(AccessToken.id.in_(token_ids), User.disabled.is_(False), _unexpired(now))
-    )
-    return set(s.scalars(live))
-
-
 def purge_expired(s: Session, now: float) -> int:
     """Drop tokens and enrolment codes that are of no use any more; how many."""
     tokens = delete(AccessToken).where(AccessToken.expires <= now).returning(AccessToken.id)
+    families = delete(TokenFamily).where(TokenFamily.expires <= now).returning(TokenFamily.id)
     codes = (
         delete(EnrolmentCode)
         .where(or_(EnrolmentCode.expires <= now, EnrolmentCode.used.is_not(None)))
         .returning(EnrolmentCode.id)
     )
-    return len(s.scalars(tokens).all()) + len(s.scalars(codes).all())
+    gone = [len(s.scalars(each).all()) for each in (tokens, families, codes)]
+    if gone[1]:
+        # Tokens that had not expired ended with them.
+        bump(s)
+    return sum(gone)
+
+
+def _principals(now: float) -> Select[int, str, str, bool, int, float | None, str | None]:
+    return (
+        select(
+            User.id,
+            User.name,
+            Realm.name,
+            User.admin,
+            AccessToken.id,
+            AccessToken.expires,
+            AccessToken.scope,
+        )
+        .join(User, User.id == AccessToken.user_id)
+        .join(Realm, Realm.id == User.realm_id)
+        .where(User.disabled.is_(False), _unexpired(now))
+    )
 
 
 def _unexpired(now: float) -> ColumnElement[bool]:

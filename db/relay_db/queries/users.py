@@ -5,11 +5,11 @@ from __future__ import annotations
 from sqlalchemy import ColumnElement, Row, Select, delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import AccessToken, Group, Membership, Realm, User
+from relay_db.models import AccessToken, Group, Membership, Realm, TokenFamily, User
 from relay_db.names import findable, normal_name
 from relay_db.queries.records import GroupRecord, RealmRecord, UserRecord
 from relay_db.queries.state import bump
-from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.errors import Invalid, NotFound, Refused
 
 DEFAULT_REALM = "default"
 
@@ -85,7 +85,7 @@ def add_user(
 def set_password(
     s: Session, user_id: int, password_hash: str | None, *, keep_token: int | None = None
 ) -> None:
-    """Change the password and end all browser sessions opened with the old one.
+    """Change the password and end all browser sessions and refreshed tokens opened with the old one.
 
     :param keep_token: number of the session that asks for the change and goes on
     :raises NotFound: no such user
@@ -99,6 +99,7 @@ def set_password(
             AccessToken.id != (-1 if keep_token is None else keep_token),
         )
     )
+    s.execute(delete(TokenFamily).where(TokenFamily.user_id == user_id))
 
 
 def set_disabled(s: Session, user_id: int, disabled: bool) -> None:
@@ -129,6 +130,18 @@ def remove_user(s: Session, user_id: int) -> None:
 def user_is_live(s: Session, user_id: int) -> bool:
     """Whether the user is there and not disabled."""
     return _holds(s, (User.id == user_id) & User.disabled.is_(False))
+
+
+def check_unchanged(s: Session, user_id: int, password_hash: str | None) -> None:
+    """See that a user whose password was just proved is still that user; until the transaction ends it stays so.
+
+    :param password_hash: what was stored when the user was proved
+    :raises Refused: another is stored now, or the user was disabled or removed
+    """
+    standing = select(User.password_hash, User.disabled).where(User.id == user_id).with_for_update()
+    user = s.execute(standing).one_or_none()
+    if user is None or user.disabled or user.password_hash != password_hash:
+        raise Refused("the account was changed while you logged in; log in again")
 
 
 def find_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord | None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
+from sqlalchemy import event
 
 from relay_db import queries
 from relay_db.engine import Database
@@ -36,7 +39,7 @@ def test_an_alert_is_written_again_in_its_place(database: Database) -> None:
         assert [each.id for each in queries.list_alerts(s, [robot], open=False)] == ["a1"]
         assert queries.list_alerts(s, [robot + 1]) == queries.list_alerts(s, []) == []
         (latest,) = queries.list_alerts(s, limit=1)
-        assert [each.id for each in queries.list_alerts(s, after=latest)] == ["a1"]
+        assert [each.id for each in queries.list_alerts(s, after=(latest.last, latest.id))] == ["a1"]
         assert queries.get_alert(s, "nothing\x00") is None
 
 
@@ -76,9 +79,31 @@ def test_alerts_are_listed_on_from_where_a_list_ended_without_what_is_not_wanted
         whole = queries.list_alerts(s)
         assert [each.id for each in whole] == ["a0", "a1", "a2", "a3", "d1", "d2", "d3"]
         for number, each in enumerate(whole):
-            assert queries.list_alerts(s, after=each) == whole[number + 1 :]
+            assert queries.list_alerts(s, after=(each.last, each.id)) == whole[number + 1 :]
         wanted = queries.list_alerts(s, kinds_but={"diagnostics": [rover]}, but=[(rover, "stale", "/t0")])
         assert [each.id for each in wanted] == ["a1", "a3", "d2", "d3"]
+
+
+@pytest.mark.parametrize(("robots", "index"), [(1, "ix_alert_robot_id"), (50, "ix_alert_last_at")])
+def test_a_page_of_a_long_list_is_read_from_where_it_begins(
+    sqlite: Database, robots: int, index: str
+) -> None:
+    """By an index, in the order of the list: not all that was ever told is sorted for it, however old the page."""
+    asked: list[tuple[str, Any]] = []
+    with sqlite.reading() as s:
+        connection = s.connection()
+        event.listen(
+            connection,
+            "before_cursor_execute",
+            lambda _, __, words, values, *___: asked.append((words, values)),
+        )
+        queries.list_alerts(s, range(1, robots + 1), after=(1e9, "a1"))
+        ((words, values),) = list(asked)
+        plan = [row[-1] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {words}", values)]
+    (search,) = [each for each in plan if each.startswith("SEARCH alert")]
+    assert index in search
+    assert "last_at<?" in search
+    assert "USE TEMP B-TREE FOR ORDER BY" not in plan
 
 
 def test_an_acknowledgement_is_seen_by_who_looks_for_changes(database: Database) -> None:

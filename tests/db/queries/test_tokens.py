@@ -31,8 +31,8 @@ def test_a_token_stands_for_its_user(database: Database, ann: UserRecord) -> Non
         assert queries.principal_by_token(s, HASH, 10.0) is None
         assert queries.token_is_live(s, token, 9.9)
         assert not queries.token_is_live(s, token, 10.0)
-        assert queries.live_tokens(s, {token, 99}, 9.9) == {token}
-        assert queries.live_tokens(s, {token, 99}, 10.0) == set()
+        assert queries.principals_by_ids(s, {token, 99}, 9.9) == [principal]
+        assert queries.principals_by_ids(s, {token, 99}, 10.0) == []
         assert queries.list_tokens(s) == [
             queries.TokenRecord(token, ann.id, "ann", "access", "mine", 1.0, 10.0)
         ]

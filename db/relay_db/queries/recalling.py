@@ -1,0 +1,298 @@
+"""Finds events of the short-term memory.
+
+A query looks at a bounded part of the rows, from the newest back, and says where to go on: however little of a
+memory is asked for, nobody waits long for the thread that looks. Rows are found by the index on what is most exact;
+everything else is judged on what that yields.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Double,
+    Integer,
+    Select,
+    Subquery,
+    Text,
+    and_,
+    bindparam,
+    func,
+    or_,
+    select,
+    tuple_,
+)
+from sqlalchemy.orm import Session
+
+from relay_db.base import canonical_json
+from relay_db.models import Memory, MemoryCount, Realm
+from relay_db.queries.records import MemoryAsk, MemoryPage, MemoryPlace, MemoryRecord
+
+OURS = "relay"
+"""Sources that begin so are the relay's own."""
+
+LOGIN = "login"
+"""Kinds that begin so are for administrators, where they are about no robot."""
+
+LOOKED_AT = 10_000
+"""Rows one call looks at, at most."""
+
+_SLICES = (256, 2048, LOOKED_AT)
+"""Rows of one look: small first, since most askers want what came last."""
+
+_COLUMNS = (
+    Memory.number,
+    Memory.at,
+    Memory.source,
+    Memory.kind,
+    Memory.robot_id,
+    Memory.user_name,
+    Memory.data,
+    Memory.used,
+)
+
+
+def recall(s: Session, ask: MemoryAsk, place: MemoryPlace | None, limit: int) -> MemoryPage:
+    """Events, the newest first: as many as were found among :data:`LOOKED_AT` rows.
+
+    :param place: only those that come after this one
+    :param limit: most events
+    """
+    found: list[MemoryRecord] = []
+    values, looked = _values(s, ask), 0
+    for size in _SLICES:
+        size = min(size, LOOKED_AT - looked)
+        looked += size
+        room = limit - len(found)
+        asked = _asked(_shape(s, ask, place))
+        now = {**values, **_place_values(place), "size": size, "room": room}
+        rows = s.execute(asked.rows, now).all()
+        found += [_record(ask, row) for row in rows if _fits(ask, row.data)]
+        # Where there was no room for more of this part, the next one begins within it.
+        place = MemoryPlace(rows[-1].at, rows[-1].number) if len(rows) == room else _end(s, asked, now)
+        if place is None or len(found) == limit:
+            break
+    return MemoryPage(found, place)
+
+
+def count_memories(s: Session, ask: MemoryAsk, place: MemoryPlace | None) -> tuple[int, MemoryPlace | None]:
+    """How many there are among :data:`LOOKED_AT` rows, and where to go on.
+
+    :param place: only those that come after this one
+    """
+    asked = _asked(_shape(s, ask, place))
+    now = {**_values(s, ask), **_place_values(place), "size": LOOKED_AT}
+    return _count(s, ask, asked, now), _end(s, asked, now)
+
+
+def _count(s: Session, ask: MemoryAsk, asked: Asked, values: dict[str, Any]) -> int:
+    """How many rows of a part are wanted; only what is in the data has to be read."""
+    if not ask.data:
+        return s.scalar(asked.size, values) or 0
+    return sum(_fits(ask, data) for data in s.scalars(asked.data, values))
+
+
+def memories_since(s: Session, realm: str, number: int, limit: int) -> list[MemoryRecord]:
+    """All events of a realm with greater numbers, in their order.
+
+    :param limit: most events
+    """
+    query = (
+        select(*_COLUMNS)
+        .where(Memory.realm_id == realm_number(s, realm), Memory.number > number)
+        .order_by(Memory.number)
+        .limit(limit)
+    )
+    return [MemoryRecord(row.number, realm, *row[1:]) for row in s.execute(query)]
+
+
+def latest_memory(s: Session, realm: str) -> int:
+    """The number of the event that was written last; 0 when there never was one."""
+    query = select(MemoryCount.last).join(Realm, Realm.id == MemoryCount.realm_id).where(Realm.name == realm)
+    return s.scalar(query) or 0
+
+
+class Shape(NamedTuple):
+    """What a statement is made of, whatever the values are. To make one takes longer than the database does.
+
+    :param by: what rows are found by, see :func:`_index`
+    :param prefixes: of source and kind, whether it is asked for by its beginning; ``None`` where it is not asked for
+    :param fields: of the data, how many are asked for
+    """
+
+    postgresql: bool
+    by: str
+    since: bool
+    until: bool
+    placed: bool
+    prefixes: tuple[bool | None, bool | None]
+    user: bool
+    fields: int
+    general: bool
+    insider: bool
+
+
+class Asked(NamedTuple):
+    """Statements of one shape: rows of a part, what these hold, how many there are, and the last row that was seen."""
+
+    rows: Select[Any]
+    data: Select[Any]
+    size: Select[Any]
+    end: Select[Any]
+
+
+def _shape(s: Session, ask: MemoryAsk, place: MemoryPlace | None) -> Shape:
+    names = (ask.source, ask.kind)
+    return Shape(
+        s.get_bind().dialect.name == "postgresql",
+        _index(ask),
+        ask.since is not None,
+        ask.until is not None,
+        place is not None,
+        (names[0] and names[0].prefix, names[1] and names[1].prefix),
+        ask.user is not None,
+        len(ask.data),
+        ask.general,
+        ask.insider,
+    )
+
+
+def _index(ask: MemoryAsk) -> str:
+    """What rows are found by: one robot, a source (which has a bounded number), a kind or a user; else the realm."""
+    if len(ask.robots) == 1 and not ask.general:
+        return "robot"
+    if ask.source is not None and not ask.source.prefix:
+        return "source"
+    if ask.kind is not None and not ask.kind.prefix:
+        return "kind"
+    return "user" if ask.user is not None else ""
+
+
+def _values(s: Session, ask: MemoryAsk) -> dict[str, Any]:
+    """What a statement is given."""
+    values: dict[str, Any] = {
+        "realm": realm_number(s, ask.realm),
+        "robots": sorted(ask.robots),
+        "robot": next(iter(ask.robots), 0),
+        "user": ask.user,
+        "since": ask.since,
+        "until": ask.until,
+    }
+    for what, name in (("source", ask.source), ("kind", ask.kind)):
+        if name is not None:
+            values |= {what: name.text, f"{what}_length": len(name.text)}
+    for number, (field, value) in enumerate(ask.data):
+        key = canonical_json(field)
+        text = f"{key}:{canonical_json(value)}"
+        values |= {f"text_{number}": text, f"bare_{number}": f"{key}:{value}" if value.isascii() else text}
+    return values
+
+
+def _place_values(place: MemoryPlace | None) -> dict[str, Any]:
+    return {} if place is None else {"place_at": place.at, "place_number": place.number}
+
+
+@lru_cache(maxsize=1024)
+def _asked(shape: Shape) -> Asked:
+    part, size = _part(shape), bindparam("size", type_=Integer)
+    wanted, order = _wanted(shape, part), (part.c.at.desc(), part.c.number.desc())
+    return Asked(
+        select(part).where(*wanted).order_by(*order).limit(bindparam("room", type_=Integer)),
+        select(part.c.data).where(*wanted),
+        select(func.count()).select_from(part).where(*wanted),
+        # Of the index alone: to read the rows of a source that is spread over a large memory takes far longer.
+        _rows(shape, Memory.at, Memory.number).limit(1).offset(size - 1),
+    )
+
+
+def _part(shape: Shape) -> Subquery:
+    """So many rows."""
+    return _rows(shape, *_COLUMNS).limit(bindparam("size", type_=Integer)).subquery()
+
+
+def _rows(shape: Shape, *columns: Any) -> Select[Any]:
+    """Rows by the index on what is most exact, the newest first."""
+    conditions: list[ColumnElement[bool]] = [Memory.realm_id == bindparam("realm")]
+    column = {
+        "robot": Memory.robot_id,
+        "source": Memory.source,
+        "kind": Memory.kind,
+        "user": Memory.user_name,
+    }.get(shape.by)
+    if column is not None:
+        conditions.append(column == bindparam(shape.by))
+    if shape.since:
+        conditions.append(Memory.at >= bindparam("since"))
+    if shape.until:
+        conditions.append(Memory.at < bindparam("until"))
+    if shape.placed:
+        at, number = bindparam("place_at", type_=Double), bindparam("place_number", type_=BigInteger)
+        # Twice: databases find the first by the index, of the second not all do.
+        conditions.append(Memory.at <= at)
+        conditions.append(tuple_(Memory.at, Memory.number) < tuple_(at, number))
+    return select(*columns).where(*conditions).order_by(Memory.at.desc(), Memory.number.desc())
+
+
+def _wanted(shape: Shape, part: Subquery) -> list[ColumnElement[bool]]:
+    """What has to be true of the rows of a part."""
+    columns = part.c
+    conditions = [_visible(shape, part)]
+    for column, what, prefix in zip(
+        (columns.source, columns.kind), ("source", "kind"), shape.prefixes, strict=True
+    ):
+        if prefix is not None:
+            length = bindparam(f"{what}_length", type_=Integer)
+            # Not LIKE: SQLite's takes great letters for small ones.
+            conditions.append((func.substr(column, 1, length) if prefix else column) == bindparam(what))
+    if shape.user:
+        conditions.append(columns.user_name == bindparam("user"))
+    holds = func.strpos if shape.postgresql else func.instr
+    for number in range(shape.fields):
+        # What holds none of these can't fit. What does is looked at more closely.
+        texts = (bindparam(f"{each}_{number}", type_=Text) for each in ("text", "bare"))
+        conditions.append(or_(*(holds(columns.data, each) > 0 for each in texts)))
+    return conditions
+
+
+def _visible(shape: Shape, part: Subquery) -> ColumnElement[bool]:
+    columns = part.c
+    about = columns.robot_id.in_(bindparam("robots", expanding=True))
+    if not shape.general:
+        return about
+    if shape.insider:
+        return or_(about, columns.robot_id.is_(None))
+    source, kind = func.substr(columns.source, 1, len(OURS)), func.substr(columns.kind, 1, len(LOGIN))
+    return or_(about, and_(columns.robot_id.is_(None), source != OURS, kind != LOGIN))
+
+
+def _end(s: Session, asked: Asked, values: dict[str, Any]) -> MemoryPlace | None:
+    """Where a part ends; ``None`` when there is nothing behind it."""
+    last = s.execute(asked.end, values).first()
+    return None if last is None else MemoryPlace(*last)
+
+
+def realm_number(s: Session, name: str) -> int:
+    """The number of a realm; 0 when there is none."""
+    return s.scalar(select(Realm.id).where(Realm.name == name)) or 0
+
+
+def _fits(ask: MemoryAsk, data: str) -> bool:
+    return not ask.data or data_fits(ask.data, json.loads(data))
+
+
+def data_fits(wanted: Iterable[tuple[str, str]], data: Mapping[str, Any]) -> bool:
+    """Whether fields have these values: as text, or as what JSON writes for anything else."""
+    return all(
+        field in data
+        and value == (data[field] if isinstance(data[field], str) else canonical_json(data[field]))
+        for field, value in wanted
+    )
+
+
+def _record(ask: MemoryAsk, row: Any) -> MemoryRecord:
+    return MemoryRecord(row.number, ask.realm, *row[1:])

@@ -1,0 +1,210 @@
+"""The short-term memory, on both databases: what is written, found, counted and let go."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from sqlalchemy import text
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_db.queries import MemoryAsk, MemoryPlace, MemoryRecord, NameIs, NewMemory, recalling
+
+ALL = MemoryAsk("default", frozenset({1, 2}), True, insider=True)
+
+
+def new(at: float, source: str = "app", kind: str = "x", **fields: Any) -> NewMemory:
+    """An event; what is no column is its data."""
+    realm, robot, user = (fields.pop(name, None) for name in ("realm", "robot_id", "user"))
+    data = json.dumps(fields, sort_keys=True, separators=(",", ":"))
+    return NewMemory(realm or "default", at, source, kind, robot, user, data)
+
+
+def remembered(database: Database, *new_ones: NewMemory) -> list[MemoryRecord]:
+    """Write them in one transaction."""
+    with database.begin() as s:
+        return queries.remember(s, new_ones)
+
+
+def found(database: Database, **ask: Any) -> list[int]:
+    """Numbers of what is asked for, all of them."""
+    place: MemoryPlace | None = None
+    numbers: list[int] = []
+    with database.reading() as s:
+        while True:
+            page = queries.recall(s, ALL._replace(**ask), place, 1000)
+            numbers += [each.number for each in page.events]
+            place = page.place
+            if place is None:
+                return numbers
+
+
+def counted(database: Database, **ask: Any) -> int:
+    """How many there are of what is asked for."""
+    with database.reading() as s:
+        place, count = None, 0
+        while True:
+            more, place = queries.count_memories(s, ALL._replace(**ask), place)
+            count += more
+            if place is None:
+                return count
+
+
+def test_events_are_numbered_within_their_realm(database: Database) -> None:
+    """In the order in which they were given, without a gap, from one transaction to the next."""
+    with database.begin() as s:
+        queries.add_realm(s, "lab")
+    kept = remembered(database, new(1.0), new(1.0, realm="lab"), new(1.0, n=1))
+    assert [(each.realm, each.number) for each in kept] == [("default", 1), ("lab", 1), ("default", 2)]
+    assert [each.number for each in remembered(database, new(2.0), new(0.5, realm="lab"))] == [3, 2]
+    with database.reading() as s:
+        assert (queries.latest_memory(s, "default"), queries.latest_memory(s, "lab")) == (3, 2)
+        assert queries.latest_memory(s, "elsewhere") == 0
+        since = queries.memories_since(s, "default", 1, 10)
+        assert queries.memory_sizes(s) == {"default": 3, "lab": 2}
+    assert [(each.number, each.data, each.used) for each in since] == [(2, '{"n":1}', 0), (3, "{}", 0)]
+    assert found(database, realm="lab") == [1, 2]
+
+
+def test_numbers_are_never_given_twice(database: Database) -> None:
+    """Also when the newest events have gone."""
+    remembered(database, new(1.0), new(2.0))
+    with database.begin() as s:
+        assert queries.forget_memories(s, "default", [1, 2, 7]) == 2
+    assert [each.number for each in remembered(database, new(3.0))] == [3]
+
+
+ASKS: list[tuple[dict[str, Any], list[int]]] = [
+    ({}, [6, 5, 4, 3, 2, 1]),
+    ({"source": NameIs("app")}, [6, 5, 1]),
+    ({"source": NameIs("a", prefix=True)}, [6, 5, 2, 1]),
+    ({"source": NameIs("A", prefix=True)}, []),
+    ({"source": NameIs("", prefix=True)}, [6, 5, 4, 3, 2, 1]),
+    ({"kind": NameIs("greeted")}, [5, 1]),
+    ({"kind": NameIs("greeted"), "source": NameIs("app")}, [5, 1]),
+    ({"kind": NameIs("r", prefix=True), "user": "ann"}, []),
+    ({"user": "ann"}, [5, 1]),
+    ({"robots": frozenset({1}), "general": False}, [4, 3]),
+    ({"robots": frozenset({1, 2}), "general": False}, [4, 3, 2]),
+    ({"robots": frozenset({1})}, [6, 5, 4, 3, 1]),
+    ({"robots": frozenset(), "general": False}, []),
+    ({"since": 3.0}, [6, 5, 4, 3]),
+    ({"since": 3.0, "until": 5.0}, [4, 3]),
+    ({"insider": False}, [5, 4, 3, 2, 1]),
+    ({"insider": False, "robots": frozenset()}, [5, 1]),
+    ({"data": (("who", "ann"),)}, [5, 1]),
+    ({"data": (("who", "ann"), ("n", "1"))}, [1]),
+    ({"data": (("n", "1"),)}, [6, 1]),
+    ({"data": (("n", '"1"'),)}, []),
+    ({"data": (("deep", "1"),)}, []),
+    ({"data": (("yes", "true"),)}, [4]),
+    ({"data": (("who", "änn"),)}, [2]),
+    ({"data": (("who", "%"),)}, []),
+]
+
+
+def test_what_is_asked_for_is_found_and_counted(database: Database) -> None:
+    """By names, their beginnings, robots, users, times and fields, as far as it may be seen, the newest first."""
+    remembered(
+        database,
+        new(1.0, kind="greeted", user="ann", who="ann", n=1),
+        new(2.0, source="anna", kind="Robot", robot_id=2, who="änn"),
+        new(3.0, source="relay:rover", kind="robot.online", robot_id=1, n=11, far={"deep": 1}),
+        new(4.0, source="relay:rover", kind="login", robot_id=1, yes=True, who="ann "),
+        new(5.0, kind="greeted", user="ann", who="ann", n=2),
+        new(6.0, kind="login.odd", n="1"),
+    )
+    for ask, numbers in ASKS:
+        assert found(database, **ask) == numbers, ask
+        assert counted(database, **ask) == len(numbers), ask
+
+
+def test_the_relays_own_are_for_insiders_where_they_are_about_no_robot(database: Database) -> None:
+    """And logins are, whoever tells of them."""
+    remembered(database, new(1.0, source="relay", kind="x"), new(2.0, kind="login.refused"), new(3.0))
+    assert found(database, insider=False) == [3]
+    assert found(database) == [3, 2, 1]
+
+
+def test_a_page_goes_on_where_the_last_one_ended(database: Database) -> None:
+    """Also among events of one moment, and where the clock was set back."""
+    remembered(database, *(new(at) for at in (5.0, 5.0, 1.0, 5.0, 9.0, 5.0)))
+    assert found(database) == [5, 6, 4, 2, 1, 3]
+    with database.reading() as s:
+        first = queries.recall(s, ALL, None, 3)
+        second = queries.recall(s, ALL, first.place, 3)
+    assert [each.number for each in first.events + second.events] == [5, 6, 4, 2, 1, 3]
+
+
+def test_one_look_is_at_a_bounded_number_of_rows(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says where to go on, and in the end nothing was passed over."""
+    monkeypatch.setattr(recalling, "LOOKED_AT", 50)
+    monkeypatch.setattr(recalling, "_SLICES", (5, 10, 50))
+    remembered(database, *(new(float(each), n=each % 7) for each in range(200)))
+    with database.reading() as s:
+        page = queries.recall(s, ALL._replace(data=(("n", "6"),)), None, 1000)
+        assert page.place is not None and page.place.number == 151
+        assert len(page.events) == 7
+    assert found(database, data=(("n", "6"),)) == [200 - each for each in range(200) if (199 - each) % 7 == 6]
+    assert counted(database, data=(("n", "6"),)) == 28
+    assert counted(database) == 200
+
+
+def test_the_least_used_go_first_then_the_oldest_and_the_newest_are_spared(database: Database) -> None:
+    """What came a moment ago nobody can have used yet."""
+    remembered(database, *(new(float(each)) for each in range(1, 31)), new(1.0, source="other"))
+    with database.begin() as s:
+        queries.use_memories(s, {("default", each): 2 for each in range(1, 11)} | {("default", 12): 1})
+        queries.use_memories(s, {("default", 99): 1})
+    with database.reading() as s:
+        assert queries.surplus_memories(s, "default", "app", 30, 100) == []
+        assert queries.surplus_memories(s, "default", "app", 20, 100) == [11, *range(13, 22)]
+        assert queries.surplus_memories(s, "default", "app", 20, 3) == [11, 13, 14]
+        # Of 10 that may stay only the newest one is spared.
+        gone = queries.surplus_memories(s, "default", "app", 10, 100)
+        assert gone == [11, *range(13, 30), 12, 1]
+        assert queries.crowded_sources(s, 29) == [("default", "app")]
+        used = {each.number: each.used for each in queries.memories_since(s, "default", 0, 100)}
+    assert (used[1], used[12], used[20]) == (2, 1, 0)
+
+
+def test_the_old_are_found_by_age_and_by_number(database: Database) -> None:
+    """The oldest first."""
+    remembered(database, new(3.0), new(1.0), new(2.0))
+    with database.reading() as s:
+        assert queries.old_memories(s, "default", 3.0, 10) == [2, 3]
+        assert queries.old_memories(s, "default", None, 10) == [2, 3, 1]
+        assert queries.old_memories(s, "default", None, 1) == [2]
+        assert queries.old_memories(s, "elsewhere", None, 10) == []
+
+
+PLANS: dict[str, dict[str, Any]] = {
+    "ix_memory_at": {},
+    "ix_memory_source": {"source": NameIs("s1"), "kind": NameIs("k1"), "user": "u1"},
+    "ix_memory_kind": {"kind": NameIs("k1"), "since": 5.0},
+    "ix_memory_user": {"user": "u1", "source": NameIs("s", prefix=True)},
+    "ix_memory_robot": {"robots": frozenset({1}), "general": False, "kind": NameIs("k1")},
+}
+
+
+def test_each_kind_of_query_goes_by_its_index(database: Database) -> None:
+    """In the order of that, without sorting more rows than are looked at; also for the pages that follow."""
+    rows = [new(float(n), f"s{n % 5}", f"k{n % 5}", user=f"u{n % 5}", robot_id=n % 5) for n in range(5000)]
+    remembered(database, *rows)
+    with database.connection() as connection:
+        connection.execute(text("ANALYZE"))
+    with database.reading() as s:
+        explain = "EXPLAIN QUERY PLAN" if s.get_bind().dialect.name == "sqlite" else "EXPLAIN"
+        for index, ask in PLANS.items():
+            for place in (None, MemoryPlace(4000.0, 4000)):
+                asks = ALL._replace(**ask)
+                part = recalling._part(recalling._shape(s, asks, place)).element
+                values = {**recalling._values(s, asks), **recalling._place_values(place), "size": 100}
+                names = part.compile(s.get_bind()).params
+                bound = part.params({name: values[name] for name in names if name in values})
+                query = bound.compile(s.get_bind(), compile_kwargs={"literal_binds": True})
+                plan = "\n".join(str(row) for row in s.execute(text(f"{explain} {query}")))
+                assert f" {index} " in plan, plan
+                assert "TEMP B-TREE" not in plan and "Sort" not in plan, plan
