@@ -32,8 +32,40 @@ def nobody(level: str, text: str, kind: str = "", about: str = "", over: bool = 
     """Nobody is there to be told."""
 
 
+class Concern:
+    """One thing that may be wrong for a while: a person hears when it begins, when it is another, and when it is over.
+
+    :param alert: tells a person
+    :param kind: what it is about, as for :class:`OnAlert`
+    :param about: the part of the robot
+    """
+
+    def __init__(self, alert: OnAlert, kind: str, about: str) -> None:
+        self.words = ""
+        """What was told and lasts; empty for nothing."""
+        self._alert = alert
+        self._kind = kind
+        self._about = about
+
+    def tell(self, words: str, well: str) -> None:
+        """Tell what is wrong now, if that is news.
+
+        :param words: empty for nothing
+        :param well: what is said of it when it is over
+        """
+        told, self.words = self.words, words
+        if words and words != told:
+            self._alert("error", words, self._kind, self._about)
+        elif told and not words:
+            self._alert("info", well, self._kind, self._about, over=True)
+
+
 MODULE = "module"
 """Kind of what is told of the daemon's own parts."""
+
+CONTROL = "control"
+"""Kind of a loss of control while the robot moved. Of no part it has happened and does not last: once heard it is told
+no more."""
 
 
 class Reach(Protocol):
@@ -80,7 +112,7 @@ class AlertMemory:
     def tell(self, message: link.Alert) -> None:
         """Say it now if the relay is there, and later if it was not."""
         self._forget()
-        if message.kind:
+        if message.kind and (message.kind, message.about) != (CONTROL, ""):
             self._remember(message)
         registered = self._reach.registered
         self._doubtful.append(_Word(message, self._now() if registered else None))

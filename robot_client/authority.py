@@ -15,6 +15,7 @@ from relay_protocol.limits import FACTS
 from robot_client.safety import MILLI
 
 _Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 
 NOBODY = 0
 LET_GO = 500 * MILLI
@@ -22,6 +23,11 @@ LET_GO = 500 * MILLI
 
 SETTLED = 5000 * MILLI
 """How long after a new control link a stream may take to be heard again: its channel link has to come first."""
+
+DOUBT = 300 * MILLI
+"""How much earlier than it was a command may seem to have been sent: the relay pings clients ten times a second, and
+pings take their way (SPEC 1.5, "Clocks and deadline").
+"""
 
 GRIPS = 4096
 """Most sources and topics whose latest commands are remembered; who was not heard for longest is forgotten first."""
@@ -33,8 +39,12 @@ class Verdict(enum.Enum):
     ALLOWED = "it is obeyed"
     STOPPED = "the robot is stopped until somebody resumes it"
     SUPPRESSED = "others command this topic for a moment"
+    OVERRULED = "others suppress a topic that moves it; send it again when that is over"
     NOT_HOLDER = "only who holds control moves the robot"
     NOT_LET_GO = "it must let go first: say zero, or nothing for half a second"
+    OVERTAKEN = (
+        "it may have been sent before the robot was stopped or resumed, or control was lost; send it again"
+    )
 
 
 class Suppression(NamedTuple):
@@ -51,7 +61,7 @@ class Suppression(NamedTuple):
 class _Grip:
     """A source that keeps moving a topic, or would.
 
-    :ivar last: its latest command, nanoseconds
+    :ivar last: when its latest command came, nanoseconds
     :ivar innocent: ever since it began nobody has held control, which is how programs take a free robot
     :ivar barred: it must let go first
     """
@@ -80,8 +90,10 @@ class Authority:
         """Topics on which the holder said zero last, since the stop."""
         self._resumed: tuple[int, int] | None = None
         """Who held control at the last resume, and when that was."""
-        self._stopped_at: int | None = None
-        """When the robot was stopped last."""
+        self._turned: int | None = None
+        """When the robot was stopped or resumed last, or its control link lost: nothing sent before moves it."""
+        self._ceded: dict[int, int] = {}
+        """Sources that have lost control since then, and when; the latest last."""
         self._lost = False
         """Whether there is no control link, and was one."""
         self._met: int | None = None
@@ -90,43 +102,60 @@ class Authority:
         """Sources that have commanded since the present control link began, the latest last."""
         self._former: dict[int, None] = {}
         """Those that commanded by earlier ones."""
+        self._users: dict[str, None] = {}
+        """Users who held control since the present control link began, the latest last."""
+        self._former_users: dict[str, None] = {}
+        """Those who did by earlier ones: to a relay that was started anew they come under another number."""
         self._again: dict[tuple[int, str], None] = {}
         """Sources and topics heard soon after that."""
+        self._released: dict[tuple[str, str], None] = {}
+        """Users and topics of which they have let go since then, by whatever connection."""
 
     # --- judging -------------------------------------------------------------------------------------------
 
-    def judge(self, source: int, topic: str, moving: bool, now: int) -> Verdict:
+    def judge(self, source: int, topic: str, moving: bool, now: int, sent: int) -> Verdict:
         """What becomes of one command; what is refused is counted.
 
         :param topic: as the platform resolved it
         :param moving: whether it is anything but zero
         :param now: own clock, nanoseconds
+        :param sent: before when it can't have been sent, own clock, nanoseconds; no later than ``now``
         """
         verdict = self._rank(source, topic, now)
-        _note(self._heard, source)
+        _note(self._heard, source, None)
         if not moving:
             self._grips.pop((source, topic), None)
-            if source == self.holder and len(self._opened) < GRIPS:
-                self._opened.add(topic)
-        elif self._barred(source, topic, verdict, now) and verdict is Verdict.ALLOWED:
+            if source == self.holder:
+                _note(self._released, (self.user, topic), None)
+                if len(self._opened) < GRIPS:
+                    self._opened.add(topic)
+        elif self._barred(source, topic, verdict, now, sent) and verdict is Verdict.ALLOWED:
             verdict = Verdict.NOT_LET_GO
+        elif self._overtaken(source, sent) and verdict is Verdict.ALLOWED:
+            verdict = Verdict.OVERTAKEN
         if self._just_met(now):
-            _note(self._again, (source, topic))
+            _note(self._again, (source, topic), None)
         if verdict is not Verdict.ALLOWED:
             self.refused += 1
         return verdict
 
-    def judge_request(self, source: int, came: int | None = None) -> Verdict:
+    def judge_request(self, source: int, now: int, sent: int) -> Verdict:
         """What becomes of a call or a goal that moves the robot; what is refused is counted.
 
-        :param came: when it did, own clock, nanoseconds, if it has waited: a stop since then counts though it is over
+        What a goal makes of itself, by publishers of the robot's own, no suppression holds back: so none begins while
+        others suppress any topic.
+
+        :param now: as of :meth:`judge`, like ``sent``
         """
         verdict = Verdict.ALLOWED
-        overtaken = came is not None and self._stopped_at is not None and came < self._stopped_at
-        if self.stopped is not None or overtaken:
+        if self.stopped is not None:
             verdict = Verdict.STOPPED
         elif source == NOBODY or source != self.holder:
             verdict = Verdict.NOT_HOLDER
+        elif self._overruled(source, now):
+            verdict = Verdict.OVERRULED
+        elif self._overtaken(source, sent):
+            verdict = Verdict.OVERTAKEN
         if verdict is not Verdict.ALLOWED:
             self.refused += 1
         return verdict
@@ -134,6 +163,10 @@ class Authority:
     def commands(self, source: int, topic: str, now: int) -> bool:
         """Whether this source is the one to move a topic now."""
         return self._rank(source, topic, now) is Verdict.ALLOWED
+
+    def level_of(self, source: int) -> str:
+        """The level of who holds control; of others, such as who suppresses a topic, nobody told us: empty."""
+        return self.level if source == self.holder else ""
 
     # --- changes -------------------------------------------------------------------------------------------
 
@@ -143,15 +176,21 @@ class Authority:
         if holder == self.holder:
             return False
         self._drop_open(now)
-        for (source, _), grip in self._grips.items():
-            grip.barred = grip.barred or (source == holder and not grip.innocent)
+        met = self._just_met(now)
+        for (source, topic), grip in self._grips.items():
+            if source == holder:
+                grip.barred = grip.barred or not grip.innocent or (met and self._returned(user, topic))
         self._opened.clear()
+        if holder != NOBODY and user:
+            _note(self._users, user, None)
+        if self.holder != NOBODY:
+            _note(self._ceded, self.holder, now)
         self.holder = holder
         return True
 
     def stop(self, stopped: link.Stopped, now: int) -> None:
         """Let nothing move until :meth:`resume`; who stopped it first stays on record."""
-        self._stopped_at = now
+        self._turn(now)
         if self.stopped is None:
             self._drop_open(now)
             for grip in self._grips.values():
@@ -164,6 +203,7 @@ class Authority:
         if self.stopped is None:
             return
         self.stopped = None
+        self._turn(now)
         self._resumed = (self.holder, now)
         for grip in self._grips.values():
             # What a source said while the robot was stopped need not have come as far as here.
@@ -185,14 +225,18 @@ class Authority:
         self.holder, self.user, self.level = NOBODY, "", ""
         self.suppressions.clear()
         if not self._lost:
+            self._turn(now)
             self._drop_open(now)
         for grip in self._grips.values():
             grip.barred = True
         self._opened.clear()
         self._resumed = self._met = None
         for source in self._heard:
-            _note(self._former, source)
+            _note(self._former, source, None)
         self._heard.clear()
+        for user in self._users:
+            _note(self._former_users, user, None)
+        self._users.clear()
         self._lost = True
 
     def meet(self, now: int) -> None:
@@ -202,6 +246,7 @@ class Authority:
         self._lost = False
         self._met = now
         self._again.clear()
+        self._released.clear()
         for grip in self._grips.values():
             grip.last = now
 
@@ -216,33 +261,68 @@ class Authority:
         held = source == self.holder and source != NOBODY
         return Verdict.ALLOWED if held else Verdict.NOT_HOLDER
 
-    def _barred(self, source: int, topic: str, verdict: Verdict, now: int) -> bool:
-        """Take note of a command to move; whether its source must let go first."""
+    def _overruled(self, source: int, now: int) -> bool:
+        """Whether any topic is suppressed by others."""
+        return any(now < each.until and source not in each.sources for each in self.suppressions.values())
+
+    def _turn(self, now: int) -> None:
+        """What can have been sent before this moves nothing any more, whoever sent it."""
+        self._turned = now
+        self._ceded.clear()
+
+    def _overtaken(self, source: int, sent: int) -> bool:
+        """Whether what moves the robot can have been sent before it was stopped or resumed, or lost its link; or while
+        its source held control another time.
+        """
+        if self._turned is not None and sent < self._turned:
+            return True
+        return sent < self._ceded.get(source, sent)
+
+    def _barred(self, source: int, topic: str, verdict: Verdict, now: int, sent: int) -> bool:
+        """Take note of a command to move; whether its source must let go first.
+
+        Silence is what lies between the last that came and the earliest moment at which this one can have been sent:
+        a link that stalls makes none.
+        """
         grip = self._grips.get((source, topic))
-        if grip is None or (self.stopped is None and now - grip.last >= LET_GO):
+        if grip is None or (self.stopped is None and sent - grip.last >= LET_GO):
+            if grip is not None and source == self.holder:
+                _note(self._released, (self.user, topic), None)
             grip = self._take(source, topic, now)
-            grip.barred = self._holds_on(source, topic, now)
+            grip.barred = self._holds_on(source, topic, now, sent)
         else:
             self._grips[source, topic] = self._grips.pop((source, topic))
         grip.last = now
-        grip.barred = grip.barred or verdict is Verdict.STOPPED
+        # Of one that only seems a little too old nobody knows; it is not obeyed, but the next may be.
+        held = verdict is Verdict.STOPPED or self._overtaken(source, sent + DOUBT)
+        grip.barred = grip.barred or held
         grip.innocent = grip.innocent and verdict is Verdict.NOT_HOLDER and self.holder == NOBODY
         if source == self.holder:
             self._opened.discard(topic)
         return grip.barred
 
-    def _holds_on(self, source: int, topic: str, now: int) -> bool:
+    def _holds_on(self, source: int, topic: str, now: int, sent: int) -> bool:
         """Whether a command to move may be the going on of one that nobody heard.
 
-        It is the first since the control link began anew, and comes soon, from who commanded before that; or it comes
-        right after the resume, from who held control then and did not say zero.
+        It is the first since the control link began anew, and comes soon, from who commanded before that, be it by
+        another connection; or it comes right after the resume, from who held control then and did not say zero.
         """
-        if self._just_met(now) and source in self._former and (source, topic) not in self._again:
+        if self._just_met(now) and self._was_there(source, topic):
             return True
         if self._resumed is None:
             return False
         holder, at = self._resumed
-        return source == holder != NOBODY and now - at < LET_GO and topic not in self._opened
+        return source == holder != NOBODY and sent - at < LET_GO and topic not in self._opened
+
+    def _was_there(self, source: int, topic: str) -> bool:
+        """Whether it is the first from a source that commanded, or whose user held control, by an earlier link."""
+        if (source, topic) in self._again:
+            return False
+        return source in self._former or (source == self.holder and self._returned(self.user, topic))
+
+    def _returned(self, user: str, topic: str) -> bool:
+        """Whether a user held control by an earlier control link and has not let go of the topic since."""
+        return user in self._former_users and (user, topic) not in self._released
 
     def _just_met(self, now: int) -> bool:
         return self._met is not None and now - self._met < SETTLED
@@ -269,9 +349,9 @@ class Authority:
             del self._grips[key]
 
 
-def _note(known: dict[_Key, None], key: _Key) -> None:
+def _note(known: dict[_Key, _Value], key: _Key, value: _Value) -> None:
     """Remember it as the latest of at most :data:`GRIPS`."""
     known.pop(key, None)
-    known[key] = None
+    known[key] = value
     if len(known) > GRIPS:
         del known[next(iter(known))]

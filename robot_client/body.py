@@ -34,5 +34,9 @@ class Body(Protocol):
     def pursued(self) -> list[str]:
         """The actions that pursue something for the relay that moves the robot, as far as is known."""
 
+    @property
+    def overdue(self) -> list[str]:
+        """Those among them whose goals were to end, and may not have."""
+
     def silence(self, topic: str) -> None:
         """What :attr:`robot_client.helm.Helm.silent` says of a topic has changed."""

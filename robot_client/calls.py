@@ -38,10 +38,10 @@ class Calls(Part):
         if id in self._calls:
             raise NotNow(f"a call with the id '{id}' is under way")
         check_room(self._calls, "calls")
-        self._gate.call(message.service, message.source, message.stamp, self._offset)
+        check = self._gate.call(message.service, message.source, message.stamp, self._offset)
         request = arguments(message.cdr, message.service)
         timeout = message.timeout if 0 < message.timeout < math.inf else CALL_SECONDS
-        answer = self._platform.call(message.service, message.type, request, timeout)
+        answer = self._platform.call(message.service, message.type, request, timeout, check)
         done = answer.addCallback(lambda body: self._answer(message, body))
         done.addErrback(lambda failure: self._failed(message, failure))
         self._calls[id] = done

@@ -17,6 +17,7 @@ from relay_protocol.errors import SwitchboardError
 from relay_protocol.frames import CommandFrame, SampleFrame
 from robot_client.authority import NOBODY
 from robot_client.calls import Calls
+from robot_client.enduring import endure
 from robot_client.gate import Gate
 from robot_client.goal_topics import Goal, GoalTopics
 from robot_client.goals import Goals, refusal
@@ -91,7 +92,7 @@ class Channel:
         self._listening: dict[int, _Listening] = {}
         self._publishing: dict[int, _Publishing] = {}
         self._calls = Calls(wire, platform, frame_limit, gate, offset)
-        self._goals = Goals(wire, platform, frame_limit, gate, offset, pursuits)
+        self._goals = Goals(wire, platform, frame_limit, gate, offset, clock, pursuits)
         self._services = OfferedServices(wire, platform, frame_limit)
         self._actions = OfferedActions(wire, platform, frame_limit)
         self._log = Logger("channel")
@@ -164,13 +165,15 @@ class Channel:
             self._log.error("could not publish on {topic}: {error}", topic=publishing.topic, error=str(error))
 
     def close(self) -> None:
-        """The link is gone: stop what moves, release all."""
+        """The link is gone: stop what moves, release all; what fails holds up nothing else."""
+        failed = "something could not be released at the end of a channel"
+        endure(self._log, failed, self._goals.close)
         for number in list(self._publishing):
-            self._unpublish(number)
+            endure(self._log, failed, self._unpublish, number)
         for number in list(self._listening):
-            self._unlisten(number)
-        for part in (self._services, self._actions, self._goals, self._calls, self._sending):
-            part.close()
+            endure(self._log, failed, self._unlisten, number)
+        for part in (self._services, self._actions, self._calls, self._sending):
+            endure(self._log, failed, part.close)
 
     def flush(self) -> None:
         """Write what waits, as far as the transport takes it."""

@@ -28,6 +28,7 @@ MOTION_TYPES = [
     "geometry_msgs/msg/TwistStamped",
     "sensor_msgs/msg/Joy",
     "trajectory_msgs/msg/JointTrajectory",
+    "trajectory_msgs/msg/MultiDOFJointTrajectory",
     "control_msgs/msg/JointJog",
 ]
 
@@ -49,8 +50,8 @@ MOTION_ACTIONS = [
 ]
 """Those of Nav2, and of whoever moves arms, in every namespace."""
 
-GOAL_TOPICS = ["*/goal_pose"]
-"""That of Nav2, in every namespace."""
+GOAL_TOPICS = ["*/goal_pose", "*/goal_update", "*/goals_update"]
+"""Those of Nav2, in every namespace: the first gives a goal, the others bend one under way (``GoalUpdater``)."""
 
 _PATTERN = re.compile(r"[/*](?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_-]+\])*\Z")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
@@ -208,10 +209,17 @@ class Limits(Speeds, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     :param operator: those who may operate the robot
     :param owner: those who own it
+    :param unlimited: topics of other types than ``Twist`` and ``TwistStamped`` on which commands pass as they are, by
+        name or by a pattern as of ``motion_topics``; on all others those of who is limited are refused
     """
 
     operator: Speeds = msgspec.field(default_factory=Speeds)
     owner: Speeds = msgspec.field(default_factory=Speeds)
+    unlimited: list[str] = msgspec.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        patterns = [_pattern("unlimited", each) for each in self.unlimited]
+        msgspec.structs.force_setattr(self, "unlimited", patterns)
 
 
 class Ros(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -244,10 +252,13 @@ class Monitor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class Video(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How pictures are shown.
 
-    :param streams: most at a time; each takes a good part of a processor's core
+    :param streams: most at a time, of which a relay shows no more than 16; each takes a good part of a processor's core
+    :param target_ms: delay that pictures stay under, from the camera to the relay's word that they are there: they get
+        smaller and fewer for it where the uplink is thin
     """
 
-    streams: Annotated[int, msgspec.Meta(ge=1, le=64)] = 8
+    streams: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8
+    target_ms: Annotated[float, msgspec.Meta(ge=50, le=5000)] = 300.0
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

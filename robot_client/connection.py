@@ -13,6 +13,7 @@ from twisted.python.failure import Failure
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from robot_client.backoff import Backoff
+from robot_client.enduring import endure
 from robot_client.link import ControlLink, Ended, Event, Registered, RelayRefused, Said, WrongRelay
 from robot_client.reactors import Clock, Endpoint, Timer
 from robot_client.safety import PROOF_EVERY
@@ -34,8 +35,11 @@ class Follower(Protocol):
     def on_order(self, message: link.Message) -> None:
         """The relay wants something."""
 
-    def on_unregistered(self, reason: str) -> None:
-        """A registered link is gone."""
+    def on_unregistered(self, reason: str, proved: int | None) -> None:
+        """A registered link is gone.
+
+        :param proved: what :attr:`Connection.answered` was at last
+        """
 
 
 class Connection:
@@ -150,12 +154,19 @@ class Connection:
 
     def on_lost(self, reason: SwitchboardError) -> None:
         """The attempt failed or the link is gone: tell, then wait and dial again."""
+        proved = self.answered
         self._protocol = self._attempt = None
         lasted = 0.0
         if self._registered_at is not None:
             lasted = self._clock.seconds() - self._registered_at
             self._registered_at = None
-            self.follower.on_unregistered(str(reason))
+            endure(
+                self._log,
+                "not all could be done that the loss of the link asks for",
+                self.follower.on_unregistered,
+                str(reason),
+                proved,
+            )
         if self._stopped is not None:
             self._stopped.callback(None)
             return

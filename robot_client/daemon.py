@@ -9,22 +9,23 @@ from typing import Any
 
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.protocol import Factory
-from twisted.internet.task import LoopingCall
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_protocol import link
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
-from robot_client.alerts import MODULE, AlertMemory
+from robot_client.alerts import CONTROL, MODULE, AlertMemory
 from robot_client.authority import Authority
 from robot_client.body import Body
 from robot_client.camera.desk import CameraDesk
 from robot_client.channel import Channel
 from robot_client.channel_end import ChannelEnd
-from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection, Dial
+from robot_client.driven import Driven
+from robot_client.enduring import Rounds, endure
 from robot_client.gate import Gate
 from robot_client.goal_topics import GoalTopics
 from robot_client.graph_parts import parts
@@ -52,7 +53,7 @@ class Daemon(Body):
     :param latch: where a stop is kept
     :param hardware: what else there is to stop
     :param dial: endpoints by address
-    :param now: clock of :mod:`robot_client.clocks`, nanoseconds
+    :param now: clock of :mod:`relay_protocol.clocks`, nanoseconds
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Daemon(Body):
         self.motion.proof = self._pursuits.proof = lambda: connection.answered or 0
         self.motion.on_commanded = connection.prove
         self._pursuits.on_pursuing = self._goals_pursued
+        self._pursuits.on_changed = self.helm.changed
         self._gate = Gate(policy, platform, self.authority, now, settings.safety.stop_call)
         self._goal_topics = GoalTopics(
             settings.safety.goal_topics, platform, self.authority, self.motion, clock, now
@@ -99,30 +101,28 @@ class Daemon(Body):
         self._frame_limit = ROBOT_FRAME
         self._told: GraphView | None = None
         self._alerts = AlertMemory(connection, now)
+        self._driven = Driven(now)
         self._machine = Machine()
         self._troubled = False
-        self._loops = [
-            (LoopingCall(self._look_at_graph), 1.0 / settings.ros.graph_hz),
-            (LoopingCall(self.helm.look), LOOK_EVERY),
-            (LoopingCall(self._pursuits.look), LOOK_EVERY),
-            (LoopingCall(self._tell_health), settings.monitor.health_seconds),
+        rounds = [
+            (self._look_at_graph, 1.0 / settings.ros.graph_hz),
+            (self.helm.look, LOOK_EVERY),
+            (self._pursuits.look, LOOK_EVERY),
+            (self._tell_health, settings.monitor.health_seconds),
         ]
+        self._rounds = Rounds(rounds, clock)
         self._log = Logger("daemon")
         connection.follower = self
 
     def start(self) -> None:
         """Begin; the platform runs already."""
-        for loop, every in self._loops:
-            loop.clock = self._clock
-            loop.start(every, now=False)
+        self._rounds.start()
         self._connection.start()
 
     def stop(self) -> Deferred[Any]:
         """Stop the robot, then leave; fires when all connections are gone."""
         self.motion.stop_all("the daemon is leaving")
-        for loop, _ in self._loops:
-            if loop.running:
-                loop.stop()
+        self._rounds.stop()
         self._close_channels("the robot's daemon is leaving")
         settled = self.settled()
         gone = self._connection.stop("the robot's daemon is leaving")
@@ -166,18 +166,27 @@ class Daemon(Body):
         elif isinstance(message, link.CloseVideo):
             self._cameras.close(message)
 
-    def on_unregistered(self, reason: str) -> None:
+    def on_unregistered(self, reason: str, proved: int | None) -> None:
         """Without a control link nobody may drive; channels are joined anew."""
-        self.helm.unregistered()
-        self.motion.stop_all("the control link is lost", gently=True)
+        driver = self._driven.lost(proved)  # before zero is said, which changes it
+        failed = "after the loss of the control link something could not be done"
+        endure(self._log, failed, self.helm.unregistered)
+        endure(self._log, failed, self.motion.stop_all, "the control link is lost", True)
         self._told = None
         self._close_channels(reason)
+        if driver is not None:
+            words = (
+                f"{driver or 'somebody'} lost control while the robot moved: its link to the relay was lost"
+            )
+            endure(self._log, failed, self.alert, "error", words, CONTROL)
         self._cameras.unregistered(reason)
 
     # --- for the helm --------------------------------------------------------------------------------------
 
     def say(self, message: link.Message) -> None:
         """Tell the relay, if it is there."""
+        if isinstance(message, link.Safety):
+            self._driven.said(message, self.authority.user)
         self._connection.say(message)
 
     def topic(self, name: str) -> tuple[str, list[str]]:
@@ -202,6 +211,11 @@ class Daemon(Body):
     def pursued(self) -> list[str]:
         """The actions that pursue a goal that moves the robot."""
         return self._pursuits.pursued
+
+    @property
+    def overdue(self) -> list[str]:
+        """The actions that may pursue a goal which was to end."""
+        return self._pursuits.overdue
 
     def _goals_pursued(self, pursued: bool) -> None:
         if pursued:
@@ -280,13 +294,13 @@ class Daemon(Body):
         end = self._ends.pop(name, None)
         if end is not None:
             # At once, not when the connection is gone: what moves must stop, what is subscribed must end.
-            end.channel.close()
-            end.say(link.Bye(reason=why))
+            endure(self._log, "a channel could not be closed", end.channel.close)
+            endure(self._log, "goodbye could not be said on a channel", end.say, link.Bye(reason=why))
             end.protocol.end(LinkLost(why), gently=True)
 
     def _close_channels(self, why: str) -> None:
         for name in {*self._opening, *self._ends}:
-            self._close(name, why)
+            endure(self._log, "a channel could not be closed", self._close, name, why)
 
     # --- what the relay is told ----------------------------------------------------------------------------
 
@@ -353,6 +367,7 @@ class Daemon(Body):
             memory=self._machine.memory(),
             rtt_ms=round(round_trip * 1000, 3) if round_trip is not None else None,
             stale_commands=self.motion.stale_commands + self._gate.stale,
+            invalid_commands=self.motion.invalid_commands,
             unguarded_commands=self.motion.unguarded_commands,
             refused_commands=self.authority.refused,
             limited_commands=self.motion.limited_commands,

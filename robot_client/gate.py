@@ -13,8 +13,8 @@ from relay_protocol.errors import Refused
 from relay_protocol.link import MotionPolicy
 from robot_client.authority import Authority, Verdict
 from robot_client.offset import Offset
-from robot_client.platforms.base import Platform
-from robot_client.safety import MILLI, Freshness, freshness
+from robot_client.platforms.base import Check, Platform
+from robot_client.safety import MILLI, earliest
 
 HIDDEN = "/_action/"
 """What the names of an action's own services have between the action's and theirs."""
@@ -46,23 +46,23 @@ class Gate:
         self._now = now
         self._switch = switch
 
-    def call(self, service: str, source: int, stamp: int | None, offset: Offset) -> None:
+    def call(self, service: str, source: int, stamp: int | None, offset: Offset) -> Check:
         """See that a source may call a service.
 
         :param stamp: the relay's monotonic nanoseconds before which the call can't have been sent, if it says so
         :param offset: of the relay's clock, by the link on which the call came
+        :return: sees to it once more, for when the call is made: much may change while its service is looked for
         :raises Refused: it moves the robot, and this source may not, or it may be too old; or it is the switch
         :raises Invalid: it is no name
         """
         if not (self._policy.services or self._policy.actions or self._switch):
-            return
+            return _nothing
         full = self._platform.full_name(service, "service")
         self._spare(full, "call")
         moves = self._policy.moves_by_service(full)
         if full.endswith(GOAL):
             moves = moves or self._policy.moves_by_action(full[: -len(GOAL)])
-        if moves:
-            self._judge(f"a call of {full}", source, stamp, offset)
+        return self._judge(f"a call of {full}", source, stamp, offset) if moves else _nothing
 
     def goal(self, action: str, source: int, stamp: int | None, offset: Offset) -> bool:
         """See that a source may have a goal pursued; whether that moves the robot.
@@ -100,17 +100,29 @@ class Gate:
                 "call /relay/stop to stop the robot, /relay/resume to let it go"
             )
 
-    def _judge(self, what: str, source: int, stamp: int | None, offset: Offset) -> None:
-        verdict = self._authority.judge_request(source)
-        if verdict is not Verdict.ALLOWED:
-            raise Refused(f"{what} moves the robot: {verdict.value}")
-        if stamp is None:
-            return
-        now, deadline = self._now(), self._policy.deadline_ms
-        if freshness(stamp, now, offset, deadline) is not Freshness.FRESH:
-            self.stale += 1
-            age = _age(offset.oldest(stamp, now))
-            raise Refused(f"{what} moves the robot: {age}; none older than {deadline} ms is obeyed")
+    def _judge(self, what: str, source: int, stamp: int | None, offset: Offset) -> Check:
+        """Judge it now; what does so again."""
+        came = self._now()
+        sent = came if stamp is None else earliest(stamp, came, offset)
+
+        def judge() -> None:
+            now, deadline = self._now(), self._policy.deadline_ms
+            verdict = self._authority.judge_request(source, now, sent)
+            if verdict is not Verdict.ALLOWED:
+                raise Refused(f"{what} moves the robot: {verdict.value}")
+            oldest = now - came if stamp is None else offset.oldest(stamp, now)
+            if oldest is None or not 0 <= oldest <= deadline * MILLI:
+                self.stale += 1
+                raise Refused(
+                    f"{what} moves the robot: {_age(oldest)}; none older than {deadline} ms is obeyed"
+                )
+
+        judge()
+        return judge
+
+
+def _nothing() -> None:
+    """What moves nothing may always be done."""
 
 
 def _age(oldest: int | None) -> str:

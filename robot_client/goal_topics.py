@@ -20,7 +20,7 @@ from robot_client.motion import MotionDesk
 from robot_client.offset import Offset
 from robot_client.platforms.base import Motion, Platform, Sink
 from robot_client.reactors import Clock, Timer
-from robot_client.safety import Freshness, freshness, void_at
+from robot_client.safety import Freshness, earliest, freshness, void_at
 from robot_client.topics import TypedTopic
 from robot_client.tracks import Outlet
 
@@ -49,7 +49,7 @@ class GoalTopics:
     :param motion: counts what is too old or makes no sense, and has the link prove itself while goals may come; what it
         takes for its own is no goal topic
     :param clock: for what waits
-    :param now: clock of :mod:`robot_client.clocks`, nanoseconds
+    :param now: clock of :mod:`relay_protocol.clocks`, nanoseconds
     """
 
     def __init__(
@@ -92,18 +92,20 @@ class GoalTopics:
 
     def take(self, source: str, goal: Goal) -> None:
         """Publish a goal if it is allowed, fresh and sane, as soon as the link has proved itself; else count it."""
-        if self._authority.judge_request(goal.by) is Verdict.ALLOWED:
-            self._judge(source, goal, self._now())
+        now = self._now()
+        sent = earliest(goal.stamp, now, goal.offset)
+        if self._authority.judge_request(goal.by, now, sent) is Verdict.ALLOWED:
+            self._judge(source, goal, sent)
 
-    def _again(self, source: str, goal: Goal, came: int) -> None:
+    def _again(self, source: str, goal: Goal, sent: int) -> None:
         """
-        :param came: when it did, nanoseconds
+        :param sent: before when it can't have been sent, nanoseconds: a stop since then counts though it is over
         """
         del self._waiting[source]
-        if self._authority.judge_request(goal.by, came) is Verdict.ALLOWED:
-            self._judge(source, goal, came)
+        if self._authority.judge_request(goal.by, self._now(), sent) is Verdict.ALLOWED:
+            self._judge(source, goal, sent)
 
-    def _judge(self, source: str, goal: Goal, came: int) -> None:
+    def _judge(self, source: str, goal: Goal, sent: int) -> None:
         on, sink = self._open[source]
         now, deadline = self._now(), self._motion.policy.deadline_ms
         fresh = freshness(goal.stamp, now, goal.offset, deadline) is Freshness.FRESH
@@ -116,7 +118,7 @@ class GoalTopics:
             return
         self._supersede(source)
         if self._void(goal, now, self._motion.proof()) <= now:
-            self._waiting[source] = self._clock.callLater(LOOK_EVERY, self._again, source, goal, came)
+            self._waiting[source] = self._clock.callLater(LOOK_EVERY, self._again, source, goal, sent)
         else:
             self._publish(on, sink, goal.body)
 

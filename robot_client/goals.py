@@ -10,7 +10,13 @@ from robot_client.gate import Gate
 from robot_client.offset import Offset
 from robot_client.platforms.base import ABORTED, NEVER_BEGAN, Goal, Outcome, Platform
 from robot_client.pursuits import Pursuits
+from robot_client.reactors import Clock
 from robot_client.wire import Part, Wire, arguments, check_room
+
+ASK_EVERY = 1.0
+"""Seconds in which the relay can have one goal cancelled once. A change of control, a stop or a lost link wait for
+nothing.
+"""
 
 
 class Goals(Part):
@@ -21,6 +27,7 @@ class Goals(Part):
 
     :param gate: judges goals that move the robot
     :param offset: clock offset of the link they come on
+    :param clock: for the time alone
     :param pursuits: sees that those that move the robot end with the daemon
     """
 
@@ -31,15 +38,19 @@ class Goals(Part):
         frame_limit: int,
         gate: Gate,
         offset: Offset,
+        clock: Clock,
         pursuits: Pursuits | None = None,
     ) -> None:
         super().__init__(wire, platform, frame_limit)
         self._pursuits = pursuits
         self._gate = gate
         self._offset = offset
+        self._clock = clock
         self._goals: dict[str, Goal] = {}
         self._moving: set[str] = set()
         """Those whose actions move the robot."""
+        self._again: dict[str, float] = {}
+        """When the relay may have one cancelled once more, seconds."""
         self._paused = False
         self._held: dict[str, link.ActionFeedback] = {}
         self._closed = False
@@ -77,9 +88,11 @@ class Goals(Part):
         )
 
     def cancel(self, message: link.CancelActionGoal) -> None:
-        """The relay wants it no more; one that has ended already is passed over."""
+        """The relay wants it no more; one that has ended already is passed over, and what follows within a second."""
         goal = self._goals.get(message.id)
-        if goal is not None:
+        now = self._clock.seconds()
+        if goal is not None and now >= self._again.get(message.id, now):
+            self._again[message.id] = now + ASK_EVERY
             goal.cancel()
 
     def cancel_all(self, only_moving: bool) -> None:
@@ -88,12 +101,8 @@ class Goals(Part):
         :param only_moving: goals of actions that don't move it go on
         """
         for id, goal in list(self._goals.items()):
-            if only_moving and id not in self._moving:
-                continue
-            try:
-                goal.cancel()
-            except Exception:  # one that fails must not keep the next from its end
-                self._log.failure("a goal could not be cancelled")
+            if not only_moving or id in self._moving:
+                self._end(goal)
 
     def pause(self) -> None:
         """The link takes nothing."""
@@ -111,9 +120,18 @@ class Goals(Part):
         self._closed = True
         self._held.clear()
         for goal in list(self._goals.values()):
-            goal.cancel()
+            self._end(goal)
         self._goals.clear()
         self._moving.clear()
+        self._again.clear()
+
+    def _end(self, goal: Goal) -> None:
+        try:
+            goal.cancel()
+        except Exception:  # one that fails must not keep the next from its end
+            self._log.failure("a goal could not be cancelled")
+        if self._pursuits is not None:
+            self._pursuits.end(goal)
 
     def _feedback(self, id: str, action: str, body: bytes) -> None:
         if id not in self._goals:
@@ -146,6 +164,7 @@ class Goals(Part):
     def _say_end(self, id: str, status: int, cdr: str | None, reason: str) -> None:
         self._goals.pop(id, None)
         self._moving.discard(id)
+        self._again.pop(id, None)
         feedback = self._held.pop(id, None)
         if self._closed:
             return

@@ -2,23 +2,31 @@
 
 Linear and angular speed are limited apart, each by its length, so that the direction stays. Acceleration is counted
 from the last command on the topic: what goes on in the direction now asked for may grow by as much as the time since
-allows. To slow down, in any direction, is never limited.
+allows. To slow down, in any direction, is never limited. What can't be read is not followed where there are limits.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from relay_protocol.link.moving import Limits
-from robot_client.limits import NONE, limits_of
+from robot_client.limits import LEVELS, NONE, limits_of
 from robot_client.topics import TypedTopic
-from robot_client.velocity import STILL, Vector, Velocity, form, scaled
+from robot_client.velocity import STILL, Form, Vector, Velocity, form, scaled
 
 NANO = 1_000_000_000
 LONGEST = NANO // 10
 """Most time that counts between two commands: after a pause nobody starts at full speed."""
+
+REMEDY = "drive by Twist or TwistStamped, or have the topic listed in 'unlimited' of the robot's [limits]"
+
+
+def unreadable(on: TypedTopic) -> str:
+    """Why nobody may command a topic whose commands have no speeds to read."""
+    return f"speed is limited, and how fast {on.type} on {on.topic} moves the robot can't be told: {REMEDY}"
 
 
 class _Last(NamedTuple):
@@ -31,15 +39,29 @@ class Governor:
 
     :param told: limits by level, as :func:`robot_client.limits.limits_told` gives them
     :param encoding: of the commands, ``cdr`` or ``json``
+    :param unlimited: patterns of topics on which commands pass though their speeds can't be read
     """
 
-    def __init__(self, told: Mapping[str, Limits], encoding: str) -> None:
+    def __init__(self, told: Mapping[str, Limits], encoding: str, unlimited: Sequence[str] = ()) -> None:
         self.limited = 0
         """Commands made slower so far."""
         self._told = dict(told)
         self._encoding = encoding
+        self._unlimited = tuple(unlimited)
         self._last: dict[TypedTopic, _Last] = {}
         self._of: dict[str, Limits | None] = {}
+
+    def covers(self, on: TypedTopic, level: str) -> bool:
+        """Whether a level's commands on a topic may be followed: it has no limits, or they can be held to them, or need
+        not be.
+
+        :param level: as of :meth:`tame`
+        """
+        return self._form(on) is not None or self._limits(level) is None or self._exempt(on)
+
+    def closed(self, on: TypedTopic) -> bool:
+        """Whether that is so for nobody."""
+        return not any(self.covers(on, level) for level in LEVELS)
 
     def tame(self, on: TypedTopic, body: bytes, level: str, now: int) -> bytes | None:
         """The command as it may be followed: itself where it is slow enough.
@@ -50,9 +72,11 @@ class Governor:
         :returns: ``None`` where its speeds can't be found, so that it must not be followed
         """
         limits = self._limits(level)
-        where = form(on.type, self._encoding) if limits is not None else None
-        if limits is None or where is None:
+        if limits is None:
             return body
+        where = self._form(on)
+        if where is None:
+            return body if self._exempt(on) else None
         asked = where.read(body)
         if asked is None or not asked.finite:
             return None
@@ -85,6 +109,12 @@ class Governor:
         if last is None:
             return STILL, LONGEST / NANO
         return last.velocity, min(max(now - last.at, 0), LONGEST) / NANO
+
+    def _form(self, on: TypedTopic) -> Form | None:
+        return form(on.type, self._encoding)
+
+    def _exempt(self, on: TypedTopic) -> bool:
+        return any(fnmatchcase(on.topic, pattern) for pattern in self._unlimited)
 
     def _limits(self, level: str) -> Limits | None:
         if not self._told:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import click
 import msgspec
 
-from robot_client.clocks import now_ns
+from relay_protocol.clocks import now_ns
 from robot_client.guard_protocol import (
     CANCEL_TYPE,
     Alive,
@@ -77,7 +77,7 @@ class _Stop:
 class Guard:
     """Decides; pure but for the outlets.
 
-    :param now: clock of :mod:`robot_client.clocks`, nanoseconds, the same the daemon has
+    :param now: clock of :mod:`relay_protocol.clocks`, nanoseconds, the same the daemon has
     """
 
     def __init__(self, within_ms: int, outlets: Outlets, now: Callable[[], int]) -> None:

@@ -49,7 +49,7 @@ class Forget(_OfTopic, array_like=True, tag_field="line", tag="forget", frozen=T
 
 
 class Command(_OfTopic, array_like=True, tag_field="line", tag="command", frozen=True):
-    """A command went out. ``at`` is the clock of :mod:`robot_client.clocks`, nanoseconds."""
+    """A command went out. ``at`` is the clock of :mod:`relay_protocol.clocks`, nanoseconds."""
 
     moving: bool
     at: int

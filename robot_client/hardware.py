@@ -1,14 +1,14 @@
 """A further stop in the robot's hardware: a service of the robot, a program on it, or both, as the settings say.
 
 It comes after zero was said, and is never waited for longer than :data:`PATIENCE` and :data:`DYING`, or twice that in
-the middle of a resume.
+the middle of a resume. What failed is thrown again as long as the robot is stopped.
 """
 
 from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from twisted.internet.defer import Deferred, DeferredList, fail, maybeDeferred, succeed
@@ -26,6 +26,13 @@ PATIENCE = 5.0
 
 DYING = 1.0
 """Seconds a program may take to be gone when it is killed."""
+
+LOOKS = 30
+"""How often, a second apart, what failed is thrown again, and how often a daemon that starts stopped looks for the
+service before it says that there is none: nodes may start after it."""
+
+RARELY = 10
+"""After that only each so many looks."""
 
 TRIGGER = "std_srvs/srv/Trigger"
 SET_BOOL = "std_srvs/srv/SetBool"
@@ -49,6 +56,10 @@ class Switches(NamedTuple):
     resume: Sequence[str] = ()
 
 
+_CALL, _PROGRAM = "call", "program"
+_ALL = frozenset((_CALL, _PROGRAM))
+
+
 class Hardware:
     """Throws the switches.
 
@@ -56,66 +67,166 @@ class Hardware:
     """
 
     def __init__(self, switches: Switches, platform: Platform, reactor: Any) -> None:
+        self.on_owed: Callable[[list[str]], None] = lambda problems: None
+        """Told what a stop has not achieved, in words, and with none when it has."""
         self._switches = switches
         self._platform = platform
         self._reactor = reactor
+        self._types: list[str] = []
+        """Of the service, as it was found last."""
+        self._prepared = ""
+        """The type of which a client is kept."""
+        self._owed: dict[str, str] = {}
+        """What is still to be thrown, and what went wrong with it; empty where it was not tried."""
+        self._looks = 0
+        self._patient = False
+        """Whether the service may yet come: nobody is told so soon that it is not there."""
+        self._again: Deferred[None] | None = None
+        """While something is thrown again: fires when that has ended."""
+        self._stopping: list[Deferred[list[str]]] = []
+        """Who waits for a stop under way."""
         self._resuming = False
         self._overtaken: list[Deferred[None]] = []
         """Stops that came while a resume was under way."""
         self._log = Logger("hardware")
 
-    @property
-    def reachable(self) -> bool:
-        """Whether the service to be called is there, if there is to be one."""
-        call = self._switches.call
-        return not call or self._platform.full_name(call, "service") in self._platform.graph().services
+    def begin(self) -> None:
+        """The robot is stopped since before this start: :meth:`look` throws the switches when they are there."""
+        self._owed, self._looks, self._patient = dict.fromkeys(_ALL, ""), 0, True
+
+    def prepare(self) -> None:
+        """Find the service before it is needed, and keep what calls it; to be called every second."""
+        if self._switches.call and not self._prepared:
+            try:
+                self._find()
+            except Exception:  # a look that fails must not be the last one
+                self._log.failure("the graph could not be read")
+
+    def look(self) -> None:
+        """Throw again what failed; to be called every second while the robot is stopped, and is not being stopped."""
+        if not self._owed or self._again is not None or self._resuming:
+            return
+        self._looks += 1
+        if self._looks > LOOKS and self._looks % RARELY:
+            return
+        which = frozenset(self._owed)
+        if self._patient and self._looks < LOOKS and self._switches.call and not self._prepared:
+            which -= {_CALL}  # the program waits for no service
+            if not which or not self._switches.stop:
+                return
+        else:
+            self._patient = False
+        self._again = Deferred()
+        thrown = maybeDeferred(self._stop, which)
+        thrown.addErrback(self._unforeseen).addCallback(self._thrown_again)
 
     def stop(self) -> Deferred[list[str]]:
         """Stop; fires with what went wrong, in words.
 
-        What is under way of a resume may undo it, so then it is done once more when that has ended.
+        One that is under way counts for all who ask meanwhile. What is under way of a resume may undo it, so then it is
+        done once more when that has ended.
         """
-        thrown = self._throw(True, self._switches.stop)
+        self._looks, self._patient = 0, False
+        stopped: Deferred[list[str]] = Deferred()
+        self._stopping.append(stopped)
+        if len(self._stopping) == 1:
+            maybeDeferred(self._stop_surely).addErrback(self._unforeseen).addCallback(self._stopped)
+        return stopped
+
+    def _stop_surely(self) -> Deferred[list[str]]:
+        thrown = self._stop()
         if not self._resuming:
             return thrown
         over: Deferred[None] = Deferred()
         self._overtaken.append(over)
-        last = over.addCallback(lambda _: self._throw(True, self._switches.stop))
+        last = over.addCallback(lambda _: self._stop())
         return thrown.addCallback(lambda _: last)
+
+    def _stopped(self, problems: list[str]) -> None:
+        stopping, self._stopping = self._stopping, []
+        for each in stopping:
+            each.callback(list(problems))
 
     def resume(self) -> Deferred[list[str]]:
         """Let go again; fires with what went wrong, in words. One at a time."""
         self._resuming = True
-        return self._throw(False, self._switches.resume).addCallback(self._resumed)
+        ready = self._again or succeed(None)
+        let_go = ready.addCallback(lambda _: self._let_go())
+        let_go.addErrback(lambda failure: {_CALL: self._unforeseen(failure)[0]})
+        return let_go.addCallback(self._resumed)
 
-    def _resumed(self, problems: list[str]) -> list[str]:
+    def _let_go(self) -> Deferred[dict[str, str]]:
+        if self._overtaken:  # a stop came while it was waited: what it has thrown must not be undone
+            return succeed({})
+        self._owed = {}
+        return self._throw(False, _ALL)
+
+    def _resumed(self, problems: dict[str, str]) -> list[str]:
         self._resuming = False
         overtaken, self._overtaken = self._overtaken, []
         for each in overtaken:
             each.callback(None)
-        return problems
+        return list(problems.values())
 
-    def _throw(self, stop: bool, command: Sequence[str]) -> Deferred[list[str]]:
-        under_way: list[Deferred[None]] = []
-        if self._switches.call:
-            under_way.append(maybeDeferred(self._call, self._switches.call, stop))
-        if command:
-            under_way.append(maybeDeferred(run, self._reactor, command))
-        if not under_way:
-            return succeed([])
-        gathered: Deferred[Any] = DeferredList(under_way, consumeErrors=True)
-        return gathered.addCallback(lambda ends: [self._words(end) for good, end in ends if not good])
+    def _stop(self, which: frozenset[str] = _ALL) -> Deferred[list[str]]:
+        return self._throw(True, which).addCallback(self._thrown, which)
+
+    def _thrown(self, problems: dict[str, str], which: frozenset[str]) -> list[str]:
+        """It stands whatever was thrown meanwhile: only a resume lets go, and that waits for this."""
+        self._owed = {name: words for name, words in self._owed.items() if name not in which} | problems
+        self.on_owed([words for words in self._owed.values() if words])
+        return list(problems.values())
+
+    def _thrown_again(self, problems: list[str]) -> None:
+        again, self._again = self._again, None
+        if again is not None:
+            again.callback(None)
+
+    def _throw(self, stop: bool, which: frozenset[str]) -> Deferred[dict[str, str]]:
+        """Throw these; fires with what went wrong, in words, by switch."""
+        under_way: dict[str, Deferred[None]] = {}
+        if self._switches.call and _CALL in which:
+            under_way[_CALL] = maybeDeferred(self._call, self._switches.call, stop)
+        command = self._switches.stop if stop else self._switches.resume
+        if command and _PROGRAM in which:
+            under_way[_PROGRAM] = maybeDeferred(run, self._reactor, command)
+        gathered: Deferred[Any] = DeferredList(list(under_way.values()), consumeErrors=True)
+        return gathered.addCallback(
+            lambda ends: {
+                name: self._words(end) for name, (good, end) in zip(under_way, ends, strict=True) if not good
+            }
+        )
+
+    def _find(self) -> None:
+        """Look for the service in the graph; where it is, have its client kept."""
+        call = self._switches.call
+        known = self._platform.graph().services.get(self._platform.full_name(call, "service"))
+        if known is None:
+            return
+        self._types = known.types
+        type = self._type
+        if type and type != self._prepared:
+            self._prepared = type
+            self._platform.prepare_call(call, type)
+
+    @property
+    def _type(self) -> str:
+        """The type the service is called by; empty: it is not there, or of none that is known."""
+        return next((each for each in (SET_BOOL, TRIGGER) if each in self._types), "")
 
     def _call(self, service: str, stop: bool) -> Deferred[None]:
-        known = self._platform.graph().services.get(self._platform.full_name(service, "service"))
-        types = known.types if known is not None else []
-        if SET_BOOL in types:
-            type, request = SET_BOOL, _CDR + bytes([stop])
-        elif TRIGGER in types:
+        try:
+            self._find()
+        except Exception:  # it may still be as it was found
+            self._log.failure("the graph could not be read")
+        type = self._type
+        if type == SET_BOOL:
+            request = _CDR + bytes([stop])
+        elif type == TRIGGER:
             if not stop:
                 return succeed(None)
-            type, request = TRIGGER, _CDR + b"\0"
-        elif known is None:
+            request = _CDR + b"\0"
+        elif not self._types:
             return fail(NotFound(f"there is no service {service} on this robot"))
         else:
             return fail(Invalid(f"the service {service} is neither {TRIGGER} nor {SET_BOOL}"))
@@ -126,8 +237,11 @@ class Hardware:
     def _words(self, failure: Failure) -> str:
         if isinstance(failure.value, SwitchboardError):
             return failure.getErrorMessage()
+        return self._unforeseen(failure)[0]
+
+    def _unforeseen(self, failure: Failure) -> list[str]:
         self._log.failure("a switch in the hardware failed", failure)
-        return "a switch in the hardware failed; the robot's log says why"
+        return ["a switch in the hardware failed; the robot's log says why"]
 
 
 def run(reactor: Any, command: Sequence[str]) -> Deferred[None]:

@@ -3,42 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
-from twisted.internet.defer import Deferred, succeed
+from twisted.internet.defer import Deferred, maybeDeferred, succeed
 from twisted.logger import Logger
+from twisted.python.failure import Failure
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.limits import FACTS
 from relay_protocol.link.moving import Order
+from robot_client.alerts import Concern
 from robot_client.authority import NOBODY, Authority, Suppression
 from robot_client.body import Body
 from robot_client.hardware import Hardware
+from robot_client.inhibiting import Inhibiting
+from robot_client.keeping import Keeping, but
 from robot_client.lasting import Latch
 from robot_client.motion import MotionDesk
 from robot_client.reactors import Timer
 from robot_client.safety import MILLI
-from robot_client.sweep import HEARD_WITHIN, PATIENCE, Sweep
-from robot_client.telling import Inhibition, Telling, safety
+from robot_client.sweep import HEARD_WITHIN, PATIENCE, Sweep, names
+from robot_client.telling import Telling, safety
+from robot_client.unread import Unread
 
 LOOK_EVERY = 1.0
 """Seconds between looks for what is still to be stopped while the robot is."""
 
-LOOKS = 30
-"""How often a daemon that starts stopped looks for the switch in the hardware: nodes may start after it."""
+KEEP_EVERY = 10
+"""Looks between two attempts to keep a stop that could not be kept: the disk is waited for."""
+
+UNFORESEEN = "a part of this order failed; the robot's log says why"
 
 
-LATE = ("stop", "actions")
-"""Kind and part of the alert that goals go on though the robot is stopped."""
+class _Stopping:
+    """An order to stop that is not answered yet.
+
+    :param before: what went wrong before it, and is told already
+    """
+
+    def __init__(self, id: int, before: Iterable[str] = ()) -> None:
+        self.id = id
+        self.before = before
+        self.once: list[str] = []
+        """What went wrong, and is told a person once."""
 
 
 class Helm:
     """Does what the relay orders.
 
     :param clock: for timers
-    :param now: clock of :mod:`robot_client.clocks`, nanoseconds
+    :param now: clock of :mod:`relay_protocol.clocks`, nanoseconds
     :param wall: Unix time, seconds
     """
 
@@ -54,34 +69,35 @@ class Helm:
         now: Callable[[], int],
         wall: Callable[[], float],
     ) -> None:
-        self.silent: dict[str, bool] = {}
-        """Topics that say nothing now, and whether they say their last value instead."""
         self.limits: dict[str, link.Limits] = {}
         """How fast whom may move the robot, for the relay to know."""
         self._authority = authority
         self._motion = motion
-        self._latch = latch
         self._hardware = hardware
         self._sweep = sweep
         self._body = body
         self._clock = clock
         self._now = now
         self._wall = wall
-        self._inhibitions: dict[str, Inhibition] = {}
-        self._timers: dict[tuple[str, str], Timer] = {}
-        self._stopping: list[int | None] = []
-        """Orders to stop that wait for hardware and actions, while those are being stopped; ``None``: our own."""
-        self._problems: list[str] = []
-        """What went wrong with them."""
-        self._unkept = ""
-        """Why the stop is not known to be on the disk; empty where it is."""
+        self._inhibiting = Inhibiting(body, self.changed, clock, now)
+        self.silent = self._inhibiting.silent
+        """Topics that say nothing now, and whether they say their last value instead."""
+        self._timers: dict[str, Timer] = {}
+        """Those that end suppressions, by topic."""
+        self._stopping: list[_Stopping] = []
+        """Orders to stop that wait for hardware and actions, while those are being stopped."""
+        self._keeping = Keeping(latch, body.alert)
         self._resuming: int | None = None
         self._looks = 0
-        """How often to look again for what is to be stopped since before this start."""
-        self._unthrown = False
-        """Whether the hardware is to be stopped in this."""
-        self._late: list[str] = []
-        """What a person was told that the stop has not achieved yet."""
+        """How often was looked while the robot was stopped."""
+        self._unsaid = False
+        """Whether zero is still to be said on the topics of others, since before this start."""
+        self._late = Concern(body.alert, "stop", "actions")
+        """Goals that go on though the robot is stopped."""
+        self._going = Concern(body.alert, "control", "goals")
+        """Goals that go on though whoever gave them has lost control."""
+        self._unthrown = Concern(body.alert, "stop", "hardware")
+        self._unread = Unread(body.alert)
         self._telling = Telling(clock, self._tell)
         self._log = Logger("helm")
         self._orders: dict[type, Callable[[Any], None]] = {
@@ -92,8 +108,9 @@ class Helm:
             link.Inhibit: self._inhibit,
         }
         motion.on_moving = self.changed
-        sweep.on_refused = self._refused
-        self._load()
+        motion.on_unread = self._unread.refused
+        hardware.on_owed = self._owed
+        self._load(latch.load())
 
     def order(self, message: link.Message) -> bool:
         """Do one order; whether it was one."""
@@ -117,9 +134,10 @@ class Helm:
     def unregistered(self) -> None:
         """The control link is gone, and control with it."""
         self._authority.forget(self._now())
-        for kind, name in list(self._timers):
-            if kind == "suppress":
-                self._timers.pop((kind, name)).cancel()
+        self._unread.over()
+        for topic in list(self._timers):
+            self._disarm(topic)
+        self._inhibiting.end()
         self._telling.end()
 
     def changed(self) -> None:
@@ -127,23 +145,30 @@ class Helm:
         self._telling.changed()
 
     def look(self) -> None:
-        """Go on with what a stop, also one of before this start, has yet to achieve; to be called every second."""
+        """Go on with what a stop, also one of before this start, has yet to achieve, and see which goals go on that are
+        to end; to be called every second.
+        """
+        self._hardware.prepare()
+        self._tell_going(self._body.overdue)
         if self._authority.stopped is None:
-            self._looks = 0
             return
+        self._looks += 1
+        if self._unsaid:
+            self._unsaid = False
+            self._sweep.zeros.say()
         self._sweep.again()
         if not self._stopping:
             self._tell_late()
-        if self._looks:
-            self._looks -= 1
-            if self._unthrown and not self._stopping and self._resuming is None:
-                self._throw_again()
+            self._hardware.look()
+        if self._keeping.unkept and self._looks % KEEP_EVERY == 0:
+            self._keeping.keep(self._authority.stopped)
 
     # --- orders --------------------------------------------------------------------------------------------
 
     def _control(self, message: link.Control) -> None:
         failed: list[str] = []
         goals: Deferred[list[str]] = succeed([])
+        self._unread.over()
         if self._authority.hold(message.holder, message.user, message.level, self._now()):
             self._log.info(
                 "control: {who} ({why})",
@@ -162,86 +187,81 @@ class Helm:
     def _controlled(self, message: link.Control, failed: list[str], going: list[str]) -> None:
         """What the former one moved stands, or does not; his goals have ended, or have had the time to."""
         if going:
-            self._log.warn("goals of {actions} were cancelled and have not ended", actions=", ".join(going))
+            self._tell_going(going)
         if failed and self._authority.holder == message.holder:
             self._authority.hold(NOBODY, "", "", self._now())
             self.changed()
         self._done(message.id, _unheard(failed))
+
+    def _tell_going(self, going: list[str]) -> None:
+        """Tell a person of goals that were to end and go on; while the robot is stopped that is told otherwise."""
+        if going and not self._going.words and self._authority.stopped is not None:
+            return
+        words = (
+            f"goals of {names(going)} may go on though they are to end; they are cancelled again every second"
+        )
+        self._going.tell(words if going else "", "no goal that was to end is known to go on")
 
     def _stop(self, message: link.Stop) -> None:
         new = self._authority.stopped is None
         stopped = link.Stopped(by=message.by, since=self._wall(), why=message.why)
         self._authority.stop(stopped, self._now())
         self._resuming = None
+        order = _Stopping(message.id)
+        self._stopping.append(order)
         why = f"{message.by} stopped the robot ({message.why or 'no reason given'})"
-        self._problems += _unheard(self._motion.halt(why))
-        self._body.cancel_goals(False)
-        self.changed()
-        self._stopping.append(message.id)
+        self._part(order.once, self._motion.halt, why).addCallback(_unheard).addCallback(order.once.extend)
+        self._part(order.once, self._body.cancel_goals, False)
+        self._part(order.once, self.changed)
         # The disk may take its time.
-        thrown = self._throw() if len(self._stopping) == 1 else None
-        if new or self._unkept:
-            self._keep(self._authority.stopped or stopped)
-        if thrown is not None:
-            thrown.addCallback(self._stopped)
+        thrown = self._throw(order)
+        if new or self._keeping.unkept:
+            self._part(order.once, self._keeping.keep, self._authority.stopped or stopped)
+        thrown.addCallback(self._stopped, order).addErrback(self._failed, message.id)
 
-    def _throw(self) -> Deferred[list[str]]:
-        """Stop what commands of clients don't move; fires with what went wrong."""
-        hardware = self._hardware.stop()
-        cancelled = self._sweep.stop()
-        self._sweep.zeros.say()
-        ended = self._body.standing(HEARD_WITHIN)
+    def _throw(self, order: _Stopping) -> Deferred[list[str]]:
+        """Stop what commands of clients don't move; fires with what went wrong in the hardware."""
+        hardware = self._part(order.once, self._hardware.stop)
+        cancelled = self._part(order.once, self._sweep.stop).addCallback(order.once.extend)
+        self._part(order.once, self._sweep.zeros.say)
+        ended = self._part(order.once, self._body.standing, HEARD_WITHIN)
         return hardware.addCallback(
-            lambda problems: cancelled.addCallback(
-                lambda also: ended.addCallback(lambda _: problems + also),
-            ),
+            lambda problems: cancelled.addCallback(lambda _: ended.addCallback(lambda _: problems)),
         )
 
-    def _throw_again(self) -> None:
-        if self._looks and not self._reachable():
-            return
-        self._unthrown = False
-        self._stopping.append(None)
-        self._sweep.zeros.say()
-        self._hardware.stop().addCallback(self._stopped)
+    def _part(self, problems: list[str], do: Callable[..., Any], *args: Any) -> Deferred[Any]:
+        """Do a part of an order; what fails in it unforeseen must not keep the others from being done.
 
-    def _reachable(self) -> bool:
-        try:
-            return self._hardware.reachable
-        except Exception:  # a look that fails must not be the last one
-            self._log.failure("the graph could not be read")
-            return False
+        :param problems: where it is said that it failed
+        """
+        return maybeDeferred(do, *args).addErrback(self._unforeseen, problems)
 
-    def _keep(self, stopped: link.Stopped) -> None:
-        self._unkept = ""
-        try:
-            self._latch.keep(stopped)
-        except Unavailable as error:
-            self._unkept = str(error)
+    def _unforeseen(self, failure: Failure, problems: list[str]) -> list[str]:
+        self._log.failure("a part of an order failed", failure)
+        problems.append(UNFORESEEN)
+        return []
 
-    def _stopped(self, problems: list[str]) -> list[str]:
-        """All is done that can be: tell those who wait for it; with what went wrong."""
-        unkept = [self._unkept] if self._unkept else []
-        problems = list(dict.fromkeys(self._problems + unkept + problems))
-        waiting, self._stopping, self._problems = self._stopping, [], []
-        if problems:
-            self._body.alert("error", f"the robot is stopped, but {'; '.join(problems)}")
-        self._tell_late()
-        for id in waiting:
-            if id is not None:
-                self._done(id, problems + self._late)
-        return problems
+    def _failed(self, failure: Failure, id: int) -> None:
+        self._log.failure("an order could not be done", failure)
+        self._done(id, [UNFORESEEN])
 
-    def _tell_late(self) -> None:
-        """Tell a person what a stop has not achieved in time, and when it has."""
-        late, self._late = self._late, self._sweep.late(self._body.pursued)
-        if self._late and not late:
-            self._body.alert("error", f"the robot is stopped, but {'; '.join(self._late)}", *LATE)
-        elif late and not self._late:
-            self._body.alert("info", "all goals that moved the stopped robot are cancelled", *LATE, over=True)
+    def _owed(self, problems: list[str]) -> None:
+        self._unthrown.tell(but(problems), "the switch in the hardware is thrown")
 
-    def _refused(self, words: str) -> None:
-        self._body.alert("error", f"the robot is stopped, but {words}")
+    def _stopped(self, unthrown: list[str], order: _Stopping) -> None:
+        """All is done that can be: tell who waits for it, with what went wrong."""
+        self._stopping.remove(order)
+        if order.once:  # the others are told as long as they last
+            self._body.alert("error", but(list(dict.fromkeys(order.once))))
+        unkept = [self._keeping.unkept] if self._keeping.unkept else []
+        problems = [*order.before, *order.once, *unkept, *unthrown, *self._tell_late()]
+        self._done(order.id, list(dict.fromkeys(problems)))
+
+    def _tell_late(self) -> list[str]:
+        """Tell a person what a stop has not achieved in time, and when it has; what that is now."""
+        late = self._sweep.late(self._body.pursued)
+        self._late.tell(but(late), "all goals that moved the stopped robot are cancelled")
+        return late
 
     def _resume(self, message: link.Resume) -> None:
         if self._authority.stopped is None:
@@ -252,7 +272,10 @@ class Helm:
                 "the robot is still being stopped or resumed; resume it again when that is done"
             )
         self._resuming = message.id
-        self._hardware.resume().addCallback(lambda problems: self._resumed(message, problems))
+        problems: list[str] = []
+        resumed = self._part(problems, self._hardware.resume)
+        resumed.addCallback(lambda more: self._resumed(message, problems + more))
+        resumed.addErrback(self._unresumed, message)
 
     def _resumed(self, message: link.Resume, problems: list[str]) -> None:
         if self._resuming != message.id:
@@ -261,35 +284,41 @@ class Helm:
         self._resuming = None
         released = not problems
         if released:
-            try:
-                self._latch.clear()
-            except Unavailable as error:
-                problems = [str(error)]
+            problems = self._keeping.clear()
         if problems:
             self._stay(message, problems, unkept=released)
             return
         self._sweep.end()
         self._authority.resume(self._now())
-        if self._late:
-            self._late = []
-            self._body.alert("info", "the robot is resumed", *LATE, over=True)
+        self._unsaid = False
+        self._keeping.end()
+        for concern in (self._late, self._unthrown):
+            concern.tell("", "the robot is resumed")
         self._log.info("resumed by {who} ({why})", who=message.by, why=message.why or "no reason given")
         self.changed()
         self._done(message.id, [])
+
+    def _unresumed(self, failure: Failure, message: link.Resume) -> None:
+        """A resume failed unforeseen: what it let go is stopped again, if the robot is not resumed yet."""
+        if self._authority.stopped is None:
+            self._failed(failure, message.id)
+            return
+        problems: list[str] = []
+        self._unforeseen(failure, problems)
+        self._stay(message, problems, unkept=True)
 
     def _stay(self, message: link.Resume, problems: list[str], unkept: bool) -> None:
         """A resume failed half-way: stop again what it let go, then say that the robot stays stopped.
 
         :param unkept: the record of the stop may be gone
         """
-        self._body.alert("error", f"the robot stays stopped: {'; '.join(problems)}")
-        self._stopping.append(None)
-        thrown = self._throw()
+        order = _Stopping(message.id, problems)
+        self._stopping.append(order)
+        self._part(order.once, self._body.alert, "error", f"the robot stays stopped: {'; '.join(problems)}")
+        thrown = self._throw(order)
         if unkept and self._authority.stopped is not None:
-            self._keep(self._authority.stopped)
-        thrown.addCallback(self._stopped).addCallback(
-            lambda also: self._done(message.id, list(dict.fromkeys(problems + also)))
-        )
+            self._part(order.once, self._keeping.keep, self._authority.stopped)
+        thrown.addCallback(self._stopped, order).addErrback(self._failed, message.id)
 
     def _suppress(self, message: link.Suppress) -> None:
         topic = self._motion_topic(message.resource)
@@ -298,7 +327,8 @@ class Helm:
             suppression = Suppression(frozenset(message.sources), until, message.by)
             if not self._authority.suppress(topic, suppression):
                 raise Unavailable(f"{FACTS} topics are suppressed already")
-            self._arm("suppress", topic, message.ms, self._end_suppression)
+            self._disarm(topic)
+            self._timers[topic] = self._clock.callLater(message.ms / 1000, self._end_suppression, topic)
             self._motion.yield_topic(topic, f"suppressed by {message.by or 'a client'}")
             self.changed()
         else:
@@ -306,7 +336,7 @@ class Helm:
         self._done(message.id, [])
 
     def _end_suppression(self, topic: str) -> None:
-        self._disarm("suppress", topic)
+        self._disarm(topic)
         if topic not in self._authority.suppressions:
             return
         self._authority.end_suppression(topic)
@@ -314,37 +344,16 @@ class Helm:
         self.changed()
 
     def _inhibit(self, message: link.Inhibit) -> None:
-        topic, types = self._body.topic(message.resource)
-        if message.ms:
-            if not types:
-                raise NotFound(f"there is no topic {topic} on this robot")
-            if topic not in self.silent and len(self.silent) >= FACTS:
-                raise Unavailable(f"{FACTS} topics are inhibited already")
-            self._inhibitions[topic] = Inhibition(message.hold, self._now() + message.ms * MILLI, message.by)
-            self._arm("inhibit", topic, message.ms, self._end_inhibition)
-            if self.silent.get(topic) != message.hold:
-                self.silent[topic] = message.hold
-                self._body.silence(topic)
-            self.changed()
-        else:
-            self._end_inhibition(topic)
+        self._inhibiting.order(message)
         self._done(message.id, [])
-
-    def _end_inhibition(self, topic: str) -> None:
-        self._disarm("inhibit", topic)
-        if self.silent.pop(topic, None) is None:
-            return
-        del self._inhibitions[topic]
-        self._body.silence(topic)
-        self.changed()
 
     # --- what they need ------------------------------------------------------------------------------------
 
-    def _load(self) -> None:
-        stopped = self._latch.load()
+    def _load(self, stopped: link.Stopped | None) -> None:
         if stopped is not None:
             self._authority.stop(stopped, self._now())
-            self._looks, self._unthrown = LOOKS, True
+            self._unsaid = True
+            self._hardware.begin()
             self._sweep.begin()
             self._log.warn(
                 "the robot is stopped since before this start, by {who} ({why})",
@@ -362,12 +371,8 @@ class Helm:
             raise Invalid(f"{topic} does not move the robot, so there is nothing to suppress")
         raise NotFound(f"there is no topic {topic} on this robot")
 
-    def _arm(self, kind: str, topic: str, ms: int, end: Callable[[str], None]) -> None:
-        self._disarm(kind, topic)
-        self._timers[kind, topic] = self._clock.callLater(ms / 1000, partial(end, topic))
-
-    def _disarm(self, kind: str, topic: str) -> None:
-        timer = self._timers.pop((kind, topic), None)
+    def _disarm(self, topic: str) -> None:
+        timer = self._timers.pop(topic, None)
         if timer is not None and timer.active():
             timer.cancel()
 
@@ -375,7 +380,8 @@ class Helm:
         self._body.say(link.Done(id=id, ok=not problems, reason="; ".join(problems)))
 
     def _tell(self) -> None:
-        told = safety(self._authority, self._motion.moving, self._inhibitions, self.limits, self._now())
+        moving = self._motion.moving or bool(self._body.pursued)
+        told = safety(self._authority, moving, self._inhibiting.told, self.limits, self._now())
         self._body.say(told)
 
 

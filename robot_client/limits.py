@@ -10,6 +10,9 @@ from robot_client.config import Settings
 NONE = Limits()
 """Nothing is limited."""
 
+LEVELS = frozenset({"operator", "owner"})
+"""Those that may move a robot."""
+
 
 def limits_told(settings: Settings) -> dict[str, Limits]:
     """What ``safety.limits`` says: by level, those that are limited."""
@@ -33,15 +36,12 @@ def stricter(one: Limits, other: Limits) -> Limits:
 
 def limits_of(told: Mapping[str, Limits], level: str) -> Limits:
     """What holds for a level; for one that is not known, the strictest of all."""
-    if level in _LEVELS:
+    if level in LEVELS:
         return told.get(level, NONE)
     strictest = NONE
     for limits in told.values():
         strictest = stricter(strictest, limits)
     return strictest
-
-
-_LEVELS = frozenset({"operator", "owner"})
 
 
 def _lower(one: float | None, other: float | None) -> float | None:

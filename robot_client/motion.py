@@ -7,10 +7,10 @@ from collections.abc import Callable
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.link import MotionPolicy, QoS
 from robot_client.authority import Authority, Verdict
-from robot_client.governor import Governor
+from robot_client.governor import Governor, unreadable
 from robot_client.guard_feed import GuardFeed
 from robot_client.offset import Offset
 from robot_client.platforms.base import Motion, Platform, Sink
@@ -20,7 +20,9 @@ from robot_client.safety import (
     DAEMON_SHARE,
     MILLI,
     Freshness,
+    Times,
     Watchdog,
+    earliest,
     freshness,
     is_motion,
     void_at,
@@ -65,6 +67,8 @@ class MotionDesk:
         """Called when that changes."""
         self.on_commanded: Callable[[bool], None] = lambda commanded: None
         """Called when somebody may command the robot, and when nobody may any more."""
+        self.on_unread: Callable[[TypedTopic, str], None] = lambda on, level: None
+        """Called when a command of that level was refused because its speed can't be read."""
         self.proof: Callable[[], int] = now
         """When the latest ping that the relay has answered was sent."""
         self.stale_commands = 0
@@ -77,7 +81,7 @@ class MotionDesk:
         self._guard = guard
         self._authority = authority
         self._rules = rules or Rules()
-        self._governor = Governor(self._rules.limits, platform.encoding)
+        self._governor = Governor(self._rules.limits, platform.encoding, self._rules.unlimited)
         self._watchdog = Watchdog(policy.stop_within_ms, DAEMON_SHARE, self._rules.ramp_ms)
         for topic, times in self._rules.topics.items():
             self._watchdog.within(topic, times.stop_within_ms)
@@ -108,7 +112,10 @@ class MotionDesk:
         It may give its place to another later; a command takes one again.
 
         :raises Unavailable: too many topics move
+        :raises Refused: nobody may command it, as all speed is limited and that of its commands can't be read
         """
+        if self._governor.closed(on):
+            raise Refused(unreadable(on))
         track = self._place(on)
         if track.idle:
             track.settle()
@@ -144,10 +151,11 @@ class MotionDesk:
         on = self._outlets[source].on
         now = self._now()
         verdict = self._platform.judge(on.type, body)
-        fresh = freshness(stamp, now, offset, self._deadline(on)) is Freshness.FRESH
+        fresh = freshness(stamp, now, offset, self._times(on).deadline_ms) is Freshness.FRESH
         # Zero that is too old tells nothing of what its source does now: it is no letting go.
         moving = verdict is not Motion.STILL or not fresh
-        if self._authority.judge(by, on.topic, moving, now) is not Verdict.ALLOWED:
+        sent = earliest(stamp, now, offset)
+        if self._authority.judge(by, on.topic, moving, now, sent) is not Verdict.ALLOWED:
             return False
         if not fresh:
             self.stale_commands += 1
@@ -160,6 +168,10 @@ class MotionDesk:
             self._outlets[source].sink.publish(body)
         elif void <= now:
             self.stale_commands += 1
+            return False
+        elif verdict is Motion.MOVING and not self._governor.covers(on, self._authority.level_of(by)):
+            self._authority.refused += 1
+            self.on_unread(on, self._authority.level_of(by))
             return False
         elif verdict is Motion.MOVING and not (placed and self._guard.ready(on)):
             self._hold_back(on)
@@ -260,18 +272,16 @@ class MotionDesk:
             return False
         return True
 
-    def _deadline(self, on: TypedTopic) -> int:
+    def _times(self, on: TypedTopic) -> Times:
         own = self._rules.topics.get(on.topic)
-        return self.policy.deadline_ms if own is None else own.deadline_ms
+        return Times(self.policy.stop_within_ms, self.policy.deadline_ms) if own is None else own
 
     def _tame(self, on: TypedTopic, body: bytes, by: int, now: int) -> bytes | None:
         """The command as it may be followed, its zero known; ``None`` where it must not be."""
         rest = self._platform.resting(on.type, body)
         if len(rest) > MAX_SHAPE:
             return None
-        # Who suppresses a topic is of a level that nobody told us.
-        level = self._authority.level if by == self._authority.holder else ""
-        tamed = self._governor.tame(on, body, level, now)
+        tamed = self._governor.tame(on, body, self._authority.level_of(by), now)
         track = self._tracks[on]
         if tamed is not None and rest != track.rest:
             track.rest = rest
@@ -279,7 +289,7 @@ class MotionDesk:
         return tamed
 
     def _void(self, on: TypedTopic, stamp: int, now: int, offset: Offset) -> int:
-        deadline, within = self._deadline(on), self.policy.stop_within_ms
+        within, deadline = self._times(on)
         return void_at(stamp, now, offset, self.proof(), deadline, within)
 
     def _move(self, source: str, body: bytes, now: int, void: int) -> None:

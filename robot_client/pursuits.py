@@ -5,13 +5,15 @@ as long as one is under way. When that ceases, or the daemon is gone, it has the
 lies on the disk, so that a daemon whose guard died with it finds at its next start what was left.
 
 A goal that was given up though its action may go on with it is *adrift*: it counts as under way for guard and note
-until its action, seen again, has answered that it cancels it.
+until its action, seen again, has answered that it cancels it, or knows nothing of it. One that is to end, as its driver
+has lost control or the robot is stopped, is asked to again until it has ended: an action may refuse that, and go on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from fnmatch import fnmatchcase
+from operator import itemgetter
 from typing import Any, TypeVar
 
 from twisted.internet.defer import Deferred, succeed
@@ -34,14 +36,20 @@ KEPT = 30.0
 LOOKS = 30
 """How often to look for actions that were left goals, a second apart: nodes may be found after the daemon's start."""
 
+OVERDUE = 1_000_000_000
+"""Nanoseconds a goal that is cancelled may take to end before it is asked to again."""
+
 UNPROVEN = 2_000_000_000
 """Nanoseconds without proof of the relay after which goals are cancelled: nobody who gave one could end it then."""
 
 ADRIFT = 600.0
-"""Seconds in which an action that was lost with a goal is looked for."""
+"""Seconds in which an action that was lost with a goal, or refused to cancel those it has, is looked for."""
 
 MAX_ADRIFT = 64
 """Goals adrift that are remembered."""
+
+MAX_ASKING = 64
+"""Goals that are being asked to end at a time."""
 
 FAREWELL = 1.5
 """Seconds a daemon that leaves waits for the goals it has cancelled to end."""
@@ -50,6 +58,22 @@ Ended = TypeVar("Ended")
 
 MAX_ACTIONS = 64
 """Actions that are had pursue goals at a time."""
+
+
+class _UnderWay:
+    """A goal that has not ended.
+
+    :param began: own clock, nanoseconds
+    """
+
+    def __init__(self, action: str, began: int) -> None:
+        self.action = action
+        self.began = began
+        self.ending: int | None = None
+        """Since when it is to end, own clock, nanoseconds."""
+        self.asking = False
+        self.asked = 0
+        """How often it was asked to once more."""
 
 
 class _Adrift:
@@ -70,7 +94,7 @@ class Pursuits:
     :param everything: patterns of all actions that move the robot, for a note that can't be read
     :param latch: where the note is kept
     :param clock: for timers
-    :param now: clock of :mod:`robot_client.clocks`, nanoseconds
+    :param now: clock of :mod:`relay_protocol.clocks`, nanoseconds
     """
 
     def __init__(
@@ -93,8 +117,9 @@ class Pursuits:
         """When the latest ping that the relay has answered was sent."""
         self.on_pursuing: Callable[[bool], None] = lambda pursuing: None
         """Called when a goal is under way, and when none is any more."""
-        self._under_way: dict[Goal, int] = {}
-        """Goals and when they began, nanoseconds."""
+        self.on_changed: Callable[[], None] = lambda: None
+        """Called when :attr:`pursued` is another."""
+        self._under_way: dict[Goal, _UnderWay] = {}
         self._doubted: set[Goal] = set()
         """Those that were cancelled for want of proof."""
         self._adrift: dict[bytes, _Adrift] = {}
@@ -107,6 +132,10 @@ class Pursuits:
         noted = latch.goals()
         self._left = set(everything if noted is None else noted)
         """Actions, or patterns of them, whose goals are still to be cancelled since before this start."""
+        self._refusing: set[str] = set()
+        """Those among them that have answered, but refuse."""
+        self._missed: dict[str, float] = {}
+        """Since when those that refuse are not there, seconds."""
         self._swept: set[str] = set()
         self._looks = LOOKS if self._left else 0
         if self._left:
@@ -114,23 +143,33 @@ class Pursuits:
             self._log.warn("a daemon before this left goals of {names}; they are cancelled", names=names)
 
     def look(self) -> None:
-        """Cancel what a daemon before this left, and what is adrift; to be called every second."""
+        """Cancel what a daemon before this left, what is adrift, and what is to end; to be called every second."""
         if self._adrift:
             self._look_for_adrift()
-        if not self._looks:
+        self._ask_again()
+        if not self._left:
             return
-        self._looks -= 1
-        for action in self._sweep.actions():
+        self._looks = max(0, self._looks - 1)
+        there = self._sweep.actions()
+        self._miss(there)
+        for action in there:
             if self._is_left(action):
-                self._sweep.cancel(action).addCallback(self._answered, action)
-        if not self._looks:
-            self._left.clear()
+                self._sweep.cancel_surely(action).addCallback(self._answered, action)
+        if not self._looks and self._left != self._refusing:
+            # Others never appeared. What refuses still has goals that nobody here knows of.
+            self._left = set(self._refusing)
             self._note()
 
     @property
     def pursued(self) -> list[str]:
         """The actions that pursue goals, or may do so, sorted."""
         return sorted(action for action, goals in self._running.items() if goals)
+
+    @property
+    def overdue(self) -> list[str]:
+        """The actions that may pursue goals which were to end a second ago or earlier, sorted."""
+        late = {each.action for each in self._late().values()}
+        return sorted(late | {each.action for each in self._adrift.values()} | self._refusing)
 
     def standing(self, seconds: float) -> Deferred[list[str]]:
         """Fires with :attr:`pursued`, when none is under way but what is adrift, or in so many seconds."""
@@ -171,12 +210,48 @@ class Pursuits:
             self._guard.topic(cancelling(action))
             self._guard.command(cancelling(action), True, self._now())
             self._note()
+            self.on_changed()
         if self._beating is None:
             self._beating = self._clock.callLater(BEAT, self._beat)
-        self._under_way[goal] = self._now()
+        self._under_way[goal] = _UnderWay(action, self._now())
         if len(self._under_way) == 1:
             self.on_pursuing(True)
         goal.result.addBoth(self._ended, action, goal)
+
+    def end(self, goal: Goal) -> None:
+        """See that a goal ends that was just cancelled, and must not go on: nobody drives the robot by it any more."""
+        known = self._under_way.get(goal)
+        if known is not None and known.ending is None:
+            known.ending = self._now()
+
+    def _late(self) -> dict[Goal, _UnderWay]:
+        least = self._now() - OVERDUE
+        return {
+            goal: each
+            for goal, each in self._under_way.items()
+            if each.ending is not None and each.ending <= least
+        }
+
+    def _ask_again(self) -> None:
+        """Ask what was cancelled and goes on."""
+        late = self._late()
+        if not late:
+            return
+        there = set(self._sweep.actions())
+        idle = [
+            (each.asked, goal, each)
+            for goal, each in late.items()
+            if not each.asking and each.action in there
+        ]
+        free = MAX_ASKING - sum(each.asking for each in late.values())
+        for _, goal, each in sorted(idle, key=itemgetter(0))[: max(0, free)]:
+            each.asking = True
+            each.asked += 1
+            self._sweep.cancel(each.action, goal.id).addCallback(self._asked, each)
+
+    def _asked(self, words: str | None, each: _UnderWay) -> None:
+        """An action was asked once more; whether it has ended the goal its result says."""
+        each.asking = False
 
     def _ended(self, outcome: Ended, action: str, goal: Goal) -> Ended:
         del self._under_way[goal]
@@ -194,6 +269,7 @@ class Pursuits:
             self._guard.command(cancelling(action), False, self._now())
             self._forgetting[action] = self._clock.callLater(KEPT, self._forget, action)
             self._note()
+            self.on_changed()
 
     def _tell_standing(self) -> None:
         if self._under_way:
@@ -222,9 +298,9 @@ class Pursuits:
                 self._sweep.cancel(each.action, id).addCallback(self._caught, id, each)
 
     def _caught(self, words: str | None, id: bytes, each: _Adrift) -> None:
-        """An action was asked to cancel a goal that was adrift."""
+        """An action was asked to cancel a goal that was adrift; only one that does not refuse ends it."""
         each.asking = False
-        if words is not None and self._adrift.pop(id, None) is not None:
+        if words == "" and self._adrift.pop(id, None) is not None:
             self._over(each.action)
 
     def _lose(self, id: bytes) -> None:
@@ -252,7 +328,7 @@ class Pursuits:
         least = self._now() - UNPROVEN
         if self.proof() >= least:
             return
-        for goal in [each for each, began in self._under_way.items() if began < least]:
+        for goal in [goal for goal, each in self._under_way.items() if each.began < least]:
             if goal in self._doubted:
                 continue
             self._doubted.add(goal)
@@ -263,6 +339,7 @@ class Pursuits:
                 goal.cancel()
             except Exception:  # one that fails must not keep the next from its end
                 self._log.failure("a goal could not be cancelled")
+            self.end(goal)
 
     def _is_left(self, action: str) -> bool:
         return action not in self._swept and any(fnmatchcase(action, each) for each in self._left)
@@ -271,10 +348,34 @@ class Pursuits:
         """An action was asked to cancel its goals: ``None``, it was not heard of; else what it refused, in words."""
         if words is None:
             return
+        if words:
+            if self._is_left(action) and action not in self._refusing:
+                self._refusing.add(action)
+                self._left.add(action)
+                self._note()
+            return
+        self._refusing.discard(action)
         self._swept.add(action)
         if action in self._left:
             self._left.discard(action)
             self._note()
+
+    def _miss(self, there: list[str]) -> None:
+        """Give up what refuses and does not come back: its goals have most likely ended with its node.
+
+        :param there: the actions there are now
+        """
+        now = self._clock.seconds()
+        self._missed = {action: self._missed.get(action, now) for action in self._refusing.difference(there)}
+        lost = {action for action, since in self._missed.items() if now - since >= ADRIFT}
+        if not lost:
+            return
+        for action in sorted(lost):
+            self._log.warn("goals of {action} may go on, and are looked for no longer", action=action)
+            self._sweep.forget(action)
+        self._refusing -= lost
+        self._left -= lost
+        self._note()
 
     def _note(self) -> None:
         try:

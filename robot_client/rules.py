@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from relay_protocol.link.moving import Limits
@@ -17,16 +17,21 @@ class Rules(NamedTuple):
     :ivar topics: times of single topics
     :ivar ramp_ms: how long it takes to a standstill where nobody said stop; 0: no time
     :ivar limits: how fast whom may move it, by level
+    :ivar unlimited: patterns of topics on which commands pass whose speeds can't be read
     """
 
     topics: Mapping[str, Times] = {}
     ramp_ms: int = 0
     limits: Mapping[str, Limits] = {}
+    unlimited: Sequence[str] = ()
 
 
 def rules_of(settings: Settings) -> Rules:
     """As the settings have them."""
     safety = settings.safety
     return Rules(
-        {each.name: safety.times(each.name) for each in safety.topic}, safety.ramp_ms, limits_told(settings)
+        {each.name: safety.times(each.name) for each in safety.topic},
+        safety.ramp_ms,
+        limits_told(settings),
+        settings.limits.unlimited,
     )

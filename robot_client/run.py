@@ -10,12 +10,12 @@ from typing import Any
 from twisted.internet.defer import Deferred, DeferredList
 from twisted.logger import Logger
 
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Unavailable
 from robot_client.backoff import Backoff
 from robot_client.camera.desk import CameraDesk
 from robot_client.camera.keeper import CameraKeeper
 from robot_client.camera.lines import Settings as CameraSettings
-from robot_client.clocks import now_ns
 from robot_client.config import Settings
 from robot_client.connection import Connection
 from robot_client.daemon import Daemon
@@ -104,6 +104,7 @@ class Runner:
                 # Begins like the daemon's own, so that the graph is told without it.
                 node=f"switchboard_{suffix}_camera",
                 streams=settings.video.streams,
+                target=settings.video.target_ms / 1000,
             ),
         )
         self._enrolment = enrolment

@@ -56,6 +56,16 @@ def freshness(stamp: int, now: int, offset: Offset, deadline_ms: int) -> Freshne
     return Freshness.AHEAD if oldest < 0 else Freshness.FRESH
 
 
+def earliest(stamp: int, now: int, offset: Offset) -> int:
+    """The moment before which a command can't have been sent, own clock, nanoseconds; no later than ``now``.
+
+    :param stamp: as of :func:`freshness`, like ``now``
+    :return: 0 while nobody knows how old it can be
+    """
+    oldest = offset.oldest(stamp, now)
+    return 0 if oldest is None else now - max(oldest, 0)
+
+
 def void_at(stamp: int, now: int, offset: Offset, proof: int, deadline_ms: int, within_ms: int) -> int:
     """When a command counts no more: by its age, or because the link is not known to work both ways, nanoseconds.
 

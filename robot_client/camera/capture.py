@@ -76,6 +76,9 @@ class Capture:
     :param silence: see :data:`SILENCE`, seconds
     """
 
+    latched = False
+    """See :class:`~robot_client.camera.feed.Origin`."""
+
     def __init__(
         self,
         source: str,

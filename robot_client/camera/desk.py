@@ -74,7 +74,8 @@ class CameraDesk:
 
     def open(self, message: link.OpenVideo) -> None:
         """The relay wants to see a camera; the process says so on the stream's link when there is none."""
-        topic, type = self._topic_of(message.camera, message.settings.transport)
+        source = self._configured.get(message.camera, "")
+        topic, type = self._topic_of(message.camera, message.settings.transport) if not source else ("", "")
         self._keeper.open(
             Open(
                 stream=message.stream,
@@ -83,7 +84,7 @@ class CameraDesk:
                 settings=message.settings,
                 topic=topic,
                 compressed=type == COMPRESSED,
-                source=self._configured.get(message.camera, ""),
+                source=source,
                 address=message.address,
                 heartbeat=self._heartbeat,
             )

@@ -15,12 +15,26 @@ from robot_client.reactors import Clock, Timer
 LOOK_EVERY = 1.0
 """Seconds between two looks at what the camera gives."""
 
+HOLDS = 2.5
+"""Pictures' time: without one for so long a camera counts as silent, and its latest picture as past."""
+
+UNKNOWN = 10.0
+"""Seconds for which a picture holds that is the only one so far. The relay can't tell its age when a stream begins with
+it, and adds its own time for such a picture."""
+
+SLOW = 2.0
+"""Seconds between pictures from which on a camera counts as slow."""
+
 _STEADY = 0.1
 """Part by which a rate may waver without being told anew."""
 
 
-class Closes(Protocol):
+class Origin(Protocol):
     """What gives the pictures."""
+
+    @property
+    def latched(self) -> bool:
+        """Whether who comes later gets the latest one, however old it is."""
 
     def close(self) -> None:
         """Give no more."""
@@ -42,19 +56,26 @@ class Feed:
         on_seen: Callable[[Seen], None],
     ) -> None:
         self.camera = camera
-        self.source: Closes
+        self.source: Origin
         self.fps = 0.0
-        """Pictures per second, as they came of late."""
+        """Pictures per second, as they came of late; 0 before there were two, and when none comes any more."""
         self.listeners: set[Callable[[Shot], None]] = set()
         self._clock = clock
         self._from_thread = from_thread
         self._on_seen = on_seen
         self._lock = threading.Lock()
         self._newest: Shot | None = None
+        self._kept: Shot | None = None
+        self._since: float | None = None
+        """When the picture came from which on they are counted."""
         self._count = 0
+        """Of those after it."""
+        self._last = 0.0
+        """When the last of them came."""
+        self._rate = 0.0
+        """As measured, also when none comes any more."""
         self._latest: Shot | None = None
         self._seen: Seen | None = None
-        self._looked = clock.seconds()
         self._timer: Timer = clock.callLater(LOOK_EVERY, self._look)
 
     def put(self, shot: Shot) -> None:
@@ -62,13 +83,48 @@ class Feed:
         with self._lock:
             waiting = self._newest is not None
             self._newest = shot
-            self._count += 1
+            if self._since is None:
+                self._since = shot.arrived
+            else:
+                self._count += 1
+            self._last = shot.arrived
         if not waiting:
             self._from_thread(self._deliver)
+
+    def keep(self, shot: Shot) -> None:
+        """A picture came that must not be shown at present; from any thread."""
+        with self._lock:
+            self._kept = shot
+
+    def speak(self) -> None:
+        """Pictures may be shown again: of those that come but once the last one that was kept is."""
+        with self._lock:
+            kept, self._kept = self._kept, None
+            newest = self._newest or self._latest
+        if kept is not None and self.source.latched and (newest is None or newest.stamp < kept.stamp):
+            self.put(kept.again(self._clock.seconds()))
+
+    def latest(self) -> Shot | None:
+        """The latest picture, as long as it is what the camera shows: until the next one is long overdue."""
+        shot = self._latest
+        if shot is None or self.source.latched:
+            return shot
+        holds = HOLDS / self._rate if self._rate else UNKNOWN
+        return shot if self._clock.seconds() - shot.arrived <= holds else None
+
+    @property
+    def slow(self) -> bool:
+        """Whether the next picture may be a while off, as far as one can tell."""
+        now = self._clock.seconds()
+        self._measure(now)
+        with self._lock:
+            alone, last = not self._rate and not self._count, self._last
+        return alone or now - last > SLOW or (self._rate > 0 and 1 / self._rate > SLOW)
 
     def close(self) -> None:
         """Nobody watches any more: what was seen last is told, with the time."""
         self.abandon()
+        self._measure(self._clock.seconds())
         self._tell(last=True)
         self.source.close()
 
@@ -88,14 +144,29 @@ class Feed:
             listener(shot)
 
     def _look(self) -> None:
-        now = self._clock.seconds()
-        with self._lock:
-            count, self._count = self._count, 0
-        rate = count / max(now - self._looked, 1e-3)
-        self._looked = now
-        self.fps = rate if not self.fps else self.fps + 0.5 * (rate - self.fps)
+        self._measure(self._clock.seconds())
         self._timer = self._clock.callLater(LOOK_EVERY, self._look)
         self._tell()
+
+    def _measure(self, now: float) -> None:
+        """Find out the rate by the time between pictures, which tells it also where there are few."""
+        with self._lock:
+            since, count, last = self._since, self._count, self._last
+            if since is None or (last <= since and now - since <= self._patience):
+                return
+            # After a silence they are counted anew.
+            self._since, self._count = (last if last > since else None), 0
+        if last > since:
+            rate = count / (last - since)
+            self._rate = rate if not self.fps else self._rate + 0.5 * (rate - self._rate)
+            self.fps = float(f"{self._rate:.3g}")
+        else:
+            self.fps = 0.0
+
+    @property
+    def _patience(self) -> float:
+        """Seconds without a picture after which the camera counts as silent."""
+        return max(HOLDS / self.fps, HOLDS * LOOK_EVERY) if self.fps else float("inf")
 
     def _tell(self, *, last: bool = False) -> None:
         if self._latest is None:
@@ -109,7 +180,7 @@ class Feed:
             encoding=encoding[:LABEL],
             width=width,
             height=height,
-            fps=round(self.fps, 1),
+            fps=self.fps,
             at=round(self._latest.stamp / 1e9, 3),
         )
         if last or self._seen is None or _differ(self._seen, seen):
@@ -119,4 +190,4 @@ class Feed:
 
 def _differ(old: Seen, new: Seen) -> bool:
     same = (old.encoding, old.width, old.height) == (new.encoding, new.width, new.height)
-    return not same or abs(new.fps - old.fps) > _STEADY * max(old.fps, 1.0)
+    return not same or abs(new.fps - old.fps) > _STEADY * old.fps

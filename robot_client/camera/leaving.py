@@ -19,10 +19,15 @@ from robot_client.camera.shot import Shot
 PART = 16 * KIB
 """A larger picture goes in parts of so many bytes."""
 
+QUESTION = 1
+"""Bytes of a picture that leave alone to ask for the round trip."""
+
 
 class _Picture:
-    def __init__(self, number: int, stamp: int, body: bytes) -> None:
+    def __init__(self, number: int, stamp: int, body: bytes, asks: bool, alone: bool) -> None:
         self.number = number
+        self.alone = alone
+        self._asks = asks
         self.left = 0
         """Bytes that have left."""
         self.total = len(body)
@@ -30,10 +35,10 @@ class _Picture:
         self._body = body
 
     def next_frame(self) -> bytes:
-        if self.total <= PART:
+        if self.total <= PART and not self._asks:
             self.left = self.total
             return frames.encode_video(self.number, self._stamp, self._body)
-        piece = self._body[self.left : self.left + PART]
+        piece = self._body[self.left : self.left + (QUESTION if self._asks and not self.left else PART)]
         frame = frames.encode_picture_part(self.number, self._stamp, self.total, self.left, piece)
         self.left += len(piece)
         return frame
@@ -54,13 +59,14 @@ class Leaving:
         """Of each frame without answer: the picture's number, how much of it has left with this one, and its bytes."""
         self._unanswered = 0
 
-    def put(self, number: int, shot: Shot, body: bytes, now: float) -> None:
+    def put(self, number: int, shot: Shot, body: bytes, now: float, alone: bool = True) -> None:
         """Have a picture leave, behind those that are here.
 
         :param shot: what it was made of
+        :param alone: whether it needs none of those before it
         """
         self._pace.sent(number, len(body), now, shot.arrived)
-        self._pictures[number] = _Picture(number, shot.stamp, body)
+        self._pictures[number] = _Picture(number, shot.stamp, body, self._pace.asks(number), alone)
         self._go()
 
     def answered(self, took: Took, now: float, round_trip: float | None) -> bool:
@@ -80,11 +86,21 @@ class Leaving:
             self._pace.took(took.number, now, round_trip)
         else:
             self._pace.came(took.number, took.upto, now, round_trip)
-        hopeless = self._pace.hopeless(now).intersection(self._pictures)
-        for number in hopeless:
+        lost = self._lost(self._pace.hopeless(now))
+        for number in lost:
             self._pace.gave_up(number, self._pictures.pop(number).left, now)
         self._go()
-        return bool(hopeless)
+        return bool(lost)
+
+    def _lost(self, hopeless: set[int]) -> list[int]:
+        """Numbers of the pictures here that are hopeless, or no use without one that is."""
+        lost: list[int] = []
+        broken = False
+        for number, picture in self._pictures.items():
+            broken = number in hopeless or (broken and not picture.alone)
+            if broken:
+                lost.append(number)
+        return lost
 
     def _go(self) -> None:
         out = []

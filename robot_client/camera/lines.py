@@ -21,6 +21,7 @@ class Settings(_Line, frozen=True, kw_only=True):
     :param server_name: name the certificate must bear, empty for the host
     :param node: name of the node that subscribes to cameras
     :param streams: most of them at a time
+    :param target: delay to stay under, seconds
     """
 
     address: str
@@ -29,6 +30,7 @@ class Settings(_Line, frozen=True, kw_only=True):
     server_name: str = ""
     node: str
     streams: int
+    target: float = 0.3
 
 
 class Open(_Line, frozen=True, kw_only=True):
@@ -38,7 +40,7 @@ class Open(_Line, frozen=True, kw_only=True):
     :param camera: as the relay calls it
     :param topic: to subscribe to; empty for a camera without ROS
     :param compressed: whether its messages are ``CompressedImage``
-    :param source: of a camera without ROS; with neither it nor a topic there is no such camera
+    :param source: of a camera without ROS, where there is no topic; with neither there is no such camera
     :param address: ``host:port`` to dial; empty for the address of the control link
     :param heartbeat: seconds, as the control link agreed
     """

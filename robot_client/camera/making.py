@@ -10,6 +10,7 @@ from robot_client.camera import formats
 from robot_client.camera.editing import plan
 from robot_client.camera.encoding import Encoder, make_encoder
 from robot_client.camera.formats import Pixels, Raw
+from robot_client.camera.orientation import without_orientation
 from robot_client.camera.shot import Look, Made, Shot, Wish
 
 _HEAD = 13
@@ -67,9 +68,10 @@ class Maker:
         """
         made = self._as_it_is(shot, wish) or self._encoded(shot, wish)
         if len(made.body) + _HEAD > PICTURE_FRAME:
+            other = "of less quality" if self._settings.codec == "jpeg" else "as JPEG"
             raise Invalid(
                 f"the picture has {len(made.body)} bytes; at most {PICTURE_FRAME - _HEAD} are sent. "
-                "Ask for a smaller one, or as JPEG"
+                f"Ask for a smaller one, or {other}"
             )
         return made
 
@@ -83,7 +85,7 @@ class Maker:
         look = shot.look()
         if plan(wanted, look.width, look.height).touches or not _goes_out(file):
             return None
-        return Made(file, look.width, look.height, look.encoding)
+        return Made(without_orientation(file), look.width, look.height, look.encoding)
 
     def _encoded(self, shot: Shot, wish: Wish) -> Made:
         raw = shot.raw()

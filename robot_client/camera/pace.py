@@ -15,9 +15,10 @@ from typing import NamedTuple
 
 from relay_protocol.limits import KIB
 from relay_protocol.link import VideoSettings
+from robot_client.camera.trip import RoundTrip, longer
 
 TARGET = 0.3
-"""Seconds from a picture's arrival at the robot to the relay's word that it is there."""
+"""Unless another one is wanted: seconds from a picture's arrival at the robot to the relay's word that it is there."""
 
 UNDER_WAY = 2
 """Most pictures the relay has not taken yet (SPEC 2.6)."""
@@ -52,6 +53,9 @@ does: at 200 kbit/s in 2 s."""
 
 PIPES = 1.5
 """Times what fits into the link in a round trip may be on its way, so that it is never empty and more can be tried."""
+
+AGAIN = 0.05
+"""Seconds after which a stream with nothing under way asks again whether the others still hold the link."""
 
 DAWDLE = 0.04
 """Seconds; a link is not filled more than it takes to have a picture leave in that time."""
@@ -89,6 +93,10 @@ class _Sent:
     there: int = 0
     """Bytes the relay has."""
     given_up: bool = False
+    asks: bool = False
+    """Whether only a few bytes have left, which ask for the round trip."""
+    held: float = 0.0
+    """Seconds it waited for their answer."""
 
 
 def steps(settings: VideoSettings) -> list[Step]:
@@ -113,10 +121,11 @@ def _bytes_at(quality: int) -> float:
 class Pace:
     """Decides for one stream when a picture is made, and how. Pure: times are given, in seconds of one clock.
 
+    :param way: what is known of the way to the relay, with all other streams that take it
     :param target: delay to stay under; with a round trip of more than half of it, twice the round trip
     """
 
-    def __init__(self, settings: VideoSettings, target: float = TARGET) -> None:
+    def __init__(self, settings: VideoSettings, way: RoundTrip | None = None, target: float = TARGET) -> None:
         self.delay: float | None = None
         """Seconds from arrival to ``took``, smoothed; ``None`` before the first."""
         self.rate: float | None = None
@@ -128,7 +137,9 @@ class Pace:
         self._step = 0
         self._under_way: dict[int, _Sent] = {}
         self._free_at = 0.0
-        self._round_trip: float | None = None
+        self._way = way or RoundTrip()
+        self._reckoned = self._trip
+        """The round trip by which the rate was measured."""
         self._own = 0.0
         self._unit: float | None = None
         self._due = float("-inf")
@@ -164,14 +175,14 @@ class Pace:
     @property
     def window(self) -> float:
         """Bytes without answer from which on no more should leave; while in doubt they leave one part at a time."""
-        if self._doubts:
+        if self._doubts or any(each.asks for each in self._under_way.values()):
             return 1
         full = PIPES * self._trip * min(self._progress, self._bytes(self._step) / DAWDLE)
         return max(WINDOW, min(full, WINDOW + self._flowed))
 
     def may_send(self, now: float) -> bool:
         """Whether a picture made now would be there in time, as far as one can tell."""
-        if len(self._under_way) >= UNDER_WAY or self.wait(now) > 0:
+        if len(self._under_way) >= UNDER_WAY or self.wait(now) > 0 or not self._way.may_leave(now):
             return False
         if not self._under_way:
             return True
@@ -184,8 +195,9 @@ class Pace:
         return self._own + ahead + self._bytes(self._step) / self.rate + self._trip <= self._goal
 
     def wait(self, now: float) -> float:
-        """Seconds until the rate that is aimed at allows another picture."""
-        return max(0.0, self._due - now) if self.fps else 0.0
+        """Seconds until another picture may be made, where no answer tells that."""
+        held = not self._under_way and not self._way.may_leave(now)
+        return max(self._due - now if self.fps else 0.0, AGAIN if held else 0.0)
 
     def sent(self, number: int, size: int, now: float, arrived: float) -> None:
         """A picture begins to leave.
@@ -195,7 +207,8 @@ class Pace:
         """
         if not self._under_way:
             self._flowed = 0
-        self._under_way[number] = _Sent(size, self._step, arrived, now)
+        asks = self._way.leaves(self, now, patient=not self._gives_up)
+        self._under_way[number] = _Sent(size, self._step, arrived, now, asks=asks)
         self._own = _smooth(self._own, now - arrived, 0.2)
         if self.fps:
             # One that is late does not put off those that follow, by up to half of their distance.
@@ -205,6 +218,15 @@ class Pace:
         if self.rate is not None:
             self._free_at = max(now, self._free_at) + size / self.rate
             self._fit(now)
+
+    def asks(self, number: int) -> bool:
+        """Whether of this picture a few bytes leave first, and the rest when they have an answer."""
+        return self._under_way[number].asks
+
+    def close(self, now: float) -> None:
+        """No more pictures leave, and no more answers come."""
+        self._under_way.clear()
+        self._way.idle(self, now)
 
     def took(self, number: int, now: float, round_trip: float | None = None) -> None:
         """The relay has a picture; a number that is not under way is passed over.
@@ -217,7 +239,7 @@ class Pace:
         seconds = self._learn(sent, sent.size, now, round_trip)
         delay = now - sent.arrived
         self.delay = delay if self.delay is None else _smooth(self.delay, delay, 0.3)
-        self._measure(sent.size, seconds, delay)
+        self._measure(sent.size, seconds, delay - sent.held)
         self._passed(now)
         self._fit(now)
 
@@ -229,6 +251,9 @@ class Pace:
         """
         sent = self._under_way.get(number)
         if sent is None or not sent.there < upto < sent.size + sent.given_up:
+            return
+        if sent.asks:
+            self._replied(sent, upto, now)
             return
         self._learn(sent, upto, now, round_trip)
         if sent.given_up and upto == sent.size:
@@ -242,19 +267,30 @@ class Pace:
         return self._late_ones(now)
 
     def gave_up(self, number: int, left: int, now: float) -> None:
-        """No more of a picture leaves.
+        """No more of a picture leaves; one that is not under way is passed over.
 
         :param left: bytes of it that have left
         """
-        sent = self._under_way[number]
+        sent = self._under_way.get(number)
+        if sent is None:  # the relay has said that it has it, whatever of it has left
+            return
         sent.size, sent.given_up = left, True
         if sent.there == left:
             del self._under_way[number]
+            self._rest(now)
         self.rate = self._latest if self.rate is None else min(self.rate, self._latest)
         coming = sum(each.size - each.there for each in self._under_way.values())
         self._free_at = max(now, now - self._trip + coming / self.rate)
         self._doubts = 0
         self._fit(now)
+
+    def _replied(self, sent: _Sent, upto: int, now: float) -> None:
+        """The answer to what asked for the round trip; all else of the picture leaves now."""
+        self._way.answered(self, now)
+        sent.asks, sent.there = False, upto
+        sent.held, sent.at = now - sent.at, now
+        self._last_answer = now
+        self._free_at += sent.held
 
     def _learn(self, sent: _Sent, upto: int, now: float, round_trip: float | None) -> float:
         """Take an answer: how quick this picture has been so far, and whether those under way will come in time.
@@ -262,7 +298,11 @@ class Pace:
         :return: seconds its bytes took, at most
         """
         if round_trip is not None:
-            self._round_trip = round_trip if self._round_trip is None else min(self._round_trip, round_trip)
+            self._way.measured(round_trip, now)
+        if longer(self._trip, self._reckoned):
+            # The rate was measured by a wrong one, and so much was tried in vain.
+            self.rate, self._hold = None, HOLD[0]
+        self._reckoned = self._trip
         # Behind another picture it began to go only when that one was there.
         began = max(sent.at, self._last_took - self._trip)
         seconds = max(now - began - self._trip, (now - began) / 8, QUICKEST)
@@ -288,6 +328,12 @@ class Pace:
         self._last_took = now
         if not self._under_way:
             self._free_at = now
+        self._rest(now)
+
+    def _rest(self, now: float) -> None:
+        """Let others know when nothing is under way."""
+        if not self._under_way:
+            self._way.idle(self, now)
 
     def _measure(self, size: int, seconds: float, delay: float) -> None:
         """Take one measurement: so many bytes took so long, at most; a busy processor makes it longer."""
@@ -338,7 +384,7 @@ class Pace:
 
     @property
     def _trip(self) -> float:
-        return self._round_trip or 0.0
+        return self._way.seconds
 
     @property
     def _goal(self) -> float:

@@ -44,6 +44,13 @@ class Shot:
         self._raw: Raw | None = None
         self._lock = threading.Lock()
 
+    def again(self, now: float) -> Shot:
+        """The same picture as if it had come now, but for its stamp: it is no fault of the uplink's how old it is.
+
+        :param now: seconds of the process's clock
+        """
+        return Shot(self.stamp, now, self.look, self.raw, self.jpeg)
+
     def raw(self) -> Raw:
         """Its pixels, not to be written to.
 

@@ -14,8 +14,9 @@ from relay_protocol import limits, link
 from relay_protocol.errors import SwitchboardError, Unavailable
 from robot_client.camera.leaving import Leaving
 from robot_client.camera.lines import Open
-from robot_client.camera.pace import Pace
+from robot_client.camera.pace import TARGET, Pace
 from robot_client.camera.shot import Made, Shot, Wish
+from robot_client.camera.trip import RoundTrip
 from robot_client.link import Ended, Event, JoinedChannel, Said
 from robot_client.reactors import Clock, Timer
 from robot_client.transport import LinkLost, LinkProtocol
@@ -38,8 +39,15 @@ class View(Protocol):
     def fps(self) -> float:
         """Pictures per second, as they came of late."""
 
+    @property
+    def latched(self) -> bool:
+        """Whether its publisher keeps the latest picture for those who come later."""
+
     def make(self, shot: Shot, wish: Wish) -> Deferred[Made]:
         """Make a picture to be sent, in a thread; one at a time."""
+
+    def latest(self) -> Shot | None:
+        """The newest picture there was before, if it is still what the camera shows."""
 
     def close(self) -> None:
         """Want it no more."""
@@ -56,6 +64,8 @@ class Stream:
     :param protocol: the connection
     :param watch: gives the camera
     :param on_gone: called once when the link is gone, with the reason
+    :param way: what is known of the way to this relay
+    :param target: delay to stay under, seconds
     """
 
     def __init__(
@@ -65,9 +75,11 @@ class Stream:
         watch: Watch,
         clock: Clock,
         on_gone: Callable[[Stream, str], None],
+        way: RoundTrip,
+        target: float = TARGET,
     ) -> None:
         self.line = line
-        self.pace = Pace(line.settings)
+        self.pace = Pace(line.settings, way, target)
         self._protocol = protocol
         self._leaving = Leaving(self.pace, protocol.write)
         self._watch = watch
@@ -77,11 +89,14 @@ class Stream:
         self._newest: Shot | None = None
         self._working = False
         self._key = True
+        self._broken = False
+        """Whether the relay lacks a picture that those made of H.264 need, up to one that stands alone."""
         self._number = 0
         self._faults = 0
         self._told: link.Playing | None = None
         self._told_at = 0.0
         self._timer: Timer | None = None
+        self._looking: Timer | None = None
         self._log = Logger("camera")
 
     # --- the link ------------------------------------------------------------------------------------------
@@ -94,6 +109,8 @@ class Stream:
             self._took(event.message)
         elif isinstance(event, Said):
             self._key = True
+            self._repeat()
+            self._next()
         elif isinstance(event, Ended):
             self._protocol.end(LinkLost(f"the relay closed the stream: {event.reason}"), gently=True)
 
@@ -128,6 +145,17 @@ class Stream:
             self._view = self._watch(self.line, self._on_shot)
         except SwitchboardError as error:
             self.refuse(str(error), busy=isinstance(error, Busy))
+            return
+        self._looking = self._clock.callLater(TELL_EVERY, self._look)
+        before = self._view.latest()
+        if before is not None:
+            self._on_shot(before.again(self._clock.seconds()))
+
+    def _repeat(self) -> None:
+        """Have a picture that its publisher keeps made once more: no other one may follow."""
+        kept = self._view.latest() if self._view is not None and self._view.latched else None
+        if kept is not None and self._newest is None:
+            self._newest = kept.again(self._clock.seconds())
 
     def _say(self, message: link.Message) -> None:
         self._protocol.link.say(message)
@@ -140,7 +168,11 @@ class Stream:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+        if self._looking is not None:
+            self._looking.cancel()
+            self._looking = None
         self._newest = None
+        self.pace.close(self._clock.seconds())
 
     # --- pictures ------------------------------------------------------------------------------------------
 
@@ -175,9 +207,15 @@ class Stream:
         if self._view is None:
             return
         self._faults = 0
+        alone = wish.key or self.line.settings.codec != "h264"
+        if self._broken and not alone:
+            self._newest = self._newest or shot
+            self._next()
+            return
+        self._broken = False
         self._number += 1
-        self._tell(made, wish)
-        self._leaving.put(self._number, shot, made.body, self._clock.seconds())
+        self._tell(made, wish, self._view)
+        self._leaving.put(self._number, shot, made.body, self._clock.seconds(), alone)
         self._next()
 
     def _not_made(self, failure: Failure, wish: Wish) -> None:
@@ -201,12 +239,21 @@ class Stream:
         measured = self._protocol.link.offset.round_trip
         round_trip = measured / 1e9 if measured is not None else None
         if self._leaving.answered(took, self._clock.seconds(), round_trip):
-            self._key = True  # what follows in H.264 must not need what was given up
+            self._key = self._broken = True  # what follows in H.264 must not need what was given up
+            if not self._working:
+                self._repeat()
         self._next()
 
-    def _tell(self, made: Made, wish: Wish) -> None:
+    def _look(self) -> None:
+        """Who publishes the pictures may be known, or be another one, only after the picture that is shown."""
+        self._looking = self._clock.callLater(TELL_EVERY, self._look)
+        if self._told is not None and self._view is not None and self._told.latched != self._view.latched:
+            self._told = replace(self._told, latched=self._view.latched)
+            self._say(self._told)
+
+    def _tell(self, made: Made, wish: Wish, view: View) -> None:
         """Say how this picture and those that follow are, if the relay does not know."""
-        delay, fps = self.pace.delay, self._view.fps if self._view is not None else 0.0
+        delay = self.pace.delay
         playing = link.Playing(
             width=made.width,
             height=made.height,
@@ -215,7 +262,8 @@ class Stream:
             reduced=round(self.pace.reduced, 3),
             delay_ms=None if delay is None else round(delay * 1000, 1),
             encoding=made.encoding[: limits.LABEL],
-            source_fps=round(fps, 1),
+            source_fps=view.fps,
+            latched=view.latched,
         )
         now = self._clock.seconds()
         if self._told is not None:

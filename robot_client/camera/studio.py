@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.protocol import Factory
@@ -12,19 +13,53 @@ from twisted.internet.threads import deferToThreadPool
 from twisted.python.failure import Failure
 from twisted.python.threadpool import ThreadPool
 
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from robot_client.camera import check_installed
-from robot_client.camera.feed import Closes, Feed
+from robot_client.camera.feed import Feed, Origin
 from robot_client.camera.lines import Answer, Close, Ended, Line, Log, Open, Settings, Silent, Taken
 from robot_client.camera.shot import Made, Shot, Wish
 from robot_client.camera.stream import Busy, Stream
-from robot_client.clocks import now_ns
+from robot_client.camera.trip import RoundTrip
 from robot_client.link import VideoLink
+from robot_client.reactors import Timer
 from robot_client.tls import endpoint, explain, split_address
 from robot_client.transport import LinkProtocol
 
-Source = tuple[str, str]
-"""What makes two streams share a camera: where its pictures come from, and by which quality of service."""
+LINGER = 30.0
+"""Seconds for which a slow camera is kept that nobody watches: who comes again in vain finds what came meanwhile. The
+process does not live longer without streams either.
+"""
+
+
+class Source(NamedTuple):
+    """What makes two streams share a camera: all by which it is opened, and nothing else.
+
+    :param topic: empty for a camera without ROS
+    :param compressed: as in :class:`~robot_client.camera.lines.Open`
+    :param qos: as in :class:`~relay_protocol.link.VideoSettings`
+    :param address: of a camera without ROS
+    """
+
+    topic: str = ""
+    compressed: bool = False
+    qos: str = ""
+    address: str = ""
+
+
+def _source_of(line: Open) -> Source:
+    if line.topic:
+        return Source(line.topic, line.compressed, line.settings.qos)
+    # Quality of service is ROS's; what is no topic may be there to be opened once.
+    return Source(address=line.source)
+
+
+def _ros_cameras(node: str) -> Any:
+    try:
+        from robot_client.platforms.ros2_camera import RosCameras
+    except ImportError as error:
+        raise Unavailable(f"no ROS 2 found ({error})") from None
+    return RosCameras(node)
 
 
 class Studio:
@@ -32,16 +67,29 @@ class Studio:
 
     :param reactor: its clock must be monotonic
     :param tell: to the daemon
+    :param make_ros: makes the node of this process, by its name, when the first camera of ROS is wanted; raises
+        :class:`Unavailable`
     """
 
-    def __init__(self, reactor: Any, settings: Settings, tell: Callable[[Answer], None]) -> None:
+    def __init__(
+        self,
+        reactor: Any,
+        settings: Settings,
+        tell: Callable[[Answer], None],
+        make_ros: Callable[[str], Any] = _ros_cameras,
+    ) -> None:
         self._reactor = reactor
         self._settings = settings
         self._tell = tell
         self._streams: dict[str, Stream] = {}
         self._dialling: dict[str, Deferred[Any]] = {}
+        self._make_ros = make_ros
         self._feeds: dict[Source, Feed] = {}
+        self._lingering: dict[Source, Timer] = {}
+        """Feeds nobody watches, and when they end."""
         self._views: set[_View] = set()
+        self._ways: WeakValueDictionary[str, RoundTrip] = WeakValueDictionary()
+        """To the relays, by address; each is kept by its streams."""
         self._ros: Any = None
         self._silent: frozenset[str] = frozenset()
         self._threads = ThreadPool(0, settings.streams, "pictures")
@@ -54,12 +102,17 @@ class Studio:
         elif isinstance(line, Close):
             self._close(line.stream, line.why)
         elif isinstance(line, Silent):
-            self._silent = frozenset(line.topics)
+            before, self._silent = self._silent, frozenset(line.topics)
+            for source, feed in list(self._feeds.items()):
+                if source.topic in before - self._silent:
+                    feed.speak()
 
     def stop(self, why: str) -> None:
         """Close all, and leave the graph; what was written still leaves."""
         for name in {*self._dialling, *self._streams}:
             self._close(name, why)
+        for source in list(self._lingering):
+            self._end(source)
         ros, self._ros = self._ros, None
         if ros is not None:
             ros.close()
@@ -87,7 +140,8 @@ class Studio:
         return LinkProtocol(video, lambda protocol: self._make_stream(line, protocol), self._reactor)
 
     def _make_stream(self, line: Open, protocol: LinkProtocol) -> Stream:
-        stream = Stream(line, protocol, self.watch, self._reactor, self._gone)
+        way = self._ways.setdefault(line.address or self._settings.address, RoundTrip())
+        stream = Stream(line, protocol, self.watch, self._reactor, self._gone, way, self._settings.target)
         self._streams[line.stream] = stream
         return stream
 
@@ -127,21 +181,37 @@ class Studio:
         if not line.topic and not line.source:
             raise NotFound(f"there is no camera {line.camera} on this robot")
         check_installed()
-        # Quality of service is ROS's; what is no topic may be there to be opened once.
-        source = (line.source, "") if line.source else (line.topic, line.settings.qos)
+        source = _source_of(line)
         feed = self._feeds.get(source)
         if feed is None:
             feed = self._feeds[source] = self._make_feed(line)
-        view = _View(feed, line, on_shot, self._work, lambda: self._unwatch(source, view))
+        timer = self._lingering.pop(source, None)
+        if timer is not None:
+            timer.cancel()
+        view = _View(
+            feed, line, on_shot, self._work, lambda: self._latest(source), lambda: self._unwatch(source, view)
+        )
         self._views.add(view)
         return view
 
     def _unwatch(self, source: Source, view: _View) -> None:
         self._views.discard(view)
         feed = self._feeds[source]
-        if not feed.listeners:
-            del self._feeds[source]
-            feed.close()
+        if feed.listeners:
+            return
+        # What is no topic and gives nothing is broken, or a device that others wait for.
+        if source.topic and feed.slow:
+            self._lingering[source] = self._reactor.callLater(LINGER, self._end, source)
+            if len(self._lingering) > self._settings.streams:
+                self._end(next(iter(self._lingering)))
+        else:
+            self._end(source)
+
+    def _end(self, source: Source) -> None:
+        timer = self._lingering.pop(source, None)
+        if timer is not None and timer.active():
+            timer.cancel()
+        self._feeds.pop(source).close()
 
     def _make_feed(self, line: Open) -> Feed:
         name = line.topic or line.camera
@@ -153,18 +223,20 @@ class Studio:
             raise
         return feed
 
-    def _subscribe(self, line: Open, feed: Feed) -> Closes:
+    def _subscribe(self, line: Open, feed: Feed) -> Origin:
         from robot_client.camera.making import message_shot
 
         def arrived(cdr: bytes) -> None:
+            shot = message_shot(time.time_ns(), self._reactor.seconds(), cdr, line.compressed)
             if line.topic in self._silent:
-                return
-            feed.put(message_shot(time.time_ns(), self._reactor.seconds(), cdr, line.compressed))
+                feed.keep(shot)
+            else:
+                feed.put(shot)
 
-        subscribed: Closes = self._in_ros().subscribe(line.topic, line.compressed, line.settings.qos, arrived)
+        subscribed: Origin = self._in_ros().subscribe(line.topic, line.compressed, line.settings.qos, arrived)
         return subscribed
 
-    def _capture(self, line: Open, feed: Feed) -> Closes:
+    def _capture(self, line: Open, feed: Feed) -> Origin:
         from robot_client.camera.capture import Capture
         from robot_client.camera.making import pixels_shot
 
@@ -178,14 +250,12 @@ class Studio:
         )
 
     def _in_ros(self) -> Any:
-        """The node of this process, made when the first camera of ROS is wanted."""
         if self._ros is None:
-            try:
-                from robot_client.platforms.ros2_camera import RosCameras
-            except ImportError as error:
-                raise Unavailable(f"no ROS 2 found ({error})") from None
-            self._ros = RosCameras(self._settings.node)
+            self._ros = self._make_ros(self._settings.node)
         return self._ros
+
+    def _latest(self, source: Source) -> Shot | None:
+        return None if source.topic in self._silent else self._feeds[source].latest()
 
     def _work(self, make: Callable[[Shot, Wish], Made], shot: Shot, wish: Wish) -> Deferred[Made]:
         return deferToThreadPool(self._reactor, self._threads, make, shot, wish)
@@ -200,6 +270,7 @@ class _View:
         line: Open,
         on_shot: Callable[[Shot], None],
         work: Callable[[Callable[[Shot, Wish], Made], Shot, Wish], Deferred[Made]],
+        latest: Callable[[], Shot | None],
         on_close: Callable[[], None],
     ) -> None:
         from robot_client.camera.making import Maker
@@ -208,6 +279,8 @@ class _View:
         self._on_shot = on_shot
         self._work = work
         self._maker = Maker(line.settings)
+        self.latest = latest
+        """Gives the newest picture there is, if it is still what the camera shows and may be shown."""
         self._on_close = on_close
         feed.listeners.add(on_shot)
 
@@ -215,6 +288,11 @@ class _View:
     def fps(self) -> float:
         """Pictures per second, as they came of late."""
         return self._feed.fps
+
+    @property
+    def latched(self) -> bool:
+        """Whether its publisher keeps the latest picture for those who come later."""
+        return self._feed.source.latched
 
     def make(self, shot: Shot, wish: Wish) -> Deferred[Made]:
         """Make a picture to be sent, in a thread."""

@@ -19,6 +19,9 @@ from robot_client.topics import TypedTopic
 
 OnSample = Callable[[bytes], None]
 OnChange = Callable[[], None]
+Check = Callable[[], None]
+"""Sees that something may still be done; raises one of :mod:`relay_protocol.errors` where it may not."""
+
 OnCall = Callable[[bytes, Callable[[bytes], None]], None]
 """Takes a request and what its answer is to be given to, which raises :class:`Invalid` for bytes that are none."""
 
@@ -139,7 +142,7 @@ class Goal(Protocol):
     """Fires once in every case."""
 
     def cancel(self) -> None:
-        """Want it no more, however far it is; :attr:`result` still comes."""
+        """Want it no more, however far it is; :attr:`result` still comes. An action that was asked is asked again."""
 
 
 class Platform(Protocol):
@@ -201,8 +204,17 @@ class Platform(Protocol):
         :param queue_size: messages kept for subscribers that are slow, unless ``qos`` says it; the usual below 1
         """
 
-    def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
-        """Call a service once; fails with a sentence. Cancelling the result gives the call up."""
+    def call(
+        self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None
+    ) -> Deferred[bytes]:
+        """Call a service once; fails with a sentence. Cancelling the result gives the call up.
+
+        :param check: called on the reactor's thread right before the request is sent, when the service is found; the
+            call fails with what it raises, and nothing is sent
+        """
+
+    def prepare_call(self, service: str, type: str) -> None:
+        """Keep for good what calls a service, so that it need not be found again when it is called by this type."""
 
     def serve(self, service: str, type: str, on_call: OnCall) -> Offer:
         """Offer a service; its calls come one after the other and are answered in any order."""

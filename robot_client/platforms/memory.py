@@ -6,7 +6,7 @@ import struct
 import uuid
 from collections.abc import Callable
 
-from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.defer import Deferred, fail
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
@@ -14,6 +14,7 @@ from robot_client.alerts import OnAlert, nobody
 from robot_client.platforms.base import (
     ABORTED,
     NEVER_BEGAN,
+    Check,
     Facts,
     GraphView,
     Motion,
@@ -165,8 +166,14 @@ class MemoryGoal:
         self.result: Deferred[Outcome] = Deferred()
         self.action = action
         self.body = body
-        self.cancelled = False
+        self.cancels = 0
+        """How often it was cancelled."""
         self._on_feedback = on_feedback
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether nobody wants it."""
+        return self.cancels > 0
 
     def feed(self, body: bytes) -> None:
         """Tell how far it is, if anybody wants to know."""
@@ -175,7 +182,7 @@ class MemoryGoal:
 
     def cancel(self) -> None:
         """Note that nobody wants it."""
-        self.cancelled = True
+        self.cancels += 1
 
 
 Service = Callable[[bytes], "bytes | Deferred[bytes]"]
@@ -196,6 +203,10 @@ class MemoryPlatform(Platform):
         self.sinks: list[MemorySink] = []
         self.published: list[tuple[str, bytes]] = []
         self.services: dict[str, Service] = {}
+        self.looking: list[Deferred[None]] | None = None
+        """Where it is a list, services take their time to be found: each call until what is added here fires."""
+        self.prepared: list[tuple[str, str]] = []
+        """Services that are to be called some time, and by which types."""
         self.actions: set[str] = set()
         self.goals: list[MemoryGoal] = []
         self.offered: dict[str, MemoryService] = {}
@@ -275,13 +286,25 @@ class MemoryPlatform(Platform):
         self.sinks.append(sink)
         return sink
 
-    def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
-        """Ask the function set for a service."""
+    def call(
+        self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None
+    ) -> Deferred[bytes]:
+        """Ask the function set for a service, when it is found."""
         function = self.services.get(service)
         if function is None:
             return fail(NotFound(f"there is no service {service} on this robot"))
-        result = function(request)
-        return result if isinstance(result, Deferred) else succeed(result)
+        found: Deferred[None] = Deferred()
+        checked = found.addCallback(lambda _: None if check is None else check())
+        answered = checked.addCallback(lambda _: function(request))
+        if self.looking is None:
+            found.callback(None)
+        else:
+            self.looking.append(found)
+        return answered
+
+    def prepare_call(self, service: str, type: str) -> None:
+        """Note that it is to be called some time."""
+        self.prepared.append((service, type))
 
     def serve(self, service: str, type: str, on_call: OnCall) -> MemoryService:
         """Offer a service."""

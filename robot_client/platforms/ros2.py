@@ -22,6 +22,7 @@ from relay_protocol.errors import SwitchboardError
 from robot_client.alerts import OnAlert, nobody
 from robot_client.platforms import ros2_facts, ros2_graph, ros2_qos
 from robot_client.platforms.base import (
+    Check,
     Facts,
     GraphView,
     Motion,
@@ -236,14 +237,22 @@ class Ros2Platform(Platform):
         self._sinks.remove(sink)
         self._lingering.take(sink.publisher)
 
-    def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
+    def call(
+        self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None
+    ) -> Deferred[bytes]:
         """Call a service once."""
         try:
             check_name(self._node.resolve_service_name, service, "service")
-            full = service_type(service, type, self._node.get_service_names_and_types())
-            return self._calls.call(service, full, request, timeout)
+            known = self._node.get_service_names_and_types()
+            full = type if self._calls.keeps(service, type) else service_type(service, type, known)
+            return self._calls.call(service, full, request, timeout, check)
         except SwitchboardError as error:
             return fail(error)
+
+    def prepare_call(self, service: str, type: str) -> None:
+        """Make a client, and keep it."""
+        check_name(self._node.resolve_service_name, service, "service")
+        self._calls.keep(service, type)
 
     def serve(self, service: str, type: str, on_call: OnCall) -> RosService:
         """Offer a service."""

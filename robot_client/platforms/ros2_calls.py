@@ -9,6 +9,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from robot_client.platforms.base import Check
 from robot_client.platforms.ros2_errors import in_words
 from robot_client.platforms.ros2_executor import Hop
 from robot_client.platforms.ros2_types import Types
@@ -44,9 +45,22 @@ class Calls:
         self.clock = clock
         self._types = types
         self._clients: dict[tuple[str, str], _Client] = {}
+        self._kept: set[tuple[str, str]] = set()
+        """Clients that stay, by service and type."""
         self._pending: set[_Call] = set()
 
-    def call(self, service: str, type: str, request: bytes, timeout: float) -> Deferred[bytes]:
+    def keep(self, service: str, type: str) -> None:
+        """Make a client that stays: it has found the service long before it is to call it."""
+        self._client(service, type, self._types.service(type))
+        self._kept.add((service, type))
+
+    def keeps(self, service: str, type: str) -> bool:
+        """Whether there is a client for this that stays."""
+        return (service, type) in self._kept
+
+    def call(
+        self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None
+    ) -> Deferred[bytes]:
         """Call once; see :meth:`robot_client.platforms.base.Platform.call`."""
         kind = self._types.service(type)
         try:
@@ -54,7 +68,7 @@ class Calls:
         except Exception:
             raise Invalid(f"the arguments for {service} are no request of type {type}") from None
         client = self._client(service, type, kind)
-        call = _Call(self, service, client, message, timeout, self._pending.discard)
+        call = _Call(self, service, client, message, timeout, self._pending.discard, check)
         self._pending.add(call)
         call.begin()
         return call.result
@@ -64,7 +78,7 @@ class Calls:
         now = self.clock.seconds()
         busy = {call.client for call in self._pending}
         for key, (client, used) in list(self._clients.items()):
-            if client not in busy and now - used[0] > IDLE:
+            if key not in self._kept and client not in busy and now - used[0] > IDLE:
                 del self._clients[key]
                 self.node.destroy_client(client)
 
@@ -75,6 +89,7 @@ class Calls:
         for client, _ in self._clients.values():
             self.node.destroy_client(client)
         self._clients.clear()
+        self._kept.clear()
 
     def _client(self, service: str, type: str, kind: Any) -> Any:
         known = self._clients.get((service, type))
@@ -95,6 +110,7 @@ class _Call:
         request: Any,
         timeout: float,
         on_done: Callable[[_Call], None],
+        check: Check | None,
     ) -> None:
         self.client = client
         self.result: Deferred[bytes] = Deferred(lambda _: self._end())
@@ -103,6 +119,7 @@ class _Call:
         self._calls = calls
         self._timeout = timeout
         self._on_done = on_done
+        self._check = check
         self._future: Any = None
         self._seen = self._began = calls.clock.seconds()
         self._next: Timer | None = None
@@ -129,6 +146,16 @@ class _Call:
             self._next = self._calls.clock.callLater(LOOK, self._look)
 
     def _ask(self) -> None:
+        """Send the request, if it may still be sent.
+
+        Orders of the relay are done on this thread as well: none can come between the judgement and the request.
+        """
+        try:
+            if self._check is not None:
+                self._check()
+        except SwitchboardError as error:
+            self.give_up(error)
+            return
         hop = self._calls.hop
         self._future = self.client.call_async(self._request)
         self._future.add_done_callback(lambda future: hop.put(self._answered, future))

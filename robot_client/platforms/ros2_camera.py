@@ -13,6 +13,7 @@ from typing import Any
 
 import rclpy
 from rclpy.clock import Clock, ClockType
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CompressedImage, Image
 
@@ -30,7 +31,7 @@ LOOK_EVERY = 1.0
 """Seconds between two looks at who publishes."""
 
 _ASKED = {
-    "": QoS(depth=DEPTH, durability="volatile"),
+    "": QoS(depth=DEPTH),
     "sensor_data": QoS(depth=DEPTH, reliability="best_effort", durability="volatile"),
     "default": QoS(depth=10, reliability="reliable", durability="volatile"),
 }
@@ -119,7 +120,12 @@ class RosCamera:
         self._on_close = on_close
         self._closed = threading.Event()
         self._subscription: Any = None
-        self._reliable = False
+        self._profile: QoSProfile | None = None
+        self._latest: bytes | None = None
+        self._passed_on: bytes | None = None
+        """What may come again, because it was subscribed anew."""
+        self.latched = False
+        """Whether the latest picture was kept for us, and would be for others; to be read from any thread."""
 
     def close(self) -> None:
         """Listen no more; from any thread."""
@@ -131,11 +137,12 @@ class RosCamera:
         found = ros2_qos.match(
             [each.qos_profile for each in self._node.get_publishers_info_by_topic(self._topic)]
         )
-        if self._subscription is not None and (found.publishers == 0 or found.reliable == self._reliable):
+        profile = ros2_qos.for_subscription(found, self._asked)
+        if self._subscription is not None and (found.publishers == 0 or profile == self._profile):
             return
         self.drop()
-        self._reliable = found.reliable
-        profile = ros2_qos.for_subscription(found, self._asked)
+        self._profile, self._passed_on = profile, self._latest
+        self.latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._subscription = self._node.create_subscription(
             self._kind, self._topic, self._arrived, profile, raw=True
         )
@@ -147,5 +154,8 @@ class RosCamera:
             self._subscription = None
 
     def _arrived(self, cdr: bytes) -> None:
-        if not self._closed.is_set():
-            self._on_picture(cdr)
+        passed_on, self._passed_on = self._passed_on, None
+        if self._closed.is_set() or (self.latched and cdr == passed_on):
+            return
+        self._latest = cdr
+        self._on_picture(cdr)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import uuid
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -34,6 +35,9 @@ GONE = 1.0
 
 UNHEARD = 5.0
 """Seconds a server has to take a goal that nobody wants any more."""
+
+MAX_UNANSWERED = 8
+"""Wishes to cancel one goal that may wait for their answers; rclpy would keep those that nobody answers."""
 
 IDLE = 30.0
 MAX_GOALS = 2000
@@ -168,13 +172,15 @@ class RosGoal:
         self._on_feedback = on_feedback
         self._state = _State.LOOKING
         self._unwanted = False
+        """Set on the reactor's thread, and read on the executor's as well."""
         self._handle: Any = None
         self._servers: frozenset[bytes] = frozenset()
         self._since = self._seen = goals.clock.seconds()
         self._pending: list[Any] = []
+        self._asked: deque[Any] = deque()
         self._given: Any = None
         self._abandoned = False
-        """These two are of the executor's thread: when it is abandoned nothing comes to the reactor's any more."""
+        """These three are of the executor's thread: when it is abandoned nothing comes to the reactor's any more."""
 
     def begin(self) -> None:
         """Look for the server; give it the goal once it is there."""
@@ -192,15 +198,19 @@ class RosGoal:
             self._goals.clock.callLater(LOOK, self.begin)
 
     def cancel(self) -> None:
-        """Want it no more; a server that has not taken it yet is told as soon as it has."""
-        if self._unwanted or self._state is _State.ENDED:
+        """Want it no more; a server that has not taken it yet is told as soon as it has.
+
+        One that was told is told again: it may have refused, or not have heard.
+        """
+        if self._state is _State.ENDED:
             return
-        self._unwanted = True
-        self._since = self._goals.clock.seconds()
+        if not self._unwanted:
+            self._unwanted = True
+            self._since = self._goals.clock.seconds()
         if self._state is _State.LOOKING:
             self._end(NEVER_BEGAN, "the goal was cancelled before it began")
         elif self._state is _State.RUNNING:
-            self._goals.spinner.do(self._handle.cancel_goal_async)
+            self._goals.spinner.do(self._ask)
 
     def abandon(self, reason: str) -> None:
         """Cancel it, once more if it was, and don't wait."""
@@ -233,6 +243,10 @@ class RosGoal:
     # --- in the executor's thread
 
     def _send(self) -> None:
+        # A stop may have come since it was asked for, and must not be followed by a movement.
+        if self._unwanted or self._abandoned:
+            self._goals.hop.put(self._failed, "it was cancelled before it began")
+            return
         tell = self._fed if self._on_feedback is not None else None
         try:
             future = self._client.ros.send_goal_async(self._message, tell, UUID(uuid=list(self.id)))
@@ -252,6 +266,11 @@ class RosGoal:
             if self._abandoned:
                 handle.cancel_goal_async()
         self._goals.hop.put(self._answered, handle)
+
+    def _ask(self) -> None:
+        if len(self._asked) == MAX_UNANSWERED:
+            self._asked.popleft().cancel()
+        self._asked.append(self._given.cancel_goal_async())
 
     def _leave(self) -> None:
         self._abandoned = True
@@ -281,7 +300,7 @@ class RosGoal:
     def _forget(self) -> None:
         if self._handle is not None:
             self._client.ros.hush(bytes(self._handle.goal_id.uuid))
-        for future in self._pending:
+        for future in (*self._pending, *self._asked):
             if not future.done():
                 future.cancel()  # rclpy would keep it for ever
 
@@ -297,7 +316,7 @@ class RosGoal:
         else:
             self._state, self._handle = _State.RUNNING, handle
             if self._unwanted:
-                self._goals.spinner.do(handle.cancel_goal_async)
+                self._goals.spinner.do(self._ask)
 
     def _feed(self, body: bytes) -> None:
         if self._state is not _State.ENDED and self._on_feedback is not None:

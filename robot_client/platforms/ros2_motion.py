@@ -13,10 +13,12 @@ from robot_client.platforms.base import Motion
 HEADER = "std_msgs/Header"
 
 JOY = "sensor_msgs/msg/Joy"
-TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+TRAJECTORIES = frozenset(
+    {"trajectory_msgs/msg/JointTrajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory"}
+)
 JOG = "control_msgs/msg/JointJog"
 
-SHAPED = frozenset({JOY, TRAJECTORY, JOG})
+SHAPED = TRAJECTORIES | {JOY, JOG}
 """Types whose zero depends on the command before: on its joints, or how many axes it had."""
 
 
@@ -28,7 +30,7 @@ def judge(type: str, message: Any) -> Motion:
     verdict = _judge(message)
     if verdict is Motion.INVALID:
         return verdict
-    if type == TRAJECTORY:  # to all zeros is a way as well
+    if type in TRAJECTORIES:  # to all zeros is a way as well
         return Motion.MOVING if message.points else Motion.STILL
     if type == JOG:  # its duration alone moves nothing
         return Motion.MOVING if any(message.displacements) or any(message.velocities) else Motion.STILL
