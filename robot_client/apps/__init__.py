@@ -1,1 +1,1 @@
-"""Applications: programs over the public interface of a relay. They run anywhere, and use nothing of the daemon."""
+"""Applications: programs over the public interface of a relay. They run anywhere, and need no daemon beside them."""

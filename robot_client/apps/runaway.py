@@ -13,17 +13,15 @@ from __future__ import annotations
 
 import contextlib
 import enum
-import itertools
-import json
 import math
-import os
-import signal
-import sys
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import click
+
+from robot_client.apps.driver import STILL, Command, twist
+from robot_client.apps.line import Line, Refused, connected, end_by_signal, in_words
 
 REACH = 1.5
 """Metres beyond which nothing pushes."""
@@ -63,13 +61,6 @@ class Force(NamedTuple):
     def strength(self) -> float:
         """How hard, however it points."""
         return math.hypot(self.ahead, self.left)
-
-
-class Command(NamedTuple):
-    """Metres per second ahead and radians per second counter-clockwise."""
-
-    speed: float
-    turn: float
 
 
 class Manners(NamedTuple):
@@ -145,27 +136,23 @@ class Runaway:
         return Command(self._manners.speed, 0.0)
 
 
-class Refused(Exception):
-    """The relay does not let it; the text says why."""
-
-
 class Link:
     """What it says to the relay, and what it hears.
 
-    :param connection: a websocket of the ``websockets`` library
+    :param line: to the robot
+    :param scan: topic of the scanner
+    :param command: topic of the commands
     """
 
-    def __init__(self, connection: Any, scan: str, command: str) -> None:
-        self._connection = connection
-        self._scan = scan
+    def __init__(self, line: Line, scan: str, command: str) -> None:
+        self._line = line
         self._command = command
-        self._numbers = itertools.count(1)
-        self._waiting = 0
+        self._waiting = ""
         self.has_it = False
         """Whether the relay has said that the robot obeys this program."""
-        self._say(op="set_level", level="error")
-        self._say(op="advertise", topic=command, type="geometry_msgs/msg/Twist")
-        self._say(op="subscribe", topic=scan, type="sensor_msgs/msg/LaserScan", queue_length=1)
+        line.say(op="set_level", level="error")
+        line.say(op="advertise", topic=command, type="geometry_msgs/msg/Twist")
+        line.say(op="subscribe", topic=scan, type="sensor_msgs/msg/LaserScan", queue_length=1)
 
     def scan(self, seconds: float) -> Scan | None:
         """The next scan that comes within this time.
@@ -174,9 +161,8 @@ class Link:
         """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
-            try:
-                message = json.loads(self._connection.recv(timeout=left))
-            except TimeoutError:
+            message = self._line.hear(left)
+            if message is None:
                 return None
             if message["op"] == "service_response":
                 self._answered(message)
@@ -189,34 +175,28 @@ class Link:
 
     def suppress(self) -> None:
         """Have the robot obey this program alone, for a moment; again to go on."""
-        self._waiting = next(self._numbers)
-        self._ask(self._waiting, SUPPRESS_MS)
+        self._waiting = self._ask(SUPPRESS_MS)
 
     def drive(self, command: Command) -> None:
         """One command, once the robot obeys."""
         if self.has_it:
-            twist = {"linear": {"x": command.speed}, "angular": {"z": command.turn}}
-            self._say(op="publish", topic=self._command, msg=twist)
+            self._line.say(op="publish", topic=self._command, msg=twist(command))
 
     def give_back(self) -> None:
         """Let go of the robot, which its driver moves again."""
-        self.drive(Command(0.0, 0.0))
+        self.drive(STILL)
         self.has_it = False
-        self._waiting = 0
-        self._ask(next(self._numbers), 0)
+        self._waiting = ""
+        self._ask(0)
 
-    def _ask(self, number: int, ms: int) -> None:
-        args = {"resource": self._command, "ms": ms}
-        self._say(op="call_service", service="/relay/suppress", id=str(number), args=args)
+    def _ask(self, ms: int) -> str:
+        return self._line.call("/relay/suppress", resource=self._command, ms=ms)
 
     def _answered(self, message: dict[str, Any]) -> None:
         if not message["result"]:
             raise Refused(str(message["values"]))
-        if message["id"] == str(self._waiting):
+        if message["id"] == self._waiting:
             self.has_it = bool(message["values"]["success"])
-
-    def _say(self, **message: Any) -> None:
-        self._connection.send(json.dumps(message))
 
 
 class Program:
@@ -274,29 +254,17 @@ def main(url: str, scan: str, command: str, near: float, clear: float) -> None:
 
     The token comes from the variable SWITCHBOARD_TOKEN. Prints READY when it watches. SIGINT and SIGTERM end it.
     """
-    from websockets.exceptions import ConnectionClosed
-    from websockets.sync.client import connect
-
     if clear <= near:
         raise click.BadParameter(f"--clear ({clear:g}) must be more than --near ({near:g})")
-    token = os.environ.get("SWITCHBOARD_TOKEN", "")
-    if not token:
-        raise click.ClickException("set SWITCHBOARD_TOKEN: switchboard token create USER")
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: sys.exit(0))
     runaway = Runaway(Manners(near=near, clear=clear))
-    try:
-        with connect(url, additional_headers={"Authorization": f"Bearer {token}"}) as connection:
-            program = Program(Link(connection, scan, command), runaway)
-            with contextlib.ExitStack() as leaving:
-                leaving.callback(program.stop)
-                click.echo("READY")
-                while True:
-                    program.step()
-    except (OSError, ConnectionClosed) as error:
-        raise click.ClickException(f"the connection to {url} is lost: {error}") from None
-    except Refused as error:
-        raise click.ClickException(str(error)) from None
+    end_by_signal()
+    with in_words(), connected(url) as line:
+        program = Program(Link(line, scan, command), runaway)
+        with contextlib.ExitStack() as leaving:
+            leaving.callback(program.stop)
+            click.echo("READY")
+            while True:
+                program.step()
 
 
 if __name__ == "__main__":

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from robot_client.sim import paint
-from robot_client.sim.world import Hits, Pose, World
+from robot_client.sim.plates import Eye, Plates
+from robot_client.sim.world import Floats, Hits, Pose, World
 
 WIDTH, HEIGHT = 640, 480
 """Pixels, where no other size is asked for."""
@@ -64,6 +65,7 @@ class Camera:
         self._floor_base = np.repeat(base[:, None, :], width, axis=1).astype(np.uint8)
         self._columns = np.tile(np.arange(width, dtype=np.float32), (height, 1))
         self._rows = np.arange(height, dtype=np.float32)[:, None] + np.float32(0.5)
+        self._plates = Plates(world, Eye(self._focal, self._horizon, EYE_HEIGHT)) if world.chargers else None
 
     def render(self, pose: Pose, speed: float, at: float) -> Image:
         """One picture, BGR, shape (height, width, 3); the array is the caller's.
@@ -74,7 +76,11 @@ class Camera:
         frame = np.empty((self._height, self._width, 3), dtype=np.uint8)
         self._draw_sky(frame, pose)
         self._draw_floor(frame, pose)
-        self._draw_walls(frame, pose)
+        hits = self._world.cast(pose.x, pose.y, pose.heading + self._ray_angles)
+        depth = np.maximum(hits.distance * self._straighten, _NEAREST)
+        self._draw_walls(frame, hits, depth)
+        if self._plates is not None:
+            self._plates.draw(frame, pose, hits, depth, np.exp(-hits.distance / _FOG_LENGTH))
         draw_clock(frame, at)
         draw_speed(frame, speed)
         return frame
@@ -111,9 +117,7 @@ class Camera:
         cv2.multiply(tiles, self._floor_gain, dst=tiles, dtype=cv2.CV_8U)
         cv2.add(cv2.cvtColor(tiles, cv2.COLOR_GRAY2BGR), self._floor_base, dst=frame[self._horizon :])
 
-    def _draw_walls(self, frame: Image, pose: Pose) -> None:
-        hits = self._world.cast(pose.x, pose.y, pose.heading + self._ray_angles)
-        depth = np.maximum(hits.distance * self._straighten, _NEAREST)
+    def _draw_walls(self, frame: Image, hits: Hits, depth: Floats) -> None:
         top = self._horizon - (WALL_HEIGHT - EYE_HEIGHT) * self._focal / depth
         first = max(0, math.floor(top.min()))
         last = min(self._height, math.ceil(self._horizon + EYE_HEIGHT * self._focal / depth.min()))

@@ -35,9 +35,11 @@ def motors(speed: float, turn: float, blocked: bool, travelled: float) -> Findin
     return Finding("motors", Severity.OK, "driving" if speed or turn else "standing", values)
 
 
-def battery(charge: float, volts: float, amperes: float) -> Finding:
-    """:param charge: share of the capacity left, 0 to 1"""
+def battery(charge: float, volts: float, amperes: float, charging: bool = False) -> Finding:
+    """:param charge: share of the capacity left, 0 to 1; :param charging: whether it hangs on a charger"""
     values = {"charge_percent": f"{charge * 100:.1f}", "volts": f"{volts:.2f}", "amperes": f"{amperes:.2f}"}
+    if charging:
+        return Finding("battery", Severity.OK, "charging" if charge < 1.0 else "full", values)
     if charge < BATTERY_NEARLY_EMPTY:
         return Finding("battery", Severity.ERROR, "nearly empty: charge it now", values)
     if charge < BATTERY_LOW:

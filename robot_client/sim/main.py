@@ -71,6 +71,14 @@ def _size(text: str) -> tuple[int, int]:
 @click.option(
     "--camera-fps", type=click.IntRange(1, 60), default=15, show_default=True, help="Pictures per second."
 )
+@click.option(
+    "--charge",
+    type=click.FloatRange(0, 100),
+    default=100.0,
+    show_default=True,
+    metavar="PERCENT",
+    help="Of the battery at the beginning.",
+)
 def main(
     namespace: str,
     record: Path | None,
@@ -79,8 +87,11 @@ def main(
     camera: bool,
     camera_size: tuple[int, int],
     camera_fps: int,
+    charge: float,
 ) -> None:
     """Run a simulated ROS 2 robot: differential drive, scanner, camera and battery in a small world.
+
+    In the default world a charger with marker 7 (4X4_50, 0.4 m) is on the wall to the right of the start.
 
     Prints READY when its topics are there. SIGINT and SIGTERM end it.
     """
@@ -93,7 +104,7 @@ def main(
         ) from None
     faulthandler.enable()  # a crash in the middleware's C++ leaves a trace instead of silence
     with _opened(record) as stream, _stop_requested() as stop:
-        _run(namespace, stream, seed, world, camera_size if camera else None, camera_fps, stop)
+        _run(namespace, stream, seed, world, camera_size if camera else None, camera_fps, charge / 100, stop)
 
 
 class _Stop:
@@ -107,6 +118,7 @@ def _run(
     world: str,
     size: tuple[int, int] | None,
     fps: int,
+    charge: float,
     stop: _Stop,
 ) -> None:
     """Imports late: `--help` and a missing ROS must not wait for, or fall over, OpenCV and rclpy."""
@@ -122,7 +134,7 @@ def _run(
 
     cv2.setNumThreads(1)  # pictures are small: threads would cost more than they give
     place = WORLDS[world]()
-    robot = Robot(place, Recorder(stream), seed, time.monotonic)
+    robot = Robot(place, Recorder(stream), seed, time.monotonic, charge)
     ensure_log_folder()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:

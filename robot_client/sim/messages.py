@@ -111,11 +111,18 @@ def battery(stamp: Time, frames: Frames, pack: Battery) -> BatteryState:
     message.capacity = message.design_capacity = CAPACITY_AH
     message.percentage = pack.charge
     message.temperature = math.nan
-    message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
+    message.power_supply_status = _supply_status(pack)
     message.power_supply_health = BatteryState.POWER_SUPPLY_HEALTH_GOOD
     message.power_supply_technology = BatteryState.POWER_SUPPLY_TECHNOLOGY_LION
     message.present = True
     return message
+
+
+def _supply_status(pack: Battery) -> int:
+    if not pack.charging:
+        return int(BatteryState.POWER_SUPPLY_STATUS_DISCHARGING)
+    full = pack.charge >= 1.0
+    return int(BatteryState.POWER_SUPPLY_STATUS_FULL if full else BatteryState.POWER_SUPPLY_STATUS_CHARGING)
 
 
 def diagnostics(stamp: Time, robot: str, findings: list[Finding]) -> DiagnosticArray:

@@ -121,7 +121,7 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._robot.reset()
         response.success = True
-        response.message = "the robot stands at its start with a full battery"
+        response.message = "the robot stands at its start, its battery is as at the beginning"
         return response
 
     def _step(self) -> None:
@@ -159,7 +159,7 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
         viewers = self._raw.get_subscription_count() + self._jpeg.get_subscription_count()
         return [
             health.motors(*body.velocity, blocked=body.blocked, travelled=body.travelled),
-            health.battery(pack.charge, pack.voltage, pack.current),
+            health.battery(pack.charge, pack.voltage, pack.current, pack.charging),
             health.camera(self._camera is not None, viewers, self._frames_sent, self._render_ms),
         ]
 

@@ -32,14 +32,21 @@ class Robot:
 
     :param seed: of the scanner's noise
     :param clock: seconds, monotonic; only for the age of the last command
+    :param charge: of the battery at the beginning and after a reset, 0 to 1
     """
 
     def __init__(
-        self, world: World, recorder: Recorder, seed: int | None, clock: Callable[[], float]
+        self,
+        world: World,
+        recorder: Recorder,
+        seed: int | None,
+        clock: Callable[[], float],
+        charge: float = 1.0,
     ) -> None:
         self.world = world
         self.body = Body(world, world.start)
-        self.battery = Battery()
+        self.battery = Battery(charge)
+        self._first_charge = charge
         self.command_timeout = 0.0
         """Seconds after which a command is void; 0 means never, as with many bases."""
         self._recorder = recorder
@@ -69,14 +76,16 @@ class Robot:
         if self.command_timeout and self._clock() - self._commanded_at > self.command_timeout:
             self.body.target = STANDING
         self.body.step(seconds)
-        self.battery.step(seconds, *self.body.velocity)
+        pose = self.body.pose
+        charging = not self.body.moving and self.world.charges(pose.x, pose.y)
+        self.battery.step(seconds, *self.body.velocity, charging)
         self._recorder.motion(self.body.moving)
         self._recorder.touch(self.body.touching)
 
     def reset(self) -> None:
         """Back to the start: place, velocity and charge."""
         self.body.reset(self.world.start)
-        self.battery = Battery()
+        self.battery = Battery(self._first_charge)
         self._recorder.reset()
         self._recorder.motion(self.body.moving)
 

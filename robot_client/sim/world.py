@@ -6,6 +6,7 @@ Metres and radians, x to the right, y up, angles counter-clockwise from x. Nothi
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -71,6 +72,24 @@ class Circle(NamedTuple):
     look: Look
 
 
+class Charger(NamedTuple):
+    """A plate on a wall with a marker on it; what stands before it is charged.
+
+    :ivar wall: number of the segment; the plate looks to the left of the way from its beginning to its end, which is
+        into a room
+    :ivar along: metres from the wall's beginning to the plate's middle
+    :ivar marker: number of the marker, of the family that OpenCV names 4X4_50
+    """
+
+    wall: int
+    along: float
+    marker: int
+
+
+CHARGER_REACH = 0.6
+"""Metres from the middle of a charger within which it charges."""
+
+
 @dataclass(frozen=True)
 class Hits:
     """What a fan of rays met, one entry per ray.
@@ -101,12 +120,20 @@ class World:
     :param segments: walls; at least one obstacle is needed in all
     :param circles: pillars
     :param start: pose of a robot at its beginning and after a reset
+    :param chargers: on the walls
     """
 
-    def __init__(self, segments: list[Segment], circles: list[Circle], start: Pose) -> None:
+    def __init__(
+        self,
+        segments: list[Segment],
+        circles: list[Circle],
+        start: Pose,
+        chargers: tuple[Charger, ...] = (),
+    ) -> None:
         self.segments = tuple(segments)
         self.circles = tuple(circles)
         self.start = start
+        self.chargers = chargers
         self.looks = tuple(wall.look for wall in segments) + tuple(pillar.look for pillar in circles)
         ends = np.array([each[:4] for each in segments], dtype=np.float64).reshape(-1, 4)
         rounds = np.array([each[:3] for each in circles], dtype=np.float64).reshape(-1, 3)
@@ -150,6 +177,21 @@ class World:
             return Contact(float(gap[best]), 1.0, 0.0)
         away = offset[best] / reach[best]
         return Contact(float(gap[best]), float(away[0]), float(away[1]))
+
+    def charges(self, x: float, y: float) -> bool:
+        """Whether a robot that stands at a point, metres, is charged."""
+        return any(self._charged_by(each, x, y) for each in self.chargers)
+
+    def looks_at(self, charger: Charger, x: float, y: float) -> bool:
+        """Whether a point, metres, is on the side to which a charger looks."""
+        wall = self.segments[charger.wall]
+        return (wall.x2 - wall.x1) * (y - wall.y1) > (wall.y2 - wall.y1) * (x - wall.x1)
+
+    def _charged_by(self, charger: Charger, x: float, y: float) -> bool:
+        wall = self.segments[charger.wall]
+        share = charger.along / math.hypot(wall.x2 - wall.x1, wall.y2 - wall.y1)
+        middle_x, middle_y = wall.x1 + share * (wall.x2 - wall.x1), wall.y1 + share * (wall.y2 - wall.y1)
+        return math.hypot(x - middle_x, y - middle_y) <= CHARGER_REACH and self.looks_at(charger, x, y)
 
     def _to_segments(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
         """Solve origin + t·direction = begin + s·run for every ray and wall; t and s, rays × walls."""

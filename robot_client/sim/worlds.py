@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from robot_client.sim.world import Circle, Colour, Look, Pose, Segment, Texture, World, box, polygon
+from robot_client.sim.world import Charger, Circle, Colour, Look, Pose, Segment, Texture, World, box, polygon
 
 _BRICKS = Look(Colour(92, 112, 168), Texture.BRICK)
 _PLASTER = Look(Colour(176, 190, 196), Texture.PANEL)
@@ -19,7 +19,7 @@ _ORANGE = Look(Colour(40, 132, 240), Texture.CHEVRON)
 
 
 def default() -> World:
-    """A hall of 12 × 9 m: a room behind a doorway, crates, a wedge, a slanted wall and pillars."""
+    """A hall of 12 × 9 m: a room behind a doorway, crates, a wedge, a slanted wall, pillars and a charger."""
     segments = [
         *box(0.0, 0.0, 12.0, 9.0, 0.0, _BRICKS),
         # a room in the north-east with a doorway of 1.2 m
@@ -39,7 +39,8 @@ def default() -> World:
         Circle(2.1, -2.5, 0.35, _TEAL),
         Circle(-5.1, 0.2, 0.30, _YELLOW),
     ]
-    return World(segments, circles, Pose(-2.4, -0.4, 0.0))
+    # On the wall in the south, where the way from the start is free.
+    return World(segments, circles, Pose(-2.4, -0.4, 0.0), (Charger(wall=1, along=3.3, marker=7),))
 
 
 def open_field() -> World:

@@ -1,0 +1,218 @@
+"""Where sentences come from: a serial device, a TCP server, or a file that somebody recorded."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import socket
+import stat
+import termios
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from relay_protocol.errors import Invalid, Unavailable
+from robot_client.services.health import Finding, Level
+
+AGAIN = 1.0
+"""Seconds until a source that was lost is opened again."""
+CONNECT = 5.0
+"""Seconds for a server to answer."""
+LOOK = 0.2
+"""Seconds in which an end is noticed."""
+CHUNK = 4096
+
+BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
+
+
+class Source(Protocol):
+    """Gives bytes."""
+
+    def read(self) -> bytes:
+        """What has come, within :data:`LOOK`; nothing is fine.
+
+        :raises EOFError: there is no more
+        :raises OSError: it is lost
+        """
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
+class Device:
+    """A serial device, or whatever else can be read like one.
+
+    :param baud: bits per second
+    :raises OSError: it can't be opened
+    """
+
+    def __init__(self, path: Path, baud: int) -> None:
+        # It must not become our terminal, whose hang-up would end us.
+        self._file = os.open(path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            if os.isatty(self._file):
+                _set_raw(self._file, baud)
+        except termios.error as error:
+            os.close(self._file)
+            raise OSError(*error.args) from None
+
+    def read(self) -> bytes:
+        """See :class:`Source`."""
+        if not select.select([self._file], [], [], LOOK)[0]:
+            return b""
+        data = os.read(self._file, CHUNK)
+        if not data:
+            raise OSError(0, "it was closed at the other end")
+        return data
+
+    def close(self) -> None:
+        """See :class:`Source`."""
+        os.close(self._file)
+
+
+class Server:
+    """A TCP server that sends sentences.
+
+    :raises OSError: it does not answer
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.create_connection((host, port), timeout=CONNECT)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._socket.settimeout(LOOK)
+
+    def read(self) -> bytes:
+        """See :class:`Source`."""
+        try:
+            data = self._socket.recv(CHUNK)
+        except TimeoutError:
+            return b""
+        if not data:
+            raise OSError(0, "the server has hung up")
+        return data
+
+    def close(self) -> None:
+        """See :class:`Source`."""
+        self._socket.close()
+
+
+class Recording:
+    """A file, played at the pace at which receivers speak.
+
+    :param pace: seconds between two positions
+    :raises OSError: it can't be opened
+    """
+
+    def __init__(self, path: Path, pace: float, sleep: Callable[[float], object] = time.sleep) -> None:
+        self._file = path.open("rb")
+        self._pace = pace
+        self._sleep = sleep
+
+    def read(self) -> bytes:
+        """See :class:`Source`."""
+        line = self._file.readline(CHUNK)
+        if not line:
+            raise EOFError
+        if line[3:6] == b"GGA":
+            self._sleep(self._pace)
+        return line
+
+    def close(self) -> None:
+        """See :class:`Source`."""
+        self._file.close()
+
+
+def opener(text: str, baud: int, pace: float) -> Callable[[], Source]:
+    """What opens the source that somebody named.
+
+    :param text: ``tcp://host:port``, or the path of a device or a file
+    :raises Invalid: it makes no sense
+    :raises Unavailable: there is no such file
+    """
+    if text.startswith("tcp://"):
+        found = re.fullmatch(r"tcp://(?:\[([^]]+)\]|([^:/]+)):([0-9]{1,5})/?", text)
+        if not found or not 0 < int(found[3]) < 65536:
+            raise Invalid(f"'{text}' is no address: write tcp://HOST:PORT")
+        host, port = found[1] or found[2], int(found[3])
+        return lambda: Server(host, port)
+    path = Path(text)
+    try:
+        regular = stat.S_ISREG(path.stat().st_mode)
+    except OSError as error:
+        # Devices come and go; a name that is in no folder of devices is a slip of the pen.
+        if path.parent.is_relative_to("/dev"):
+            return lambda: Device(path, baud)
+        raise Unavailable(f"{text}: {error.strerror}") from None
+    if regular:
+        return lambda: Recording(path, pace)
+    return lambda: Device(path, baud)
+
+
+class Reader:
+    """Reads a source in a thread of its own, and opens it again when it is lost.
+
+    :param name: of the source, for people
+    :param on_data: called in the thread with what came
+    """
+
+    def __init__(
+        self, name: str, open_source: Callable[[], Source], on_data: Callable[[bytes], None]
+    ) -> None:
+        self._name = name
+        self._open = open_source
+        self._on_data = on_data
+        self._ending = threading.Event()
+        self._trouble: Finding | None = Finding(Level.STALE, f"waiting for {name}")
+        self._thread = threading.Thread(target=self._run, name="gps-source", daemon=True)
+        self._thread.start()
+
+    def finding(self) -> Finding | None:
+        """What is wrong with the source, else ``None``."""
+        return self._trouble
+
+    def close(self) -> None:
+        """Read no more."""
+        self._ending.set()
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            try:
+                self._read_all()
+            except EOFError:
+                self._trouble = Finding(Level.STALE, f"{self._name} has been played to its end")
+                return
+            except OSError as error:
+                self._trouble = Finding(Level.ERROR, f"{self._name}: {error.strerror or error}")
+                self._ending.wait(AGAIN)
+
+    def _read_all(self) -> None:
+        source = self._open()
+        try:
+            while not self._ending.is_set():
+                data = source.read()
+                if data:
+                    self._trouble = None
+                    self._on_data(data)
+        finally:
+            source.close()
+
+
+def _set_raw(file: int, baud: int) -> None:
+    """Eight bits, no parity, one stop bit, nothing translated.
+
+    :raises termios.error: the device does not take it
+    """
+    speed = getattr(termios, f"B{baud}")
+    settings = termios.tcgetattr(file)
+    settings[0] = termios.IGNPAR
+    settings[1] = 0
+    settings[2] = termios.CS8 | termios.CREAD | termios.CLOCAL
+    settings[3] = 0
+    settings[4] = settings[5] = speed
+    settings[6][termios.VMIN], settings[6][termios.VTIME] = 1, 0
+    termios.tcsetattr(file, termios.TCSANOW, settings)
+    termios.tcflush(file, termios.TCIFLUSH)
