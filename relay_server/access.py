@@ -6,8 +6,10 @@ compiled anew in place, and whoever holds one is told.
 
 from __future__ import annotations
 
+import math
+import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,16 +19,23 @@ from relay_db import queries
 from relay_db.queries import PrincipalRecord, RobotRecord
 from relay_protocol.errors import Refused
 from relay_protocol.rights import Grant, Operation, Rules, Verdict
+from relay_protocol.scopes import Scope
 from relay_server.store import Store
 
 K = TypeVar("K")
 V = TypeVar("V")
 
-PROVED = 256
+PROVED = 1024
 """Credentials that are remembered; the longest unused are forgotten first."""
+
+IN_STEP_SECONDS = 1.0
+"""So long after a look at the database what is remembered of a credential counts as the database's own word."""
 
 ADMITTED = 4096
 """Users on robots that are remembered, in the same way."""
+
+LISTED = 1024
+"""Users, with the scopes of their tokens, whose robots are remembered."""
 
 Changed = Callable[[], None]
 Revoked = Callable[[Refused], None]
@@ -42,8 +51,10 @@ class BadCredentials(Refused):
 class Principal:
     """Who is asking, once proved.
 
+    :param admin: whether it may administer, now: its user may, and the token's scope covers it
     :param token_id: the token that proved it; when that one ends, so does all that was opened with it
     :param expires: Unix seconds at which the token ends by itself, or ``None``
+    :param scope: what the token may be used for; ``None`` for all that its user may
     """
 
     user_id: int
@@ -52,11 +63,27 @@ class Principal:
     admin: bool
     token_id: int
     expires: float | None
+    scope: Scope | None = None
 
     @classmethod
     def of(cls, record: PrincipalRecord) -> Principal:
         """From the database's row."""
-        return cls(record.user_id, record.name, record.realm, record.admin, record.token_id, record.expires)
+        scope = None if record.scope is None else Scope(record.scope)
+        admin = record.admin and (scope is None or scope.admin)
+        token = record.token_id, record.expires, scope
+        return cls(record.user_id, record.name, record.realm, admin, *token)
+
+    def needs_whole(self) -> None:
+        """Refuse what reaches further than any one robot.
+
+        :raises Refused: the token is for less than all that its user may
+        """
+        if self.scope is not None:
+            raise Refused("this takes a token without a scope: for all that you may")
+
+    def rules(self, robot: str, grants: Iterable[Grant]) -> Rules:
+        """What it may do on a robot of this name, of what its user was granted."""
+        return Rules(grants, None if self.scope is None else self.scope.on(robot))
 
 
 class Permit:
@@ -87,18 +114,25 @@ class Access:
     """Compiles rights from the database and keeps every open permit in step with them.
 
     :param wall: current Unix time in seconds
+    :param seconds: a monotonic clock
     """
 
-    def __init__(self, store: Store, wall: Callable[[], float]) -> None:
+    def __init__(
+        self, store: Store, wall: Callable[[], float], seconds: Callable[[], float] = time.monotonic
+    ) -> None:
         self._store = store
         self._wall = wall
+        self._seconds = seconds
+        self._in_step = -math.inf
+        """All changes that were made before this moment have been taken up."""
         self._permits: set[Permit] = set()
-        self._robots: dict[int, list[tuple[RobotRecord, Rules]]] = {}
+        self._robots: OrderedDict[tuple[int, str | None], list[tuple[RobotRecord, Rules]]] = OrderedDict()
+        """By user and scope; those of the longest unchanged are forgotten first."""
         self._refreshed = 0
         self._proved: OrderedDict[str, Principal] = OrderedDict()
         """By the hash of a token, who it proved. Kept in step with the database as permits are."""
-        self._admitted: OrderedDict[tuple[int, int], None] = OrderedDict()
-        """Users and robots, of late found to have a right on them."""
+        self._admitted: OrderedDict[tuple[int, str | None, int], None] = OrderedDict()
+        """Users, with the scopes of their tokens, and robots, of late found to have a right on them."""
 
     @property
     def refreshed(self) -> int:
@@ -116,25 +150,39 @@ class Access:
     def remembered(self, token_hash: str) -> Principal | None:
         """Who a token proves, as far as that is known without asking the database."""
         principal = self._proved.get(token_hash)
-        if principal is not None and principal.expires is not None and principal.expires <= self._wall():
+        if principal is None or (principal.expires is not None and principal.expires <= self._wall()):
             return None
+        self._proved.move_to_end(token_hash)
         return principal
+
+    def in_step(self, seconds: float) -> None:
+        """Everything that was changed in the database before a moment has been taken up.
+
+        :param seconds: the moment, by the monotonic clock
+        """
+        self._in_step = max(self._in_step, seconds)
+
+    def proves(self, token_hash: str) -> Principal | None:
+        """Who a token proves, where that is as certain as by asking the database."""
+        if self._seconds() - self._in_step > IN_STEP_SECONDS:
+            return None
+        return self.remembered(token_hash)
 
     def knows(self, principal: Principal, robot_id: int) -> bool:
         """Whether the principal is known to have a right on a robot, without asking the database."""
-        user = principal.user_id
+        who = _who(principal)
         return (
-            (user, robot_id) in self._admitted
-            or any(record.id == robot_id for record, _ in self._robots.get(user, ()))
-            or any(each.robot_id == robot_id and each.principal.user_id == user for each in self._permits)
+            (*who, robot_id) in self._admitted
+            or any(record.id == robot_id for record, _ in self._robots.get(who, ()))
+            or any(each.robot_id == robot_id and _who(each.principal) == who for each in self._permits)
         )
 
-    async def permit(self, principal: Principal, robot_id: int) -> Permit | None:
-        """A live permit, or ``None`` when the principal has no right at all on the robot.
+    async def permit(self, principal: Principal, robot: RobotRecord) -> Permit | None:
+        """A live permit, or ``None`` when the principal has no right at all on the robot, or its token is not for it.
 
         :raises BadCredentials: the token has ended or the account was disabled since it was proved
         """
-        key = (principal.user_id, principal.token_id, robot_id)
+        key = (principal.user_id, principal.token_id, robot.id)
         # What was read while a refresh went by may be what the refresh was about.
         seen = -1
         while seen != self._refreshed:
@@ -142,22 +190,25 @@ class Access:
             now = (await self._store.read(_standing, {key}, self._wall()))[key]
         if isinstance(now.ended, BadCredentials):
             raise now.ended
-        if now.ended is not None:
+        rules = principal.rules(robot.name, now.grants)
+        if now.ended is not None or not rules:
             return None
-        permit = Permit(principal, robot_id, Rules(now.grants))
+        permit = Permit(principal, robot.id, rules)
         self._permits.add(permit)
-        _keep(self._admitted, (principal.user_id, robot_id), None, ADMITTED)
+        _keep(self._admitted, (*_who(principal), robot.id), None, ADMITTED)
         return permit
 
     async def robots(self, principal: Principal) -> list[tuple[RobotRecord, Rules]]:
         """The robots a principal has any right on, kept until something changes in the database."""
-        found = self._robots.get(principal.user_id)
+        who = _who(principal)
+        found = self._robots.get(who)
         if found is None:
             seen = self._refreshed
             rows = await self._store.read(queries.robots_with_grants, principal.user_id)
-            found = [(record, Rules(grants)) for record, grants in rows]
+            judged = ((record, principal.rules(record.name, grants)) for record, grants in rows)
+            found = [(record, rules) for record, rules in judged if rules]
             if seen == self._refreshed:
-                self._robots[principal.user_id] = found
+                _keep(self._robots, who, found, LISTED)
         return found
 
     def release(self, permit: Permit) -> None:
@@ -193,21 +244,31 @@ class Access:
             if now.ended is not None:
                 self._revoke(permit, now.ended)
             elif tuple(now.grants) != permit.rules.grants:
-                permit.rules = Rules(now.grants)
+                permit.rules = Rules(now.grants, permit.rules.scope)
                 permit.on_change()
 
     async def _refresh_proved(self) -> None:
         asked = {principal.token_id for principal in self._proved.values()}
-        if asked:
-            live = await self._store.read(queries.live_tokens, asked, self._wall())
-            for token_hash, principal in list(self._proved.items()):
-                if principal.token_id in asked - live:
-                    del self._proved[token_hash]
+        if not asked:
+            return
+        records = await self._store.read(queries.principals_by_ids, asked, self._wall())
+        live = {record.token_id: Principal.of(record) for record in records}
+        for token_hash, principal in list(self._proved.items()):
+            if principal.token_id in live:
+                # Perhaps it may administer no more, or again.
+                self._proved[token_hash] = live[principal.token_id]
+            elif principal.token_id in asked:
+                del self._proved[token_hash]
 
     def _revoke(self, permit: Permit, error: Refused) -> None:
         self._permits.discard(permit)
         permit.rules = Rules()
         permit.on_revoke(error)
+
+
+def _who(principal: Principal) -> tuple[int, str | None]:
+    """Equal for principals with the same rights."""
+    return principal.user_id, None if principal.scope is None else str(principal.scope)
 
 
 def _keep(kept: OrderedDict[K, V], key: K, value: V, most: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
 
 from sqlalchemy.orm import Session
 from twisted.internet.defer import Deferred
@@ -16,9 +17,10 @@ from relay_protocol.limits import TICKET_SECONDS
 from relay_server import passwords
 from relay_server.access import BadCredentials, Principal
 from relay_server.limiter import LoginLimiter
+from relay_server.origins import Origins
 from relay_server.store import Store, Threads
 
-__all__ = ["Authenticator", "BadCredentials", "TooManyTries"]
+__all__ = ["Authenticator", "BadCredentials", "TooManyTries", "session_token"]
 
 SESSION_SECONDS = 12 * 3600.0
 HASHING_THREADS = 2
@@ -136,7 +138,7 @@ class Authenticator:
         if record is None or not right:
             raise BadCredentials("user or password is wrong")
         self._limiter.succeeded(user, address)
-        return Login(record.id, record.name, record.realm, record.admin, 0, None, stored)
+        return Login(record.id, record.name, record.realm, record.admin, 0, None, password_hash=stored)
 
     async def token(self, token: str) -> Principal:
         """The principal behind an access token or a portal session.
@@ -214,13 +216,33 @@ class Authenticator:
         return found.principal
 
 
+def session_token(origins: Origins, name: str, header: str, origin: str | None, host: str) -> str | None:
+    """The token of a session cookie in a websocket's handshake, ``None`` when there is no such cookie.
+
+    :param name: of the cookie
+    :param header: ``Cookie``
+    :raises Refused: a cookie without a listed Origin
+    :raises BadCredentials: the relay's own page has none
+    """
+    try:
+        morsel = SimpleCookie(header).get(name)
+    except CookieError:
+        morsel = None
+    if morsel is None:
+        if origin is not None and origin == f"{'https' if origins.tls else 'http'}://{host}":
+            raise BadCredentials("your session has ended; log in again")
+        return None
+    origins.check(origin, host)
+    return morsel.value
+
+
 def _consume(s: Session, code_hash: str, now: float) -> Login | None:
     """Use a login link up."""
     found = queries.consume_login(s, code_hash, now)
     user = None if found is None else queries.get_user(s, found.user_id)
     if user is None:
         return None
-    return Login(user.id, user.name, user.realm, user.admin, 0, None, user.password_hash)
+    return Login(user.id, user.name, user.realm, user.admin, 0, None, password_hash=user.password_hash)
 
 
 def _open_session(s: Session, login: Login, token_hash: str, origin: str, how: str, now: float) -> None:

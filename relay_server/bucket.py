@@ -29,6 +29,12 @@ class TokenBucket:
         self._fill()
         return max(0.0, (1 - self._tokens) / self._rate)
 
+    @property
+    def left(self) -> float:
+        """Tokens it holds now."""
+        self._fill()
+        return self._tokens
+
     def take(self) -> bool:
         """Whether one more may pass now; if so it is counted."""
         self._fill()
@@ -59,10 +65,14 @@ class Buckets:
 
     def take(self, who: Hashable) -> bool:
         """As :meth:`TokenBucket.take`."""
+        return self.of(who).take()
+
+    def of(self, who: Hashable) -> TokenBucket:
+        """The bucket of one of them."""
         bucket = self._buckets.get(who)
         if bucket is None:
             bucket = self._buckets[who] = TokenBucket(self._rate, self._burst, self._seconds)
         self._buckets.move_to_end(who)
         while len(self._buckets) > self._most:
             self._buckets.popitem(last=False)
-        return bucket.take()
+        return bucket

@@ -56,6 +56,16 @@ def looping(clock: Clock, call: Callable[[], object]) -> LoopingCall:
     return loop
 
 
+async def sleep(clock: Clock, seconds: float) -> None:
+    """Wait so long; who gives up waiting leaves no timer."""
+    done: Deferred[None] = Deferred()
+    timer = clock.callLater(seconds, done.callback, None)
+    try:
+        await done
+    finally:
+        cancel(timer)
+
+
 async def within(
     clock: Clock, seconds: float, work: Coroutine[Deferred[Any], Any, T] | Deferred[T], words: str
 ) -> T:

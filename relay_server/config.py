@@ -53,13 +53,15 @@ class Endpoint:
 class AlertSettings:
     """What an operator can set of alerts.
 
-    :param webhook_networks: private networks that messages may go to
+    :param webhook_networks: private networks, and those of the machine itself, that messages may go to
+    :param webhook_deny: further networks that messages may not go to
     :param apprise_schemes: beginnings of apprise's URLs that users may have messages sent by
     :param battery_low: charge, 0 to 1, at which an alert begins; 0 is never
     :param battery_critical: charge at which it becomes worse
     """
 
     webhook_networks: tuple[str, ...] = ()
+    webhook_deny: tuple[str, ...] = ()
     apprise_schemes: tuple[str, ...] = ()
     battery_low: float = 0.2
     battery_critical: float = 0.1
@@ -84,6 +86,10 @@ class Settings:
     :param control_request: seconds who has control has to answer a request, before it lapses
     :param control_idle: seconds without a command that moves, after which control is free again
     :param recordings: bytes all recordings together may have
+    :param recordings_reserve: bytes of the disk they leave free
+    :param events_of_source: events that each source may have in the memory
+    :param events_kept: seconds after which the memory lets an event go
+    :param requests: HTTP requests a second of one user, or of a network in which nobody is known; 0: as many as come
     :param alerts: what people are told of, and where that may go
     """
 
@@ -103,10 +109,14 @@ class Settings:
     refresh: float = 0.25
     connections_per_address: int = 512
     recordings: int = 10 * 10**9
+    recordings_reserve: int = 10**9
     explicit_control: bool = False
     control_grace: float = 30.0
     control_request: float = 60.0
     control_idle: float = 600.0
+    events_of_source: int = 10_000
+    events_kept: float = 30 * 86400.0
+    requests: float = 500.0
     alerts: AlertSettings = field(default_factory=AlertSettings)
 
     @property
@@ -118,6 +128,17 @@ class Settings:
     def scheme(self) -> str:
         """``https`` with TLS, else ``http``."""
         return "https" if self.tls else "http"
+
+    def url(self, port: int) -> str:
+        """Where people go: the first origin that was listed, else where the relay listens.
+
+        :param port: the one it listens on for HTTP
+        """
+        if self.origins:
+            return self.origins[0].rstrip("/")
+        host = self.http.host
+        shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104
+        return f"{self.scheme}://{shown}:{port}"
 
     @property
     def socket_path(self) -> Path:

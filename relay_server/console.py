@@ -16,13 +16,14 @@ from relay_protocol.rights import Level, Operation
 from relay_server.access import Access, Principal
 from relay_server.channel import resolve
 from relay_server.clock import Clock, within
-from relay_server.control import Actor, Answer, Client, Desk, Desks, NotDone, view
+from relay_server.control import Actor, Answer, Client, Desk, Desks, NotDone, acts_for, view
 from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, FrontDesk
 from relay_server.registry import Presence, Registry
 from relay_server.store import Store
 
 CONFIRM_SECONDS = 15.0
-"""So long it is waited for a stop: longer than a robot has to confirm that it stands. The stop itself goes on."""
+"""So long it is waited for a stop: longer than a robot has to confirm that it stands, by when the database has had as
+long to keep the order. The stop itself goes on."""
 
 NOT_CONFIRMED = (
     f"the stop is not confirmed: within {CONFIRM_SECONDS:g} s the robot has not answered, and the database has not "
@@ -93,33 +94,39 @@ class Console:
             lease = desk.lease
             held, request = lease.holder or lease.coming, lease.request
             answer = Answer(False, "you have no control of this robot")
-            asks = request is not None and request.client.user == principal.user_id
+            asks = request is not None and acts_for(admission.permit, request.client)
             owner = admission.permit.rules.level is Level.OWNER
             if request is not None and asks:
                 answer = desk.release(request.client, why, actor)
-            if held is not None and (held.client.user == principal.user_id or owner):
+            if held is not None and (acts_for(admission.permit, held.client) or owner):
                 answer = desk.release(held.client, why, actor)
             return answer
 
-    async def grant(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+    async def grant(
+        self, principal: Principal, robot: str, why: str, address: str, client: int = 0
+    ) -> Answer:
         """Hand control over to who asks for it.
 
+        :param client: the number of the connection that is meant, 0 for whoever asks
         :raises NotFound: as :meth:`control`
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             desk = self._of(admission)
-            holder = _own_holder(desk, principal)
-            return _NOT_YOURS if holder is None else desk.grant(holder, why)
+            holder = _own_holder(desk, admission)
+            return _NOT_YOURS if holder is None else desk.grant(holder, why, client)
 
-    async def refuse(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+    async def refuse(
+        self, principal: Principal, robot: str, why: str, address: str, client: int = 0
+    ) -> Answer:
         """Keep control.
 
+        :param client: as for :meth:`grant`
         :raises NotFound: as :meth:`control`
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             desk = self._of(admission)
-            holder = _own_holder(desk, principal)
-            return _NOT_YOURS if holder is None else desk.refuse(holder, why)
+            holder = _own_holder(desk, admission)
+            return _NOT_YOURS if holder is None else desk.refuse(holder, why, client)
 
     async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
         """Stop a robot; everybody with any right on it may.
@@ -145,20 +152,22 @@ class Console:
         with self._admitted(await within(self._clock, LOOKUP_SECONDS, looked_up, NOT_LOOKED_UP)) as admission:
             return admission.robot
 
-    async def resume(self, principal: Principal, robot: str, why: str, address: str) -> None:
+    async def resume(self, principal: Principal, robot: str, why: str, address: str, sent: int) -> None:
         """Let a robot move again; for who controls it, and owners.
 
+        :param sent: a moment before which it can't have been asked for, the relay's monotonic nanoseconds
         :raises NotFound: as :meth:`control`
         :raises Refused: the principal is neither
+        :raises StoppedSince: the robot may have been stopped after that
         :raises NotDone: the robot says that it can't
         :raises Unavailable: it can't be reached
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             desk = self._of(admission)
             owner = admission.permit.rules.level is Level.OWNER
-            if not owner and _own_holder(desk, principal) is None:
+            if not owner and _own_holder(desk, admission) is None:
                 raise Refused("only who has control of the robot, and its owners, may resume it")
-            await desk.stopping.resume(_actor(principal, address), why)
+            await desk.stopping.resume(_actor(principal, address), why, sent)
 
     async def suppress(self, principal: Principal, robot: str, resource: str, ms: int, address: str) -> None:
         """Have a topic obey all connections of the principal and nobody else, for moments.
@@ -240,14 +249,15 @@ class Console:
         except SwitchboardError as error:
             return {"robot": robot, "done": False, "reason": str(error)}
 
-    async def resume_here(self, robot: str, why: str, by: str) -> None:
+    async def resume_here(self, robot: str, why: str, by: str, sent: int) -> None:
         """Let a robot move again.
 
+        :param sent: as of :meth:`resume`
         :raises NotFound: no such robot
         :raises SwitchboardError: it has not done it
         """
         for each in await self._meant(robot):
-            await self._desks.of(each).stopping.resume(_local(by), why)
+            await self._desks.of(each).stopping.resume(_local(by), why, sent)
 
     async def _meant(self, robot: str | None) -> list[Presence]:
         records = await self._store.read(queries.list_robots)
@@ -280,10 +290,10 @@ class Console:
 _NOT_YOURS = Answer(False, "you have no control of this robot")
 
 
-def _own_holder(desk: Desk, principal: Principal) -> Client | None:
-    """The connection of the principal that has control, if one has."""
+def _own_holder(desk: Desk, admission: Admission) -> Client | None:
+    """The connection of the principal that has control, if one has, and its token is for that."""
     holder = desk.lease.holder
-    mine = holder is not None and holder.client.user == principal.user_id
+    mine = holder is not None and acts_for(admission.permit, holder.client)
     return holder.client if holder is not None and mine else None
 
 

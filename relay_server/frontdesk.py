@@ -7,7 +7,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
+from functools import partial
 from typing import Any
 
 from relay_db import queries
@@ -16,7 +16,7 @@ from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server import closing, passwords
 from relay_server.access import Access, Permit, Principal
-from relay_server.auth import Authenticator, BadCredentials, Opening, TooManyTries
+from relay_server.auth import Authenticator, Opening, TooManyTries, session_token
 from relay_server.budget import Budgets
 from relay_server.channel import Channels
 from relay_server.clock import Clock, within
@@ -148,9 +148,13 @@ class FrontDesk:
 
     async def token(self, token: str) -> Principal:
         """The principal of an access token or session."""
+        token_hash = passwords.token_hash(token)
+        known = self._access.proves(token_hash)
+        if known is not None:
+            return known
         seen = self._access.refreshed
         principal = await self._auth.token(token)
-        self._access.remember(passwords.token_hash(token), principal, seen)
+        self._access.remember(token_hash, principal, seen)
         return principal
 
     bearer = token
@@ -174,16 +178,8 @@ class FrontDesk:
 
         :raises Refused: a cookie without a listed Origin
         """
-        try:
-            morsel = SimpleCookie(header).get(self._cookie)
-        except CookieError:
-            morsel = None
-        if morsel is None:
-            if origin is not None and origin == f"{'https' if self._origins.tls else 'http'}://{host}":
-                raise BadCredentials("your session has ended; log in again")
-            return None
-        self._origins.check(origin, host)
-        return await self._auth.token(morsel.value)
+        token = session_token(self._origins, self._cookie, header, origin, host)
+        return None if token is None else await self._auth.token(token)
 
     # --- robots -------------------------------------------------------------------------------------------
 
@@ -193,7 +189,7 @@ class FrontDesk:
         :raises NotFound: no such robot, or no right on it: one and the same answer
         """
         record = await self._store.read(queries.find_robot, robot, principal.realm)
-        permit = None if record is None else await self._access.permit(principal, record.id)
+        permit = None if record is None else await self._access.permit(principal, record)
         if record is None or permit is None:
             self._journal.event(
                 "client.refused",
@@ -236,6 +232,7 @@ class FrontDesk:
         self._sessions.setdefault(robot.robot_id, {})[session.number] = session
         robot.users = len(self._sessions[robot.robot_id])
         principal = admission.permit.principal
+        session.notice = partial(self._journal.tell, robot_id=robot.robot_id, source=f"user:{principal.name}")
         self._journal.event(
             "client.joined",
             f"user:{principal.name}",

@@ -29,6 +29,9 @@ WAITING = 128
 Listener = Callable[[str, int | None, dict[str, Any]], None]
 """Is told the kind of an event, the robot's number if it is about one, and what belongs to it."""
 
+Witness = Callable[[str, str, int | None, dict[str, Any]], None]
+"""The same, and second who says so."""
+
 
 @dataclass
 class _Cause:
@@ -49,16 +52,19 @@ class Journal:
         self._wall = wall
         self._causes: OrderedDict[str, _Cause] = OrderedDict()
         self._waiting = 0
-        self._listeners: list[Listener] = []
+        self._witnesses: list[Witness] = []
 
     def listen(self, listener: Listener) -> None:
         """Have all that happens told to somebody at once, also what is not kept."""
-        self._listeners.append(listener)
+        self._witnesses.append(lambda kind, source, robot_id, data: listener(kind, robot_id, data))
 
-    def tell(self, kind: str, robot_id: int) -> None:
+    def witness(self, witness: Witness) -> None:
+        """Have it told to somebody who wants to know who says so."""
+        self._witnesses.append(witness)
+
+    def tell(self, kind: str, robot_id: int, source: str = "relay", **data: Any) -> None:
         """Something happened that is not worth keeping, but listeners may act by it."""
-        for listener in self._listeners:
-            listener(kind, robot_id, {})
+        self._tell(kind, source, robot_id, data)
 
     def event(
         self,
@@ -75,8 +81,7 @@ class Journal:
         :param cause: who can make this happen at will: an address, or something like ``robot:r2-d2``
         :returns: whether it is kept. What is not is counted, and told with the next of the same cause.
         """
-        for listener in self._listeners:
-            listener(kind, robot_id, data)
+        self._tell(kind, source, robot_id, data)
         cause = network_of(cause)
         known = self._known(cause)
         if self._waiting >= WAITING or not known.bucket.take():
@@ -90,6 +95,13 @@ class Journal:
             self._write("events.suppressed", "relay", {"cause": cause, "count": suppressed})
         self._write(kind, source, data, robot_id, user_id)
         return True
+
+    def _tell(self, kind: str, source: str, robot_id: int | None, data: dict[str, Any]) -> None:
+        for witness in self._witnesses:
+            try:
+                witness(kind, source, robot_id, data)
+            except Exception:  # what has happened goes on, and is kept, whatever becomes of what listens
+                self.log.failure("who listens to events failed at '{kind}'", kind=kind)
 
     def _known(self, cause: str) -> _Cause:
         known = self._causes.get(cause)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from relay_protocol.errors import Invalid, Refused
+from relay_protocol.limits import NAME
+
+_HOST = re.compile(r"(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?\Z")
 
 
 class Origins:
@@ -25,6 +29,19 @@ class Origins:
         self.tls = scheme == "https"
         self._scheme = scheme
         self._listed = {_checked(each) for each in listed}
+
+    def base(self, host: str) -> str:
+        """``scheme://host[:port]`` of this relay for who asks it by this ``Host``.
+
+        Behind a proxy that speaks another scheme, the origin that people see is a listed one.
+
+        :raises Invalid: it is no host
+        """
+        if len(host) > NAME or _HOST.match(host) is None:
+            raise Invalid("send 'Host' with the name or address the relay is asked by")
+        seen = {each: _parse(f"{each}://{host}") for each in ("https", "http")}
+        scheme = next((each for each, origin in seen.items() if origin in self._listed), self._scheme)
+        return f"{scheme}://{host}"
 
     def check(self, origin: str | None, host: str) -> None:
         """Take or refuse a cookie that came with this ``Origin`` and ``Host``.

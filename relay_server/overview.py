@@ -58,7 +58,7 @@ class Overview:
                     "state": there.state.value,
                     "link": there.reading().told(),
                     "drops": _drops(there),
-                    "battery": there.health.battery,
+                    "battery": _battery(there),
                     "people": people,
                     "more": more,
                 }
@@ -84,7 +84,8 @@ class Overview:
             "people": self._people.count(robot, rules),
             "holder": view.holder(standing),
             "stopped": view.stopped(standing),
-            "battery": robot.health.battery,
+            **view.hands(robot, rules),
+            "battery": _battery(robot),
             "rtt_ms": milliseconds(link.rtt),
             "quality": link.quality,
             "host": robot.description.host,
@@ -103,11 +104,12 @@ class Overview:
             "rtt_ms": milliseconds(robot.rtt),
             "link": robot.reading().told(),
             "drops": _drops(robot),
-            "battery": robot.health.battery,
+            "battery": _battery(robot),
             "last_seen": robot.last_seen,
-            "health": msgspec.structs.asdict(robot.health),
+            "health": None if robot.control is None else msgspec.structs.asdict(robot.health),
             "holder": self._holder(robot),
             "stopped": view.stopped(self._desks.standing(robot.robot_id)),
+            **view.hands(robot),
             "clients": [_client(each, robot.reading()) for each in self._sessions(robot.robot_id)],
             "onlookers": [
                 {"user": each.name, "address": each.address, "since": since, "camera": each.camera}
@@ -126,6 +128,11 @@ class Overview:
 def _drops(robot: Presence) -> int | None:
     """Samples the robot has dropped, as far as it has told."""
     return None if robot.control is None else robot.health.dropped_samples
+
+
+def _battery(robot: Presence) -> float | None:
+    """The charge it has, 0 to 1; what it had before it went away nobody shall take for that."""
+    return None if robot.control is None else robot.health.battery
 
 
 def _client(session: Session, onward: Reading) -> dict[str, Any]:

@@ -21,6 +21,9 @@ MAX_BYTES = 1024
 TOKEN_PREFIX = "swb_"  # noqa: S105 - lets people and scanners know a token when they see one
 _TOKEN_BYTES = 32
 
+REALM = "switchboard"
+"""The protection space of all programs' keys. Verifiers are made with it, so it is the same for all relays."""
+
 CODE_ALPHABET = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """32 characters, 5 bit each; without 0, 1, I and O, which are read for each other."""
 _CODE_GROUPS = 4
@@ -74,6 +77,11 @@ def token_hash(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
+def verifier(key: str, secret: str) -> str:
+    """What is stored of a program's secret, by which Digest can be checked: H(A1) of RFC 7616 section 3.4.2."""
+    return token_hash(f"{key}:{REALM}:{secret}")
+
+
 def new_enrolment_code() -> str:
     """A code of 80 random bits to be read and typed: ``K7QF-92MB-X4TC-HW6P``."""
     groups = ("".join(secrets.choice(CODE_ALPHABET) for _ in range(_CODE_GROUP)) for _ in range(_CODE_GROUPS))
@@ -102,10 +110,11 @@ def _normal(text: str) -> str | None:
 
 @cache
 def _argon2() -> Any:
-    # The library loads its hashes when first asked, and breaks when two threads ask at once.
+    # The library loads its hashes, and what computes them, when first asked, and breaks when two threads ask at once.
     with _loading:
         from passlib.hash import argon2
 
+        argon2.get_backend()
         return argon2.using(type="ID", memory_cost=19456, time_cost=2, parallelism=1)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -42,6 +43,9 @@ def run(settings: Settings, ready: Callable[[Relay, str | None], None], *, hangu
 
     async def begin() -> None:
         await relay.start()
+        # What is there by now stays. To look through all of it for garbage, every few seconds under load, took 90 ms.
+        gc.collect()
+        gc.freeze()
         ready(relay, await relay.first_login())
 
     def end() -> None:

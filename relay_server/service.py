@@ -8,8 +8,7 @@ import time
 from functools import partial
 from typing import Any
 
-from autobahn.twisted.resource import WebSocketResource
-from twisted.internet.defer import Deferred, DeferredList
+from twisted.internet.defer import Deferred, DeferredList, maybeDeferred
 from twisted.internet.endpoints import (
     SSL4ServerEndpoint,
     TCP4ServerEndpoint,
@@ -23,7 +22,8 @@ from twisted.web.server import Site
 import relay_server
 from relay_db import queries
 from relay_db.engine import Database
-from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_protocol.clocks import now_ns
+from relay_protocol.errors import Invalid, SwitchboardError
 from relay_server import invitation, passwords
 from relay_server.access import Access
 from relay_server.alerts import AlertHouse
@@ -32,25 +32,40 @@ from relay_server.channel import Channels
 from relay_server.config import Endpoint, Settings
 from relay_server.console import Console
 from relay_server.control import ControlRules, DatabaseRecord, Desks
-from relay_server.edges import alerts, fleet, presence, recordings
+from relay_server.directory.house import DirectoryHouse
+from relay_server.edges import (
+    alerts,
+    events,
+    fleet,
+    presence,
+    recordings,
+    representing,
+    resources,
+    vocabulary,
+)
 from relay_server.edges import control as control_edge
+from relay_server.edges import directory as directory_edge
 from relay_server.edges.admin import AdminSocket
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
+from relay_server.edges.limiting import RequestLimits
+from relay_server.edges.pages import PageGate
 from relay_server.edges.robot_roles import Opening, RobotHall
 from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
-from relay_server.edges.site import Portal, RelaySite, Robots, Root
-from relay_server.edges.video import Video, VideoFactory
-from relay_server.edges.websocket import ClientFactory
+from relay_server.edges.site import RelaySite
+from relay_server.edges.whole import site_of
 from relay_server.fleet import FleetDesk
 from relay_server.folder import DataFolder
 from relay_server.frontdesk import FrontDesk
 from relay_server.journal import Journal
+from relay_server.memory import MemoryHouse
 from relay_server.metrics import RelayCollector, registry_of
+from relay_server.moments import Moments
+from relay_server.oauth import OAuthDesk
 from relay_server.origins import Origins
 from relay_server.recording import FOLDER, Library, RecordingDesk, Recordings, sweep
 from relay_server.registry import Registry
-from relay_server.rounds import Rounds
+from relay_server.retiring import retire
 from relay_server.session import Timing
 from relay_server.store import Store
 from relay_server.tls import ServerTls
@@ -78,6 +93,7 @@ class Relay:
         self._tls = (
             ServerTls(settings.tls_cert, settings.tls_key) if settings.tls_cert and settings.tls_key else None
         )
+        self._workshop = representing.Workshop(reactor)
         self._auth = Authenticator(reactor, self._store, time.monotonic, time.time)
         self._access = Access(self._store, time.time)
         self._registry = Registry(time.time)
@@ -85,30 +101,26 @@ class Relay:
             reactor, linger=settings.linger, new_ticket=passwords.new_token, wall_ns=time.time_ns
         )
         self._videos = Videos(reactor, new_ticket=passwords.new_token)
-        library = Library(settings.data / FOLDER, settings.recordings)
+        library = Library(settings.data / FOLDER, settings.recordings, settings.recordings_reserve)
         self._recordings = Recordings(reactor, reactor, library, self._channels, self._videos, time.time)
         self._journal = Journal(self._store, time.time)
         self._alerts = AlertHouse(
             reactor, self._store, self._access, self._registry, self._channels, self._journal, settings
         )
-        self._desks = Desks(
-            reactor,
-            DatabaseRecord(self._store, self._journal, time.time),
-            ControlRules(
-                settings.explicit_control,
-                settings.control_grace,
-                settings.control_idle,
-                settings.control_request,
-            ),
-            self._registry.changed,
-            time.time,
-        )
+        told = self._journal, self._alerts.alerts
+        judged = self._store, self._access, self._registry
+        self._memory = MemoryHouse(reactor, *judged, *told, settings)
+        self._directory = DirectoryHouse(reactor, *judged, self._channels, self._memory.note)
+        record = DatabaseRecord(self._store, self._journal, time.time)
+        rules, changed = ControlRules.of(settings), self._registry.changed
+        self._desks = Desks(reactor, record, rules, changed, time.time)
         self._ports: list[Any] = []
         self._revision = -1
         self._polling = LoopingCall(self._poll)
         self._purging = LoopingCall(self._purge)
         self._database_fine = True
         self._desk: FrontDesk | None = None
+        self._pages: PageGate | None = None
         self._fleet: FleetDesk | None = None
         self._console: Console | None = None
         self.http_port = 0
@@ -124,28 +136,21 @@ class Relay:
         :raises CannotListenError: an address is taken
         """
         self._database.upgrade()
-        self._store.start()
-        self._auth.start()
+        for each in (self._store, self._workshop, self._auth):
+            each.start()
         self._recordings.open()
         self._revision = await self._store.read(queries.revision)
         self._desks.expect(await self._store.read(queries.pending_stops))
         await sweep(self._recordings, self._store, self._journal)
         self._recordings.recover()
         name = self.settings.name or self._folder.relay_name()
+        await self._memory.start()
+        await self._directory.leases.start()
         await self._alerts.start(name)
         http = await self._listen(self.settings.http, self._site(name))
         self.http_port = http.getHost().port
-        hall = RobotHall(
-            name,
-            self._store,
-            self._registry,
-            self._channels,
-            self._videos,
-            self._desks,
-            self._journal,
-            time.monotonic,
-            time.time,
-        )
+        rooms = self._store, self._registry, self._channels, self._videos, self._desks, self._journal
+        hall = RobotHall(name, *rooms, time.monotonic, time.time)
         robots = await self._listen(self.settings.robots, self._robot_factory(hall))
         self.robots_port = robots.getHost().port
         await self._listen_locally()
@@ -174,36 +179,41 @@ class Relay:
             origins,
             Timing(settings.client_ping, settings.driving_ping, settings.stall_limit),
             cookie=cookie,
-            clock_ns=time.monotonic_ns,
+            clock_ns=now_ns,
             wall=time.time,
         )
-        desk = self._desk
-        metrics = registry_of(RelayCollector(self._registry, self._channels, self._videos, lambda: desk))
+        desk, moments = self._desk, Moments(now_ns)
+        collector = RelayCollector(self._registry, self._channels, self._videos, lambda: desk)
+        metrics = registry_of(collector, self._memory)
         keeper = RecordingDesk(desk, self._recordings, self._store, self._journal, time.time)
         self._console = Console(self._reactor, desk, self._access, self._desks, self._registry, self._store)
         below = {
             "recordings": partial(recordings.below, self._reactor, keeper),
             "people": partial(presence.below, desk.overview),
-            **{part: partial(control_edge.below, self._console, part) for part in control_edge.PARTS},
+            **resources.parts(self._reactor, desk, self._workshop, moments, now_ns, time.time),
+            **{
+                part: partial(control_edge.below, self._console, moments, part) for part in control_edge.PARTS
+            },
         }
         self._fleet = FleetDesk(
             self._reactor, desk, self._access, self._registry, self._desks, self._store, self._journal
         )
         beside = {
             "alerts": partial(alerts.beside, self._alerts.desk),
-            "fleet": partial(fleet.beside, self._reactor, self._fleet),
+            "directory": partial(directory_edge.beside, self._reactor, self._directory.desk),
+            "events": partial(events.beside, self._reactor, self._memory.desk),
+            "fleet": partial(fleet.beside, self._reactor, self._fleet, moments),
+            "vocabulary": partial(
+                vocabulary.beside, vocabulary.Meanings(self._access, self._registry, self._workshop)
+            ),
         }
-        events = {"alerts": self._alerts.desk.shown}
+        told = {"alerts": self._alerts.desk.shown}
         served = desk, origins, metrics, below, beside
-        api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, events=events)
-        cap = AddressCap(settings.connections_per_address)
-        websocket = WebSocketResource(ClientFactory(self._reactor, time.monotonic_ns, desk, cap))
-        rounds = Rounds(self._reactor)
-        pictures = WebSocketResource(VideoFactory(self._reactor, time.monotonic_ns, desk, cap, rounds))
-        video = Video(self._reactor, rounds, desk, api.principal, pictures)
-        robots = Robots(websocket, video, relay_server.VERSION)
-        root = Root(robots, api.app.resource(), Portal(relay_server.PORTAL))
-        return RelaySite(root, self._reactor, cap, settings.tls)
+        limits = RequestLimits(settings.requests, time.monotonic)
+        api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, events=told, limits=limits)
+        self._pages = PageGate(self._reactor, desk, origins, cookie, {"robots": desk.robots, **told})
+        oauth = OAuthDesk(self._store, self._auth, self._access, self._journal, time.monotonic, time.time)
+        return site_of(self._reactor, now_ns, desk, api, oauth, self._pages, settings, limits, cookie)
 
     def _robot_factory(self, hall: RobotHall) -> RobotFactory:
         cap = AddressCap(self.settings.connections_per_address)
@@ -211,7 +221,7 @@ class Relay:
 
         def build() -> RobotConnection:
             return RobotConnection(
-                self._reactor, time.monotonic_ns, timing, lambda connection: Opening(hall, connection), cap
+                self._reactor, now_ns, timing, lambda connection: Opening(hall, connection), cap
             )
 
         return RobotFactory(build)
@@ -249,44 +259,28 @@ class Relay:
     @property
     def url(self) -> str:
         """Where people go: the first origin that was listed, else where the relay listens."""
-        if self.settings.origins:
-            return self.settings.origins[0].rstrip("/")
-        host = self.settings.http.host
-        shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104
-        return f"{self.settings.scheme}://{shown}:{self.http_port}"
+        return self.settings.url(self.http_port)
 
     # --- running ------------------------------------------------------------------------------------------
 
     async def refresh(self) -> None:
         """Take up changes somebody made in the database."""
-        revision = await self._store.read(queries.revision)
-        if revision == self._revision:
-            return
+        looked, revision = time.monotonic(), await self._store.read(queries.revision)
+        if revision != self._revision:
+            await self._take_up(revision)
+        self._access.in_step(looked)
+
+    async def _take_up(self, revision: int) -> None:
         await self._access.refresh()
-        await self._check_robots()
+        await retire(self._store, self._registry, self._desks, self._videos)
         self._desks.expect(await self._store.read(queries.pending_stops))
         await self._alerts.alerts.refresh()
+        self._directory.leases.soon()
         # Not waited for: rights must be taken up however long a disk takes.
         self._sweep()
         # Only now: had anything above failed, the next look would have to do it again.
         self._revision = revision
         self._registry.changed()
-
-    async def _check_robots(self) -> None:
-        """Cut robots whose key was revoked, forget those that were removed."""
-        links = [(robot, robot.control) for robot in self._registry]
-        keys = {(robot.robot_id, robot.key) for robot, control in links if control is not None}
-        live = await self._store.read(queries.live_keys, keys)
-        there = {record.id for record in await self._store.read(queries.list_robots)}
-        for robot, control in links:
-            if robot.robot_id not in there:
-                self._registry.forget(robot.robot_id)
-                self._desks.forget(robot.robot_id)
-                self._videos.end(robot, NotFound("this robot was removed from the relay"))
-            elif control is not None and robot.control is control and (robot.robot_id, robot.key) not in live:
-                self.log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
-                control.close("the robot's key is not accepted any more")
-                self._videos.end(robot, Unavailable("the robot's key is not accepted any more"))
 
     def _sweep(self) -> Deferred[None]:
         return Deferred.fromCoroutine(sweep(self._recordings, self._store, self._journal)).addErrback(
@@ -326,6 +320,7 @@ class Relay:
             pass
         await self._alerts.alerts.purge()
         await self._sweep()
+        self._recordings.recover()
 
     def reload_tls(self) -> None:
         """Read the certificate again (SIGHUP)."""
@@ -365,35 +360,39 @@ class Relay:
 
         def finish() -> None:
             self._auth.stop()
+            self._workshop.stop()
             self._recordings.close()
             self._alerts.finish()
             self._store.stop()
             self._reactor.callFromThread(done.callback, None)
 
+        self._workshop.close()
         done: Deferred[None] = Deferred()
         threading.Thread(target=finish, name="finish", daemon=True).start()
         await done
 
     async def _say_goodbye(self) -> None:
-        await self._alerts.stop()
+        why = "the relay is going down"
+        self._alerts.hush()
         if self._desk is not None:
-            self._desk.say_goodbye("the relay is going down")
-        await self._recordings.shut("the relay is going down")
+            self._desk.say_goodbye(why)
+        if self._pages is not None:
+            self._pages.say_goodbye(why)
+        # Nobody drives on until a disk or a database has answered: all are told first.
+        recorded = Deferred.fromCoroutine(self._recordings.shut(why))
         for robot in self._registry:
             if robot.control is not None:
-                robot.control.close("the relay is going down")
-        for loop in (self._polling, self._purging):
+                robot.control.close(why)
+        for loop in (self._polling, self._purging, self._directory.leases.looking):
             if loop.running:
                 loop.stop()
         for channel in self._channels:
             channel.shut()
         self._videos.shut()
-        await DeferredList(
-            [Deferred.fromCoroutine(_stopped(port)) for port in self._ports], consumeErrors=True
-        )
+        ports = [maybeDeferred(port.stopListening) for port in self._ports]
+        await DeferredList(ports, consumeErrors=True)
+        await self._alerts.keep()
+        await self._memory.keep()
+        await recorded
         # The farewells are on their way; a moment lets slow networks take them.
         await deferLater(self._reactor, 0.2)
-
-
-async def _stopped(port: Any) -> None:
-    await port.stopListening()

@@ -12,7 +12,7 @@ from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_protocol.rights import Operation
 from relay_server.access import Permit
 from relay_server.registry import Presence
-from relay_server.video import NO_CAMERA, Picture, Stream, Videos
+from relay_server.video import NO_CAMERA, Picture, Stream, Videos, differing
 
 
 class Screen(Protocol):
@@ -23,6 +23,13 @@ class Screen(Protocol):
 
     def playing(self, playing: link.Playing) -> None:
         """What the robot sends from now on."""
+
+    def instead(self, other: dict[str, Any]) -> None:
+        """What is shown from now on is not what was asked for but another form of the camera, because the robot is at
+        its limit. Told before the first picture, if it is so then, and whenever it changes.
+
+        :param other: the parameters by which it differs, as they are in it; none: it is what was asked for
+        """
 
     def ended(self, error: SwitchboardError) -> None:
         """There is nothing to see, or no more. Called once, and not after :meth:`Watching.leave`."""
@@ -91,7 +98,10 @@ class Watching:
         :raises Unavailable: too many do
         """
         check_view(self.permit, self.camera, self.settings.transport)
-        self._stream = videos.watch(self.robot, self.camera, self.settings, self)
+        stream = videos.watch(self.robot, self.camera, self.settings, self, newest=True)
+        self._stream = stream
+        if stream.settings != self.settings:
+            self._screen.instead(differing(self.settings, stream.settings))
 
     def start_anew(self) -> None:
         """A picture of H.264 was left out: show nothing before the next one that stands alone."""
@@ -125,6 +135,7 @@ class Watching:
     def moved(self, stream: Stream) -> None:
         """To another stream."""
         self._stream = stream
+        self._screen.instead(differing(self.settings, stream.settings))
 
     def ended(self, error: SwitchboardError) -> None:
         """Detached by the stream."""

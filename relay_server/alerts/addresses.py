@@ -1,11 +1,13 @@
-"""Which addresses the relay may send to: none of special networks, unless its administrator allows them.
+"""Which addresses the relay may send to: none of special networks, nor of those its machine is in, unless its
+administrator allows them.
 
 A user who chooses where the relay sends must not reach by it what only the relay can reach.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 
 from relay_protocol.errors import Invalid
@@ -66,23 +68,60 @@ def networks(texts: Iterable[str]) -> tuple[Network, ...]:
     return tuple(found)
 
 
-def allowed(text: str, also: Iterable[Network] = ()) -> bool:
+@dataclass(frozen=True)
+class Fence:
+    """Keeps messages out of networks that only the relay can reach.
+
+    :param attached: the networks that the relay's machine is in, asked whenever something is judged
+    :param also: networks that the administrator allows
+    :param never: networks that the administrator denies, also within those that are allowed
+    """
+
+    attached: Callable[[], Collection[Network]]
+    also: tuple[Network, ...] = ()
+    never: tuple[Network, ...] = ()
+
+    def passed(self, texts: Iterable[str]) -> list[str]:
+        """Those of these addresses that may be connected to, in their order.
+
+        :raises Undelivered: nobody can say which networks the machine is in
+        """
+        refused = self.attached()
+        return [each for each in texts if allowed(each, self.also, self.never, refused)]
+
+
+def allowed(
+    text: str,
+    also: Collection[Network] = (),
+    never: Collection[Network] = (),
+    attached: Collection[Network] = (),
+) -> bool:
     """Whether this address may be connected to.
 
     :param text: as the system's resolver gives it
     :param also: networks that the administrator allows
+    :param never: networks that he denies
+    :param attached: networks that the machine is in
     """
     try:
         address = ip_address(text)
     except ValueError:
         return False
     address = _carried(address)
-    if any(address in network for network in also if network.version == address.version):
+    if _within(address, never):
+        return False
+    if _within(address, also):
         return True
+    if _within(address, attached):
+        return False
     if isinstance(address, IPv4Address):
         return not any(address in network for network in SPECIAL)
     plain = address in UNICAST and not any(address in network for network in SPECIAL_6)
     return plain and address.scope_id is None
+
+
+def _within(address: Address, networks: Iterable[Network]) -> bool:
+    return any(address in network for network in networks if network.version == address.version)
 
 
 def _carried(address: Address) -> Address:

@@ -99,8 +99,8 @@ class Book:
             yield from robot.over.values()
 
     def load(self, records: list[AlertRecord], now: Moment) -> None:
-        """Take up what an earlier relay kept."""
-        for each in sorted(records, key=lambda record: record.last):
+        """Take up what an earlier relay kept. Of what is the same that which lasts counts, as when it was told."""
+        for each in sorted(records, key=lambda record: (record.over is None, record.last)):
             robot = self._robots.setdefault(each.robot_id, _Robot(filled=now.tick))
             key = (each.kind, each.about)
             (robot.open if each.over is None else robot.over)[key] = each
@@ -110,6 +110,8 @@ class Book:
                 kinds.severity(each.level),
                 each.over is None,
             )
+            if each.over is None:
+                robot.over.pop(key, None)
 
     def take_changed(self) -> list[AlertRecord]:
         """What is to be written, each once."""
@@ -158,11 +160,12 @@ class Book:
         back = robot.over.get(key)
         if back is not None and now.tick - robot.marks[key].since < kinds.REJOIN_SECONDS:
             return self._back(robot, back, level, text, now)
-        if kind != kinds.FLOOD and kind not in kinds.SINGLE and not self._room(robot, now):
+        if kind != kinds.FLOOD and not _has_place(robot, key) and not self._room(robot, now):
             robot.full += 1
-            # Not what they say: whoever sees this may have no right to see them.
+            # Not what they say: whoever sees this may have no right to see them. But how bad it is.
             words = f"{robot.full} more alerts of {name} are not kept one by one"
-            return self.tell(robot_id, name, kinds.FLOOD, "", "warning", words, now)
+            worst = max(level, "warning", key=kinds.severity)
+            return self.tell(robot_id, name, kinds.FLOOD, "", worst, words, now)
         made = AlertRecord(
             self._new_id(),
             robot_id,
@@ -271,8 +274,7 @@ class Book:
         self._changed[over.id] = over
         self.states += 1
         while len(robot.over) > KEPT:
-            oldest = next(iter(robot.over))
-            del robot.over[oldest], robot.marks[oldest]
+            _forget(robot, next(iter(robot.over)))
         # The end of what was told is told, however soon it came: nobody shall go on worrying.
         return [Change(over, Event.OVER)] if told else []
 
@@ -297,6 +299,14 @@ class Book:
         return True
 
 
+def _has_place(robot: _Robot, key: Key) -> bool:
+    """Whether an alert needs no room among the others. What was over of late counts as well: else parts without end."""
+    kind = key[0]
+    if kind not in kinds.RESERVED:
+        return kind in kinds.SINGLE
+    return sum(each[0] == kind and each != key for each in (*robot.open, *robot.over)) < kinds.RESERVE
+
+
 def _patience(kind: str) -> float:
     """Seconds after which an alert that was not told again is over."""
     if kind == kinds.FLOOD:
@@ -307,4 +317,11 @@ def _patience(kind: str) -> float:
 def _forget_old(robot: _Robot, now: Moment) -> None:
     for key in list(robot.over):
         if now.tick - robot.marks[key].since > kinds.SHOWN_SECONDS:
-            del robot.over[key], robot.marks[key]
+            _forget(robot, key)
+
+
+def _forget(robot: _Robot, key: Key) -> None:
+    """What was over is remembered no more; what is known of the same while it lasts stays."""
+    del robot.over[key]
+    if key not in robot.open:
+        del robot.marks[key]

@@ -8,6 +8,7 @@ what the user may know of gets to the second and third, and only of that it is c
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Collection
+from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass
 from math import inf
 
@@ -52,11 +53,19 @@ JUDGE_SECONDS = 2.0
 LONGEST_REST = 3600.0
 """Wall clocks are set: nobody sleeps longer on the word of one."""
 
-Send = Callable[[AlertRuleRecord, Message, bool], Awaitable[None]]
-"""Sends a message by a rule's way. The last says whether the one before has failed. Raises :class:`Undelivered`."""
+Send = Callable[[AlertRuleRecord, Message], Awaitable[None]]
+"""Sends a message by a rule's way. Raises :class:`Undelivered`."""
+
+Room = Callable[[AlertRuleRecord, bool], AbstractAsyncContextManager[None]]
+"""What a message has to wait for, and keeps while it is sent. The last says whether the one before has failed."""
 
 Known = Callable[[AlertRuleRecord, Collection[AlertRecord]], Awaitable[set[str]]]
 """Which of these alerts the rule's user may still know of, by their ids. Raises :class:`SwitchboardError`."""
+
+
+def at_once(rule: AlertRuleRecord, doubtful: bool) -> AbstractAsyncContextManager[None]:
+    """The room of a way on which no message waits."""
+    return nullcontext()
 
 
 @dataclass
@@ -89,6 +98,7 @@ class Office:
     send: Send
     known: Known
     lasts: Callable[[str], bool]
+    room: Room = at_once
 
 
 class Delivery:
@@ -303,15 +313,13 @@ class Delivery:
 
     async def _try(self, name: str, batch: list[Notice], left_out: int) -> bool:
         """Send what the user may still know of; whether there was anything."""
-        known = await self._office.known(self.rule, [each.alert for each in batch])
-        notices = [each for each in batch if each.alert.id in known]
-        if not notices:
-            return False
-        await self._places.acquire()
-        try:
-            await self._office.send(self.rule, Message(name, notices, left_out), self._failing)
-        finally:
-            self._places.release()
+        async with self._places, self._office.room(self.rule, self._failing):
+            # Judged after every long wait: meanwhile the right may be gone.
+            known = await self._office.known(self.rule, [each.alert for each in batch])
+            notices = [each for each in batch if each.alert.id in known]
+            if not notices:
+                return False
+            await self._office.send(self.rule, Message(name, notices, left_out))
         self._remember(notices)
         return True
 
@@ -355,11 +363,9 @@ async def test(office: Office, rule: AlertRuleRecord, places: DeferredSemaphore)
     now = office.wall()
     text = "This is a test: alerts of your robots arrive like this."
     alert = AlertRecord("test", 0, "test", "robot", "", "info", text, now, now, 1, 1, None, None, None)
-    await places.acquire()
     try:
-        await office.send(rule, Message(office.name(), [Notice(alert, "test")]), False)
+        async with places, office.room(rule, False):
+            await office.send(rule, Message(office.name(), [Notice(alert, "test")]))
     except Undelivered as error:
         return str(error)
-    finally:
-        places.release()
     return ""

@@ -19,6 +19,7 @@ from relay_server.access import Access, Principal
 from relay_server.alerts import kinds, rules
 from relay_server.alerts.hub import Alerts
 from relay_server.alerts.message import view
+from relay_server.alerts.position import Position
 from relay_server.alerts.rules import Ask
 from relay_server.alerts.ways import Ways
 from relay_server.bucket import TokenBucket
@@ -86,12 +87,18 @@ class AlertDesk:
     # --- alerts -------------------------------------------------------------------------------------------
 
     async def all(
-        self, principal: Principal, robot: str = "", open: bool | None = None, limit: int = 100
+        self,
+        principal: Principal,
+        robot: str = "",
+        open: bool | None = None,
+        limit: int = 100,
+        before: Position | None = None,
     ) -> list[dict[str, Any]]:
         """Alerts the principal may know of, the latest first.
 
         :param robot: of this robot only
         :param open: only those that last, or only those that are over
+        :param before: only those that come after this one in the list
         """
         rights = await self._rights(principal)
         asked = [number for number, (name, _) in rights.items() if not robot or name == robot]
@@ -99,14 +106,14 @@ class AlertDesk:
         deaf = [each for each in asked if not rules.visible(rights[each][1], kinds.DIAGNOSTICS, "")]
         found: list[dict[str, Any]] = []
         refused: set[tuple[int, str, str]] = set()
-        rows: list[AlertRecord] = []
+        after: tuple[float, str] | None = before
         while True:
-            rows = await self._store.read(
+            rows: list[AlertRecord] = await self._store.read(
                 queries.list_alerts,
                 asked,
                 open=open,
                 limit=PAGE,
-                after=rows[-1] if rows else None,
+                after=after,
                 kinds_but={kinds.DIAGNOSTICS: deaf},
                 but=refused,
             )
@@ -117,6 +124,7 @@ class AlertDesk:
                     refused.add((each.robot_id, each.kind, each.about))
             if len(rows) < PAGE or len(found) >= limit:
                 return found[:limit]
+            after = rows[-1].last, rows[-1].id
 
     async def shown(self, principal: Principal) -> list[dict[str, Any]]:
         """What a page of the principal shows now; the same list as long as it is the same."""
@@ -191,6 +199,7 @@ class AlertDesk:
 
     async def rules(self, principal: Principal) -> dict[str, Any]:
         """The principal's rules, and what a rule may say here."""
+        principal.needs_whole()
         found = await self._store.read(queries.list_alert_rules, principal.user_id)
         return {
             "rules": [self._rule(each) for each in found],
@@ -207,6 +216,7 @@ class AlertDesk:
         :raises Invalid: the rule makes no sense, or there are too many
         :raises TooOften: so many changes in so short a time
         """
+        principal.needs_whole()
         self._count("change", principal, CHANGES, "you change rules")
         rules.check(ask, self._ways.channels)
         await self._ways.check(ask.channel, ask.url)
@@ -222,6 +232,7 @@ class AlertDesk:
 
         :raises NotFound: the principal has none of this number
         """
+        principal.needs_whole()
         self._count("change", principal, CHANGES, "you change rules")
         await self._store.write(_remove, principal, number, address, self._wall())
         await self._take_up()
@@ -231,6 +242,7 @@ class AlertDesk:
 
         :raises NotFound: the principal has no rule of this number
         """
+        principal.needs_whole()
         self._count("test", principal, TESTS, "you test rules")
         mine = await self._store.read(queries.list_alert_rules, principal.user_id)
         rule = next((each for each in mine if each.id == number), None)

@@ -36,7 +36,7 @@ class AlertHouse:
         settings: Settings,
     ) -> None:
         own = settings.alerts
-        self._ways = Ways(reactor, time.time, own.webhook_networks, own.apprise_schemes)
+        self._ways = Ways(reactor, time.time, own.webhook_networks, own.apprise_schemes, own.webhook_deny)
         self.alerts = Alerts(
             reactor,
             time.time,
@@ -47,6 +47,7 @@ class AlertHouse:
             journal,
             Thresholds(HEARTBEATS_MISSED * settings.heartbeat, own.battery_low, own.battery_critical),
             self._ways.send,
+            self._ways.room,
         )
         self.desk = AlertDesk(self.alerts, self._ways, store, access, journal, reactor.seconds, time.time)
 
@@ -58,9 +59,13 @@ class AlertHouse:
         self._ways.start(relay)
         await self.alerts.start()
 
-    async def stop(self) -> None:
+    def hush(self) -> None:
         """Tell nobody any more: robots go because the relay does."""
-        await self.alerts.stop()
+        self.alerts.hush()
+
+    async def keep(self) -> None:
+        """Keep what there is, if the database takes it soon."""
+        await self.alerts.keep()
 
     def finish(self) -> None:
         """End the threads; blocks for as long as that takes."""

@@ -16,11 +16,11 @@ from relay_protocol.rights import Rules
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds, rules
 from relay_server.alerts.book import Book, Change, Key, Moment
-from relay_server.alerts.delivery import Office, Send
+from relay_server.alerts.delivery import Office, Room, Send, at_once
 from relay_server.alerts.senses import LOOK_SECONDS, Senses, Thresholds, stopped_by
 from relay_server.alerts.tellers import Tellers
 from relay_server.channel import Channels
-from relay_server.clock import Clock, looping
+from relay_server.clock import Clock, looping, within
 from relay_server.journal import Journal
 from relay_server.registry import Presence, Registry
 from relay_server.store import Store
@@ -37,6 +37,9 @@ ABSENT_SECONDS = 30.0
 AGAIN_SECONDS = 10.0
 """A daemon that began anew has so long to hear what is still wrong, and to tell it."""
 
+KEEP_SECONDS = 3.0
+"""The latest alerts have so long to be kept when the relay goes down."""
+
 BATCH = 200
 """Alerts written in one transaction."""
 
@@ -46,6 +49,7 @@ class Alerts:
 
     :param wall: Unix time in seconds
     :param send: sends a message by a rule's way
+    :param room: what it has to wait for there
     """
 
     log = Logger()
@@ -61,6 +65,7 @@ class Alerts:
         journal: Journal,
         thresholds: Thresholds,
         send: Send,
+        room: Room = at_once,
     ) -> None:
         self.version = 0
         """Another number whenever there is something else to show."""
@@ -68,7 +73,7 @@ class Alerts:
         self.tellers = Tellers(
             Office(
                 clock, wall, secrets.SystemRandom().random, lambda: secrets.token_hex(8), send, self._known,
-                self._lasts,
+                self._lasts, room,
             )
         )  # fmt: skip
         self._clock = clock
@@ -90,6 +95,9 @@ class Alerts:
         """When each robot's daemon began, as it says itself."""
         self._untold: dict[int, set[Key]] = {}
         """What each robot told before its latest registration and not since."""
+        self._steered: set[int] = set()
+        """Robots of which this relay has seen somebody take control: of a loss after that it needs nobody's word."""
+        self._listeners: list[Callable[[str, AlertRecord], None]] = []
         self._rights: dict[int, tuple[object, dict[int, Rules]]] = {}
         """By user: the list that :meth:`Access.robots` gave last, and what that says by robot."""
         self._takers: dict[str, Callable[[Presence, dict[str, Any]], None]] = {
@@ -99,9 +107,13 @@ class Alerts:
             "robot.alert": self._robot_tells,
             "robot.alerts_told": self._all_told,
             "control.lost": self._control_lost,
-            "control.taken": lambda robot, data: self.over(robot, kinds.CONTROL),
+            "control.taken": self._control_taken,
         }
         journal.listen(self._happened)
+
+    def listen(self, listener: Callable[[str, AlertRecord], None]) -> None:
+        """Have somebody told of what is worth telling: what has become of an alert, and the alert as it is now."""
+        self._listeners.append(listener)
 
     async def start(self) -> None:
         """Take up what an earlier relay kept, and look from now on."""
@@ -114,13 +126,17 @@ class Alerts:
         await self.refresh()
         self._looking.start(LOOK_SECONDS, now=False)
 
-    async def stop(self) -> None:
-        """Tell nobody any more, and keep what there is."""
+    def hush(self) -> None:
+        """Look no more, and tell nobody."""
         if self._looking.running:
             self._looking.stop()
         self.tellers.close()
+
+    async def keep(self) -> None:
+        """Keep what there is, if the database takes it soon."""
+        late = f"the database has not taken them within {KEEP_SECONDS:g} s"
         try:
-            await self.flush()
+            await within(self._clock, KEEP_SECONDS, self.flush(), late)
         except SwitchboardError as error:
             self.log.error("the latest alerts could not be kept: {reason}", reason=str(error))
 
@@ -138,7 +154,10 @@ class Alerts:
         there = {each.id for each in await self._store.read(queries.list_robots)}
         for gone in {each.robot_id for each in self.book} - there:
             self.book.forget(gone)
-            self._untold.pop(gone, None)
+        for kept in (self._came, self._daemons, self._untold):
+            for gone in kept.keys() - there:
+                del kept[gone]
+        self._steered &= there
         self.version += 1
 
     async def purge(self) -> None:
@@ -184,6 +203,9 @@ class Alerts:
             self._states = self.book.states
             self.version += 1
         self.tellers.offer(changes)
+        for change in changes:
+            for listener in self._listeners:
+                listener(change.event.value, change.alert)
 
     def _happened(self, kind: str, robot_id: int | None, data: dict[str, Any]) -> None:
         """An event of the journal, whether it is kept there or not."""
@@ -207,7 +229,11 @@ class Alerts:
             self.tell(robot, kinds.STOP, "", "warning", text)
 
     def _robot_tells(self, robot: Presence, data: dict[str, Any]) -> None:
-        kind, about = kinds.from_robot(str(data.get("alert_kind", "")), str(data.get("about", "")))
+        word = str(data.get("alert_kind", "")), str(data.get("about", ""))
+        if word == (kinds.CONTROL, "") and not data.get("over"):
+            self._was_bereft(robot, str(data.get("text", "")))
+            return
+        kind, about = kinds.from_robot(*word)
         self._untold.get(robot.robot_id, set()).discard((kind, about))
         if data.get("over"):
             self.over(robot, kind, about)
@@ -226,6 +252,15 @@ class Alerts:
         if data.get("moving"):
             who, why = data.get("user", "somebody"), data.get("why", "")
             self.tell(robot, kinds.CONTROL, "", "error", f"{who} lost control while the robot moved: {why}")
+
+    def _control_taken(self, robot: Presence, data: dict[str, Any]) -> None:
+        self._steered.add(robot.robot_id)
+        self.over(robot, kinds.CONTROL)
+
+    def _was_bereft(self, robot: Presence, text: str) -> None:
+        """The robot says that its driver lost it: only of an earlier relay's time is that anything new."""
+        if robot.robot_id not in self._steered:
+            self.tell(robot, kinds.CONTROL, "", "error", text)
 
     # --- looking ------------------------------------------------------------------------------------------
 

@@ -23,6 +23,11 @@ OURS = frozenset({OFFLINE, BATTERY, STOP, CONTROL, STALE, FLOOD})
 SINGLE = frozenset({OFFLINE, BATTERY, STOP, CONTROL})
 """What a robot can have one of at most: no flood of others hides it."""
 
+RESERVED = frozenset({MODULE})
+RESERVE = 16
+"""What a flood of others does not hide either, of so many parts: that a process has died, by which the robot is
+guarded, seen or reached."""
+
 LEVELS = ("info", "warning", "error")
 """From the least to the worst."""
 

@@ -8,7 +8,8 @@ nobody should be let choose it who is not trusted with the network.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import AsyncIterator, Collection
+from contextlib import asynccontextmanager
 from importlib.util import find_spec
 from typing import Any
 
@@ -17,8 +18,8 @@ from twisted.internet.defer import TimeoutError as DeferTimeout
 
 from relay_db.queries import AlertRuleRecord
 from relay_protocol.errors import Invalid, Unavailable
-from relay_server.alerts import addresses, kinds, services
-from relay_server.alerts.addresses import Network
+from relay_server.alerts import kinds, services
+from relay_server.alerts.addresses import Fence
 from relay_server.alerts.message import Message, Undelivered
 from relay_server.alerts.names import SPECIAL, unreachable
 from relay_server.alerts.webhook import Resolve, parse
@@ -47,19 +48,18 @@ class Mailing:
 
     :param reactor: calls results back
     :param schemes: beginnings of apprise's URLs that the administrator allows
-    :param allowed: networks that may be reached though they are special ones
+    :param fence: says which addresses may be reached
     :raises Invalid: one of the schemes can't be allowed
     """
 
-    def __init__(
-        self, reactor: Any, resolve: Resolve, schemes: Collection[str], allowed: Sequence[Network]
-    ) -> None:
+    def __init__(self, reactor: Any, resolve: Resolve, schemes: Collection[str], fence: Fence) -> None:
         services.check(schemes)
         self._reactor = reactor
         self._resolve = resolve
         self.schemes = sorted(schemes)
-        self._allowed = allowed
+        self._fence = fence
         self._threads = Threads(reactor, "alert-mail", THREADS, WAITING, "too many messages wait")
+        self._places = DeferredSemaphore(THREADS)
         self._doubtful = DeferredSemaphore(DOUBTFUL)
 
     def start(self) -> None:
@@ -83,24 +83,26 @@ class Mailing:
         if await self._threads.run(_open, url) is None:
             raise Invalid(f"this is no URL of '{scheme}' that apprise understands")
 
-    async def send(self, rule: AlertRuleRecord, message: Message, doubtful: bool) -> None:
-        """Deliver one message.
+    @asynccontextmanager
+    async def room(self, doubtful: bool) -> AsyncIterator[None]:
+        """Wait until a thread is free for a message, and keep it meanwhile.
 
-        :param doubtful: the one before did not arrive
+        :param doubtful: the message before did not arrive
+        """
+        if doubtful:
+            async with self._doubtful, self._places:
+                yield
+        else:
+            async with self._places:
+                yield
+
+    async def send(self, rule: AlertRuleRecord, message: Message) -> None:
+        """Deliver one message, within :meth:`room`.
+
         :raises Undelivered: it was not taken
         """
         if _scheme(rule.url) not in self.schemes:
             raise Undelivered("the relay's administrator does not allow this service any more", again=False)
-        if not doubtful:
-            await self._send(rule, message)
-            return
-        await self._doubtful.acquire()
-        try:
-            await self._send(rule, message)
-        finally:
-            self._doubtful.release()
-
-    async def _send(self, rule: AlertRuleRecord, message: Message) -> None:
         try:
             service = await self._threads.run(_open, rule.url)
             if service is None:
@@ -124,7 +126,7 @@ class Mailing:
         if plain is None:
             raise Undelivered("the URL names no server by a plain name or address", again=False)
         found = await self._resolve(plain, port, user)
-        if not all(addresses.allowed(each, self._allowed) for each in found):
+        if len(self._fence.passed(found)) < len(found):
             raise unreachable(plain, SPECIAL)
 
 

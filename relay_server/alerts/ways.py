@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractAsyncContextManager, nullcontext
 from typing import Any
 
 from relay_db.queries import AlertRuleRecord
 from relay_protocol.errors import Invalid
-from relay_server.alerts import mailing
-from relay_server.alerts.addresses import networks
+from relay_server.alerts import attached, mailing
+from relay_server.alerts.addresses import Fence, networks
 from relay_server.alerts.mailing import Mailing
 from relay_server.alerts.message import Message, Undelivered
 from relay_server.alerts.names import Names
@@ -20,8 +21,9 @@ class Ways:
 
     :param reactor: Twisted's
     :param wall: Unix time in seconds
-    :param special: networks that may be reached though they are special ones
+    :param special: networks that may be reached though they are special ones, or the machine's own
     :param schemes: beginnings of apprise's URLs that may be used
+    :param never: networks that may not be reached though they are neither
     :raises Invalid: a network or a scheme that is none
     """
 
@@ -31,12 +33,13 @@ class Ways:
         wall: Callable[[], float],
         special: Sequence[str],
         schemes: Sequence[str],
+        never: Sequence[str] = (),
     ) -> None:
-        allowed = networks(special)
+        fence = Fence(attached.networks, networks(special), networks(never))
         check_schemes(schemes)
         self._names = Names(reactor)
-        self._webhooks = Webhooks(reactor, self._names.addresses, allowed, wall)
-        self._mailing = Mailing(reactor, self._names.addresses, schemes, allowed) if schemes else None
+        self._webhooks = Webhooks(reactor, self._names.addresses, fence, wall)
+        self._mailing = Mailing(reactor, self._names.addresses, schemes, fence) if schemes else None
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -74,16 +77,24 @@ class Ways:
         elif channel == "apprise" and self._mailing is not None:
             await self._mailing.check(url)
 
-    async def send(self, rule: AlertRuleRecord, message: Message, doubtful: bool) -> None:
-        """Deliver one message.
+    def room(self, rule: AlertRuleRecord, doubtful: bool) -> AbstractAsyncContextManager[None]:
+        """What a message of a rule has to wait for, and keeps while it is sent.
 
         :param doubtful: the one before did not arrive
+        """
+        if rule.channel == "webhook" or self._mailing is None:
+            return nullcontext()
+        return self._mailing.room(doubtful)
+
+    async def send(self, rule: AlertRuleRecord, message: Message) -> None:
+        """Deliver one message, within :meth:`room`.
+
         :raises Undelivered: it was not taken
         """
         if rule.channel == "webhook":
             await self._webhooks.send(rule, message)
         elif self._mailing is not None:
-            await self._mailing.send(rule, message, doubtful)
+            await self._mailing.send(rule, message)
         else:
             raise Undelivered("this relay does not send by apprise any more", again=False)
 

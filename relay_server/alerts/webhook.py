@@ -10,7 +10,7 @@ import hashlib
 import hmac
 import io
 import re
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from ipaddress import IPv6Address
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -33,8 +33,7 @@ from relay_db.queries import AlertRuleRecord
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import KIB
-from relay_server.alerts import addresses
-from relay_server.alerts.addresses import Network
+from relay_server.alerts.addresses import Fence
 from relay_server.alerts.message import Message, Undelivered
 from relay_server.alerts.names import SPECIAL, unreachable
 
@@ -117,7 +116,7 @@ class Webhooks:
     """Sends messages as HTTP requests.
 
     :param reactor: Twisted's
-    :param allowed: networks that may be reached though they are special ones
+    :param fence: says which addresses may be reached
     :param wall: Unix time in seconds
     :param trust: whose certificates count; ``None`` for those the system trusts
     """
@@ -126,13 +125,13 @@ class Webhooks:
         self,
         reactor: Any,
         resolve: Resolve,
-        allowed: Sequence[Network],
+        fence: Fence,
         wall: Callable[[], float],
         trust: Any = None,
     ) -> None:
         self._reactor = reactor
         self._resolve = resolve
-        self._allowed = allowed
+        self._fence = fence
         self.relay = ""
         """Its name, for those who are told."""
         self._wall = wall
@@ -181,7 +180,7 @@ class Webhooks:
     async def _send(self, place: Place, user: int, headers: Headers, body: bytes) -> int:
         """The status of the answer."""
         found = await self._resolve(place.host, place.port, user)
-        good = [each for each in found if addresses.allowed(each, self._allowed)]
+        good = self._fence.passed(found)
         if not good:
             raise unreachable(place.host, SPECIAL)
         for address in good[:ADDRESSES]:

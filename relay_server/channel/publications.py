@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import orjson
 
@@ -113,11 +113,16 @@ class Publications:
         """
         publication = self._topics.get(topic)
         if publication is None or member not in publication.holders:
-            wanted = type_name or self._known(topic)
+            wanted = type_name or self.known_type(topic)
             if not wanted:
                 raise Invalid(f"topic {topic} does not exist and no type was given; advertise it first")
             publication = self._join(member, ask, topic, wanted, None)
         return publication
+
+    def holders(self, topic: str) -> Collection[Member]:
+        """Who has advertised a topic."""
+        publication = self._topics.get(topic)
+        return () if publication is None else publication.holders.keys()
 
     def active(self) -> tuple[tuple[str, str], ...]:
         """Topics the robot has a publisher on for us, with their types."""
@@ -254,7 +259,8 @@ class Publications:
             if publication.type == type_name and publication.phase is not Phase.WAITING:
                 self.refused(publication.number, reason)
 
-    def _known(self, topic: str) -> str:
+    def known_type(self, topic: str) -> str:
+        """The type of a topic that is published to, or is in the robot's graph; empty where nobody knows it."""
         publication = self._topics.get(topic)
         return (publication.type if publication else None) or self._wire.robot.graph.topic_type(topic) or ""
 
@@ -262,7 +268,7 @@ class Publications:
         return self._wire.cdr and not self._wire.robot.types.knows(publication.type)
 
     def _get(self, member: Member, topic: str, type_name: str) -> Publication:
-        known = self._known(topic)
+        known = self.known_type(topic)
         if known and known != type_name:
             raise Invalid(f"topic {topic} has the type {known}, not {type_name or 'none'}")
         if not type_name:

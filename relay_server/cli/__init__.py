@@ -22,7 +22,16 @@ _COMMANDS = {
     ),
     "right": Entry("relay_server.cli.rights", "right", "Say who may do what on which robot."),
     "token": Entry("relay_server.cli.tokens", "token", "Create, list and revoke access tokens."),
+    "program": Entry(
+        "relay_server.cli.programs", "program", "Add, list and revoke programs with key and secret."
+    ),
     "alerts": Entry("relay_server.cli.alerts", "alerts", "Show alerts, and say who is told how."),
+    "events": Entry("relay_server.cli.events", "events", "Show what happened of late."),
+    "directory": Entry(
+        "relay_server.cli.directory",
+        "directory",
+        "Show which services and applications there are, and where.",
+    ),
     "audit": Entry("relay_server.cli.audit", "audit", "Read and verify the audit log."),
     "db": Entry("relay_server.cli.database", "db", "Look after the database."),
 }

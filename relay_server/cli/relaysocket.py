@@ -10,9 +10,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 
 SOCKET_NAME = "relay.sock"
+
+_SENT_HEADER = "Switchboard-Sent"
+"""When an order was given, by the machine's clock."""
 
 _KNOCK_SECONDS = 2.0
 _ASK_SECONDS = 5.0
@@ -113,9 +117,10 @@ def order_motion(
     :raises SwitchboardError: it says no, in its own words
     """
     connection = _Connection(folder, _MOTION_SECONDS if unsure is None else _SURE_SECONDS)
+    headers = _dated()
     try:
         try:
-            connection.request("POST", f"/{what}", json.dumps(order), {"Content-Type": "application/json"})
+            connection.request("POST", f"/{what}", json.dumps(order), headers)
             answer = connection.getresponse()
         except TimeoutError:
             if unsure is None or connection.sock is None:
@@ -143,9 +148,9 @@ def give_order(folder: Path, order: dict[str, Any]) -> Iterator[dict[str, Any]]:
     :raises NotFound: it means no robot
     """
     connection = _Connection(folder, _LINE_SECONDS)
+    headers = _dated()
     try:
         try:
-            headers = {"Content-Type": "application/json"}
             connection.request("POST", "/fleet", json.dumps(order), headers)
             answer = connection.getresponse()
             if answer.status != http.client.OK:
@@ -158,6 +163,11 @@ def give_order(folder: Path, order: dict[str, Any]) -> Iterator[dict[str, Any]]:
             raise _unanswered(error, _LINE_SECONDS) from None
     finally:
         connection.close()
+
+
+def _dated() -> dict[str, str]:
+    """Headers of an order that is given now: a relay that is frozen, or slow, does not do later what was meant now."""
+    return {"Content-Type": "application/json", _SENT_HEADER: str(now_ns())}
 
 
 def _line(line: bytes) -> dict[str, Any]:
@@ -179,7 +189,7 @@ def _refusal(status: int, body: bytes) -> SwitchboardError:
     detail = said.get("detail") if isinstance(said, dict) else None
     if not isinstance(detail, str):
         return Unavailable(f"the relay on this data folder answered something else (HTTP {status})")
-    kinds: dict[int, type[SwitchboardError]] = {400: Invalid, 404: NotFound, 409: Refused}
+    kinds: dict[int, type[SwitchboardError]] = {400: Invalid, 404: NotFound, 409: Refused, 412: Refused}
     return kinds.get(status, Unavailable)(detail)
 
 

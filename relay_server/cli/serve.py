@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from relay_server.service import Relay
 
 DAY = 86400.0
+YEARS = 3650
+"""Longest that events are kept, days."""
+
+MOST_REQUESTS = 1_000_000
 
 
 @click.command(
@@ -61,6 +65,25 @@ DAY = 86400.0
     help="How much recordings may take in all, gigabytes. 0: nothing is recorded.",
 )
 @click.option(
+    "--recordings-reserve-gb",
+    default=1.0,
+    show_default=True,
+    help="How much of the disk stays free, gigabytes: with less, recordings end and none begins.",
+)
+@click.option(
+    "--events-per-source",
+    default=10_000,
+    show_default=True,
+    type=click.IntRange(10, 1_000_000),
+    help="How many events each source may have in the memory; the least used and oldest go first.",
+)
+@click.option(
+    "--events-days",
+    default=30.0,
+    show_default=True,
+    help="How long the memory keeps an event, days.",
+)
+@click.option(
     "--explicit-control",
     is_flag=True,
     help="A robot nobody controls obeys nobody: control is taken by asking for it, never by a first command.",
@@ -88,7 +111,14 @@ DAY = 86400.0
     default="",
     metavar="NETWORKS",
     envvar="SWITCHBOARD_WEBHOOK_NETWORKS",
-    help="Private networks that alerts may be sent to, as 192.168.7.0/24,fd00:7::/64. None else.",
+    help="Networks that alerts may be sent to though private or this machine's own, as 192.168.7.0/24,fd00:7::/64.",
+)
+@click.option(
+    "--webhook-deny",
+    default="",
+    metavar="NETWORKS",
+    envvar="SWITCHBOARD_WEBHOOK_DENY",
+    help="Networks that alerts may not be sent to though they have public addresses.",
 )
 @click.option(
     "--apprise-schemes",
@@ -104,6 +134,13 @@ DAY = 86400.0
     help="Percent at which a battery is an alert; 0: never.",
 )
 @click.option("--battery-critical", default=10.0, show_default=True, help="Percent at which it is worse.")
+@click.option(
+    "--requests-per-second",
+    default=500.0,
+    show_default=True,
+    help="HTTP requests of one user, or of a network in which nobody has logged in; ten times as many at once. "
+    "Never held back: stops. 0: no limit.",
+)
 @click.option("--log-json", is_flag=True, help="Log one JSON object a line.")
 @click.option("--debug", is_flag=True, help="Log more.")
 @pass_app
@@ -118,14 +155,19 @@ def serve(
     name: str,
     heartbeat: float,
     recordings_gb: float,
+    recordings_reserve_gb: float,
+    events_per_source: int,
+    events_days: float,
     explicit_control: bool,
     control_grace: float,
     control_request: float,
     control_idle: float,
     webhook_networks: str,
+    webhook_deny: str,
     apprise_schemes: str,
     battery_low: float,
     battery_critical: float,
+    requests_per_second: float,
     log_json: bool,
     debug: bool,
 ) -> None:
@@ -144,8 +186,12 @@ def serve(
         raise Invalid("--tls-cert and --tls-key go together")
     if heartbeat <= 0:
         raise Invalid("--heartbeat must be more than 0 s")
-    if recordings_gb < 0:
-        raise Invalid("--recordings-gb must not be less than 0")
+    if recordings_gb < 0 or recordings_reserve_gb < 0:
+        raise Invalid("--recordings-gb and --recordings-reserve-gb must not be less than 0")
+    if not 0 < events_days <= YEARS:
+        raise Invalid(f"--events-days must be more than 0 and at most {YEARS}")
+    if not 0 <= requests_per_second <= MOST_REQUESTS:
+        raise Invalid(f"--requests-per-second must be from 0 to {MOST_REQUESTS}")
     _check_control(control_grace, control_request, control_idle)
     if battery_low == 0:
         battery_critical = 0.0
@@ -163,12 +209,20 @@ def serve(
         name=name,
         heartbeat=heartbeat,
         recordings=round(recordings_gb * 10**9),
+        recordings_reserve=round(recordings_reserve_gb * 10**9),
         explicit_control=explicit_control,
         control_grace=control_grace,
         control_request=control_request,
         control_idle=control_idle,
+        events_of_source=events_per_source,
+        events_kept=events_days * DAY,
+        requests=requests_per_second,
         alerts=AlertSettings(
-            _listed(webhook_networks), _listed(apprise_schemes), battery_low / 100, battery_critical / 100
+            _listed(webhook_networks),
+            _listed(webhook_deny),
+            _listed(apprise_schemes),
+            battery_low / 100,
+            battery_critical / 100,
         ),
     )
     logs.begin(log_json, debug)

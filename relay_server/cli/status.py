@@ -102,8 +102,8 @@ def _row(robot: dict[str, Any]) -> tuple[str, ...]:
     return (
         str(robot.get("name", "?")),
         str(robot.get("state", "?")),
-        _named(robot.get("holder"), "user"),
-        _named(robot.get("stopped"), "by"),
+        _control(robot),
+        _stopped(robot.get("stopped")),
         _names(_people(robot)),
         link.rtt,
         _span(each.get("robot_rtt_ms") for each in _dicts(robot.get("clients"))),
@@ -165,8 +165,28 @@ def _names(people: Iterable[dict[str, Any]]) -> str:
     return ", ".join(name if count == 1 else f"{name} ({count})" for name, count in times.items()) or _NONE
 
 
+def _control(robot: dict[str, Any]) -> str:
+    """Who has it, and who has a hand on topics all the same."""
+    commands = [
+        f"{each.get('by', '?')} commands {each.get('resource', '?')}"
+        for each in _dicts(robot.get("suppressed"))
+    ]
+    quiet = [
+        f"{each.get('by', '?')} {'holds' if each.get('hold') else 'inhibits'} {each.get('resource', '?')}"
+        for each in _dicts(robot.get("inhibited"))
+    ]
+    return "; ".join([_named(robot.get("holder"), "user"), *commands, *quiet])
+
+
 def _named(value: Any, field: str) -> str:
     return str(value.get(field) or "?") if isinstance(value, dict) else _NONE
+
+
+def _stopped(value: Any) -> str:
+    """By whom; of a robot that has not confirmed it, that it is only being stopped."""
+    by = _named(value, "by")
+    told = not isinstance(value, dict) or value.get("told", True)
+    return by if told else f"being stopped by {by}"
 
 
 def _number(value: Any) -> str:

@@ -9,6 +9,7 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.scopes import Scope
 from relay_server import passwords
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of
 from relay_server.cli.output import show, tell
@@ -24,15 +25,20 @@ def token() -> None:
     epilog=examples(
         "switchboard token create ann --ttl 1h",
         'switchboard token create fleet-report --ttl 30d --label "nightly report" --json',
+        "switchboard token create ann --scope 'viewer publish:/lights@rover'",
     )
 )
 @click.argument("user")
 @click.option("--ttl", default="24h", show_default=True, help="How long it is good: 90s, 15m, 1h, 7d, 2w.")
+@click.option(
+    "--scope", help="What it may be used for, if not for all that USER may: viewer, operator@rover …"
+)
 @click.option("--label", default="", help="What it is for, one line.")
 @json_option
 @pass_app
-def create(app: App, user: str, ttl: str, label: str, as_json: bool) -> None:
+def create(app: App, user: str, ttl: str, scope: str | None, label: str, as_json: bool) -> None:
     """Create a token that acts as USER. It is shown once and not stored."""
+    checked = None if scope is None else str(Scope(scope))
     seconds, secret, now = parse_duration(ttl), passwords.new_token(), time.time()
     with app.change() as change:
         found = change.user(user)
@@ -46,8 +52,9 @@ def create(app: App, user: str, ttl: str, label: str, as_json: bool) -> None:
             label=label,
             expires=now + seconds,
             now=now,
+            scope=checked,
         )
-        change.audit("token.create", found.name, id=number, ttl_s=seconds, label=label)
+        change.audit("token.create", found.name, id=number, ttl_s=seconds, scope=checked, label=label)
     answer = {"token": secret, "expires_in": seconds, "id": number, "user": found.name}
     tell(as_json, answer, secret)
     if not as_json:
@@ -65,10 +72,18 @@ def list_(app: App, user: str | None, as_json: bool) -> None:
         tokens = queries.list_tokens(session, None if user is None else user_of(session, user).id)
     now = time.time()
     cells = (
-        (str(each.id), each.user, each.kind, _expiry(each, now), moment(each.created), each.label)
+        (
+            str(each.id),
+            each.user,
+            each.kind,
+            each.scope or "all",
+            _expiry(each, now),
+            moment(each.created),
+            each.label,
+        )
         for each in tokens
     )
-    columns = ("id", "user", "kind", "expires", "created", "label")
+    columns = ("id", "user", "kind", "scope", "expires", "created", "label")
     show(as_json, (_json(each) for each in tokens), columns, cells)
 
 

@@ -11,8 +11,8 @@ from relay_server.control.hub import Desks
 from relay_server.control.lease import FREE, Client, Lease, State
 from relay_server.control.orders import NotDone
 from relay_server.control.record import Actor, DatabaseRecord, Record, reason_in, reason_of
-from relay_server.control.stopping import Stopped
-from relay_server.control.terms import ROBOT, Answer, ControlRules, Standing, actor_of
+from relay_server.control.stopping import Stopped, StoppedSince
+from relay_server.control.terms import ROBOT, Answer, ControlRules, Standing, actor_of, acts_for
 
 __all__ = [
     "FREE",
@@ -30,7 +30,9 @@ __all__ = [
     "Standing",
     "State",
     "Stopped",
+    "StoppedSince",
     "actor_of",
+    "acts_for",
     "reason_in",
     "reason_of",
     "view",

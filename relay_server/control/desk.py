@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.bucket import Buckets
@@ -19,6 +21,7 @@ from relay_server.control.terms import (
     DESERTED_SECONDS,
     IMPLICIT,
     LET_GO_SECONDS,
+    REST_SECONDS,
     ROBOT,
     TAKES_A_SECOND,
     TAKES_AT_ONCE,
@@ -34,6 +37,7 @@ class Desk(Steering):
 
     :param changed: called when what the list of robots shows of it is another
     :param wall: Unix time in seconds
+    :param clock_ns: the relay's monotonic nanoseconds
     """
 
     def __init__(
@@ -44,12 +48,15 @@ class Desk(Steering):
         rules: ControlRules,
         changed: Callable[[], None],
         wall: Callable[[], float],
+        clock_ns: Callable[[], int] = now_ns,
     ) -> None:
-        super().__init__(clock, robot, record, rules, changed, wall)
+        super().__init__(clock, robot, record, rules, changed, wall, clock_ns)
         self._takes = Buckets(TAKES_A_SECOND, TAKES_AT_ONCE, USERS, clock.seconds)
         """By user, how often he may take control still."""
         self._cut_off: OrderedDict[int, float] = OrderedDict()
         """By user, the moment of the latest command of a connection that ended before he had let go."""
+        self._resting: OrderedDict[int, tuple[int, float]] = OrderedDict()
+        """By user, the connection that refused him control the last time, and until when he does not ask it again."""
 
     # --- commands -----------------------------------------------------------------------------------------
 
@@ -80,7 +87,8 @@ class Desk(Steering):
                 f"nobody controls robot {name}: take control first, with /relay/take_control or the portal"
             )
         self._count_take(client)
-        self._succeed(client, IMPLICIT, "taken", "the same user commands from another connection")
+        lost = "the same user commands from another connection"
+        self._succeed(client, IMPLICIT, "taken", lost, implicit=True)
         return False
 
     def zero(self, client: Client) -> None:
@@ -139,15 +147,18 @@ class Desk(Steering):
         """A client has published to the robot while that is away: it must find no hand on the stick."""
         self._bereft[client] = self._clock.seconds()
 
-    def _succeed(self, client: Client, why: str, how: str, lost: str) -> Deferred[SwitchboardError | None]:
+    def _succeed(
+        self, client: Client, why: str, how: str, lost: str, *, implicit: bool = False
+    ) -> Deferred[SwitchboardError | None]:
         """Have the robot obey this client in the place of who has control now, if anybody has.
 
         :param lost: what that one is told
+        :param implicit: whether a command of his takes it
         """
         former = self.lease.holder
         if former is not None:
             self._note_lost(former, lost)
-        waiting = self._hand_to(client, why, how)
+        waiting = self._hand_to(client, why, how, implicit)
         if former is not None:
             self._tell_lost(former, lost)
         return waiting
@@ -191,6 +202,8 @@ class Desk(Steering):
         self._judge(client)
         lease = self.lease
         if lease.held_by(client):
+            if lease.holder is not None and lease.holder.implicit:
+                self._become(lease.meant())
             return Answer(True, "you have control")
         if lease.holder is not None and not self._may_take_over(client):
             return self._request(client, why)
@@ -211,7 +224,21 @@ class Desk(Steering):
         if holder is not None and holder.client.user == client.user:
             # Nobody asks himself for anything.
             return True
-        return lease.requested_by(client) and owns(client) and self._clock.seconds() >= self._due
+        return lease.requested_by(client) and self._comes_due(client) and self._clock.seconds() >= self._due
+
+    def _comes_due(self, client: Client) -> bool:
+        """Whether this client takes over after the grace time: an owner, or anybody from an implicit holder."""
+        holder = self.lease.holder
+        return owns(client) or (holder is not None and holder.implicit)
+
+    def _see_rested(self, client: Client, holder: Client) -> None:
+        """:raises Refused: this holder has just refused control to the same user"""
+        refuser, until = self._resting.get(client.user, (0, 0.0))
+        left = until - self._clock.seconds()
+        if refuser == holder.number and left > 0:
+            raise Refused(
+                f"{holder.name} has just kept control of {self.robot.name}; ask again in {math.ceil(left)} s"
+            )
 
     def _request(self, client: Client, why: str) -> Answer:
         lease, now = self.lease, self._wall()
@@ -219,10 +246,11 @@ class Desk(Steering):
         holder, request = lease.holder.client, lease.request
         if request is not None and request.client is client:
             left = max(0.0, self._due - self._clock.seconds())
-            after = f"; after {left:.0f} s ask again to take over" if owns(client) else ""
+            after = f"; after {left:.0f} s ask again to take over" if self._comes_due(client) else ""
             return Answer(False, f"{holder.name} has control and was asked for it already{after}")
         if request is not None and (owns(request.client) or not owns(client)):
             return Answer(False, f"{holder.name} has control, and {request.client.name} asks for it already")
+        self._see_rested(client, holder)
         self._due = self._clock.seconds() + self.rules.grace
         self._note_lapsed(request, f"{client.name} asks for it before")
         self._become(lease.requested(Request(client, now, now + self.rules.grace, why)))
@@ -252,29 +280,55 @@ class Desk(Steering):
         self._let_go(f"given back by {client.name if by is None else by.name}")
         return Answer(True, "control is given back")
 
-    def grant(self, client: Client, why: str) -> Answer:
-        """The holder hands control over to who asks for it."""
+    def _asked_by(self, client: Client, meant: int) -> Request | Answer:
+        """The request that the holder answers, or why he answers none.
+
+        :param meant: the number of the connection whose request he means, 0 for whoever asks
+        """
         request = self.lease.request
         if not self.lease.held_by(client):
             return Answer(False, "you have no control of this robot")
         if request is None:
             return Answer(False, "nobody asks for control")
+        if meant not in (0, request.client.number):
+            return Answer(
+                False,
+                f"who you mean asks for control no more; {request.client.name} does, and has no answer yet",
+            )
+        return request
+
+    def grant(self, client: Client, why: str, meant: int = 0) -> Answer:
+        """The holder hands control over to who asks for it.
+
+        :param meant: the number of the connection he means, 0 for whoever asks
+        """
+        request = self._asked_by(client, meant)
+        if isinstance(request, Answer):
+            return request
         self._note("control.granted", client, why[:WHY], to=request.client.name)
         self._hand_to(request.client, f"granted by {client.name}", "granted")
         return Answer(True, f"{request.client.name} gets control")
 
-    def refuse(self, client: Client, why: str) -> Answer:
-        """The holder keeps control."""
-        request, why = self.lease.request, why[:WHY]
-        if not self.lease.held_by(client):
-            return Answer(False, "you have no control of this robot")
-        if request is None:
-            return Answer(False, "nobody asks for control")
+    def refuse(self, client: Client, why: str, meant: int = 0) -> Answer:
+        """The holder keeps control, and is left alone by who asked for a while.
+
+        :param meant: as for :meth:`grant`
+        """
+        request, why = self._asked_by(client, meant), why[:WHY]
+        if isinstance(request, Answer):
+            return request
+        self._rests(request.client.user, client)
         self._note("control.refused", client, why, to=request.client.name)
         said = f": {why}" if why else ""
         self._become(self.lease.withdrawn())
         request.client.tell("warning", f"{client.name} keeps control of {self.robot.name}{said}")
         return Answer(True, f"you keep control; {request.client.name} is told")
+
+    def _rests(self, user: int, refuser: Client) -> None:
+        self._resting.pop(user, None)
+        self._resting[user] = (refuser.number, self._clock.seconds() + REST_SECONDS)
+        while len(self._resting) > USERS:
+            self._resting.popitem(last=False)
 
     def may_resume(self, client: Client) -> bool:
         """Whether this client may let a robot that is stopped move again: who has control, and owners."""

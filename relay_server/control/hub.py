@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 from relay_db.queries import StopRecord
+from relay_protocol.clocks import now_ns
 from relay_server.clock import Clock
 from relay_server.control.desk import Desk
 from relay_server.control.lease import FREE
@@ -14,11 +16,22 @@ from relay_server.control.terms import ControlRules, Standing
 from relay_server.registry import Presence
 
 
+class _Expected(NamedTuple):
+    """An order to stop that the database has.
+
+    :param seen: when it was first read there, the relay's monotonic nanoseconds
+    """
+
+    order: StopRecord
+    seen: int
+
+
 class Desks:
     """One desk for each robot, made when somebody first asks for it.
 
     :param changed: called when what the list of robots shows is another
     :param wall: Unix time in seconds
+    :param clock_ns: the relay's monotonic nanoseconds
     """
 
     def __init__(
@@ -28,14 +41,16 @@ class Desks:
         rules: ControlRules,
         changed: Callable[[], None],
         wall: Callable[[], float],
+        clock_ns: Callable[[], int] = now_ns,
     ) -> None:
         self._clock = clock
         self._record = record
         self._rules = rules
         self._changed = changed
         self._wall = wall
+        self._clock_ns = clock_ns
         self._desks: dict[int, Desk] = {}
-        self._expected: dict[int, StopRecord] = {}
+        self._expected: dict[int, _Expected] = {}
 
     def __iter__(self) -> Iterator[Desk]:
         return iter(list(self._desks.values()))
@@ -44,9 +59,11 @@ class Desks:
         """The robot's desk."""
         desk = self._desks.get(robot.robot_id)
         if desk is None:
-            desk = Desk(self._clock, robot, self._record, self._rules, self._changed, self._wall)
-            self._desks[robot.robot_id] = desk
-            desk.stopping.expect(self._expected.pop(robot.robot_id, None))
+            rooms = self._clock, robot, self._record, self._rules, self._changed, self._wall, self._clock_ns
+            desk = self._desks[robot.robot_id] = Desk(*rooms)
+            expected = self._expected.pop(robot.robot_id, None)
+            if expected is not None:
+                desk.stopping.expect(*expected)
         return desk
 
     def standing(self, robot_id: int) -> Standing:
@@ -54,7 +71,8 @@ class Desks:
         desk = self._desks.get(robot_id)
         if desk is not None:
             return desk.standing
-        order = self._expected.get(robot_id)
+        expected = self._expected.get(robot_id)
+        order = None if expected is None else expected.order
         return Standing(FREE, {}, None if order is None else Stopped(order.by, order.why, order.at, False))
 
     def holder(self, robot: Presence) -> int:
@@ -67,14 +85,19 @@ class Desks:
 
         :raises SwitchboardError: nobody can say
         """
-        self.of(robot).stopping.expect(await self._record.pending(robot))
+        order = await self._record.pending(robot)
+        self.of(robot).stopping.expect(order, self._clock_ns())
 
     def expect(self, orders: Iterable[StopRecord]) -> None:
         """Orders to stop, as the database has them. Robots that are there are told now."""
-        self._expected = {order.robot_id: order for order in orders}
+        now, before = self._clock_ns(), self._expected
+        self._expected = {order.robot_id: _Expected(order, now) for order in orders}
+        for robot_id, known in before.items():
+            if robot_id in self._expected and self._expected[robot_id].order == known.order:
+                self._expected[robot_id] = known
         for desk in self:
-            order = self._expected.pop(desk.robot.robot_id, None)
-            if desk.stopping.expect(order) and desk.robot.control is not None:
+            order, seen = self._expected.pop(desk.robot.robot_id, (None, now))
+            if desk.stopping.expect(order, seen) and desk.robot.control is not None:
                 desk.stopping.came()
 
     def forget(self, robot_id: int) -> None:

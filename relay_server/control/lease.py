@@ -103,10 +103,12 @@ class Tenure(NamedTuple):
     """Somebody has control, or is to have it.
 
     :param since: Unix time, seconds
+    :param implicit: whether a command took it, and nobody who can be asked has said that he wants it
     """
 
     client: Client
     since: float
+    implicit: bool = False
 
 
 class Request(NamedTuple):
@@ -153,9 +155,14 @@ class Lease:
         """Whether this connection is to have control when the robot has answered."""
         return self.coming is not None and self.coming.client is client
 
-    def give(self, client: Client, now: float) -> Lease:
+    def give(self, client: Client, now: float, implicit: bool = False) -> Lease:
         """The robot is being told that this client is to have it. Who asked for it asks no more."""
-        return Lease(self._after(Event.GIVE), coming=Tenure(client, now))
+        return Lease(self._after(Event.GIVE), coming=Tenure(client, now, implicit))
+
+    def meant(self) -> Lease:
+        """Who has control has said that he wants it."""
+        assert self.holder is not None
+        return replace(self, holder=self.holder._replace(implicit=False))
 
     def free(self) -> Lease:
         """The robot is being told that nobody has it."""
@@ -165,7 +172,7 @@ class Lease:
         """The robot obeys."""
         state = self._after(Event.DONE)
         coming = self.coming
-        return Lease(state, holder=None if coming is None else Tenure(coming.client, now))
+        return Lease(state, holder=None if coming is None else coming._replace(since=now))
 
     def failed(self) -> Lease:
         """It has not said that it does."""

@@ -9,6 +9,7 @@ from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_protocol import link
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.clock import Clock, Timer, cancel
@@ -29,6 +30,7 @@ class Steering:
 
     :param changed: called when what the list of robots shows of it is another
     :param wall: Unix time in seconds
+    :param clock_ns: the relay's monotonic nanoseconds
     """
 
     log = Logger()
@@ -41,6 +43,7 @@ class Steering:
         rules: ControlRules,
         changed: Callable[[], None],
         wall: Callable[[], float],
+        clock_ns: Callable[[], int] = now_ns,
     ) -> None:
         self._clock = clock
         self.robot = robot
@@ -49,7 +52,7 @@ class Steering:
         self._changed = changed
         self._wall = wall
         self.orders = Orders(clock, robot)
-        self.stopping = Stopping(robot, self.orders, record, self._stand, wall, clock.seconds)
+        self.stopping = Stopping(clock, robot, self.orders, record, self._stand, wall, clock_ns)
         self.subsuming = Subsuming(clock, robot, self.orders, record, self._stand)
         self.pushing = Pushing(clock)
         self.standing = Standing(FREE, {}, None)
@@ -76,6 +79,9 @@ class Steering:
         if isinstance(message, link.Done):
             self.orders.done(message)
             return
+        if message.stopped is not None and self.stopping.stopped is None:
+            # Of what comes from here it has been told, and that is known.
+            self.stopping.anew()
         self.robot.safety = message
         self.stopping.heard()
         self._stand()
@@ -179,13 +185,18 @@ class Steering:
         if self.lease.holder is not None:
             self._lose(self.lease.holder.client, f"no command for {self.rules.idle:g} s")
 
-    def _hand_to(self, client: Client, why: str, how: str) -> Deferred[SwitchboardError | None]:
-        """Have the robot obey this client and nobody else; what comes back is that of :meth:`_settled`."""
+    def _hand_to(
+        self, client: Client, why: str, how: str, implicit: bool = False
+    ) -> Deferred[SwitchboardError | None]:
+        """Have the robot obey this client and nobody else; what comes back is that of :meth:`_settled`.
+
+        :param implicit: whether a command of his takes it
+        """
         request = self.lease.request
         ousted = request if request is not None and request.client is not client else None
         gone = f"{client.name} gets it"
         self._note_lapsed(ousted, gone)
-        lease = self.lease.give(client, self._wall())
+        lease = self.lease.give(client, self._wall(), implicit)
         self._become(lease)
         waiting = self._settled()
         if ousted is not None:
@@ -221,13 +232,14 @@ class Steering:
     def _not_settled(self, error: SwitchboardError, asked: Lease) -> None:
         """The robot has not said that it obeys: nobody has control."""
         self.log.warn("control of {robot} is free: {why}", robot=self.robot.name, why=str(error))
-        self._become(asked.failed(), error)
-        if asked.coming is not None:
-            # It may have heard us all the same.
+        client = None if asked.coming is None else asked.coming.client
+        if client is not None:
+            # It may have heard us all the same. First: whoever waits for a free robot is given it by what follows.
             given = self.orders.give(lambda id: link.Control(id=id, why=str(error)), always=True)
             given.addErrback(_unheard)
-            client = asked.coming.client
             self._note("control.lost", client, str(error), moving=self.robot.safety.moving)
+        self._become(asked.failed(), error)
+        if client is not None:
             client.tell("error", f"you did not get control of {self.robot.name}: {error}")
 
     def _become(self, lease: Lease, error: SwitchboardError | None = None) -> None:

@@ -12,15 +12,17 @@ from twisted.logger import Logger
 
 from relay_db.queries import StopRecord
 from relay_protocol import link
-from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_server.bucket import Buckets
+from relay_server.clock import Clock, sleep
 from relay_server.control.detached import detached
 from relay_server.control.orders import NotDone, Orders
 from relay_server.control.record import WHY, Actor, Record
 from relay_server.registry import Presence
 
-STOP_SECONDS = 10.0
-"""A robot has so long to confirm that it stands: a switch in its hardware may take some seconds."""
+STOP_SECONDS = 14.0
+"""A robot has so long to confirm that it stands: a switch in its hardware may take 6 s, and has to be thrown once more
+where the stop came in the middle of a resume."""
 
 KEEPING = 8
 """Orders to stop one robot that are being written at a time: who stops it again and again must not fill the database's
@@ -28,6 +30,9 @@ queue. The robot is told all the same; where it can't be, whoever comes then is 
 
 KNOWN = 256
 """Orders to stop one robot that are remembered: a slow database may still tell of them."""
+
+PUT_AWAY_SECONDS = 10.0
+"""From one attempt to take out of the database what is over to the next."""
 
 AGAIN_A_SECOND = 3 / 60
 AGAIN_AT_ONCE = 3
@@ -53,31 +58,42 @@ class Stopped(NamedTuple):
     told: bool
 
 
+class StoppedSince(Refused):
+    """Somebody may have stopped the robot after it was asked for that it may move again."""
+
+    code = "stopped_since"
+
+
 class Stopping:
     """The stop of one robot.
 
     :param changed: called when it is another
     :param wall: Unix time in seconds
-    :param seconds: a monotonic clock
+    :param clock_ns: the relay's monotonic nanoseconds
     """
 
     log = Logger()
 
     def __init__(
         self,
+        clock: Clock,
         robot: Presence,
         orders: Orders,
         record: Record,
         changed: Callable[[], None],
         wall: Callable[[], float],
-        seconds: Callable[[], float],
+        clock_ns: Callable[[], int],
     ) -> None:
+        self._clock = clock
         self._robot = robot
         self._orders = orders
         self._record = record
         self._changed = changed
         self._wall = wall
-        self._again = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, seconds)
+        self._clock_ns = clock_ns
+        self._latest = 0
+        """When the robot was stopped the last time, as far as this relay knows; its monotonic nanoseconds."""
+        self._again = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, clock.seconds)
         self._pending: StopRecord | None = None
         self._known: deque[float] = deque(maxlen=KNOWN)
         """The moments that name the orders seen here, whatever has become of them. They are compared for being the
@@ -87,7 +103,11 @@ class Stopping:
         self._look = False
         """Whether what the robot says next of itself shows if it still stands."""
         self._under_way = 0
-        self._keeping = 0
+        self._keeping: list[StopRecord] = []
+        """Orders that are being written."""
+        self._left: deque[float] = deque(maxlen=KNOWN)
+        """The moments of orders that are over, and may still be in the database."""
+        self._clearing = False
 
     @property
     def stopped(self) -> Stopped | None:
@@ -107,8 +127,9 @@ class Stopping:
         """
         order = StopRecord(self._robot.robot_id, actor.name, why[:WHY], self._wall())
         self._known.append(order.at)
+        self.anew()
         audit = self.stopped is None or self._again.take(actor.source)
-        if self._pending is None or self._keeping < KEEPING:
+        if self._pending is None or len(self._keeping) < KEEPING:
             # Else those stand that are being written.
             self._pending = order
         self._changed()
@@ -121,8 +142,8 @@ class Stopping:
         outcome = await _outcome(given)
         # Whoever asked is not kept waiting by a database that hangs.
         if outcome is None:
-            self._believe(link.Stopped(by=order.by, why=order.why, since=order.at))
-            detached(self._tidy(order, keeping)).addErrback(self._failed)
+            self._has(order)
+            keeping.addErrback(self._failed)
             return True
         if isinstance(outcome, NotDone):
             self._unsure = order
@@ -134,20 +155,21 @@ class Stopping:
         return False
 
     async def _keep(self, order: StopRecord, actor: Actor, audit: bool) -> None:
-        if self._keeping >= KEEPING:
+        if len(self._keeping) >= KEEPING:
             raise Unavailable(f"{KEEPING} orders to stop {self._robot.name} are being written already")
-        self._keeping += 1
+        self._keeping.append(order)
         try:
             await self._record.ordered(self._robot, order, actor, audit=audit)
         finally:
-            self._keeping -= 1
+            self._keeping.remove(order)
+        if self._pending is None:
+            self._put_away(order)
 
-    async def _tidy(self, order: StopRecord, keeping: Deferred[None] | None = None) -> None:
+    def _has(self, order: StopRecord) -> None:
         """The robot has it: nobody need tell it again."""
+        self._believe(link.Stopped(by=order.by, why=order.why, since=order.at))
         self._over(order)
-        if keeping is not None:
-            await keeping
-        await self._record.told(self._robot, order.at)
+        self._put_away(order)
 
     def _believe(self, stopped: link.Stopped | None) -> None:
         """The robot has done as it was told; how it says so of itself may come a moment later."""
@@ -161,6 +183,34 @@ class Stopping:
         if self._pending is order:
             self._pending = None
             self._changed()
+
+    def _put_away(self, order: StopRecord) -> None:
+        """Have the database tell nobody of an order that is over, a later relay neither; nobody waits for that."""
+        # What is being written is put away when it is there.
+        if order not in self._keeping and order.at not in self._left:
+            self._left.append(order.at)
+            if not self._clearing:
+                self._clearing = True
+                detached(self._clear()).addErrback(self._failed)
+
+    async def _clear(self) -> None:
+        try:
+            while self._left:
+                at = self._left[0]
+                try:
+                    await self._record.told(self._robot, at)
+                except SwitchboardError as error:
+                    robot, reason = self._robot.name, str(error)
+                    self.log.warn(
+                        "a stop of {robot} is over and still kept: {reason}", robot=robot, reason=reason
+                    )
+                    await sleep(self._clock, PUT_AWAY_SECONDS)
+                else:
+                    # It is not there where so many were over meanwhile that the oldest went.
+                    if at in self._left:
+                        self._left.remove(at)
+        finally:
+            self._clearing = False
 
     def _failed(self, failure: Any) -> None:
         """A robot that is told to stop again stands all the same."""
@@ -182,21 +232,33 @@ class Stopping:
         self._under_way -= 1
         return result
 
-    def resume(self, actor: Actor, why: str) -> Deferred[None]:
+    def anew(self) -> None:
+        """The robot is stopped now: nothing that was asked for before lets it move again."""
+        self._latest = self._clock_ns()
+
+    def resume(self, actor: Actor, why: str, sent: int) -> Deferred[None]:
         """Let the robot move again. A stop it was not told of is taken back.
 
-        What comes back fails with :class:`NotDone` or :class:`Unavailable` when the robot has not done it. One that is
+        What comes back fails with :class:`StoppedSince` when it can have been asked for before the robot was last
+        stopped, with :class:`NotDone` or :class:`Unavailable` when the robot has not done it. One that is
         offline keeps what it was told, also where this relay has not seen it since it began.
-        """
-        return detached(self._resume(actor, why[:WHY], self._pending))
 
-    async def _resume(self, actor: Actor, why: str, pending: StopRecord | None) -> None:
+        :param sent: a moment before which it can't have been asked for, the relay's monotonic nanoseconds
+        """
+        return detached(self._resume(actor, why[:WHY], self._pending, sent))
+
+    async def _resume(self, actor: Actor, why: str, pending: StopRecord | None, sent: int) -> None:
         robot = self._robot
-        if robot.control is not None:
+        if sent < self._latest:
+            raise StoppedSince(
+                f"robot {robot.name} was stopped, or may have been, after you asked for this: see why it stands, and "
+                "resume it once more"
+            )
+        told = robot.control is not None
+        if told:
             await self._orders.give(
                 lambda id: link.Resume(id=id, by=actor.name[:255], why=why), seconds=STOP_SECONDS, always=True
             )
-            self._believe(None)
         elif robot.safety.stopped is not None:
             raise Unavailable(
                 f"robot {robot.name} is offline, and stopped: it can be resumed when it is back"
@@ -205,18 +267,32 @@ class Stopping:
             raise Unavailable(
                 f"robot {robot.name} is offline, and may be stopped: it can be resumed when it is back"
             )
-        if pending is not None:
+        else:
             await self._record.told(robot, pending.at)
+        if told:
+            # What the robot has done is done, whatever the database says.
+            self._believe(None)
+        if pending is not None:
             self._over(pending)
         self._record.note("robot.resumed", robot, actor, why)
+        if told and pending is not None:
+            self._put_away(pending)
 
     # --- the robot ----------------------------------------------------------------------------------------
 
-    def expect(self, order: StopRecord | None) -> bool:
-        """What the database says is still to be told; whether that is new."""
-        if order is None or order.at in self._known:
+    def expect(self, order: StopRecord | None, seen: int) -> bool:
+        """What the database says is still to be told; whether that is new.
+
+        :param seen: when it was first read there, the relay's monotonic nanoseconds
+        """
+        if order is None:
+            return False
+        if order.at in self._known:
+            if self._pending is None:
+                self._put_away(order)
             return False
         self._known.append(order.at)
+        self._latest = max(self._latest, seen)
         self._pending = order
         self._changed()
         return True
@@ -245,8 +321,7 @@ class Stopping:
             robot = self._robot.name
             self.log.error("robot {robot} was to be stopped: {reason}", robot=robot, reason=str(outcome))
         if outcome is None:
-            self._believe(link.Stopped(by=order.by, why=order.why, since=order.at))
-            await self._tidy(order)
+            self._has(order)
         elif isinstance(outcome, NotDone):
             self._unsure = order
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from relay_protocol.rights import Operation
+from relay_server.access import Permit
+from relay_server.config import Settings
 from relay_server.control.lease import Client, Lease
 from relay_server.control.record import Actor
 from relay_server.control.stopping import Stopped
@@ -25,6 +28,9 @@ TAKES_A_SECOND = 5.0
 TAKES_AT_ONCE = 20
 """How often a user takes control of a robot or asks for it; each time is put on record."""
 
+REST_SECONDS = 10.0
+"""Who was refused control asks the same holder for it again only after so long."""
+
 USERS = 256
 """Users remembered for each robot; the longest quiet are forgotten first."""
 
@@ -43,6 +49,12 @@ class ControlRules(NamedTuple):
     idle: float = 600.0
     request: float = 60.0
 
+    @classmethod
+    def of(cls, settings: Settings) -> ControlRules:
+        """As an operator has set them."""
+        asked = settings.control_grace, settings.control_idle, settings.control_request
+        return cls(settings.explicit_control, *asked)
+
 
 class Answer(NamedTuple):
     """What becomes of something a client asks for.
@@ -60,6 +72,12 @@ class Standing(NamedTuple):
     lease: Lease
     suppressed: Mapping[str, frozenset[int]]
     stopped: Stopped | None
+
+
+def acts_for(permit: Permit, client: Client) -> bool:
+    """Whether who has this permit may use this connection's control: it is his own, and his token is not for less."""
+    own = client.user == permit.principal.user_id
+    return own and (permit.principal.scope is None or permit.judge(Operation.CONTROL, ROBOT).allowed)
 
 
 def actor_of(client: Client) -> Actor:

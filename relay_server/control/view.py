@@ -12,6 +12,7 @@ from relay_protocol.rights import Level, Operation, Rules
 from relay_server.control.desk import Desk
 from relay_server.control.lease import Client, Request, State, Tenure
 from relay_server.control.terms import ROBOT, Standing
+from relay_server.registry import Presence
 
 
 class Asker:
@@ -77,6 +78,23 @@ def stopped(standing: Standing) -> dict[str, Any] | None:
     return None if found is None else found._asdict()
 
 
+def hands(robot: Presence, rules: Rules | None = None) -> dict[str, list[dict[str, Any]]]:
+    """Who has a hand on topics of a robot without having control of it: who commands, and who keeps quiet.
+
+    :param rules: of who is told, who learns of no topic that he may not use; ``None``: of all
+    """
+    asker = None if rules is None else Asker(rules, lambda client: False)
+
+    def told(facts: Iterable[Suppressed | Inhibited]) -> list[dict[str, Any]]:
+        return [
+            {"resource": each.resource, "by": each.by, "hold": isinstance(each, Inhibited) and each.hold}
+            for each in facts
+            if asker is None or asker.may_know(each.resource)
+        ]
+
+    return {"suppressed": told(robot.safety.suppressed), "inhibited": told(robot.safety.inhibited)}
+
+
 def _holder(tenure: Tenure, asker: Asker) -> dict[str, Any]:
     client = tenure.client
     return {
@@ -84,6 +102,7 @@ def _holder(tenure: Tenure, asker: Asker) -> dict[str, Any]:
         "client": client.number,
         "since": tenure.since,
         "you": asker.mine(client),
+        "implicit": tenure.implicit,
     }
 
 

@@ -15,7 +15,7 @@ from relay_protocol.errors import SwitchboardError
 from relay_server.clock import to_the_end
 from relay_server.console import Halted
 from relay_server.control import reason_in
-from relay_server.edges.fleet import is_stop
+from relay_server.edges.fleet import is_stop, sent_of
 from relay_server.edges.problems import problem_of
 
 
@@ -25,7 +25,7 @@ class Stopping(Protocol):
     async def stop_here(self, robot: str | None, why: str, by: str) -> Halted:
         """Stop a robot, or all."""
 
-    async def resume_here(self, robot: str, why: str, by: str) -> None:
+    async def resume_here(self, robot: str, why: str, by: str, sent: int) -> None:
         """Let one move again."""
 
 
@@ -95,7 +95,9 @@ class AdminSocket:
 
     async def _resume(self, request: Request) -> Any:
         order = jsontext.decode(_order_decoder, request.content.read())
-        await self._stopping.resume_here(order.robot or "", reason_in(order.why), order.by)
+        # Of which nobody says when it was given, it is older than any stop.
+        sent = sent_of(request) or 0
+        await self._stopping.resume_here(order.robot or "", reason_in(order.why), order.by, sent)
         return {}
 
     async def _told(self, request: Request, work: Awaitable[Any]) -> bytes:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 from klein import Klein
+from msgspec import Meta
 from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
 from relay_protocol.errors import Invalid, NotFound
 from relay_server.access import Principal
-from relay_server.alerts import Ask
+from relay_server.alerts import Ask, Position
 from relay_server.edges.api import Api, body_of
+from relay_server.openapi import Answer, Operation, described, query
+from relay_server.openapi.kept import Alert, Alerts, Rule, Rules, Tested
 
 MOST = 500
 _ANSWERS = {"": None, "true": True, "false": False}
@@ -22,9 +25,9 @@ class Desk(Protocol):
     """What is asked about alerts; see :class:`relay_server.alerts.AlertDesk`."""
 
     async def all(
-        self, principal: Principal, robot: str, open: bool | None, limit: int
+        self, principal: Principal, robot: str, open: bool | None, limit: int, before: Position | None
     ) -> list[dict[str, Any]]:
-        """Those the principal may know of."""
+        """Those the principal may know of, the latest first."""
 
     async def acknowledge(self, principal: Principal, alert_id: str) -> dict[str, Any]:
         """The principal looks after one."""
@@ -52,22 +55,59 @@ class AlertPages:
         self._api = api
 
     @app.route("/", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path="/api/v1/alerts",
+            tag="alerts",
+            summary="Alerts, the latest first",
+            parameters=(
+                query("robot", "of this robot only"),
+                query(
+                    "open", "only those that last, or only those that are over", Literal["", "true", "false"]
+                ),
+                query(
+                    "limit",
+                    "most alerts of an answer; 100 where left out",
+                    Annotated[int, Meta(ge=1, le=MOST)],
+                ),
+                query("before", "`next` of an earlier answer: what comes behind that"),
+            ),
+            answers={200: Answer("alerts", Alerts)},
+        )
+    )
     def list(self, request: Request) -> Any:
         return self._api.answer(request, self._list(request))
 
     async def _list(self, request: Request) -> Any:
         principal = await self._api.principal(request)
-        robot, lasts, limit = (_argument(request, name) for name in (b"robot", b"open", b"limit"))
+        names = (b"robot", b"open", b"limit", b"before")
+        robot, lasts, limit, before = (_argument(request, name) for name in names)
         if lasts not in _ANSWERS:
             raise Invalid("'open' is true or false, or left out")
         if limit and not (
             limit.isascii() and limit.isdecimal() and len(limit) <= 9 and 1 <= int(limit) <= MOST
         ):
             raise Invalid(f"'limit' is a number from 1 to {MOST}")
-        found = await self._desk.all(principal, robot, _ANSWERS[lasts], int(limit or 100))
-        return {"alerts": found}
+        most = int(limit or 100)
+        # One more than is told: that there is more shall be told only where there is.
+        found = await self._desk.all(
+            principal, robot, _ANSWERS[lasts], most + 1, Position.parse(before) if before else None
+        )
+        told = found[:most]
+        return {"alerts": told, "next": str(_position(told[-1])) if len(found) > most else None}
 
     @app.route("/<id>/acknowledge", methods=["POST"])
+    @described(
+        Operation(
+            method="POST",
+            path="/api/v1/alerts/{id}/acknowledge",
+            tag="alerts",
+            summary="Look after an alert",
+            more="For operators and owners.",
+            answers={200: Answer("the alert", Alert)},
+        )
+    )
     def acknowledge(self, request: Request, id: str) -> Any:
         return self._api.answer(request, self._acknowledge(request, id))
 
@@ -75,6 +115,15 @@ class AlertPages:
         return await self._desk.acknowledge(await self._api.principal(request), id)
 
     @app.route("/rules", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path="/api/v1/alerts/rules",
+            tag="alerts",
+            summary="The caller's rules, and what a rule may say here",
+            answers={200: Answer("rules", Rules)},
+        )
+    )
     def rules(self, request: Request) -> Any:
         return self._api.answer(request, self._rules(request))
 
@@ -82,6 +131,16 @@ class AlertPages:
         return await self._desk.rules(await self._api.principal(request))
 
     @app.route("/rules", methods=["POST"])
+    @described(
+        Operation(
+            method="POST",
+            path="/api/v1/alerts/rules",
+            tag="alerts",
+            summary="Be told of alerts by one more rule",
+            body=Ask,
+            answers={201: Answer("the rule", Rule)},
+        )
+    )
     def add(self, request: Request) -> Any:
         return self._api.answer(request, self._add(request))
 
@@ -92,6 +151,15 @@ class AlertPages:
         return made
 
     @app.route("/rules/<number>", methods=["DELETE"])
+    @described(
+        Operation(
+            method="DELETE",
+            path="/api/v1/alerts/rules/{number}",
+            tag="alerts",
+            summary="Be told by this rule no more",
+            answers={204: Answer("deleted")},
+        )
+    )
     def remove(self, request: Request, number: str) -> Any:
         return self._api.answer(request, self._remove(request, number))
 
@@ -100,6 +168,15 @@ class AlertPages:
         await self._desk.remove_rule(principal, _number(number), _address(request))
 
     @app.route("/rules/<number>/test", methods=["POST"])
+    @described(
+        Operation(
+            method="POST",
+            path="/api/v1/alerts/rules/{number}/test",
+            tag="alerts",
+            summary="Send a made-up alert now",
+            answers={200: Answer("whether it arrived", Tested)},
+        )
+    )
     def test(self, request: Request, number: str) -> Any:
         return self._api.answer(request, self._test(request, number))
 
@@ -110,6 +187,10 @@ class AlertPages:
     def unrouted(self, request: Request, failure: Any) -> bytes:
         answer: bytes = self._api.unrouted(request, failure)
         return answer
+
+
+def _position(alert: dict[str, Any]) -> Position:
+    return Position(alert["last"], alert["id"])
 
 
 def _argument(request: Request, name: bytes) -> str:

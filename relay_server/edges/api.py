@@ -6,28 +6,32 @@ A cookie that changes state counts only with a listed Origin. Every error is pro
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 from klein import Klein
-from msgspec import Meta
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 from twisted.web.resource import IResource
 from twisted.web.server import Request
-from werkzeug.exceptions import HTTPException
+from werkzeug.exceptions import HTTPException, MethodNotAllowed
 from werkzeug.exceptions import NotFound as NothingHere
+from werkzeug.routing import RequestRedirect
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
-from relay_protocol.limits import NAME, TICKET_SECONDS
+from relay_protocol.limits import TICKET_SECONDS
 from relay_server.access import Principal
 from relay_server.auth import SESSION_SECONDS, BadCredentials, Opening
 from relay_server.clock import Clock, to_the_end
+from relay_server.edges import api_operations as operations
+from relay_server.edges.api_operations import Login, TicketFor
+from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.problems import problem, problem_of
 from relay_server.edges.stream import EventStream, Source
+from relay_server.openapi import described
 from relay_server.origins import Origins
 
 T = TypeVar("T")
@@ -64,22 +68,6 @@ class Desk(Protocol):
         """Call ``listener`` when something about robots may have changed; returns what ends that."""
 
 
-class Login(msgspec.Struct):
-    """Body of ``POST /api/v1/session``: a user with a password, or a code from a login link."""
-
-    user: str = ""
-    password: str = ""
-    code: str = ""
-
-
-class TicketFor(msgspec.Struct, rename={"purpose": "for"}):
-    """Body of ``POST /api/v1/tickets``: for the robot's websocket, or for its cameras, or one of them."""
-
-    robot: str
-    purpose: Literal["robot", "video"] = "robot"
-    camera: Annotated[str, Meta(max_length=NAME)] = ""
-
-
 class Api:
     """The HTTP API as a klein application.
 
@@ -88,6 +76,7 @@ class Api:
     :param events: what else is told to pages, by the name of the event
     :param cookie: name of the session cookie
     :param secure: cookies only over TLS
+    :param limits: how many requests there may be; without them as many as come
     """
 
     log = Logger()
@@ -105,8 +94,10 @@ class Api:
         cookie: str,
         secure: bool,
         events: Mapping[str, Source] | None = None,
+        limits: RequestLimits | None = None,
     ) -> None:
         self._events = {} if events is None else events
+        self._limits = limits or RequestLimits(0.0, clock.seconds)
         self._clock = clock
         self._desk = desk
         self._origins = origins
@@ -118,13 +109,26 @@ class Api:
 
     # --- who asks -----------------------------------------------------------------------------------------
 
-    async def principal(self, request: Request, *, urgent: bool = False) -> Principal:
-        """Who sent this request.
+    async def principal(self, request: Request, *, urgent: bool = False, passes: bool = False) -> Principal:
+        """Who sent this request, which counts as one of his.
 
-        :param urgent: it stops robots
+        :param urgent: it stops robots, or must not keep somebody from it
+        :param passes: it stops something: however many there are, it is served
         :raises BadCredentials: nobody that can be told
         :raises Refused: a cookie that changes state without a listed Origin
+        :raises TooManyRequests: he, or who is not known in his network, has sent too many
         """
+        try:
+            found = await self._proved(request, urgent)
+        except BadCredentials:
+            if not passes:
+                self._limits.of_network(request)
+            raise
+        if not passes:
+            self._limits.of_user(request, found.user_id)
+        return found
+
+    async def _proved(self, request: Request, urgent: bool) -> Principal:
         prove = self._desk.urgent_token if urgent else self._desk.token
         scheme, _, token = (request.getHeader("authorization") or "").partition(" ")
         if scheme.lower() == "bearer":
@@ -137,6 +141,13 @@ class Api:
         if request.method not in (b"GET", b"HEAD"):
             self._origins.check(request.getHeader("origin"), request.getHeader("host") or "")
         return await prove(cookie.decode("ascii", "replace"))
+
+    def base(self, request: Request) -> str:
+        """``scheme://host[:port]`` of the relay, as who asks sees it.
+
+        :raises Invalid: the request does not say
+        """
+        return self._origins.base(request.getHeader("host") or "")
 
     def _set_cookie(self, request: Request, token: str, seconds: float) -> None:
         request.addCookie(
@@ -152,10 +163,12 @@ class Api:
     # --- sessions -----------------------------------------------------------------------------------------
 
     @app.route("/api/v1/session", methods=["POST"])
+    @described(operations.LOGIN)
     def login(self, request: Request) -> Any:
         return self.answer(request, self._login(request))
 
     async def _login(self, request: Request) -> Any:
+        self._limits.of_network(request)
         if request.getHeader("origin") is not None:
             self._origins.check(request.getHeader("origin"), request.getHeader("host") or "")
         body = body_of(request, Login)
@@ -170,13 +183,16 @@ class Api:
         return _me(principal)
 
     @app.route("/api/v1/session", methods=["GET"])
+    @described(operations.SESSION)
     def session(self, request: Request) -> Any:
         return self.answer(request, self._session(request))
 
     async def _session(self, request: Request) -> Any:
-        return _me(await self.principal(request))
+        # By it the portal finds out whether anybody is there to stop robots, also while the database hangs.
+        return _me(await self.principal(request, urgent=True))
 
     @app.route("/api/v1/session", methods=["DELETE"])
+    @described(operations.LOGOUT)
     def logout(self, request: Request) -> Any:
         return self.answer(request, self._logout(request))
 
@@ -188,6 +204,7 @@ class Api:
     # --- robots -------------------------------------------------------------------------------------------
 
     @app.route("/api/v1/robots", methods=["GET"])
+    @described(operations.ROBOTS)
     def robots(self, request: Request) -> Any:
         return self.answer(request, self._robots(request))
 
@@ -195,6 +212,7 @@ class Api:
         return {"robots": await self._desk.robots(await self.principal(request))}
 
     @app.route("/api/v1/robots/stream", methods=["GET"])
+    @described(operations.STREAM)
     def stream(self, request: Request) -> Any:
         return self.answer(request, self._stream(request))
 
@@ -205,6 +223,7 @@ class Api:
         return STREAMED
 
     @app.route("/api/v1/robots/<name>", methods=["GET"])
+    @described(operations.ROBOT)
     def robot(self, request: Request, name: str) -> Any:
         return self.answer(request, self._robot(request, name))
 
@@ -222,7 +241,7 @@ class Api:
         request.postpath = request.postpath or [b""]
         return self._below[part](self, name)
 
-    @app.route("/api/v1/<any(alerts,fleet):part>", branch=True)
+    @app.route("/api/v1/<any(alerts,directory,events,fleet,vocabulary):part>", branch=True)
     def beside(self, request: Request, part: str) -> Any:
         if part not in self._beside:
             raise NothingHere
@@ -230,6 +249,7 @@ class Api:
         return self._beside[part](self)
 
     @app.route("/api/v1/tickets", methods=["POST"])
+    @described(operations.TICKETS)
     def tickets(self, request: Request) -> Any:
         return self.answer(request, self._tickets(request))
 
@@ -246,15 +266,18 @@ class Api:
     # --- operations ---------------------------------------------------------------------------------------
 
     @app.route("/healthz", methods=["GET"])
+    @described(operations.HEALTH)
     def healthz(self, request: Request) -> Any:
         return self.answer(request, self._healthz(request))
 
     async def _healthz(self, request: Request) -> Any:
+        self._limits.of_network(request)
         if not await self._desk.healthy():
             raise Unavailable("the database does not answer; what is open goes on, new logins fail")
         return {"status": "ok"}
 
     @app.route("/metrics", methods=["GET"])
+    @described(operations.METRICS)
     def metrics(self, request: Request) -> Any:
         return self.answer(request, self._show_metrics(request))
 
@@ -302,7 +325,12 @@ class Api:
     @app.handle_errors(HTTPException)
     def unrouted(self, request: Request, failure: Any) -> bytes:
         """There is nothing here, or not by this method."""
-        error = failure.value
+        error: Any = failure.value
+        if isinstance(error, RequestRedirect):
+            # To what the same address would be without a slash too many: nobody is sent about.
+            error = NothingHere()
+        if isinstance(error, MethodNotAllowed) and error.valid_methods:
+            request.setHeader("allow", ", ".join(sorted(error.valid_methods)))
         details = {404: "There is nothing at this address.", 405: "This address does not take that method."}
         status = error.code or 500
         return problem(request, status, details.get(status, "The request can't be served."))

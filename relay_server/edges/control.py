@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable
 from typing import Annotated, Any, Protocol, TypeVar
 
 import msgspec
@@ -20,6 +21,10 @@ from relay_server.console import Outcome
 from relay_server.control import Answer, NotDone, reason_of
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.problems import problem
+from relay_server.moments import HEADER, Moments
+from relay_server.openapi import PROBLEM, Operation, described, header
+from relay_server.openapi import Answer as Told
+from relay_server.openapi.answers import Control, ControlAnswer, StopAnswer, StopProblem
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -34,6 +39,16 @@ class Why(msgspec.Struct):
     """Body of what takes a reason and no more."""
 
     why: ReasonText = ""
+
+
+class Reply(msgspec.Struct):
+    """Body of an answer to a request; without ``client`` to that of whoever asks now.
+
+    :param client: the number of the connection that asks
+    """
+
+    why: ReasonText = ""
+    client: Annotated[int, Meta(ge=0, lt=1 << 32)] = 0
 
 
 class Suppress(msgspec.Struct):
@@ -51,6 +66,77 @@ class Inhibit(msgspec.Struct):
     hold: bool = False
 
 
+ROBOT = "/api/v1/robots/{robot}"
+
+CHANGES = {
+    "release": "Give control back, or a request for it",
+    "grant": "Hand control over to who asks for it",
+    "refuse": "Keep control",
+}
+
+
+def _change_of(what: str, words: str) -> Operation:
+    return Operation(
+        method="POST",
+        path=f"{ROBOT}/control/{what}",
+        tag="control",
+        summary=words,
+        more="For all connections of the caller.",
+        body=Why if what == "release" else Reply,
+        optional=True,
+        answers={200: Told("what became of it", ControlAnswer)},
+    )
+
+
+_DATED = {HEADER: "when this was answered; who resumes the robot gives it back"}
+
+STOP = Operation(
+    method="POST",
+    path=f"{ROBOT}/stop",
+    tag="control",
+    summary="Stop a robot",
+    more="For everybody with a right on it. No stop is refused for its reason, nor for how many there are.",
+    body=Why,
+    optional=True,
+    answers={
+        200: Told("it is stopped", StopAnswer, headers=_DATED),
+        202: Told("it will be as soon as it can be reached", StopAnswer, headers=_DATED),
+    },
+    problems={409: Told("it is stopped, but for what is told", StopProblem, media=(PROBLEM,))},
+)
+RESUME = Operation(
+    method="POST",
+    path=f"{ROBOT}/resume",
+    tag="control",
+    summary="Let a robot move again",
+    more="For who holds control, and for owners: 412 (`stopped_since`) where the robot may have been stopped after the "
+    "moment that is given back, 428 without one.",
+    parameters=(header(HEADER, "that of the latest answer about the robot's control"),),
+    body=Why,
+    optional=True,
+    answers={200: Told("it may move", StopAnswer, headers=_DATED)},
+    errors=(409, 412, 428),
+)
+SUPPRESS = Operation(
+    method="POST",
+    path=f"{ROBOT}/suppress",
+    tag="control",
+    summary="Command a topic for moments",
+    body=Suppress,
+    answers={200: Told("as it was asked", Suppress)},
+    errors=(409,),
+)
+INHIBIT = Operation(
+    method="POST",
+    path=f"{ROBOT}/inhibit",
+    tag="control",
+    summary="Have a topic say nothing for a time",
+    body=Inhibit,
+    answers={200: Told("as it was asked", Inhibit)},
+    errors=(409,),
+)
+
+
 class Desk(Protocol):
     """What is asked about control; see :class:`relay_server.console.Console`."""
 
@@ -60,16 +146,16 @@ class Desk(Protocol):
     async def release(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
         """Give control back."""
 
-    async def grant(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+    async def grant(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
         """Hand it over."""
 
-    async def refuse(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+    async def refuse(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
         """Keep it."""
 
     async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
         """Stop the robot."""
 
-    async def resume(self, principal: Principal, robot: str, why: str, address: str) -> None:
+    async def resume(self, principal: Principal, robot: str, why: str, address: str, sent: int) -> None:
         """Let it move again."""
 
     async def suppress(self, principal: Principal, robot: str, resource: str, ms: int, address: str) -> None:
@@ -89,31 +175,49 @@ class RobotControl:
 
     app = Klein()
 
-    def __init__(self, desk: Desk, part: str, api: Api, robot: str) -> None:
+    def __init__(self, desk: Desk, moments: Moments, part: str, api: Api, robot: str) -> None:
         self._desk = desk
+        self._moments = moments
         self._part = part
         self._api = api
         self._robot = robot
 
     @app.route("/", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path=f"{ROBOT}/control",
+            tag="control",
+            summary="Who moves a robot",
+            more="Control is taken by a websocket's connection alone.",
+            answers={200: Told("who does", Control, headers=_DATED)},
+        )
+    )
     def control(self, request: Request) -> Any:
         self._only("control")
-        return self._api.answer(request, self._control(request))
+        return self._answer(request, self._control(request))
 
     async def _control(self, request: Request) -> Any:
         return await self._desk.control(*await self._asked(request))
 
     @app.route("/<any(release,grant,refuse):what>", methods=["POST"])
+    @described(*(_change_of(what, words) for what, words in CHANGES.items()))
     def change(self, request: Request, what: str) -> Any:
         self._only("control")
         return self._api.answer(request, self._change(request, what))
 
     async def _change(self, request: Request, what: str) -> Any:
         principal, robot, address = await self._asked(request)
-        do = {"release": self._desk.release, "grant": self._desk.grant, "refuse": self._desk.refuse}[what]
-        return (await do(principal, robot, _body(request, Why).why, address))._asdict()
+        if what == "release":
+            done = await self._desk.release(principal, robot, _body(request, Why).why, address)
+        else:
+            reply = _body(request, Reply)
+            do = self._desk.grant if what == "grant" else self._desk.refuse
+            done = await do(principal, robot, reply.why, address, reply.client)
+        return done._asdict()
 
     @app.route("/", methods=["POST"])
+    @described(STOP, RESUME, SUPPRESS, INHIBIT)
     def order(self, request: Request) -> Any:
         self._only("stop", "resume", "suppress", "inhibit")
         orders = {
@@ -123,13 +227,14 @@ class RobotControl:
             "inhibit": self._inhibit,
         }
         # Who stops a robot and leaves has it stopped all the same.
-        return self._api.answer(request, orders[self._part](request), lasts=self._part == "stop")
+        return self._answer(request, orders[self._part](request), lasts=self._part == "stop")
 
     async def _stop(self, request: Request) -> Any:
         why = _reason(request)
-        principal, robot, address = await self._asked(request, urgent=True)
+        principal, robot, address = await self._asked(request, stops=True)
         outcome = await self._desk.stop(principal, robot, why, address)
         if outcome.failed:
+            request.setHeader(HEADER, self._moments.now())
             request.write(problem(request, 409, outcome.failed, code=NotDone.code, stopped=outcome.stopped))
             return STREAMED
         if not outcome.done:
@@ -138,7 +243,8 @@ class RobotControl:
 
     async def _resume(self, request: Request) -> Any:
         principal, robot, address = await self._asked(request)
-        await self._desk.resume(principal, robot, _body(request, Why).why, address)
+        sent = self._moments.needed(request.getHeader(HEADER))
+        await self._desk.resume(principal, robot, _body(request, Why).why, address, sent)
         return {"stopped": None}
 
     async def _suppress(self, request: Request) -> Any:
@@ -153,13 +259,24 @@ class RobotControl:
         await self._desk.inhibit(principal, robot, ask.resource, ask.ms, ask.hold, address)
         return msgspec.to_builtins(ask)
 
+    def _answer(self, request: Request, work: Awaitable[Any], *, lasts: bool = False) -> Any:
+        """Answer with the moment at which that is done; see :meth:`relay_server.edges.api.Api.answer`."""
+
+        async def dated() -> Any:
+            try:
+                return await work
+            finally:
+                request.setHeader(HEADER, self._moments.now())
+
+        return self._api.answer(request, dated(), lasts=lasts)
+
     def _only(self, *parts: str) -> None:
         if self._part not in parts:
             raise NothingHere
 
-    async def _asked(self, request: Request, *, urgent: bool = False) -> tuple[Principal, str, str]:
+    async def _asked(self, request: Request, *, stops: bool = False) -> tuple[Principal, str, str]:
         """Who asks, about which robot, from where."""
-        principal = await self._api.principal(request, urgent=urgent)
+        principal = await self._api.principal(request, urgent=stops, passes=stops)
         return principal, self._robot, getattr(request.getClientAddress(), "host", "local")
 
     @app.handle_errors(HTTPException)
@@ -185,7 +302,7 @@ def _reason(request: Request) -> str:
     return reason_of(said.get("why")) if isinstance(said, dict) else ""
 
 
-def below(desk: Desk, part: str, api: Api, robot: str) -> IResource:
+def below(desk: Desk, moments: Moments, part: str, api: Api, robot: str) -> IResource:
     """What serves one of the addresses below a robot's."""
-    resource: IResource = RobotControl(desk, part, api, robot).app.resource()
+    resource: IResource = RobotControl(desk, moments, part, api, robot).app.resource()
     return resource

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, Protocol
 
 from klein import Klein
@@ -16,7 +16,16 @@ from relay_protocol.errors import SwitchboardError
 from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
-from relay_server.fleet import LOCAL, Order, Plan, Result
+from relay_server.fleet import LOCAL, Order, Plan, Result, StopOrder
+from relay_server.moments import HEADER, Moments
+from relay_server.openapi import Answer, Operation, described, header
+from relay_server.openapi.told import Groups
+
+SENT_HEADER = "switchboard-sent"
+"""Of requests on the local socket: when they were sent, nanoseconds of the machine's clock."""
+
+_DIGITS = 20
+_DATED = {HEADER: "when this was answered; what moves robots gives it back"}
 
 STALL_SECONDS = 30.0
 """Who takes nothing of the answer for so long is cut, and the order with him."""
@@ -28,7 +37,7 @@ class Desk(Protocol):
     async def groups(self, asker: Principal) -> list[dict[str, Any]]:
         """Groups of robots."""
 
-    async def plan(self, asker: Principal, order: Order, address: str) -> Plan:
+    async def plan(self, asker: Principal, order: Order, address: str, sent: int | None = None) -> Plan:
         """Which robots an order means."""
 
     async def carry_out(
@@ -42,28 +51,68 @@ class FleetApi:
 
     app = Klein()
 
-    def __init__(self, clock: Clock, desk: Desk, api: Api) -> None:
+    def __init__(self, clock: Clock, desk: Desk, moments: Moments, api: Api) -> None:
         self._clock = clock
         self._desk = desk
+        self._moments = moments
         self._api = api
 
     @app.route("/", methods=["POST"])
+    @described(
+        Operation(
+            method="POST",
+            path="/api/v1/fleet",
+            tag="fleet",
+            summary="One order to many robots",
+            more="The answer is an object a line: what is meant, what became of it on each robot, and a last one with "
+            "`done`. A stop is never one order too many, and goes on when the client leaves.",
+            parameters=(
+                header(
+                    HEADER, "that of the latest answer here, for what moves robots or lets them move again"
+                ),
+            ),
+            body=Order,
+            answers={200: Answer("lines", media=("application/x-ndjson",), headers=_DATED)},
+            errors=(404, 412, 428),
+        )
+    )
     def order(self, request: Request) -> Any:
-        return self._api.answer(request, self._order(request), lasts=is_stop(request))
+        return self._answer(request, self._order(request), lasts=is_stop(request))
 
     async def _order(self, request: Request) -> Any:
-        order = body_of(request, Order)
+        order = _order_of(request)
         # Whatever is ordered: rights are judged anew when a robot has its turn.
-        principal = await self._api.principal(request, urgent=True)
+        principal = await self._api.principal(request, urgent=True, passes=order.do == "stop")
         address = getattr(request.getClientAddress(), "host", "local")
-        return await _carry_out(self._clock, self._desk, request, order, principal, address)
+        sent = None if order.do == "stop" else self._moments.read(request.getHeader(HEADER))
+        # Before anything is sent on: the lines of the answer come with it.
+        request.setHeader(HEADER, self._moments.now())
+        return await _carry_out(self._clock, self._desk, request, order, principal, address, sent)
 
     @app.route("/groups", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path="/api/v1/fleet/groups",
+            tag="fleet",
+            summary="Groups of robots",
+            answers={200: Answer("groups", Groups, headers=_DATED)},
+        )
+    )
     def groups(self, request: Request) -> Any:
-        return self._api.answer(request, self._groups(request))
+        return self._answer(request, self._groups(request))
 
     async def _groups(self, request: Request) -> Any:
         return {"groups": await self._desk.groups(await self._api.principal(request))}
+
+    def _answer(self, request: Request, work: Awaitable[Any], *, lasts: bool = False) -> Any:
+        async def dated() -> Any:
+            try:
+                return await work
+            finally:
+                request.setHeader(HEADER, self._moments.now())
+
+        return self._api.answer(request, dated(), lasts=lasts)
 
     @app.handle_errors(HTTPException)
     def unrouted(self, request: Request, failure: Any) -> bytes:
@@ -71,9 +120,9 @@ class FleetApi:
         return answer
 
 
-def beside(clock: Clock, desk: Desk, api: Api) -> IResource:
+def beside(clock: Clock, desk: Desk, moments: Moments, api: Api) -> IResource:
     """What serves the addresses of orders to many robots."""
-    resource: IResource = FleetApi(clock, desk, api).app.resource()
+    resource: IResource = FleetApi(clock, desk, moments, api).app.resource()
     return resource
 
 
@@ -82,7 +131,24 @@ async def local(clock: Clock, desk: Desk, request: Request) -> Any:
 
     :raises SwitchboardError: it can't be begun, in words
     """
-    return await _carry_out(clock, desk, request, body_of(request, Order), LOCAL, "local")
+    return await _carry_out(clock, desk, request, _order_of(request), LOCAL, "local", sent_of(request))
+
+
+def sent_of(request: Request) -> int | None:
+    """When a request of the relay's own machine was sent, by the clock that both read, nanoseconds; ``None`` if it does
+    not say. Nobody but the relay's own user comes here: he is believed.
+    """
+    said = request.getHeader(SENT_HEADER) or ""
+    return int(said) if len(said) <= _DIGITS and said.isascii() and said.isdigit() else None
+
+
+def _order_of(request: Request) -> Order:
+    """The order that a request brings.
+
+    :raises Invalid: its body is not said to be JSON
+    :raises MalformedMessage: it is no order
+    """
+    return body_of(request, StopOrder).order if is_stop(request) else body_of(request, Order)
 
 
 def is_stop(request: Request) -> bool:
@@ -97,10 +163,13 @@ def is_stop(request: Request) -> bool:
 
 
 async def _carry_out(
-    clock: Clock, desk: Desk, request: Request, order: Order, asker: Principal, address: str
+    clock: Clock, desk: Desk, request: Request, order: Order, asker: Principal, address: str, sent: int | None
 ) -> Any:
-    """Carry out an order, and tell of it line by line as long as somebody listens."""
-    plan = await desk.plan(asker, order, address)
+    """Carry out an order, and tell of it line by line as long as somebody listens.
+
+    :param sent: as for :meth:`relay_server.fleet.FleetDesk.plan`
+    """
+    plan = await desk.plan(asker, order, address, sent)
     lines = _Lines(clock, request, plan)
     try:
         await desk.carry_out(plan, lines.begin, lines.tell)

@@ -13,6 +13,7 @@ from relay_server.auth import Opening
 from relay_server.frontdesk import Admission, GoingDown
 from relay_server.outbox import Outbox
 from relay_server.session import ClientTransport
+from relay_server.video import NotMade
 
 HANDSHAKE_STATUS = {
     closing.INVALID: 400,
@@ -119,6 +120,8 @@ def code_of(error: SwitchboardError) -> int:
         return closing.NOT_FOUND
     if isinstance(error, GoingDown):
         return closing.GOING_AWAY
+    if isinstance(error, NotMade):
+        return closing.NOT_MADE
     if isinstance(error, Unavailable):
         return closing.UNAVAILABLE
     return closing.FORBIDDEN

@@ -11,6 +11,8 @@ from werkzeug.exceptions import HTTPException
 
 from relay_server.access import Principal
 from relay_server.edges.api import Api
+from relay_server.openapi import Answer, Operation, described
+from relay_server.openapi.answers import People
 
 
 class Desk(Protocol):
@@ -31,6 +33,15 @@ class RobotPeople:
         self._robot = robot
 
     @app.route("/", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path="/api/v1/robots/{robot}/people",
+            tag="robots",
+            summary="Who is at a robot, and how good its link is",
+            answers={200: Answer("people", People)},
+        )
+    )
     def people(self, request: Request) -> Any:
         return self._api.answer(request, self._people(request))
 

@@ -6,11 +6,25 @@ from typing import Any
 
 from twisted.web.server import Request
 
+from relay_db.queries import NoRoom, Taken
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, Refused, SwitchboardError, Unavailable
 from relay_server.alerts.desk import TooOften as TooManyRules
 from relay_server.auth import BadCredentials, TooManyTries
-from relay_server.control import NotDone
+from relay_server.control import NotDone, StoppedSince
+from relay_server.directory.desk import MatchNeeded, TooManyChanges
+from relay_server.directory.entries import TooLarge
+from relay_server.edges.limiting import TooManyRequests
+from relay_server.inside import MaybeDone
+from relay_server.memory import Full
+from relay_server.resources import (
+    KeyReused,
+    MomentNeeded,
+    NotAcceptable,
+    NotAsBefore,
+    TooOld,
+    UnknownForm,
+)
 from relay_server.video import NothingCame, TooOften
 
 _TITLES = {
@@ -19,11 +33,15 @@ _TITLES = {
     403: "Refused",
     404: "Not found",
     405: "Method not allowed",
+    406: "Not acceptable",
     409: "Not done",
+    412: "Precondition failed",
     413: "Too large",
     415: "Unsupported media type",
     416: "Range not satisfiable",
+    422: "Unprocessable content",
     426: "Upgrade required",
+    428: "Precondition required",
     429: "Too many requests",
     500: "Internal error",
     503: "Unavailable",
@@ -33,11 +51,25 @@ _TITLES = {
 _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (BadCredentials, 401),
     (TooManyTries, 429),
+    (TooManyRequests, 429),
     (NotFound, 404),
+    (MomentNeeded, 428),
+    (MatchNeeded, 428),
+    (Taken, 409),
+    (NoRoom, 409),
+    (TooManyChanges, 429),
+    (TooLarge, 413),
+    (TooOld, 412),
+    (StoppedSince, 412),
+    (NotAsBefore, 412),
+    (KeyReused, 422),
+    (NotAcceptable, 406),
+    (UnknownForm, 415),
     (Refused, 403),
     (Invalid, 400),
     (MalformedMessage, 400),
     (NotDone, 409),
+    (MaybeDone, 409),
     (NothingCame, 504),
     (TooOften, 429),
     (TooManyRules, 429),
@@ -50,16 +82,27 @@ def problem(request: Request, status: int, detail: str, **more: Any) -> bytes:
     request.setResponseCode(status)
     request.setHeader(b"content-type", b"application/problem+json")
     request.setHeader(b"cache-control", b"no-store")
+    return problem_body(status, detail, **more)
+
+
+def problem_body(status: int, detail: str, **more: Any) -> bytes:
+    """The body of such an answer."""
     title = _TITLES.get(status, "Error")
-    body = {"type": "about:blank", "title": title, "status": status, "detail": detail, **more}
-    return jsontext.encode(body)
+    return jsontext.encode(
+        {"type": "about:blank", "title": title, "status": status, "detail": detail, **more}
+    )
 
 
 def problem_of(request: Request, error: SwitchboardError) -> bytes:
     """The same for an error of ours, with what its status wants to be said beside."""
-    if isinstance(error, (TooManyTries, TooOften, TooManyRules)):
+    if isinstance(error, (TooManyTries, TooManyRequests, TooOften, TooManyRules, TooManyChanges, Full)):
         request.setHeader(b"retry-after", str(int(error.retry_after) + 1).encode())
     if isinstance(error, BadCredentials):
         request.setHeader(b"www-authenticate", b"Bearer")
     status = next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
-    return problem(request, status, str(error), code=error.code)
+    more: dict[str, Any] = {}
+    if isinstance(error, (NotAcceptable, UnknownForm)):
+        more["available"] = error.available
+    if isinstance(error, MaybeDone):
+        more["title"] = "Perhaps done"
+    return problem(request, status, str(error), code=error.code, **more)

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 from klein import Klein
-from twisted.internet.defer import Deferred
+from msgspec import Meta
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import Logger
 from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
+from relay_protocol.errors import Invalid, Unavailable
 from relay_protocol.limits import KIB
 from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.problems import problem
 from relay_server.edges.ranges import Part, part_of
-from relay_server.recording import Ask
+from relay_server.openapi import Answer, Operation, described, header, query
+from relay_server.openapi.kept import Recordable, Recording, RecordingPage
+from relay_server.recording import PAGE, PAGE_MOST, Ask
 
 PART_BYTES = 256 * KIB
 """Read from the disk at a time. No more of a file is in memory than this and what the transport holds."""
@@ -60,8 +65,10 @@ class Desk(Protocol):
     async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
         """What could be recorded now."""
 
-    async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
-        """Those the principal may have."""
+    async def all(
+        self, principal: Principal, robot: str, address: str, limit: int, before: str
+    ) -> dict[str, Any]:
+        """Those the principal may have, a page of them."""
 
     async def one(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
         """One of them."""
@@ -76,6 +83,11 @@ class Desk(Protocol):
         """The file of one."""
 
 
+PATH = "/api/v1/robots/{robot}/recordings"
+FILE = "application/octet-stream"
+_TAG = {"ETag": "names this content"}
+
+
 class RobotRecordings:
     """The recordings of one robot, for one request."""
 
@@ -88,13 +100,46 @@ class RobotRecordings:
         self._robot = robot
 
     @app.route("/", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path=PATH,
+            tag="recordings",
+            summary="Recordings of a robot, the latest first",
+            parameters=(
+                query(
+                    "limit",
+                    f"most of an answer; {PAGE} where left out",
+                    Annotated[int, Meta(ge=1, le=PAGE_MOST)],
+                ),
+                query("before", "`next` of an earlier answer: what comes behind that"),
+            ),
+            answers={200: Answer("recordings", RecordingPage)},
+        )
+    )
     def list(self, request: Request) -> Any:
         return self._api.answer(request, self._list(request))
 
     async def _list(self, request: Request) -> Any:
-        return {"recordings": await self._desk.all(*await self._asked(request))}
+        asked = await self._asked(request)
+        limit, before = _argument(request, b"limit"), _argument(request, b"before")
+        if limit and not (
+            limit.isascii() and limit.isdecimal() and len(limit) <= 9 and 1 <= int(limit) <= PAGE_MOST
+        ):
+            raise Invalid(f"'limit' is a number from 1 to {PAGE_MOST}")
+        return await self._desk.all(*asked, int(limit or PAGE), before)
 
     @app.route("/", methods=["POST"])
+    @described(
+        Operation(
+            method="POST",
+            path=PATH,
+            tag="recordings",
+            summary="Begin a recording",
+            body=Ask,
+            answers={201: Answer("the recording", Recording, headers={"Location": "its address"})},
+        )
+    )
     def start(self, request: Request) -> Any:
         return self._api.answer(request, self._start(request))
 
@@ -106,6 +151,15 @@ class RobotRecordings:
         return begun
 
     @app.route("/new", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path=f"{PATH}/new",
+            tag="recordings",
+            summary="What could be recorded now",
+            answers={200: Answer("topics and cameras", Recordable)},
+        )
+    )
     def possible(self, request: Request) -> Any:
         return self._api.answer(request, self._possible(request))
 
@@ -113,6 +167,15 @@ class RobotRecordings:
         return await self._desk.possible(*await self._asked(request))
 
     @app.route("/<id>", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path=f"{PATH}/{{id}}",
+            tag="recordings",
+            summary="One recording",
+            answers={200: Answer("the recording", Recording)},
+        )
+    )
     def one(self, request: Request, id: str) -> Any:
         return self._api.answer(request, self._one(request, id))
 
@@ -121,6 +184,16 @@ class RobotRecordings:
         return await self._desk.one(principal, robot, id, address)
 
     @app.route("/<id>", methods=["DELETE"])
+    @described(
+        Operation(
+            method="DELETE",
+            path=f"{PATH}/{{id}}",
+            tag="recordings",
+            summary="Delete a recording",
+            more="For who began it, and for owners.",
+            answers={204: Answer("deleted")},
+        )
+    )
     def delete(self, request: Request, id: str) -> Any:
         return self._api.answer(request, self._delete(request, id))
 
@@ -129,14 +202,42 @@ class RobotRecordings:
         await self._desk.delete(principal, robot, id, address)
 
     @app.route("/<id>/stop", methods=["POST"])
+    @described(
+        Operation(
+            method="POST",
+            path=f"{PATH}/{{id}}/stop",
+            tag="recordings",
+            summary="Finish a recording",
+            more="For who began it, and for owners.",
+            answers={200: Answer("the recording", Recording)},
+        )
+    )
     def stop(self, request: Request, id: str) -> Any:
         return self._api.answer(request, self._stop(request, id))
 
     async def _stop(self, request: Request, id: str) -> Any:
-        principal, robot, address = await self._asked(request)
+        principal, robot, address = await self._asked(request, stops=True)
         return await self._desk.stop(principal, robot, id, address)
 
     @app.route("/<id>/file", methods=["GET"])
+    @described(
+        Operation(
+            method="GET",
+            path=f"{PATH}/{{id}}/file",
+            tag="recordings",
+            summary="The file of a recording (MCAP)",
+            parameters=(
+                header("Range", "one part of it, in bytes"),
+                header("If-Range", "the `ETag` it should have"),
+            ),
+            answers={
+                200: Answer("the file", media=(FILE,), headers=_TAG),
+                206: Answer("a part of it", media=(FILE,), headers=_TAG),
+            },
+            errors=(416,),
+            lasts="It may be as large as a disk, and comes as fast as it is taken.",
+        )
+    )
     def file(self, request: Request, id: str) -> Any:
         return self._api.answer(request, self._file(request, id))
 
@@ -166,13 +267,13 @@ class RobotRecordings:
             request.setHeader(b"content-range", part.content_range(file.size).encode())
         request.setHeader(b"accept-ranges", b"bytes")
         request.setHeader(b"etag", tag.encode())
-        request.setHeader(b"content-type", b"application/octet-stream")
+        request.setHeader(b"content-type", FILE.encode())
         request.setHeader(b"content-length", str(part.stop - part.start).encode())
         request.setHeader(b"content-disposition", f'attachment; filename="{file.name}"'.encode())
 
-    async def _asked(self, request: Request) -> tuple[Principal, str, str]:
+    async def _asked(self, request: Request, *, stops: bool = False) -> tuple[Principal, str, str]:
         """Who asks, about which robot, from where."""
-        principal = await self._api.principal(request)
+        principal = await self._api.principal(request, passes=stops)
         return principal, self._robot, getattr(request.getClientAddress(), "host", "local")
 
     @app.handle_errors(HTTPException)
@@ -182,7 +283,13 @@ class RobotRecordings:
 
 
 class _Sending:
-    """A file on its way out, no faster than it is taken: Twisted's push producer."""
+    """A file on its way out, no faster than it is taken: Twisted's push producer.
+
+    What was promised and can't be sent ends the connection: a client must see that it has not got all, and nothing
+    else may stand where the file should go on.
+    """
+
+    log = Logger()
 
     def __init__(self, clock: Clock, request: Request, file: File, part: Part) -> None:
         self._clock = clock
@@ -198,24 +305,37 @@ class _Sending:
         file.watch(lambda reason: self._cut())
         request.registerProducer(self, True)
         try:
-            offset, stop = self._part.start, self._part.stop
-            while offset < stop and not request._disconnected:
-                if self._paused:
-                    await self._room()
-                    continue
-                try:
-                    part = await file.part(offset, min(PART_BYTES, stop - offset))
-                except OSError:
-                    part = b""
-                if not part:
-                    # What was promised can't be sent: the client must see that it has not got all.
-                    self._cut()
-                    return
-                offset += len(part)
-                if not request._disconnected:
-                    request.write(part)
+            await self._send()
+        except (OSError, Unavailable):
+            self._cut()
+        except CancelledError:
+            # The client has left.
+            raise
+        except Exception:
+            self.log.failure("sending {name} failed", name=file.name)
+            self._cut()
         finally:
             request.unregisterProducer()
+
+    async def _send(self) -> None:
+        """Send all.
+
+        :raises OSError: it can't be read
+        :raises Unavailable: too much is read at once
+        """
+        request = self._request
+        offset, stop = self._part.start, self._part.stop
+        while offset < stop and not request._disconnected:
+            if self._paused:
+                await self._room()
+                continue
+            part = await self._file.part(offset, min(PART_BYTES, stop - offset))
+            if not part:
+                self._cut()
+                return
+            offset += len(part)
+            if not request._disconnected:
+                request.write(part)
 
     def pauseProducing(self) -> None:
         """The transport's buffer is full."""
@@ -242,6 +362,11 @@ class _Sending:
     def _cut(self) -> None:
         if not self._request._disconnected:
             self._request.transport.abortConnection()
+
+
+def _argument(request: Request, name: bytes) -> str:
+    values = request.args.get(name, [b""])
+    return str(values[0].decode("utf-8", "replace"))
 
 
 def below(clock: Clock, desk: Desk, api: Api, robot: str) -> IResource:

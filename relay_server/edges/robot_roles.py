@@ -185,7 +185,7 @@ class Opening(Role):
         connection = self._connection
         stream = self._hall.videos.redeem(message.ticket)
         if stream is not None:
-            self._joined(stream.name, VideoEnd(stream, connection), limits.PICTURE_FRAME)
+            self._joined(stream.name, VideoEnd(stream, connection, self._hall.seconds), limits.PICTURE_FRAME)
             stream.joined(connection)
             return
         try:

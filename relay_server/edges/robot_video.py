@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage
 from relay_protocol.frames import SAMPLE_HEAD, PictureJoiner, PicturePart, SampleFrame, VideoFrame
+from relay_protocol.limits import KIB
+from relay_server.bucket import TokenBucket
 from relay_server.edges.robots import RobotConnection, Role
 from relay_server.video import Stream
 
+LEAST_PART = KIB
+"""Bytes of a part of a picture, at least, but of the last and now and then of the first: each is answered."""
+
+QUESTIONS_A_SECOND = 1.0
+QUESTIONS_AT_ONCE = 8
+"""First parts that may be smaller: a robot measures the round trip by one, every few seconds."""
+
 
 class VideoEnd(Role):
-    """The robot's end of a stream."""
+    """The robot's end of a stream.
 
-    def __init__(self, stream: Stream, connection: RobotConnection) -> None:
+    :param seconds: a monotonic clock
+    """
+
+    def __init__(self, stream: Stream, connection: RobotConnection, seconds: Callable[[], float]) -> None:
         self._stream = stream
+        self._questions = TokenBucket(QUESTIONS_A_SECOND, QUESTIONS_AT_ONCE, seconds)
         self._connection = connection
         self._parts = PictureJoiner(limits.PICTURE_FRAME - SAMPLE_HEAD)
 
@@ -39,10 +54,14 @@ class VideoEnd(Role):
             self._parts.drop()
             self._stream.picture(frame)
             return
+        last = frame.offset + len(frame.body) >= frame.total
+        if len(frame.body) < LEAST_PART and not last and (frame.offset or not self._questions.take()):
+            raise MalformedMessage(f"parts of a picture have at least {LEAST_PART} bytes, but for the last")
         whole = self._parts.join(frame)
         if whole is not None:
             self._stream.picture(whole)
         else:
+            self._stream.part()
             self._connection.send(link.Took(number=frame.number, upto=self._parts.size))
 
     def lost(self, reason: str) -> None:

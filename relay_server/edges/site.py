@@ -8,14 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from twisted.logger import Logger
+from twisted.python.failure import Failure
 from twisted.web.http import HTTPChannel
 from twisted.web.resource import IResource, Resource
 from twisted.web.server import Request, Site
+from werkzeug.exceptions import HTTPException
 
 from relay_protocol import jsontext, limits
 from relay_server.clock import Timer, cancel
 from relay_server.edges.caps import AddressCap
-from relay_server.edges.problems import problem
+from relay_server.edges.problems import problem, problem_body
+from relay_server.openapi import Answer, Credential, Operation, described
+from relay_server.openapi.answers import About
 
 BODY_BYTES = limits.UNPROVEN_BYTES
 IDLE_SECONDS = 60.0
@@ -34,6 +38,10 @@ SECURITY_HEADERS = {
     b"cross-origin-resource-policy": b"same-origin",
 }
 HSTS = b"max-age=31536000"
+
+DOCUMENTS = (b"/api/openapi.json", b"/api/docs")
+ROUTED = (b"api", b"oauth", b"healthz", b"metrics")
+"""First parts of addresses that klein has routes for."""
 
 
 class DeadlineChannel(HTTPChannel):
@@ -75,13 +83,18 @@ class DeadlineChannel(HTTPChannel):
         """Answer whatever is being sent here with a status and words, and end the connection."""
         self._stop_deadline()
         self.log.info("a request from {address} is refused: {reason}", address=self._address, reason=reason)
-        body = reason.encode() + b"\n"
+        number, _, title = status.decode().partition(" ")
+        body = problem_body(int(number), reason, title=title)
         self.transport.write(
-            b"HTTP/1.1 %b\r\n%bContent-Type: text/plain; charset=utf-8\r\nContent-Length: %d\r\n"
+            b"HTTP/1.1 %b\r\n%bContent-Type: application/problem+json\r\nContent-Length: %d\r\n"
             b"Connection: close\r\n\r\n%b" % (status, headers, len(body), body)
         )
         self.transport.loseConnection()
         self._deadline = self.site.reactor.callLater(CLOSE_SECONDS, self._idle)
+
+    def _respondToBadRequestAndDisconnect(self) -> None:
+        # Twisted would say no word.
+        self.refuse(b"400 Bad Request", "this is no request of HTTP/1.1 (RFC 9112)")
 
     def _start_deadline(self, seconds: float, late: Callable[[], None]) -> None:
         self._stop_deadline()
@@ -105,6 +118,8 @@ class DeadlineChannel(HTTPChannel):
 class BoundedRequest(Request):
     """A request whose body may not grow beyond :data:`BODY_BYTES`, announced or not."""
 
+    log = Logger()
+
     def gotLength(self, length: int | None) -> None:
         if length is not None and length > BODY_BYTES:
             self._too_big()
@@ -117,10 +132,34 @@ class BoundedRequest(Request):
             return
         super().handleContentChunk(data)
 
+    def process(self) -> None:
+        headers = self.requestHeaders
+        for name, values in list(headers.getAllRawHeaders()):
+            # Twisted fails where somebody reads as text what is none (RFC 9110 section 5.5).
+            headers.setRawHeaders(name, [each.decode(errors="replace").encode() for each in values])
+        super().process()
+
     def render(self, resource: IResource) -> None:
         # Twisted has named itself and its version by now.
         self.setHeader(b"server", b"switchboard")
         super().render(resource)
+
+    def processingFailed(self, reason: Failure) -> Failure:
+        """Something failed before anybody could say why: Twisted would answer with a page of its own."""
+        error = reason.value
+        if self.startedWriting:
+            self.transport.abortConnection()
+            return reason
+        if isinstance(error, HTTPException) and error.code is not None:
+            # As of a host that can't be one, before klein looks for a route.
+            body = problem(self, error.code, "The request can't be served.")
+        else:
+            self.log.failure("{method} {path} failed", reason, method=self.method, path=self.path)
+            body = problem(self, 500, "The relay failed on this request; its log tells more.")
+        self.setHeader(b"content-length", b"%d" % len(body))
+        self.write(body)
+        self.finish()
+        return reason
 
     def _too_big(self) -> None:
         self.channel.refuse(b"413 Content Too Large", f"a request may carry at most {BODY_BYTES} bytes")
@@ -161,20 +200,76 @@ class RelaySite(Site):
 
 
 class Root(Resource):
-    """All URLs: robots' websockets, the API, the portal."""
+    """All URLs: robots' websockets, the API, tokens, the portal.
 
-    def __init__(self, robots: IResource, api: IResource, portal: IResource) -> None:
+    :param pages: what pages are told over a websocket; to others the API tells it at the same address
+    :param documents: what tells of the API at :data:`DOCUMENTS`
+    """
+
+    PAGES = b"/api/v1/robots/stream"
+
+    def __init__(
+        self,
+        robots: IResource,
+        api: IResource,
+        oauth: IResource,
+        portal: IResource,
+        pages: IResource,
+        documents: IResource | None = None,
+    ) -> None:
         super().__init__()
+        self._documents = documents
         self.putChild(b"robots", robots)
         self._api = api
+        self._oauth = oauth
         self._portal = portal
+        self._pages = pages
 
     def getChild(self, path: bytes, request: Request) -> IResource:
+        if request.path == self.PAGES and wants_websocket(request):
+            return self._pages
         request.postpath.insert(0, request.prepath.pop())
-        return self._api if path in (b"api", b"healthz", b"metrics") else self._portal
+        if path not in ROUTED:
+            return self._portal
+        if not _is_text(b"/".join(request.postpath)):
+            return Missing(400, "The address is not in UTF-8.")
+        request.postpath = single_slashes(request.postpath)
+        if request.path in DOCUMENTS and self._documents is not None:
+            return self._documents
+        if path == b"oauth":
+            return self._oauth
+        return self._api
 
 
-class Robots(Resource):
+def single_slashes(segments: list[bytes]) -> list[bytes]:
+    """Parts of an address without those that are empty, or begin with a slash that came escaped.
+
+    Names of ROS begin with one, and mean the same without it; whoever puts one into an address has two of them there.
+    """
+    bare = [each.lstrip(b"/") for each in segments]
+    return [*(each for each in bare[:-1] if each), *bare[-1:]]
+
+
+def _is_text(path: bytes) -> bool:
+    try:
+        path.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+class ReadOnly(Resource):
+    """What is there to be read."""
+
+    def render(self, request: Request) -> bytes | int:
+        if request.method not in (b"GET", b"HEAD"):
+            request.setHeader(b"allow", b"GET, HEAD")
+            return problem(request, 405, "This address does not take that method.")
+        answer: bytes | int = self.render_GET(request)
+        return answer
+
+
+class Robots(ReadOnly):
     """``/robots/<robot>``: a websocket, or on a plain GET what speaks here (a websocket client's first question).
 
     :param video: what is below ``/robots/<robot>/video``; a leaf, it finds the robot in the request's path
@@ -200,6 +295,17 @@ class Robots(Resource):
             return self._websocket
         return self if not request.postpath else Missing()
 
+    @described(
+        Operation(
+            method="GET",
+            path="/robots/{robot}",
+            tag="relay",
+            summary="What speaks at a robot's websocket",
+            more="The websocket itself speaks rosbridge v2 (SPEC section 1).",
+            answers={200: Answer("what speaks here", About)},
+            credential=Credential.NONE,
+        )
+    )
     def render_GET(self, request: Request) -> bytes:
         request.setHeader(b"content-type", b"application/json")
         return self._about
@@ -211,15 +317,20 @@ def wants_websocket(request: Request) -> bool:
 
 
 class Missing(Resource):
-    """404 in words."""
+    """An error in words; where nothing else is said, 404."""
 
     isLeaf = True
 
+    def __init__(self, status: int = 404, detail: str = "There is nothing at this address.") -> None:
+        super().__init__()
+        self._status = status
+        self._detail = detail
+
     def render(self, request: Request) -> bytes:
-        return problem(request, 404, "There is nothing at this address.")
+        return problem(request, self._status, self._detail)
 
 
-class Portal(Resource):
+class Portal(ReadOnly):
     """The built portal: its files, and its page for every address the portal itself routes."""
 
     isLeaf = True

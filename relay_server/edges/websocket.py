@@ -41,6 +41,8 @@ class ClientProtocol(BoundedProtocol):
 
     log = Logger()
     factory: ClientFactory
+    takes = limits.CLIENT_MESSAGE
+    """Bytes a message may have once a session has begun."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -165,7 +167,7 @@ class ClientProtocol(BoundedProtocol):
         admission, self._admission = self._admission, None
         self._stop_deadline()
         self._known()
-        self.take_at_most(limits.CLIENT_MESSAGE)
+        self.take_at_most(self.takes)
         session = self._session = self._occupant(admission)
         # What the session sends goes to the socket without a look at the state; see nothing_more.
         session.outbox.write = self._writer.write

@@ -5,7 +5,7 @@ that is a client's like any other (``client``), ``rank`` by many side by side; `
 """
 
 from relay_server.fleet.desk import LOCAL, FleetDesk, Plan
-from relay_server.fleet.order import Order
+from relay_server.fleet.order import Order, StopOrder
 from relay_server.fleet.result import Result
 
-__all__ = ["LOCAL", "FleetDesk", "Order", "Plan", "Result"]
+__all__ = ["LOCAL", "FleetDesk", "Order", "Plan", "Result", "StopOrder"]

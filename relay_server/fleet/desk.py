@@ -15,13 +15,14 @@ from twisted.python.failure import Failure
 
 from relay_db import queries
 from relay_db.queries import RobotRecord
+from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Access, Permit, Principal
 from relay_server.bucket import Buckets
 from relay_server.clock import Clock, as_twisted, within
 from relay_server.control import Actor, Desks
-from relay_server.fleet.client import OrderClient
+from relay_server.fleet.dating import Dating
 from relay_server.fleet.errand import Errand
 from relay_server.fleet.halting import Halting
 from relay_server.fleet.matching import GROUP, meant
@@ -29,6 +30,7 @@ from relay_server.fleet.order import Order
 from relay_server.fleet.rank import side_by_side
 from relay_server.fleet.result import Outcome, Result
 from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, FrontDesk, GoingDown
+from relay_server.inside import InsideClient
 from relay_server.journal import Journal
 from relay_server.registry import Registry
 from relay_server.store import Store
@@ -46,8 +48,9 @@ STOPS_AT_ONCE = 10
 STOP_USERS = 256
 """Users remembered for that; the longest quiet are forgotten first."""
 
-STOP_SECONDS = 15.0
-"""What a stop and a resume have, whatever the order says: they are given up by who carries them out before that."""
+STOP_SECONDS = 18.0
+"""What a stop and a resume have, whatever the order says: they are given up by who carries them out before that, though
+the database be asked first."""
 
 LOCAL = Principal(0, "admin (local)", "default", True, 0, None)
 """Whoever may open the relay's local socket. No user can have this name: it has a space in it."""
@@ -62,6 +65,7 @@ class Plan:
 
     :param missed: why it may mean others, which nobody could look up
     :param stopping: those that are being stopped already, and what comes of it
+    :param sent: a moment before which it can't have been given, the relay's monotonic nanoseconds, where one is known
     """
 
     order: Order
@@ -71,6 +75,12 @@ class Plan:
     unmatched: list[str]
     missed: str = ""
     stopping: Mapping[str, Deferred[Result]] = field(default_factory=dict)
+    sent: int | None = None
+
+    @property
+    def dating(self) -> Dating:
+        """How old it is."""
+        return Dating(self.order, self.sent)
 
     @property
     def actor(self) -> Actor:
@@ -104,7 +114,7 @@ class FleetDesk:
         store: Store,
         journal: Journal,
         *,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        clock_ns: Callable[[], int] = now_ns,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._clock = clock
@@ -128,14 +138,17 @@ class FleetDesk:
         )
         return [each for each in told if each["robots"]]
 
-    async def plan(self, asker: Principal, order: Order, address: str) -> Plan:
+    async def plan(self, asker: Principal, order: Order, address: str, sent: int | None = None) -> Plan:
         """Find out which robots an order means.
 
         A stop is on its way to those that are here, and known to be the asker's, before the database is asked for the
         others; where that does not answer these are all that are meant.
 
+        :param sent: a moment before which it can't have been given, the relay's monotonic nanoseconds
         :raises Invalid: the order makes no sense, or means too many
         :raises NotFound: it means no robot the asker has a right on
+        :raises MomentNeeded: it moves one of them, or lets it move again, and no moment is named
+        :raises TooOld: it moves one of them, and may be too old
         :raises Unavailable: the database does not answer
         """
         order.check()
@@ -158,8 +171,10 @@ class FleetDesk:
         if order.do != "stop" and len(found.robots) > ROBOTS:
             raise Invalid(f"the order means {len(found.robots)} robots; it may mean {ROBOTS} at most")
         robots = {name: mine[name] for name in found.robots}
+        known = (self._registry.find(each.id) for each in robots.values())
+        Dating(order, sent).check([robot for robot in known if robot is not None], self._clock_ns())
         stopping = {name: stopping for name, (_, stopping) in told.items()}
-        return Plan(order, asker, address, robots, found.unmatched, missed, stopping)
+        return Plan(order, asker, address, robots, found.unmatched, missed, stopping, sent)
 
     def _at_once(
         self, asker: Principal, order: Order, address: str
@@ -276,7 +291,7 @@ class FleetDesk:
         try:
             if order.do == "stop":
                 return await halting.stop(record, plan.actor, order.why)
-            return await halting.resume(record, admission.permit.rules, plan.asker, plan.actor, order.why)
+            return await halting.resume(record, admission.permit, plan.actor, order.why, plan.dating.since)
         finally:
             self._front.turn_away(admission)
 
@@ -285,11 +300,16 @@ class FleetDesk:
         if not self._front.accepting:
             self._front.turn_away(admission)
             raise GoingDown("the relay is going down")
-        client = OrderClient()
+        # However late its turn comes, it is as old as it is.
+        client = InsideClient(undated=plan.dating.since)
         session = self._front.open(admission, client, self._clock_ns())
+
+        def young() -> None:
+            plan.dating.check_turn(session.robot, self._clock_ns())
+
         try:
             client.begin(session)
-            return await Errand(self._clock, session, client, plan.order).run()
+            return await Errand(self._clock, session, client, plan.order, young).run()
         finally:
             session.end()
 

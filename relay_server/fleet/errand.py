@@ -4,32 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 
-from twisted.internet.defer import Deferred
+import msgspec
 
-from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol import jsontext
+from relay_protocol.errors import Refused, SwitchboardError
 from relay_server.channel import resolve
-from relay_server.clock import Clock, cancel
-from relay_server.fleet.client import OrderClient
+from relay_server.clock import Clock
+from relay_server.fleet.dating import moves
 from relay_server.fleet.order import Order
 from relay_server.fleet.result import Outcome
+from relay_server.inside import InsideClient
+from relay_server.inside.publishing import Speaker, may_move, type_of
 from relay_server.session import Session
-from relay_server.session.names import normal_type
-
-LOOK_SECONDS = 0.02
-"""How often it is looked whether the robot is ready for a message."""
-
-SUBSCRIBER_SECONDS = 2.0
-"""So long somebody who subscribes is waited for."""
-
-MATCHING_SECONDS = 0.5
-"""What ROS 2 has to bring a new publisher and its subscribers together, and to send what was published."""
 
 
 class Errand:
-    """What is to be done on one robot."""
+    """What is to be done on one robot.
 
-    def __init__(self, clock: Clock, session: Session, client: OrderClient, order: Order) -> None:
+    :param young: sees that it moves the robot in time, and raises else
+    """
+
+    def __init__(
+        self, clock: Clock, session: Session, client: InsideClient, order: Order, young: Callable[[], None]
+    ) -> None:
         self._clock = clock
+        self._young = young
         self._session = session
         self._client = client
         self._order = order
@@ -37,6 +36,8 @@ class Errand:
     async def run(self) -> Outcome:
         """Do it. What goes wrong is told in the outcome."""
         try:
+            if moves(self._session.robot, self._order):
+                self._young()
             return await _WAYS[self._order.do](self)
         except SwitchboardError as error:
             return Outcome(False, str(error))
@@ -48,6 +49,7 @@ class Errand:
             return await self._call()
         await self._take_control()
         try:
+            self._young()
             return await self._call()
         finally:
             self._session.desk.release(self._session, "the order is done")
@@ -55,7 +57,8 @@ class Errand:
     async def _call(self) -> Outcome:
         order = self._order
         answer = await self._client.call(order.service, order.args, order.type, order.timeout)
-        return Outcome.of_service(answer.values) if answer.result else Outcome(False, str(answer.values))
+        said = answer.read
+        return Outcome.of_service(said) if answer.result else Outcome(False, str(said))
 
     async def publish(self) -> Outcome:
         """Publish one message, once the robot can and somebody listens.
@@ -64,37 +67,25 @@ class Errand:
         :raises NotFound: nobody knows the topic's type
         :raises Unavailable: the robot is offline
         """
-        order, robot = self._order, self._session.robot
-        if robot.control is None:
-            raise Unavailable(f"robot {robot.name} is offline")
+        order, session = self._order, self._session
         topic = resolve(order.topic)
-        known = robot.graph.topics.get(topic)
-        types = [normal_type(order.type), *(known.types if known is not None else ())]
-        if any(robot.is_motion(topic, each) for each in types):
+        type_name = type_of(session, topic, order.type)
+        if may_move(session, topic, type_name):
+            name = session.robot.name
             raise Refused(
-                f"{topic} counts as motion on {robot.name}: one message moves no robot; call a service, or drive it"
+                f"{topic} counts as motion on {name}: one message moves no robot; call a service, or drive it"
             )
-        type_name = next(filter(None, types), "")
-        if not type_name:
-            raise NotFound(f"there is no topic {topic} on {robot.name}; say its type")
-        self._say("advertise", topic=topic, type=type_name)
-        await self._until(
-            lambda: any(each == topic for each, _ in self._session.channel.publications.active())
-        )
-        await self._until(lambda: self._subscribed(topic), SUBSCRIBER_SECONDS)
-        await self._matching()
-        self._say("publish", topic=topic, msg=order.msg)
-        await self._matching()
-        self._client.check()
+        await Speaker(self._clock, self._client, session, topic).say(order.msg, type_name)
         return Outcome(True)
 
     async def set(self) -> Outcome:
         """Set a parameter of a node."""
         args = {"name": self._order.name, "value": bytes(self._order.value).decode()}
-        answer = await self._client.call("/rosapi/set_param", args)
+        answer = await self._client.call("/rosapi/set_param", msgspec.Raw(jsontext.encode(args)))
+        said = answer.read
         if not answer.result:
-            return Outcome(False, str(answer.values))
-        return Outcome(bool(answer.values["successful"]), str(answer.values["reason"]))
+            return Outcome(False, str(said))
+        return Outcome(bool(said["successful"]), str(said["reason"]))
 
     async def _take_control(self) -> None:
         """:raises Refused: somebody else has it, or the asker may not
@@ -115,37 +106,6 @@ class Errand:
         if not answer.success:
             desk.release(session, "the order does not wait")
             raise Refused(answer.message)
-
-    # --- waiting ------------------------------------------------------------------------------------------
-
-    def _say(self, op: str, **fields: object) -> None:
-        self._client.say(op, **fields)
-        self._client.check()
-
-    def _subscribed(self, topic: str) -> bool:
-        known = self._session.robot.graph.topics.get(topic)
-        return known is not None and bool(known.subscribers)
-
-    async def _matching(self) -> None:
-        if "cdr" in self._session.robot.encodings:
-            await self._sleep(MATCHING_SECONDS)
-
-    async def _until(self, true: Callable[[], bool], seconds: float | None = None) -> None:
-        """Wait until something holds, or for so long."""
-        until = None if seconds is None else self._clock.seconds() + seconds
-        while not true() and (until is None or self._clock.seconds() < until):
-            await self._sleep(LOOK_SECONDS)
-            self._client.check()
-            if self._session.robot.control is None:
-                raise Unavailable(f"robot {self._session.robot.name} went offline")
-
-    async def _sleep(self, seconds: float) -> None:
-        done: Deferred[None] = Deferred()
-        timer = self._clock.callLater(seconds, done.callback, None)
-        try:
-            await done
-        finally:
-            cancel(timer)
 
 
 _WAYS: dict[str, Callable[[Errand], Awaitable[Outcome]]] = {

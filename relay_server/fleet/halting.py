@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from relay_db.queries import RobotRecord
 from relay_protocol.errors import Refused
-from relay_protocol.rights import Level, Rules
-from relay_server.access import Principal
-from relay_server.control import Actor, Desk, Desks
+from relay_protocol.rights import Level
+from relay_server.access import Permit
+from relay_server.control import Actor, Desk, Desks, acts_for
 from relay_server.fleet.result import Outcome
 from relay_server.registry import Registry
 
@@ -33,21 +33,22 @@ class Halting:
             return Outcome(True)
         return Outcome(True, "it will be stopped as soon as it can be reached", pending=True)
 
-    async def resume(
-        self, record: RobotRecord, rules: Rules, asker: Principal, actor: Actor, why: str
-    ) -> Outcome:
+    async def resume(self, record: RobotRecord, permit: Permit, actor: Actor, why: str, sent: int) -> Outcome:
         """Let a robot move again.
 
-        :raises Refused: the asker neither owns nor controls it
+        :param permit: of who asks
+        :param sent: a moment before which it can't have been asked for, the relay's monotonic nanoseconds
+        :raises Refused: he neither owns nor controls it, or asks by a token that is for less
+        :raises StoppedSince: the robot may have been stopped after that
         :raises NotDone: the robot says that it can't
         :raises Unavailable: it can't be reached
         """
         desk = self._desk(record)
         holder = desk.lease.holder
-        controls = holder is not None and holder.client.user == asker.user_id
-        if rules.level is not Level.OWNER and not controls:
+        controls = holder is not None and acts_for(permit, holder.client)
+        if permit.rules.level is not Level.OWNER and not controls:
             raise Refused("only who has control of the robot, and its owners, may resume it")
-        await desk.stopping.resume(actor, why)
+        await desk.stopping.resume(actor, why, sent)
         return Outcome(True)
 
     def _desk(self, record: RobotRecord) -> Desk:

@@ -10,6 +10,15 @@ GROUP = "group:"
 """How the name of a group begins in an order. No robot's name can: it has no colon."""
 
 
+WILD = frozenset("*?[")
+"""By one of these a pattern is told from a name."""
+
+
+def is_name(asked: str) -> bool:
+    """Whether what an order says is the name of one robot, and neither a pattern nor a group."""
+    return not asked.startswith(GROUP) and WILD.isdisjoint(asked)
+
+
 class Meant(NamedTuple):
     """What an order means.
 
@@ -34,8 +43,9 @@ def meant(asked: Iterable[str], robots: Collection[str], groups: Mapping[str, Co
     for each in dict.fromkeys(asked):
         if each.startswith(GROUP):
             these = known & set(groups.get(each.removeprefix(GROUP).lower(), ()))
-        elif each in known:
-            these = {each}
+        elif each in known or is_name(each):
+            # A thousand names must not each be held against all robots.
+            these = known & {each}
         else:
             these = {name for name in known if fnmatchcase(name, each)}
         found |= these

@@ -12,9 +12,14 @@ from relay_protocol.errors import Invalid, SwitchboardError
 from relay_protocol.limits import NAME
 from relay_server.control import reason_in
 from relay_server.control.record import WHY
+from relay_server.fleet.matching import is_name
 
-ROBOTS = 64
+TARGETS = 1000
 """Names, patterns and groups in one order."""
+
+PATTERNS = 64
+"""Patterns and groups among them. A pattern is held against all robots there are, which takes some 7 ms for 10,000 of
+them; names are looked up."""
 
 SECONDS = 10.0
 """What a robot has when nothing is said."""
@@ -23,6 +28,9 @@ _NOTHING = msgspec.Raw(b"{}")
 _NO_REASON = msgspec.Raw(b'""')
 
 Text = Annotated[str, Meta(max_length=NAME)]
+Targets = Annotated[
+    list[Annotated[str, Meta(min_length=1, max_length=NAME)]], Meta(min_length=1, max_length=TARGETS)
+]
 
 _FIELDS = {
     "stop": {"why"},
@@ -37,7 +45,7 @@ _NEEDED = {"call": ("service",), "publish": ("topic",), "set": ("name", "value")
 
 
 class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of ``POST /api/v1/fleet``.
+    """Body of ``POST /api/v1/fleet``, but for a stop: that is :class:`StopOrder`.
 
     :param robots: names, patterns with shell wildcards, ``group:<name>``
     :param name: of a parameter, ``<node>:<parameter>``
@@ -46,19 +54,17 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     :param reason: JSON; of a stop anything, see :attr:`why`
     """
 
-    robots: Annotated[
-        list[Annotated[str, Meta(min_length=1, max_length=NAME)]], Meta(min_length=1, max_length=ROBOTS)
-    ]
+    robots: Targets
     do: Literal["stop", "resume", "call", "publish", "set"]
     service: Text = ""
     topic: Text = ""
     type: Text = ""
     name: Text = ""
-    args: msgspec.Raw = _NOTHING
-    msg: msgspec.Raw = _NOTHING
-    value: msgspec.Raw = msgspec.Raw(b"")
+    args: msgspec.Raw = msgspec.field(default_factory=lambda: _NOTHING)
+    msg: msgspec.Raw = msgspec.field(default_factory=lambda: _NOTHING)
+    value: msgspec.Raw = msgspec.field(default_factory=lambda: msgspec.Raw(b""))
     timeout: Annotated[float, Meta(ge=0.1, le=300.0)] = SECONDS
-    reason: msgspec.Raw = msgspec.field(default=_NO_REASON, name="why")
+    reason: msgspec.Raw = msgspec.field(default_factory=lambda: _NO_REASON, name="why")
 
     @property
     def why(self) -> str:
@@ -66,7 +72,9 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return reason_in(self.reason)
 
     def check(self) -> None:
-        """:raises Invalid: a field is missing, or does not go with what is to be done"""
+        """:raises Invalid: a field is missing, or does not go with what is to be done; too many patterns and groups"""
+        if sum(not is_name(each) for each in self.robots) > PATTERNS:
+            raise Invalid(f"an order may have {PATTERNS} patterns and groups at most; of names {TARGETS}")
         if self.do != "stop" and not _sound(self.reason):
             raise Invalid(f"'why' must be a string of {WHY} characters at most")
         for field in _NEEDED.get(self.do, ()):
@@ -80,6 +88,19 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def subject(self) -> str:
         """What it is about: a service, a topic, a parameter, or nothing."""
         return self.service or self.topic or self.name
+
+
+class StopOrder(msgspec.Struct, frozen=True):
+    """Body of an order to stop. Whatever else it says is passed over: nothing of it is a reason to keep moving."""
+
+    robots: Targets
+    do: Literal["stop"]
+    reason: msgspec.Raw = msgspec.field(default=_NO_REASON, name="why")
+
+    @property
+    def order(self) -> Order:
+        """The order, as any other."""
+        return Order(self.robots, self.do, reason=self.reason)
 
 
 def _sound(reason: msgspec.Raw) -> bool:

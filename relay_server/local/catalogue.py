@@ -113,6 +113,13 @@ MSG: switchboard_msgs/msg/Steering
 string state
 string holder
 bool you
+Hand[] suppressed
+Hand[] inhibited
+{_LINE}
+MSG: switchboard_msgs/msg/Hand
+string resource
+string by
+bool hold
 {_LINE}
 MSG: switchboard_msgs/msg/Client
 string user
@@ -194,6 +201,7 @@ float64 cpu
 float64 memory
 float64 rtt_ms
 uint64 stale_commands
+uint64 invalid_commands
 uint64 unguarded_commands
 uint64 refused_commands
 uint64 limited_commands

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from relay_protocol.errors import Invalid, Refused, SwitchboardError
+from relay_protocol.errors import Invalid, Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
-from relay_server.control import Answer, actor_of, reason_of, view
+from relay_server.control import Answer, NotDone, actor_of, reason_of, view
 from relay_server.local.arguments import argument, text
 from relay_server.session import Session
 
@@ -25,29 +25,35 @@ async def release_control(session: Session, args: Any) -> Any:
 
 async def grant_control(session: Session, args: Any) -> Any:
     """``/relay/grant_control``"""
-    return session.desk.grant(session, _why(args))._asdict()
+    return session.desk.grant(session, _why(args), _number(args, "client", 1, 0))._asdict()
 
 
 async def refuse_control(session: Session, args: Any) -> Any:
     """``/relay/refuse_control``"""
-    return session.desk.refuse(session, _why(args))._asdict()
+    return session.desk.refuse(session, _why(args), _number(args, "client", 1, 0))._asdict()
 
 
 async def stop(session: Session, args: Any) -> Any:
-    """``/relay/stop``: for everybody with a right on the robot, which is who has a session."""
-    done = await session.desk.stopping.stop(actor_of(session), reason_of(argument(args, "why")))
+    """``/relay/stop``: for everybody with a right on the robot, which is who has a session.
+
+    ``done`` tells whether the robot has done it; where it has not, and it is no failure, it will when it is back.
+    """
     name = session.robot.name
+    try:
+        done = await session.desk.stopping.stop(actor_of(session), reason_of(argument(args, "why")))
+    except (NotDone, Unavailable) as error:
+        return {**Answer(False, str(error))._asdict(), "done": False}
     said = (
         f"robot {name} is stopped" if done else f"robot {name} will be stopped as soon as it can be reached"
     )
-    return Answer(True, said)._asdict()
+    return {**Answer(True, said)._asdict(), "done": done}
 
 
 async def resume(session: Session, args: Any) -> Any:
-    """``/relay/resume``"""
+    """``/relay/resume``: what can have been sent before the robot was last stopped does not let it move."""
     if not session.desk.may_resume(session):
         raise Refused("only who has control of the robot, and its owners, may resume it")
-    await session.desk.stopping.resume(actor_of(session), _why(args))
+    await session.desk.stopping.resume(actor_of(session), _why(args), session.not_before)
     return Answer(True, f"robot {session.robot.name} may move again")._asdict()
 
 

@@ -22,6 +22,7 @@ string user
 uint32 client
 float64 since
 bool you
+bool implicit
 {_LINE}
 MSG: switchboard_msgs/msg/Request
 string user
@@ -67,13 +68,15 @@ bool may_resume
 
 _ANSWER = "---\nbool success\nstring message\n"
 _ORDER = ("switchboard_msgs/srv/Order", f"string why\n{_ANSWER}")
+_REPLY = ("switchboard_msgs/srv/Reply", f"string why\nuint32 client\n{_ANSWER}")
+_STOP = ("switchboard_msgs/srv/Stop", f"string why\n{_ANSWER}bool done\n")
 
 SERVICES = {
     "/relay/take_control": _ORDER,
     "/relay/release_control": _ORDER,
-    "/relay/grant_control": _ORDER,
-    "/relay/refuse_control": _ORDER,
-    "/relay/stop": _ORDER,
+    "/relay/grant_control": _REPLY,
+    "/relay/refuse_control": _REPLY,
+    "/relay/stop": _STOP,
     "/relay/resume": _ORDER,
     "/relay/suppress": ("switchboard_msgs/srv/Suppress", f"string resource\nuint32 ms 100\n{_ANSWER}"),
     "/relay/inhibit": (

@@ -101,6 +101,7 @@ class RelayNode:
                 "state": view.state(standing),
                 "holder": view.holder(standing) or "",
                 "you": standing.lease.held_by(session),
+                **view.hands(robot, session.permit.rules),
             },
             "stopped": standing.stopped is not None,
         }

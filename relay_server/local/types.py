@@ -30,7 +30,7 @@ _CONTAINED = re.compile(r"\nMSG: (\w+)/msg/(\w+)[ \t\r]*$", re.MULTILINE)
 """It begins with what is rare and never at the start: so it is found ten times as fast."""
 
 
-async def _known(session: Session, type_name: str, own_text: bool = False) -> TypeRegistry:
+async def known(session: Session, type_name: str, own_text: bool = False) -> TypeRegistry:
     """Where the definition of a type is, once it is there.
 
     :param own_text: its own text is wanted; else one that contains it will do
@@ -59,7 +59,7 @@ async def message_details(session: Session, args: Any) -> Any:
     """``/rosapi/message_details``: a type the robot does not have gets an empty answer, as in rosapi."""
     type_name = _type(args, "msg")
     try:
-        types = await _known(session, type_name)
+        types = await known(session, type_name)
         await session.share.own_turn()
         with session.share.counted():
             return {"typedefs": types.typedefs(type_name)}
@@ -69,7 +69,7 @@ async def message_details(session: Session, args: Any) -> Any:
 
 async def _part_details(session: Session, args: Any, kind: str, part: str) -> Any:
     type_name = _type(args, kind)
-    types = await _known(session, type_name)
+    types = await known(session, type_name)
     await session.share.own_turn()
     with session.share.counted():
         return {"typedefs": types.typedefs(f"{type_name}_{part}")}
@@ -140,7 +140,7 @@ async def _full_text(session: Session, type_name: str) -> str:
     if not type_name:
         return ""
     try:
-        types = await _known(session, type_name, own_text=True)
+        types = await known(session, type_name, own_text=True)
         return types.definition(type_name)
     except SwitchboardError as error:
         return f"# no definition: {error}"

@@ -12,9 +12,10 @@ from weakref import WeakKeyDictionary
 
 from relay_protocol import link
 from relay_protocol.link import Service, Topic
-from relay_protocol.rights import Grant, Operation
+from relay_protocol.rights import Operation, Rules
 from relay_server.graph import Ends, GraphMirror
 from relay_server.local.catalogue import OWN_SERVICES, OWN_TOPICS, RELAY, ROSAPI
+from relay_server.registry import Presence
 from relay_server.session import Session
 from relay_server.sight import may_hear
 
@@ -42,25 +43,33 @@ class _Kept(NamedTuple):
         return (self.version, self.ends, self.cameras) == (graph.version, ends, cameras)
 
 
-_kept: WeakKeyDictionary[GraphMirror, OrderedDict[tuple[Grant, ...], _Kept]] = WeakKeyDictionary()
+_kept: WeakKeyDictionary[GraphMirror, OrderedDict[tuple[object, ...], _Kept]] = WeakKeyDictionary()
 
 
 def view(session: Session) -> View:
     """What the caller sees; made anew only after something has changed."""
-    graph, ends, cameras = session.robot.graph, session.channel.ends(), session.robot.cameras
+    return seen(session.robot, session.channel.ends(), session.permit.rules)
+
+
+def seen(robot: Presence, ends: Ends, rules: Rules) -> View:
+    """What one sees by these rules, whether or not he is connected.
+
+    :param ends: what the relay has in the robot's graph for its clients
+    """
+    graph, cameras = robot.graph, robot.cameras
     views = _kept.setdefault(graph, OrderedDict())
-    key = session.permit.rules.grants
+    key = rules.key
     found = views.get(key)
     if found is None or not found.is_of(graph, ends, cameras):
-        found = views[key] = _Kept(graph.version, ends, cameras, _made(session, graph, ends))
+        found = views[key] = _Kept(graph.version, ends, cameras, _made(robot, ends, rules))
     views.move_to_end(key)
     while len(views) > KEPT:
         views.popitem(last=False)
     return found.view
 
 
-def _made(session: Session, graph: GraphMirror, ends: Ends) -> View:
-    judge = session.permit.judge
+def _made(robot: Presence, ends: Ends, rules: Rules) -> View:
+    graph, judge = robot.graph, rules.judge
 
     def may_call(name: str) -> bool:
         return judge(Operation.CALL, name).allowed
@@ -69,10 +78,7 @@ def _made(session: Session, graph: GraphMirror, ends: Ends) -> View:
         name: topic
         for name, topic in sorted(_topics(graph, ends).items())
         if not hidden(name)
-        and (
-            may_hear(judge, session.robot, name, topic.types).allowed
-            or judge(Operation.PUBLISH, name).allowed
-        )
+        and (may_hear(judge, robot, name, topic.types).allowed or judge(Operation.PUBLISH, name).allowed)
     }
     services = {
         name: service

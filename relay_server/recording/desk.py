@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -11,15 +12,15 @@ from typing import Any
 import msgspec
 
 from relay_db import queries
-from relay_protocol.errors import NotFound, Refused, Unavailable
+from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.access import Permit, Principal
 from relay_server.bucket import TokenBucket
 from relay_server.frontdesk import Admission, FrontDesk
 from relay_server.journal import Journal
-from relay_server.recording.library import READABLE, RUNNING, UNKNOWN, Entry
-from relay_server.recording.recorder import why_denied, why_not
+from relay_server.recording.library import READABLE, RUNNING, UNKNOWN, Entry, place
 from relay_server.recording.recordings import Ask, Recordings
+from relay_server.recording.rights import why_denied, why_not
 from relay_server.sight import may_hear
 from relay_server.store import Store
 
@@ -32,6 +33,10 @@ FETCH_SECONDS = 3600.0
 
 FETCHES = 1000
 """Downloads that are remembered for that."""
+
+PAGE = 100
+PAGE_MOST = 500
+"""Recordings that are listed at a time, unless others are asked for, and at most."""
 
 
 class Download:
@@ -153,20 +158,33 @@ class RecordingDesk:
                 "denied": reasons[0] if all(reasons) and reasons else "",
                 "megabytes": library.quota / 10**6,
                 "left": library.left / 10**6,
+                "full": await self._recordings.full(there.robot_id),
             }
 
-    async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
+    async def all(
+        self, principal: Principal, robot: str, address: str, limit: int = PAGE, before: str = ""
+    ) -> dict[str, Any]:
         """The recordings of a robot that the principal may have, the latest first.
 
+        :param limit: no more than so many
+        :param before: what an earlier answer gave as ``next``: go on behind the last of that one
         :raises NotFound: no such robot, or no right on it
+        :raises Invalid: no answer gave that
         """
+        behind = _place_of(before) if before else None
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
-            entries = self._recordings.library.of(admission.robot.robot_id)
-            return [
-                self._view(self._recordings.look(entry))
-                for entry in entries
-                if not why_denied(admission.permit, entry)
-            ]
+            found: list[Entry] = []
+            for entry in self._recordings.library.of(admission.robot.robot_id):
+                if (behind is None or place(entry) < behind) and not why_denied(admission.permit, entry):
+                    if len(found) == limit:
+                        # There is one more.
+                        return self._page(found, _cursor_of(found[-1]))
+                    found.append(entry)
+            return self._page(found, None)
+
+    def _page(self, found: list[Entry], following: str | None) -> dict[str, Any]:
+        shown = [self._view(self._recordings.look(entry)) for entry in found]
+        return {"recordings": shown, "next": following}
 
     async def one(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
         """One recording.
@@ -214,7 +232,7 @@ class RecordingDesk:
             if entry.state in RUNNING:
                 raise Unavailable("it is still being recorded: stop it, or wait for its end")
             if entry.state not in READABLE:
-                raise Unavailable("it broke off, and the file is not recovered yet")
+                raise Unavailable("it broke off, and the file is not recovered yet; try again later")
         except BaseException:
             self._desk.turn_away(admission)
             raise
@@ -319,3 +337,24 @@ class RecordingDesk:
             recording=entry.id,
             **data,
         )
+
+
+def _cursor_of(entry: Entry) -> str:
+    """Where a page ends: also when that recording is deleted, the next one begins behind it."""
+    begun, id = place(entry)
+    return f"{begun!r}_{id}"
+
+
+def _place_of(cursor: str) -> tuple[float, str]:
+    """Where :func:`_cursor_of` says.
+
+    :raises Invalid: it never said that
+    """
+    begun, _, id = cursor.partition("_")
+    try:
+        at = float(begun)
+    except ValueError:
+        at = math.nan
+    if not math.isfinite(at):
+        raise Invalid("'before' is what an earlier answer gave as 'next'")
+    return at, id

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,10 @@ import msgspec
 from twisted.logger import Logger
 
 from relay_protocol.errors import Invalid, NotFound, Unavailable
+
+KEPT = 10_000
+ROBOT_KEPT = 1000
+"""Recordings that may be kept in all, and of one robot, however small they are."""
 
 UNKNOWN = "there is no such recording, or it holds what you may not record and see"
 
@@ -111,14 +116,19 @@ class Library:
     """The folder of recordings. What is in it is read once, by :meth:`open`.
 
     :param quota: bytes all recordings together may have
+    :param reserve: bytes of the disk that stay free; other things of the relay are on it too
+    :ivar copied: bytes that are taken twice, while a file is mended
     """
 
     log = Logger()
 
-    def __init__(self, folder: Path, quota: int) -> None:
+    def __init__(self, folder: Path, quota: int, reserve: int = 0) -> None:
         self._folder = folder
         self.quota = quota
+        self.reserve = reserve
+        self.copied = 0
         self._entries: dict[str, Entry] = {}
+        self._robots: dict[int, dict[str, Entry]] = {}
 
     def open(self) -> None:
         """Find out what is there.
@@ -141,7 +151,10 @@ class Library:
         if entry.state in RUNNING:
             entry.state = State.INCOMPLETE
             entry.reason = "the relay ended without warning"
-        self._entries[entry.id] = entry
+        if entry.state is State.INCOMPLETE:
+            # Nobody came to write down how large it became.
+            entry.bytes = self.size(entry)
+        self._keep(entry)
 
     # --- what is there ------------------------------------------------------------------------------------
 
@@ -149,9 +162,8 @@ class Library:
         return iter(list(self._entries.values()))
 
     def of(self, robot_id: int) -> list[Entry]:
-        """A robot's recordings, the latest first."""
-        found = [entry for entry in self._entries.values() if entry.robot_id == robot_id]
-        return sorted(found, key=lambda entry: (entry.begun, entry.id), reverse=True)
+        """A robot's recordings, the latest first: in the order of :func:`place`, backwards."""
+        return sorted(self._robots.get(robot_id, {}).values(), key=place, reverse=True)
 
     def find(self, robot_id: int, id: str) -> Entry:
         """One recording of a robot.
@@ -174,12 +186,23 @@ class Library:
     @property
     def used(self) -> int:
         """Bytes that are taken, with all that is being recorded may still become."""
-        return sum(entry.limit if entry.state in RUNNING else entry.bytes for entry in self._entries.values())
+        kept = (entry.limit if entry.state in RUNNING else entry.bytes for entry in self._entries.values())
+        return sum(kept) + self.copied
 
     @property
     def left(self) -> int:
         """Bytes that one more may take."""
         return max(0, self.quota - self.used)
+
+    def full(self, robot_id: int) -> str:
+        """Why there can't be one more of a robot, however small; empty when there can."""
+        if len(self._robots.get(robot_id, {})) >= ROBOT_KEPT:
+            return (
+                f"{ROBOT_KEPT} recordings of this robot are kept, the most there may be: delete some of them"
+            )
+        if len(self._entries) >= KEPT:
+            return f"{KEPT} recordings are kept, the most there may be in all: delete some, of any robot"
+        return ""
 
     def path(self, entry: Entry) -> Path:
         """The file."""
@@ -190,20 +213,55 @@ class Library:
     def add(self, entry: Entry) -> None:
         """One more.
 
-        :raises Unavailable: it could become more than there may be
+        :raises Unavailable: it would be one too many, or could become more than there may be
         """
+        full = self.full(entry.robot_id)
+        if full:
+            raise Unavailable(full)
         if entry.limit > self.left:
             raise Unavailable(
                 f"recordings may have {self.quota // 10**6} MB in all, of which {self.left // 10**6} MB "
                 f"are left: delete some, or record at most that much"
             )
-        self._entries[entry.id] = entry
+        self._keep(entry)
 
     def forget(self, entry: Entry) -> None:
         """It is there no more."""
         self._entries.pop(entry.id, None)
+        others = self._robots.get(entry.robot_id, {})
+        others.pop(entry.id, None)
+        if not others:
+            self._robots.pop(entry.robot_id, None)
+
+    def _keep(self, entry: Entry) -> None:
+        self._entries[entry.id] = entry
+        self._robots.setdefault(entry.robot_id, {})[entry.id] = entry
 
     # --- the disk; any thread -----------------------------------------------------------------------------
+
+    def size(self, entry: Entry) -> int:
+        """Bytes of the file, 0 if there is none.
+
+        :raises OSError: it can't be looked at
+        """
+        try:
+            return self.path(entry).stat().st_size
+        except FileNotFoundError:
+            return 0
+
+    def spare(self) -> int:
+        """Bytes of the disk that are free beyond the reserve; less than 0 when it is nearly full.
+
+        :raises OSError: it can't be looked at
+        """
+        return shutil.disk_usage(self._folder).free - self.reserve
+
+    def nearly_full(self) -> bool:
+        """Whether less of the disk is free than shall stay so.
+
+        :raises OSError: it can't be looked at
+        """
+        return self.spare() < 0
 
     def save(self, id: str, text: bytes) -> None:
         """Put on the disk what a recording is.
@@ -227,6 +285,11 @@ class Library:
         for suffix in (".mcap", ".json"):
             with contextlib.suppress(FileNotFoundError):
                 (self._folder / f"{id}{suffix}").unlink()
+
+
+def place(entry: Entry) -> tuple[float, str]:
+    """Where a recording stands among others: when it was begun, in Unix seconds, and its id."""
+    return entry.begun, entry.id
 
 
 def text_of(entry: Entry) -> bytes:

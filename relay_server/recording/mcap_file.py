@@ -20,7 +20,10 @@ from relay_protocol.limits import KIB, MIB
 from relay_server import VERSION
 
 CHUNK_BYTES = 512 * KIB
-"""Messages are compressed together by so many bytes."""
+"""Messages are compressed together by so many bytes, or more in a large file."""
+
+CHUNKS = 16 * KIB
+"""A file has not many more chunks by its size than this: the index of each is in memory until the end."""
 
 RECORD_BYTES = 64 * MIB
 """No record of ours is larger; a length beyond it is damage."""
@@ -79,6 +82,11 @@ class Track(NamedTuple):
         return LATCHED if self.latched else ""
 
 
+def chunk_bytes(size: int) -> int:
+    """How large the chunks are of a file that may have so many bytes."""
+    return max(CHUNK_BYTES, size // CHUNKS)
+
+
 class Full(Exception):
     """The file has no room for this message; nothing of it was written."""
 
@@ -93,7 +101,7 @@ class McapFile:
 
     def __init__(self, stream: BinaryIO, limit: int, ros: bool) -> None:
         self._stream = stream
-        self._writer = Writer(stream, chunk_size=CHUNK_BYTES)
+        self._writer = Writer(stream, chunk_size=chunk_bytes(limit))
         self._limit = limit
         self._written = 0
         self._pending = 0
@@ -188,7 +196,7 @@ def mend(path: Path, stopping: Callable[[], bool]) -> int | None:
     fresh = path.with_suffix(".part")
     try:
         with path.open("rb") as damaged, fresh.open("wb") as stream:
-            messages = _copy(damaged, stream, stopping)
+            messages = _copy(damaged, stream, chunk_bytes(path.stat().st_size), stopping)
         if messages is not None:
             fresh.replace(path)
         return messages
@@ -196,8 +204,8 @@ def mend(path: Path, stopping: Callable[[], bool]) -> int | None:
         fresh.unlink(missing_ok=True)
 
 
-def _copy(damaged: BinaryIO, stream: BinaryIO, stopping: Callable[[], bool]) -> int | None:
-    writer = Writer(stream, chunk_size=CHUNK_BYTES)
+def _copy(damaged: BinaryIO, stream: BinaryIO, chunk_size: int, stopping: Callable[[], bool]) -> int | None:
+    writer = Writer(stream, chunk_size=chunk_size)
     schemas, channels, messages, begun = {0: 0}, dict[int, int](), 0, False
     for record in _whole_records(damaged):
         if stopping():

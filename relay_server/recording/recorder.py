@@ -5,11 +5,12 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 
+from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
 from relay_protocol import link, rosbridge
 from relay_protocol.errors import SwitchboardError
-from relay_protocol.rights import Operation
+from relay_protocol.limits import MIB
 from relay_server.access import Permit, Principal
 from relay_server.budget import Budgets
 from relay_server.channel import Channel
@@ -19,15 +20,26 @@ from relay_server.clock import Clock, Timer, cancel
 from relay_server.recording import compressed
 from relay_server.recording.library import Entry, State
 from relay_server.recording.mcap_file import Track
+from relay_server.recording.rights import why_denied
 from relay_server.recording.writer import Message, Outcome, Writer
 from relay_server.sight import carries_pictures
-from relay_server.video import Picture, Stream, Videos
+from relay_server.video import Picture, Stream, Videos, differing
 
 AGAIN_SECONDS = 5.0
-"""A camera that is not shown any more is asked for anew after so long."""
+"""A camera that is not shown any more is asked for anew after so long; what can't be put on record is tried again."""
+
+HELD = 100
+HELD_BYTES = 8 * MIB
+"""Samples that wait until it is on record that their topics carry pictures. What comes then is dropped, and counted."""
 
 PROBLEMS = 20
 """Most that is kept of what was not as it should be."""
+
+STAMPS_END = 2**31 * 10**9
+"""The first nanosecond that ``builtin_interfaces/Time`` can't hold, in January 2038."""
+
+AS_IT_IS = link.VideoSettings()
+"""How cameras are recorded."""
 
 _NOBODY = -1
 
@@ -50,31 +62,14 @@ NEXT: dict[tuple[State, Event], State] = {
 """An event that is not listed for a state changes nothing."""
 
 
-def why_not(permit: Permit, see: Operation, name: str) -> str:
-    """Why somebody may not record something; empty when he may.
-
-    :param see: what is needed to see it
-    """
-    for operation in (Operation.RECORD, see):
-        verdict = permit.judge(operation, name)
-        if not verdict.allowed:
-            return verdict.reason
-    return ""
-
-
-def why_denied(permit: Permit, entry: Entry) -> str:
-    """Why somebody may not have all that a recording holds; empty when he may."""
-    asked = [(Operation.SUBSCRIBE, topic) for topic in entry.topics]
-    asked += [(Operation.VIEW, each) for each in (*entry.cameras, *entry.pictures)]
-    return next((reason for see, name in asked if (reason := why_not(permit, see, name))), "")
-
-
 class Recorder:
     """See the module's text.
 
     :param permit: of who records; the recording ends with it
     :param make_writer: makes the writer of the file, given what to call at its end
     :param wall: Unix time in seconds
+    :param changed: puts on the disk what the recording is, and tells whether that was done; called when topics are
+        found to carry pictures: who may have the file must be known also after a crash
     :param ended: called once, when the file is whole or has been given up
     """
 
@@ -94,6 +89,7 @@ class Recorder:
         make_writer: Callable[[Callable[[Outcome], None]], Writer],
         *,
         wall: Callable[[], float],
+        changed: Callable[[Entry], Deferred[bool]],
         ended: Callable[[Recorder], None],
     ) -> None:
         self._clock = clock
@@ -103,8 +99,15 @@ class Recorder:
         self._videos = videos
         self._writer = make_writer(self._written)
         self._wall = wall
+        self._changed = changed
         self._ended = ended
         self._timer: Timer | None = None
+        self._save_timer: Timer | None = None
+        self._saving = False
+        self._unsaved: set[str] = set()
+        """Topics of pictures that are not on record as such."""
+        self._held: list[tuple[str, Sample, int]] = []
+        """What came of them, as :meth:`keep` has it."""
         self._tracks: dict[str, tuple[Converter, Track]] = {}
         self._eyes = [_Eye(clock, self, camera) for camera in entry.cameras]
         self._lost = 0
@@ -127,6 +130,7 @@ class Recorder:
         :raises SwitchboardError: something can't be recorded; then nothing has begun
         """
         self._channel.attach(self)
+        self._look_for_pictures()
         try:
             for topic in self.entry.topics:
                 listener = _Ear(self._clock, self, topic)
@@ -141,6 +145,7 @@ class Recorder:
         self.permit.on_revoke = lambda error: self.stop(str(error))
         self._timer = self._clock.callLater(self.entry.seconds, self.stop, "it has taken its time")
         self._writer.start()
+        self.judge_again()
 
     def stop(self, reason: str) -> None:
         """It is enough: finish the file. What came so far is in it."""
@@ -172,18 +177,47 @@ class Recorder:
 
     def _let_go(self) -> None:
         cancel(self._timer)
+        cancel(self._save_timer)
+        self._lost += len(self._held)
+        self._held.clear()
         for eye in self._eyes:
             eye.close()
         self._channel.detach(self)
 
     def judge_again(self) -> None:
         """A topic may carry pictures that did not before."""
+        self._look_for_pictures()
+        self._judge()
+        self._put_on_record()
+
+    def _look_for_pictures(self) -> None:
         entry, robot = self.entry, self._channel.robot
         # One that the robot does not have just now is what it was.
         there = [topic for topic in entry.topics if topic in robot.graph.topics]
-        more = {topic for topic in there if carries_pictures(robot, topic)}
+        more = {topic for topic in there if carries_pictures(robot, topic)}.difference(entry.pictures)
         entry.pictures = tuple(sorted({*entry.pictures, *more}))
-        self._judge()
+        self._unsaved |= more
+
+    def _put_on_record(self) -> None:
+        """See that it is known of all topics of pictures, also after a crash, that they are such."""
+        if self._unsaved and not self._saving and self.entry.state is State.RECORDING:
+            self._saving = True
+            self._changed(self.entry).addCallback(self._on_record, frozenset(self._unsaved))
+
+    def _on_record(self, saved: bool, topics: frozenset[str]) -> None:
+        self._saving = False
+        if self.entry.state is not State.RECORDING:
+            return
+        if not saved:
+            self.tell("error", "a topic was found to carry pictures, and that could not be put on record")
+            cancel(self._save_timer)
+            self._save_timer = self._clock.callLater(AGAIN_SECONDS, self._put_on_record)
+            return
+        self._unsaved -= topics
+        held, self._held = self._held, []
+        for each in held:
+            self.keep(*each)
+        self._put_on_record()
 
     def _judge(self) -> None:
         reason = why_denied(self.permit, self.entry)
@@ -216,12 +250,23 @@ class Recorder:
 
         :param log_time: nanoseconds
         """
+        if topic in self._unsaved:
+            self._hold(topic, sample, log_time)
+            return
         converter = sample.converter
         found = self._tracks.get(topic)
         if found is None or found[0] is not converter:
             found = self._tracks[topic] = (converter, self._track(topic, converter))
         make = None if converter.cdr else _anew(converter)
-        self._put(Message(found[1], log_time, sample.stamp, sample.body, make))
+        logged, published = self._lawful(topic, log_time), self._lawful(topic, sample.stamp)
+        self._put(Message(found[1], logged, published, sample.body, make))
+
+    def _hold(self, topic: str, sample: Sample, log_time: int) -> None:
+        size = sum(len(each.body) for _, each, _ in self._held) + len(sample.body)
+        if len(self._held) < HELD and size <= HELD_BYTES:
+            self._held.append((topic, sample, log_time))
+        else:
+            self._lost += 1
 
     def _track(self, topic: str, converter: Converter) -> Track:
         if not converter.cdr:
@@ -233,7 +278,7 @@ class Recorder:
         """Have a picture written."""
         # A robot whose time is simulated has no other for its pictures either.
         simulated = self._channel.robot.description.sim_time
-        stamp = self.now_ns if simulated else round(picture.stamp * 1e9)
+        stamp = self.now_ns if simulated else self._lawful(camera, round(picture.stamp * 1e9))
 
         def make(body: bytes) -> bytes:
             return compressed.message(body, stamp, picture.codec)
@@ -241,13 +286,26 @@ class Recorder:
         track = Track(compressed.topic_of(camera), compressed.TYPE, "cdr", compressed.TEXT)
         self._put(Message(track, stamp, stamp, picture.body, make))
 
+    def _lawful(self, name: str, stamp: int) -> int:
+        """A robot's stamp, or now where no message of ROS could hold it: its clock is broken, or it lies.
+
+        :param stamp: nanoseconds
+        """
+        if 0 <= stamp < STAMPS_END:
+            return stamp
+        self.tell(
+            "error",
+            f"{name}: the robot's stamps are beyond what ROS can hold; the relay's time stands for them",
+        )
+        return self.now_ns
+
     def _put(self, message: Message) -> None:
         if not self._writer.put(message):
             self._lost += 1
 
     def watch(self, camera: str, eye: _Eye) -> Stream:
         """Have a camera shown; see :meth:`Videos.watch`."""
-        return self._videos.watch(self._channel.robot, camera, link.VideoSettings(), eye)
+        return self._videos.watch(self._channel.robot, camera, AS_IT_IS, eye, first=True)
 
 
 class _Ear(Listener):
@@ -282,7 +340,7 @@ class _Eye:
 
         :raises Unavailable: too many do already
         """
-        self._stream = self._recorder.watch(self._camera, self)
+        self.moved(self._recorder.watch(self._camera, self))
 
     def close(self) -> None:
         """Watch no more."""
@@ -299,8 +357,16 @@ class _Eye:
         """Pictures say themselves how large they are."""
 
     def moved(self, stream: Stream) -> None:
-        """The robot is at its limit: what others watch is recorded."""
+        """Where the robot is at its limit what others watch is recorded, and that is told."""
         self._stream = stream
+        other = differing(AS_IT_IS, stream.settings)
+        if other:
+            words = ", ".join(f"{name} {value}" for name, value in other.items())
+            self._recorder.tell(
+                "warning",
+                f"{self._camera}: the robot is at its limit; for a while there are the pictures that others "
+                f"asked for: {words}",
+            )
 
     def ended(self, error: SwitchboardError) -> None:
         """It is not to be had at present."""

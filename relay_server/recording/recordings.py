@@ -8,22 +8,24 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
+from weakref import WeakValueDictionary
 
 import msgspec
 from msgspec import Meta
-from twisted.internet.defer import Deferred, DeferredList, TimeoutError, succeed
+from twisted.internet.defer import Deferred, DeferredList, DeferredLock, DeferredSemaphore, TimeoutError
 from twisted.logger import Logger
 
 from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_protocol.limits import NAME
 from relay_server.access import Permit
 from relay_server.channel import Channels, resolve
-from relay_server.clock import Clock, as_twisted
+from relay_server.clock import Clock, as_twisted, to_the_end
 from relay_server.recording import compressed
 from relay_server.recording.library import Entry, Library, State, text_of
-from relay_server.recording.mcap_file import mend
-from relay_server.recording.recorder import Recorder, why_denied
-from relay_server.recording.writer import Outcome, Writer
+from relay_server.recording.mender import Mender
+from relay_server.recording.recorder import Recorder
+from relay_server.recording.rights import why_denied
+from relay_server.recording.writer import NEARLY_FULL, Outcome, Writer
 from relay_server.registry import Presence
 from relay_server.sight import carries_pictures
 from relay_server.store import Threads
@@ -37,6 +39,9 @@ RECORDINGS = 16
 THREADS = 2
 WAITING = 64
 """Pieces of work on files that may be under way or wait."""
+
+READING = WAITING // 2
+"""Of them, parts of downloads. Further ones wait for their turn: a download that has begun can't be refused."""
 
 FINISH_SECONDS = 5.0
 """A relay that is going down waits no longer for the disk."""
@@ -84,14 +89,24 @@ class Recordings:
         self._channels = channels
         self._videos = videos
         self._wall = wall
+        self._starting: dict[str, Entry] = {}
+        self._deleting: set[str] = set()
         self._running: dict[str, Recorder] = {}
         self._ended: dict[str, list[Callable[[Entry], None]]] = {}
+        self._saving: WeakValueDictionary[str, DeferredLock] = WeakValueDictionary()
         self._stopping = threading.Event()
-        self._mending: Entry | None = None
-        self.mended: Deferred[None] = succeed(None)
-        """Fires when all is readable that can be."""
         self._threads = Threads(
             reactor, "recordings", THREADS, WAITING, "too much is done with recordings now; try again"
+        )
+        self._turns = DeferredSemaphore(READING)
+        self._mender = Mender(
+            clock,
+            library,
+            self._threads,
+            self._stopping,
+            busy=lambda entry: entry.id in self._running or entry.id in self._deleting,
+            save=self._save,
+            drop=self._take_back,
         )
 
     # --- life of the relay --------------------------------------------------------------------------------
@@ -106,13 +121,17 @@ class Recordings:
 
     def recover(self) -> None:
         """Begin to mend what was not finished."""
-        self.mended = Deferred.fromCoroutine(self._mend_all()).addErrback(
-            lambda failure: self.log.failure("recordings could not be mended", failure)
-        )
+        self._mender.recover()
+
+    @property
+    def mended(self) -> Deferred[None]:
+        """Fires when all is readable that can be."""
+        return self._mender.done
 
     async def shut(self, reason: str) -> None:
         """Finish all that run."""
         self._stopping.set()
+        self._mender.shut()
         running = list(self._running.values())
         stopping = [self.stop(recorder.entry, reason) for recorder in running]
         finishing = DeferredList(stopping, consumeErrors=True)
@@ -136,7 +155,7 @@ class Recordings:
         :raises Invalid: there is nothing to record, a bad name, or something would be recorded twice
         """
         topics = tuple(dict.fromkeys(resolve(topic) for topic in ask.topics))
-        cameras = tuple(dict.fromkeys(ask.cameras))
+        cameras = tuple(dict.fromkeys(_camera(name) for name in ask.cameras))
         if not topics and not cameras:
             raise Invalid("say what to record: 'topics', 'cameras' or both")
         written = [compressed.topic_of(camera) for camera in cameras]
@@ -170,8 +189,9 @@ class Recordings:
         """
         self._check_room(entry)
         self.library.add(entry)
+        self._starting[entry.id] = entry
         try:
-            await self._threads.run(self.library.save, entry.id, text_of(entry))
+            await self._threads.run(self._begin, entry.id, text_of(entry))
             reason = why_denied(permit, entry)
             if reason:
                 raise Refused(reason)
@@ -185,10 +205,16 @@ class Recordings:
             if isinstance(error, OSError):
                 raise Unavailable(f"recordings can't be written: {error.strerror}") from None
             raise
+        finally:
+            del self._starting[entry.id]
         self._ended[entry.id] = [ended]
 
     def stop(self, entry: Entry, reason: str) -> Deferred[None]:
-        """Finish a recording; fires when it has."""
+        """Finish a recording; fires when it has.
+
+        :raises Unavailable: it is just being begun
+        """
+        self._check_begun(entry)
         done: Deferred[None] = Deferred()
         running = self._running.get(entry.id)
         if running is None:
@@ -210,7 +236,7 @@ class Recordings:
         ros = not robot.encodings or "cdr" in robot.encodings
 
         def make_writer(ended: Callable[[Outcome], None]) -> Writer:
-            return Writer(self._reactor, path, entry.limit, ros, ended)
+            return Writer(self._reactor, path, entry.limit, ros, self.library.nearly_full, ended)
 
         recorder = self._running[entry.id] = Recorder(
             self._clock,
@@ -220,20 +246,60 @@ class Recordings:
             self._videos,
             make_writer,
             wall=self._wall,
+            changed=lambda entry: Deferred.fromCoroutine(self._save(entry)),
             ended=self._over,
         )
         return recorder
 
+    async def full(self, robot_id: int) -> str:
+        """Why there can't be one more recording of a robot, however small; empty when there can.
+
+        :raises Unavailable: too much is done with recordings to find out
+        """
+        full = self.library.full(robot_id)
+        try:
+            return full or await self._threads.run(self._why_nearly_full)
+        except OSError as error:
+            return f"recordings can't be written: {error.strerror}"
+
+    def _why_nearly_full(self) -> str:
+        """In a thread."""
+        if not self.library.nearly_full():
+            return ""
+        return f"{NEARLY_FULL}: {self.library.reserve / 10**6:.0f} MB of it must stay free; delete some recordings"
+
+    def _begin(self, id: str, text: bytes) -> None:
+        """In a thread: a recording that may begin is put on the disk.
+
+        :raises Unavailable: the disk is nearly full
+        :raises OSError: it can't be written
+        """
+        full = self._why_nearly_full()
+        if full:
+            raise Unavailable(full)
+        self.library.save(id, text)
+
     def _over(self, recorder: Recorder) -> None:
         entry = recorder.entry
-        saving = Deferred.fromCoroutine(self._save(entry))
+        saving = Deferred.fromCoroutine(self._put_down(entry))
 
         def told(_: object) -> None:
             del self._running[entry.id]
             for each in self._ended.pop(entry.id):
                 each(entry)
+            if entry.state is State.INCOMPLETE:
+                self._mender.later(entry)
 
         saving.addBoth(told)
+
+    async def _put_down(self, entry: Entry) -> None:
+        """Put on record how a recording ended."""
+        if entry.state is State.INCOMPLETE:
+            try:
+                entry.bytes = await self._threads.run(self.library.size, entry)
+            except (OSError, Unavailable):
+                self.log.error("nobody knows how large recording {id} became", id=entry.id)
+        await self._save(entry)
 
     async def _take_back(self, entry: Entry) -> None:
         try:
@@ -243,14 +309,24 @@ class Recordings:
                 "recording {id} did not begin, and stays: {reason}", id=entry.id, reason=str(error)
             )
 
-    async def _save(self, entry: Entry) -> None:
+    async def _save(self, entry: Entry) -> bool:
+        """Put on the disk what a recording is; whether that was done."""
         try:
-            await self._threads.run(self.library.save, entry.id, text_of(entry))
+            # One after the other: two threads would write the same file.
+            async with self._saving.setdefault(entry.id, DeferredLock()):
+                await self._threads.run(self.library.save, entry.id, text_of(entry))
         except (OSError, Unavailable) as error:
             self.log.error("recording {id} can't be put on record: {reason}", id=entry.id, reason=str(error))
+            return False
+        return True
+
+    def _check_begun(self, entry: Entry) -> None:
+        if entry.id in self._starting:
+            raise Unavailable("it is just being begun; try again in a moment")
 
     def _check_room(self, entry: Entry) -> None:
-        running = [recorder.entry for recorder in self._running.values()]
+        begun = {id: recorder.entry for id, recorder in self._running.items()}
+        running = {**self._starting, **begun}.values()
         if len(running) >= RECORDINGS:
             raise Unavailable(f"{RECORDINGS} recordings run, the most there may be")
         if sum(each.robot_id == entry.robot_id for each in running) >= ROBOT_RECORDINGS:
@@ -265,13 +341,22 @@ class Recordings:
 
         :raises Unavailable: it can't be deleted
         """
-        if self._mending is entry:
+        self._check_begun(entry)
+        if self._mender.current is entry:
             raise Unavailable("it is being recovered; try again in a moment")
+        self._deleting.add(entry.id)
         try:
-            await self._threads.run(self.library.delete, entry.id)
+            await to_the_end(Deferred.fromCoroutine(self._delete(entry)))
         except OSError as error:
             raise Unavailable(f"the recording can't be deleted: {error.strerror}") from None
-        self.library.forget(entry)
+
+    async def _delete(self, entry: Entry) -> None:
+        # To the end, also when who asked has left: what is half gone is kept by nobody's count.
+        try:
+            await self._threads.run(self.library.delete, entry.id)
+            self.library.forget(entry)
+        finally:
+            self._deleting.discard(entry.id)
 
     async def read(self, path: Path, offset: int, size: int) -> bytes:
         """A part of a file.
@@ -285,33 +370,23 @@ class Recordings:
                 file.seek(offset)
                 return file.read(size)
 
-        return await self._threads.run(work)
+        await self._turns.acquire()
+        # Who leaves keeps his turn until the thread is done: else coming and going would fill the queue.
+        return await to_the_end(Deferred.fromCoroutine(self._in_turn(work)))
 
-    async def _mend_all(self) -> None:
-        for entry in self.library.incomplete():
-            if self.library.has(entry) and not self._stopping.is_set():
-                self._mending = entry
-                try:
-                    await self._mend(entry)
-                except (OSError, Unavailable) as error:
-                    self.log.error(
-                        "recording {id} is not recovered: {reason}", id=entry.id, reason=str(error)
-                    )
-                finally:
-                    self._mending = None
-
-    async def _mend(self, entry: Entry) -> None:
-        path = self.library.path(entry)
+    async def _in_turn(self, work: Callable[[], bytes]) -> bytes:
         try:
-            messages = await self._threads.run(mend, path, self._stopping.is_set)
-        except FileNotFoundError:
-            # It had just been wanted.
-            await self._take_back(entry)
-            self.library.forget(entry)
-            return
-        if messages is not None:
-            found = path.stat()
-            entry.messages, entry.bytes = messages, found.st_size
-            entry.state, entry.ended = State.RECOVERED, entry.ended or found.st_mtime
-            self.log.info("recording {id} was recovered: {count} messages", id=entry.id, count=messages)
-            await self._save(entry)
+            return await self._threads.run(work)
+        finally:
+            self._turns.release()
+
+
+def _camera(name: str) -> str:
+    """A camera's full name; one without slash in front is taken as if it had it.
+
+    :raises Invalid: no name a camera could have
+    """
+    full = name if name.startswith("/") else f"/{name}"
+    if not full.strip("/") or len(full) > NAME or not full.isprintable():
+        raise Invalid(f"the name of a camera has at most {NAME} characters that can be printed")
+    return full

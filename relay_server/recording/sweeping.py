@@ -29,10 +29,10 @@ async def sweep(recordings: Recordings, store: Store, journal: Journal) -> None:
     for entry in left:
         if entry.begun > removed.get(entry.robot, -SLACK_SECONDS) + SLACK_SECONDS:
             continue
-        await recordings.stop(entry, "the robot was removed from the relay")
-        if not recordings.library.has(entry):
-            continue
         try:
+            await recordings.stop(entry, "the robot was removed from the relay")
+            if not recordings.library.has(entry):
+                continue
             await recordings.delete(entry)
         except Unavailable as error:
             _log.error(

@@ -17,10 +17,22 @@ from relay_server.recording.mcap_file import Full, McapFile, Track
 
 QUEUE_BYTES = 32 * MIB
 QUEUE_MESSAGES = 10_000
-"""What may wait for the disk. What comes then is dropped, and counted."""
+"""What may wait for the disk, with what is just being written. What comes then is dropped, and counted."""
 
-FLUSH_SECONDS = 1.0
-"""How much a relay that is killed may lose."""
+BATCH = 64
+"""Messages that the thread takes at a time; they keep their place in the queue until all of them are written."""
+
+LOOK_SECONDS = 1.0
+"""How often the disk is looked at."""
+
+FLUSH_SECONDS = (1.0, 10.0)
+"""How much a relay that is killed may lose: at first, and of a recording that has run for long."""
+
+FLUSH_SHARE = 1 / 60
+"""Of the time a recording has run, what may be lost, between these two. With each flush a chunk ends, which the file's
+index has in memory until the end."""
+
+NEARLY_FULL = "the disk is nearly full"
 
 
 class Message(NamedTuple):
@@ -37,6 +49,12 @@ class Message(NamedTuple):
     publish_time: int
     body: bytes
     make: Callable[[bytes], bytes] | None = None
+
+
+def flush_pause(age: float) -> float:
+    """Seconds until the next flush of a recording that has run for so many."""
+    least, most = FLUSH_SECONDS
+    return min(most, max(least, age * FLUSH_SHARE))
 
 
 class CallsBack(Protocol):
@@ -63,22 +81,32 @@ class Writer:
     :param path: where nothing is yet
     :param limit: bytes the file may have
     :param ros: whether messages are those of ROS 2
+    :param nearly_full: whether the disk is; asked in the thread, may raise :class:`OSError`
     :param ended: called once in the reactor's thread
     """
 
     log = Logger()
 
     def __init__(
-        self, reactor: CallsBack, path: Path, limit: int, ros: bool, ended: Callable[[Outcome], None]
+        self,
+        reactor: CallsBack,
+        path: Path,
+        limit: int,
+        ros: bool,
+        nearly_full: Callable[[], bool],
+        ended: Callable[[Outcome], None],
     ) -> None:
         self._reactor = reactor
         self._path = path
         self._limit = limit
         self._ros = ros
+        self._nearly_full = nearly_full
         self._ended = ended
         self._waiting: deque[Message] = deque()
         self._waiting_bytes = 0
+        self._in_hand = 0
         self._closing = False
+        self._astonished = False
         self._changed = threading.Condition()
         self.bytes = 0
         self.messages = 0
@@ -95,7 +123,7 @@ class Writer:
         with self._changed:
             if (
                 self._closing
-                or len(self._waiting) >= QUEUE_MESSAGES
+                or len(self._waiting) + self._in_hand >= QUEUE_MESSAGES
                 or self._waiting_bytes + len(message.body) > QUEUE_BYTES
             ):
                 return False
@@ -127,33 +155,46 @@ class Writer:
         reason = ""
         with self._path.open("xb") as stream:
             file = McapFile(stream, self._limit, self._ros)
-            flush_at = time.monotonic() + FLUSH_SECONDS
+            began = time.monotonic()
+            look_at, flush_at = began + LOOK_SECONDS, began + flush_pause(0)
             while True:
-                batch, closing = self._take(flush_at - time.monotonic())
+                batch, closing = self._take(min(look_at, flush_at) - time.monotonic())
                 try:
                     for message in batch:
                         self._add(file, message)
                 except Full:
                     reason = "it has reached its size"
                     break
+                self._put_down(batch)
                 if closing and not batch:
                     break
-                if time.monotonic() >= flush_at:
+                now = time.monotonic()
+                if now >= flush_at:
                     file.flush()
-                    flush_at = time.monotonic() + FLUSH_SECONDS
+                    flush_at = now + flush_pause(now - began)
+                if now >= look_at:
+                    if self._nearly_full():
+                        reason = NEARLY_FULL
+                        break
+                    look_at = now + LOOK_SECONDS
                 self.bytes, self.messages = file.size, file.messages
             file.finish()
             self.bytes, self.messages = file.size, file.messages
         return Outcome(True, reason)
 
     def _take(self, seconds: float) -> tuple[list[Message], bool]:
-        """What waits, after at most so long; and whether more may come."""
+        """Some of what waits, after at most so long; and whether no more may come."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._closing, max(0.0, seconds))
-            batch = list(self._waiting)
-            self._waiting.clear()
-            self._waiting_bytes = 0
+            batch = [self._waiting.popleft() for _ in range(min(BATCH, len(self._waiting)))]
+            self._in_hand = len(batch)
             return batch, self._closing
+
+    def _put_down(self, batch: list[Message]) -> None:
+        """These are written: others may have their place."""
+        with self._changed:
+            self._in_hand = 0
+            self._waiting_bytes -= sum(len(message.body) for message in batch)
 
     def _add(self, file: McapFile, message: Message) -> None:
         body = message.body
@@ -161,6 +202,13 @@ class Writer:
             try:
                 body = message.make(body)
             except SwitchboardError:
+                self.broken += 1
+                return
+            except Exception:
+                # What came from a robot must never end the file for all the others.
+                if not self._astonished:
+                    self._astonished = True
+                    self.log.failure("a message of {topic} could not be made", topic=message.track.topic)
                 self.broken += 1
                 return
         file.add(message.track, message.log_time, message.publish_time, body)

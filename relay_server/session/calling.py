@@ -10,6 +10,7 @@ from twisted.internet.defer import CancelledError, Deferred
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Refused, SwitchboardError
 from relay_protocol.limits import KIB, MIB
+from relay_protocol.link import MotionPolicy
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
 from relay_server.channel.wire import Sent
@@ -25,6 +26,7 @@ CALLS = 256
 CALL_BYTES = 2 * MIB
 """Arguments of calls that wait, over all of them."""
 STOP = "/relay/stop"
+RESUME = "/relay/resume"
 URGENT = (STOP, "/relay/release_control")
 """Who has used up what he may ask for may still stop a robot, and let go of it."""
 
@@ -44,7 +46,7 @@ class Calling:
     def __init__(self, session: Session, local: LocalNode) -> None:
         self._session = session
         self._local = local
-        self._calls: dict[Deferred[None], rosbridge.CallService] = {}
+        self._calls: dict[Deferred[bool], rosbridge.CallService] = {}
         self._bytes = 0
         self._ended = False
 
@@ -90,8 +92,10 @@ class Calling:
         running = Deferred.fromCoroutine(self._finish(ask, answer))
         self._calls[running] = ask
         self._bytes += size
+        if local is None:
+            self._session.notice("call.begun", service=service)
         running.addErrback(self._unexpected, ask)
-        running.addBoth(self._call_ended, running, size)
+        running.addBoth(self._call_ended, running, size, service if local is None else "")
 
     def sent(self, service: str, stamp: int) -> Sent:
         """What a call of a service is sent with; where calls of it move the robot it takes control.
@@ -100,9 +104,7 @@ class Calling:
         :raises Refused: it may be too old, somebody else has control, or it must be taken first
         """
         session = self._session
-        motion = session.robot.description.motion
-        action, goal, _ = service.partition(SEND_GOAL)
-        moves = motion.moves_by_service(service) or bool(goal and motion.moves_by_action(action))
+        moves = moves_by(session.robot.description.motion, service)
         movement = Movement(session, f"a call of {service}", stamp) if moves else None
         return Sent(session.number, stamp, movement)
 
@@ -111,9 +113,12 @@ class Calling:
         message = rosbridge.service_response(call.service, call.id, result, values)
         self._session.say(message, asked(call, untold))
 
-    def _call_ended(self, _: Any, running: Deferred[None], size: int) -> None:
+    def _call_ended(self, done: bool | None, running: Deferred[bool], size: int, service: str) -> None:
+        """:param service: of the robot; empty for one of the relay's own"""
         self._calls.pop(running, None)
         self._bytes -= size
+        if service:
+            self._session.notice("call.ended", service=service, ok=bool(done))
 
     async def _call_local(
         self, local: Callable[[Session, Any], Awaitable[Any]], args: Any, urgent: bool
@@ -123,11 +128,13 @@ class Calling:
         with share.timed() if urgent else share.counted():
             return jsontext.encode(answer)
 
-    async def _finish(self, ask: rosbridge.CallService, answer: Awaitable[bytes]) -> None:
+    async def _finish(self, ask: rosbridge.CallService, answer: Awaitable[bytes]) -> bool:
         try:
             self.answer(ask, True, await answer)
         except SwitchboardError as error:
             self._session.refuse(ask, error)
+            return False
+        return True
 
     def _unexpected(self, failure: Any, ask: rosbridge.CallService) -> None:
         if failure.check(CancelledError):
@@ -137,6 +144,12 @@ class Calling:
             return
         self._session.log.failure("a call of {service} failed", failure, service=ask.service)
         self.answer(ask, False, jsontext.encode("the relay failed on this call; its log tells more"))
+
+
+def moves_by(motion: MotionPolicy, service: str) -> bool:
+    """Whether calls of a service move a robot, be it by giving an action a goal."""
+    action, goal, _ = service.partition(SEND_GOAL)
+    return motion.moves_by_service(service) or bool(goal and motion.moves_by_action(action))
 
 
 def is_urgent(ask: rosbridge.ClientOp) -> bool:

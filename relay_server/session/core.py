@@ -29,7 +29,7 @@ from relay_server.outbox import DATA_PER_TOPIC, Outbox
 from relay_server.registry import Presence
 from relay_server.rounds import Rounds
 from relay_server.session.calling import Calling
-from relay_server.session.ends import ClientTransport, LocalNode, Timing
+from relay_server.session.ends import ClientTransport, LocalNode, Notice, Timing, unnoticed
 from relay_server.session.incoming import Incoming
 from relay_server.session.listening import Listening
 from relay_server.session.operations import CHANGES_A_SECOND, CHANGES_AT_ONCE, answer_failed, perform
@@ -98,6 +98,7 @@ class Session:
         self.refusals = 0
         self.plain_instead = 0
         self.queued_bytes = 0
+        self.notice: Notice = unnoticed
         self.share = Share(self)
         self._clock = clock
         self._transport = transport
@@ -173,6 +174,7 @@ class Session:
         self.incoming.end()
         self.listening.end()
         self.calling.end()
+        self.pursuing.end()
         self.channel.detach(self)
         self._ended(self)
 
@@ -233,6 +235,24 @@ class Session:
         except SwitchboardError as error:
             self.refuse(operation, error)
             self.share.refused()
+
+    def do(self, operation: rosbridge.ClientOp, since: int | None) -> None:
+        """What a client asks for that lives in the relay: as :meth:`message`, but what is refused is raised.
+
+        :param since: a moment before which it can't have been asked for, where it may be older than a message would be
+        :raises SwitchboardError: it is refused
+        """
+        with self._freshness.as_of(self._freshness.not_before if since is None else since):
+            try:
+                if isinstance(operation, rosbridge.Publish):
+                    self.share.check()
+                    self.publishing.publish(operation)
+                else:
+                    perform(self, operation)
+            except SwitchboardError:
+                self.refusals += 1
+                self.share.refused()
+                raise
 
     def _no_rosbridge(self, error: PeerError, data: bytes) -> None:
         self._malformed += 1

@@ -36,6 +36,17 @@ class LocalNode(Protocol):
         """Whether such a topic is published when it changes, and not once a second."""
 
 
+class Notice(Protocol):
+    """Who takes notes of what clients do, beside all samples."""
+
+    def __call__(self, kind: str, **data: Any) -> None:
+        """Something has begun or ended: ``kind`` such as ``goal.begun``."""
+
+
+def unnoticed(kind: str, **data: Any) -> None:
+    """Nobody takes notes."""
+
+
 @dataclass(frozen=True)
 class Timing:
     """Times of a session, seconds; see :class:`relay_server.config.Settings`."""

@@ -17,7 +17,9 @@ TOPICS = 64
 STILL_BYTES = 64 * KIB
 """A longer command is not looked at, and counts as one that moves."""
 
-_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+_TRAJECTORIES = frozenset(
+    {"trajectory_msgs/msg/JointTrajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory"}
+)
 _BESIDE = {"control_msgs/msg/JointJog": ("header", "joint_names", "duration")}
 """By type, the fields that move nothing."""
 
@@ -61,7 +63,7 @@ def is_still(type_name: str, body: bytes) -> bool:
         return False
     if not isinstance(message, dict):
         return False
-    if type_name == _TRAJECTORY:  # to all zeros is a way as well
+    if type_name in _TRAJECTORIES:  # to all zeros is a way as well
         return not message.get("points")
     beside = _BESIDE.get(type_name, ("header",))
     return all(_nothing(value) for field, value in message.items() if field not in beside)

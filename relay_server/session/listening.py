@@ -91,6 +91,10 @@ class Listening:
             return
         self._drop(topic)
 
+    def hears(self, topic: str) -> bool:
+        """Whether a topic is subscribed, still."""
+        return topic in self._listeners
+
     def drops(self) -> dict[str, int]:
         """Samples the client did not take in time, by topic."""
         counted = self._session.outbox.drops

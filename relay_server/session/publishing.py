@@ -83,6 +83,7 @@ class Publishing:
         "_desk",
         "_freshness",
         "_grips",
+        "_held",
         "_number",
         "_permit",
         "_robot",
@@ -105,6 +106,8 @@ class Publishing:
         self._waiting: dict[str, _Waiting] = {}
         """The newest command to each topic, while the robot is being told that it comes from here."""
         self._grips = Grips()
+        self._held: object = None
+        """The latest tenure of control in which this client has moved the robot."""
         self.stale_commands = 0
         self.commanded = 0
         """The relay's monotonic nanoseconds before which the latest command can't have been sent."""
@@ -202,7 +205,8 @@ class Publishing:
         desk, session = self._desk, self._session
         if session.number in desk.standing.suppressed.get(topic, ()):
             return False
-        return desk.lease.held_by(session) and self._grips.holds(topic, self._now())
+        # By when it can have been sent at the earliest: a link that stalls is no silence of the client.
+        return desk.lease.held_by(session) and self._grips.holds(topic, self._freshness.not_before)
 
     def _let_by(self, route: Route, ask: rosbridge.Publish) -> bool:
         """Whether a command goes to the robot though its route does not pass; else it waits.
@@ -242,6 +246,10 @@ class Publishing:
         """A command has passed: one that moves keeps control from idling, while the robot is not stopped."""
         if route.standing.stopped is None and not _is_still(route, ask):
             self.drove = self._freshness.not_before
+            holder = self._desk.lease.holder
+            if holder is not self._held and self._desk.lease.held_by(self._session):
+                self._held = holder
+                self._session.notice("motion.begun", topic=route.publication.topic)
 
     def _in_vain(self, route: Route, still: bool) -> None:
         """A command was refused, held back or too old.
@@ -251,7 +259,7 @@ class Publishing:
         topic, now = route.publication.topic, self._now()
         if still:
             self._grips.let_go(topic)
-        elif self._desk.in_vain(self._session) or self._grips.holds(topic, now):
+        elif self._desk.in_vain(self._session) or self._grips.holds(topic, self._freshness.not_before):
             self._grips.in_vain(topic, now)
 
     def _now(self) -> int:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from twisted.internet.defer import Deferred
+
 from relay_protocol import jsontext, rosbridge
 from relay_protocol.errors import Invalid, Refused
 from relay_protocol.limits import MIB
@@ -72,6 +74,7 @@ class Pursuing:
         self._check_room(ask)
         goal = _Goal(self, ask, asked(ask, session.tell), moves)
         self._goals.append(goal)
+        session.notice("goal.begun", action=action, goal=ask.id)
         pursued = session.channel.asking.pursue(
             session,
             goal,
@@ -82,6 +85,22 @@ class Pursuing:
             feedback=ask.feedback,
         )
         goal.pursued = pursued
+
+    def beginning(self, id: rosbridge.Id) -> Deferred[None]:
+        """Fires when a goal has been handed on to who is to pursue it, or is over."""
+        waiting: Deferred[None] = Deferred()
+
+        def done(result: object) -> object:
+            if not waiting.called:
+                waiting.callback(None)
+            return result
+
+        for goal in self._goals:
+            if goal.ask.id == id and goal.pursued is not None and goal.pursued.beginning is not None:
+                goal.pursued.beginning.addBoth(done)
+                return waiting
+        done(None)
+        return waiting
 
     def cancel(self, ask: rosbridge.CancelActionGoal) -> None:
         """The client wants a goal no more; its result still comes."""
@@ -121,10 +140,19 @@ class Pursuing:
     def goal_ended(self, goal: _Goal, status: int, result: bool, values: bytes) -> None:
         """Take a goal off the list. Feedback that still waits would come behind the result; it is let go."""
         self._goals.remove(goal)
+        self._notice_end(goal, status)
         self._session.outbox.forget(goal)
         if status == Status.NEVER_BEGAN:
             self._session.tell("error", str(jsontext.decode_any(values)), goal.ask.id)
         self.answer(goal.ask, status, result, values, goal.form)
+
+    def end(self) -> None:
+        """Nobody is left to hear of goals; the channel has them cancelled."""
+        for goal in self._goals:
+            self._notice_end(goal, Status.CANCELED)
+
+    def _notice_end(self, goal: _Goal, status: int) -> None:
+        self._session.notice("goal.ended", action=resolve(goal.ask.action), goal=goal.ask.id, status=status)
 
     def _check_room(self, ask: rosbridge.SendActionGoal) -> None:
         if ask.id is not None and any(goal.ask.id == ask.id for goal in self._goals):

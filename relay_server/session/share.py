@@ -72,6 +72,10 @@ class Share:
         if not self.counting:
             await self._session.channel.line.turn()
 
+    def took(self, seconds: float) -> None:
+        """Work for the client was done by another thread, for so long."""
+        self._spent(seconds)
+
     def refused(self) -> None:
         """Something was refused, which is not timed: that would take longer."""
         self._spent(REFUSAL)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from msgspec import structs
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError, Unavailable
@@ -22,6 +24,12 @@ class NothingCame(Unavailable):
     code = "nothing_came"
 
 
+class NotMade(Unavailable):
+    """The robot can't make these pictures in the form of H.264; in another one it may."""
+
+    code = "not_made"
+
+
 class TooOften(Unavailable):
     """Somebody begins ever new streams; he may again after ``retry_after`` seconds."""
 
@@ -32,6 +40,25 @@ class TooOften(Unavailable):
             f"you begin streams of robot {robot} faster than it can; try again in {int(retry_after) + 1} s"
         )
         self.retry_after = retry_after
+
+
+def differing(wanted: link.VideoSettings, shown: link.VideoSettings) -> dict[str, Any]:
+    """The parameters by which a form of a camera differs from the one that was asked for, as they are in it."""
+    asked = structs.asdict(wanted)
+    return {name: value for name, value in structs.asdict(shown).items() if value != asked[name]}
+
+
+class Wish(NamedTuple):
+    """What a viewer came for.
+
+    :param settings: the form he asked for, which is another one than he is shown while the robot is at its limit
+    :param newest: whether he wants to see the newest picture of a slow camera until the next one comes
+    :param first: whether he gets a place that becomes free before others do: a recording can't be made again
+    """
+
+    settings: link.VideoSettings
+    newest: bool = False
+    first: bool = False
 
 
 class VideoLink(Protocol):
@@ -61,7 +88,9 @@ class Viewer(Protocol):
         """What the robot sends from now on."""
 
     def moved(self, stream: Stream) -> None:
-        """The robot is at its limit: from now on it is this stream that is watched, and left by ``detach``."""
+        """From now on it is this stream that is watched, and left by ``detach``: the nearest one, because the robot is
+        at its limit, or, when there is a place again, the one that was asked for.
+        """
 
     def ended(self, error: SwitchboardError) -> None:
         """The stream can't be had, or no more. Called once; the viewer is detached already."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator
 
 from relay_protocol import link
@@ -11,7 +12,7 @@ from relay_server.bucket import TokenBucket
 from relay_server.clock import Clock
 from relay_server.registry import Presence
 from relay_server.tickets import Tickets
-from relay_server.video.ends import TooOften, Viewer
+from relay_server.video.ends import TooOften, Viewer, Wish
 from relay_server.video.states import State
 from relay_server.video.stream import Hooks, Stream
 
@@ -19,8 +20,8 @@ ROBOT_STREAMS = 16
 """Most streams of one robot, if it does not say that it makes fewer."""
 
 USER_SHARE = 0.75
-"""Of these one user may watch so many alone: who asks for ever other sizes, or for cameras that are not there, leaves
-room for others."""
+"""Of these one user may watch so many alone, rounded up: who asks for ever other sizes, or for cameras that are not
+there, leaves room for others."""
 
 USER_VIEWERS = 32
 """Most viewers of one user on one robot, over all his connections."""
@@ -44,10 +45,14 @@ class Videos:
         self._clock = clock
         self._streams: dict[Key, Stream] = {}
         self._tickets: Tickets[Stream] = Tickets(clock, new_ticket)
-        self._hooks = Hooks(self._tickets.issue, self._busy, self._forget)
+        self._hooks = Hooks(self._tickets.issue, self._busy, self._left, self._forget)
         self._counter = itertools.count(1)
         self._begun: dict[tuple[int, int], TokenBucket] = {}
         """By user and robot. Each is kept for good: who comes back has what he has left."""
+        self._refused: Stream | None = None
+        """The latest that the robot had no place for: that it is over makes no place either."""
+        self._free: set[int] = set()
+        """Ids of robots that may have a place again, which is given away in the next turn."""
 
     def __iter__(self) -> Iterator[Stream]:
         return iter(list(self._streams.values()))
@@ -56,9 +61,23 @@ class Videos:
         """The robot's streams, oldest first."""
         return [stream for stream in self if stream.robot is robot]
 
-    def watch(self, robot: Presence, camera: str, settings: link.VideoSettings, viewer: Viewer) -> Stream:
+    def watch(
+        self,
+        robot: Presence,
+        camera: str,
+        settings: link.VideoSettings,
+        viewer: Viewer,
+        *,
+        newest: bool = False,
+        first: bool = False,
+    ) -> Stream:
         """Have a camera shown to a viewer, until he detaches from the stream or is told that it has ended.
 
+        Where one more stream can't be it is the nearest there is, which its ``settings`` tell; he is moved as soon as
+        there is a place.
+
+        :param newest: as in :class:`Wish`
+        :param first: as in :class:`Wish`
         :raises Unavailable: too many are shown or watch already
         :raises TooOften: the user begins new ones too fast
         """
@@ -68,7 +87,7 @@ class Videos:
         stream = self._streams.get((robot.robot_id, camera, settings)) or self._place(
             robot, camera, settings, viewer.user
         )
-        stream.attach(viewer)
+        stream.attach(viewer, Wish(settings, newest, first))
         return stream
 
     def redeem(self, ticket: str) -> Stream | None:
@@ -93,9 +112,9 @@ class Videos:
         here = self.of(robot)
         most = min(robot.streams or ROBOT_STREAMS, ROBOT_STREAMS)
         alone = sum({each.user for each in stream.viewers} == {user} for stream in here)
-        if alone >= max(1, int(most * USER_SHARE)):
+        if alone >= math.ceil(most * USER_SHARE):
             return self._instead(
-                robot, camera, settings, f"you have {alone} streams of robot {robot.name} to yourself"
+                robot, camera, settings, f"you have {_streams(alone)} of robot {robot.name} to yourself"
             )
         idle: Stream | None = None
         if len(here) >= most:
@@ -105,11 +124,14 @@ class Videos:
                     robot,
                     camera,
                     settings,
-                    f"robot {robot.name} shows {most} streams already, the most it can",
+                    f"robot {robot.name} shows {_streams(most)} already, the most it can",
                 )
         self._count(robot, user)
         if idle is not None:
             idle.shut(Unavailable("others need the place"))
+        return self._new(robot, camera, settings)
+
+    def _new(self, robot: Presence, camera: str, settings: link.VideoSettings) -> Stream:
         name = f"{robot.name}#video{next(self._counter)}"
         stream = Stream(self._clock, robot, camera, settings, name, self._hooks)
         self._streams[robot.robot_id, camera, settings] = stream
@@ -135,21 +157,85 @@ class Videos:
         return nearest
 
     def _busy(self, stream: Stream) -> None:
+        self._refused = stream
         nearest = self._nearest(stream.robot, stream.camera, stream.settings)
         if nearest is not None:
-            stream.move(nearest)
+            for viewer in list(stream.viewers):
+                stream.move(viewer, nearest)
+
+    def _give_away(self, robot: Presence) -> None:
+        """Who is shown another form than he asked for gets that, as far as there is room; recordings first."""
+        self._free.discard(robot.robot_id)
+        if robot.control is None:
+            # Whether there is a place it can't be asked.
+            return
+        waiting = [
+            (viewer, stream, wish)
+            for stream in self.of(robot)
+            for viewer, wish in stream.wishes.items()
+            if wish.settings != stream.settings
+        ]
+        for viewer, stream, wish in sorted(waiting, key=lambda each: not each[2].first):
+            key = (robot.robot_id, stream.camera, wish.settings)
+            try:
+                found = self._streams.get(key) or self._place(
+                    robot, stream.camera, wish.settings, viewer.user
+                )
+            except Unavailable:
+                continue
+            if found.settings == wish.settings:
+                stream.move(viewer, found)
+        for stream in self.of(robot):
+            if stream.viewers and not _asked_for(stream):
+                self._replace(stream)
+
+    def _replace(self, stream: Stream) -> None:
+        """None of those who are shown it asked for it: one of them gets what he asked for in its place."""
+        wishes = stream.wishes.values()
+        fitting = (
+            (viewer, wish.settings)
+            for viewer, wish in sorted(stream.wishes.items(), key=lambda each: not each[1].first)
+            if all(_may_stand_for(wish.settings, each.settings) for each in wishes)
+        )
+        viewer, settings = next(fitting, (None, stream.settings))
+        if viewer is None:
+            return
+        try:
+            self._count(stream.robot, viewer.user)
+        except TooOften:
+            return
+        found = self._new(stream.robot, stream.camera, settings)
+        for each in list(stream.wishes):
+            stream.move(each, found)
+        stream.shut(Unavailable("others need the place"))
+
+    def _left(self, stream: Stream) -> None:
+        if stream is not self._refused and not _asked_for(stream):
+            self._look_for_places(stream.robot)
+
+    def _look_for_places(self, robot: Presence) -> None:
+        """Give away what there is in the next turn, and not at once: who has just freed a place may need it."""
+        if robot.robot_id not in self._free:
+            self._free.add(robot.robot_id)
+            self._clock.callLater(0, self._give_away, robot)
 
     def _nearest(self, robot: Presence, camera: str, settings: link.VideoSettings) -> Stream | None:
-        """The stream of a camera that is nearest in size, rather one that has the time burned in, or not, as wished.
+        """The stream of a camera that is nearest in size, then in quality, then in the time between two pictures.
 
-        Never one that is turned or cropped otherwise: an upside-down picture misleads who drives by it.
+        Rather one that has the time burned in, or not, as wished. Never one that is turned or cropped otherwise: an
+        upside-down picture misleads who drives by it.
         """
         wanted = _pixels(robot, camera, settings)
 
-        def distance(stream: Stream) -> tuple[bool, int]:
-            picture = stream.newest
+        def distance(stream: Stream) -> tuple[bool, int, int, float]:
+            picture, its = stream.newest, stream.settings
             there = picture.width * picture.height if picture is not None else 0
-            return stream.settings.stamp != settings.stamp, abs(there - wanted)
+            return (
+                its.stamp != settings.stamp,
+                abs(there - wanted),
+                abs(its.quality - settings.quality),
+                abs(_pause(its) - _pause(settings)),
+            )
 
         shown = [
             stream
@@ -158,20 +244,41 @@ class Videos:
             and stream.settings != settings
             and _part(stream.settings) == _part(settings)
             and stream.settings.codec == settings.codec
-            # Another transport may be another topic, with rights of its own.
-            and stream.settings.transport in ("", settings.transport)
+            and _may_stand_for(stream.settings, settings)
             and stream.newest is not None
         ]
         return min(shown, key=distance, default=None)
 
     def _forget(self, stream: Stream) -> None:
-        del self._streams[stream.robot.robot_id, stream.camera, stream.settings]
+        robot = stream.robot
+        del self._streams[robot.robot_id, stream.camera, stream.settings]
         self._tickets.withdraw(stream)
+        if stream is not self._refused:
+            self._look_for_places(robot)
+
+
+def _streams(count: int) -> str:
+    return f"{count} stream{'' if count == 1 else 's'}"
+
+
+def _asked_for(stream: Stream) -> bool:
+    """Whether anybody who is shown it asked for just that."""
+    return any(wish.settings == stream.settings for wish in stream.wishes.values())
+
+
+def _may_stand_for(settings: link.VideoSettings, wanted: link.VideoSettings) -> bool:
+    """Whether who wants the one may be shown the other: another transport may be another topic, with its own rights."""
+    return settings.transport in ("", wanted.transport)
 
 
 def _part(settings: link.VideoSettings) -> tuple[object, ...]:
     """What of the camera's picture is shown, and how it is turned."""
     return settings.crop, settings.rotate, settings.invert
+
+
+def _pause(settings: link.VideoSettings) -> float:
+    """Seconds between two pictures; 0 where all there are were asked for."""
+    return 1 / settings.fps if settings.fps else 0.0
 
 
 def _pixels(robot: Presence, camera: str, settings: link.VideoSettings) -> int:

@@ -7,8 +7,17 @@ import msgspec
 STALE_SECONDS = 0.5
 """Age from which a picture is not shown any more, the least time on its way not counted."""
 
+OFTEN = 0.5
+"""Pictures per second from which on the next one comes soon, and one that is late is not missed."""
+
 SPAN_SECONDS = 10.0
 """The least delay is that of the last one or two times this."""
+
+EVEN_SECONDS = 2.0
+WAVER_SECONDS = 0.2
+EVEN_PICTURES = 3
+"""Pictures that come for so long, by delays that waver by no more than this, and at least so many, are not held up by
+anything: the robot's clock was set, or their way is another one now."""
 
 
 class Picture(msgspec.Struct, frozen=True, gc=False):
@@ -21,6 +30,7 @@ class Picture(msgspec.Struct, frozen=True, gc=False):
     :param width: pixels
     :param height: pixels
     :param key: whether it stands alone; always true for JPEG and PNG
+    :param reduced: how far it is below what was asked for, 0 to 1
     """
 
     number: int
@@ -31,19 +41,24 @@ class Picture(msgspec.Struct, frozen=True, gc=False):
     height: int
     key: bool
     body: bytes
+    reduced: float = 0.0
 
 
 class Lateness:
     """How much later pictures come than they might: after a stall of the network old ones come in a heap.
 
     The robot's clock and the relay's show different times; but what came with the least delay of late was hardly late.
+    What comes too late to be shown, and evenly so, is the new measure: else nobody saw anything once a clock was set.
     """
 
-    __slots__ = ("_before", "_least", "_since")
+    __slots__ = ("_before", "_count", "_even_since", "_high", "_least", "_low", "_since")
 
     def __init__(self) -> None:
         self._since = float("-inf")
         self._least = self._before = float("inf")
+        self._even_since = 0.0
+        self._low = self._high = 0.0
+        self._count = 0
 
     def of(self, stamp: float, now: float) -> float:
         """Seconds.
@@ -55,4 +70,20 @@ class Lateness:
         if now - self._since >= SPAN_SECONDS:
             self._since, self._before, self._least = now, self._least, delay
         self._least = min(self._least, delay)
-        return delay - min(self._least, self._before)
+        late = delay - min(self._least, self._before)
+        if late <= STALE_SECONDS:
+            self._count = 0
+        elif self._come_evenly(delay, now):
+            self._since, self._before, self._least = now, float("inf"), self._low
+            self._count = 0
+            return delay - self._low
+        return late
+
+    def _come_evenly(self, delay: float, now: float) -> bool:
+        """Whether the last pictures, which were all late, were so by much the same."""
+        low, high = min(self._low, delay), max(self._high, delay)
+        if self._count == 0 or high - low > WAVER_SECONDS:
+            self._even_since, self._count, low, high = now, 0, delay, delay
+        self._low, self._high = low, high
+        self._count += 1
+        return self._count >= EVEN_PICTURES and now - self._even_since >= EVEN_SECONDS

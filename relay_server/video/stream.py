@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from msgspec import structs
 from twisted.logger import Logger
 
 from relay_protocol import link
@@ -13,15 +14,14 @@ from relay_protocol.frames import VideoFrame
 from relay_protocol.pictures import look_at
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.registry import Presence
-from relay_server.video.ends import NO_CAMERA, NothingCame, VideoLink, Viewer
-from relay_server.video.pictures import STALE_SECONDS, Lateness, Picture
+from relay_server.video.ends import NO_CAMERA, NothingCame, NotMade, VideoLink, Viewer, Wish
+from relay_server.video.keys import Keys
+from relay_server.video.patience import UNKNOWN_SECONDS, Patience, between
+from relay_server.video.pictures import OFTEN, STALE_SECONDS, Lateness, Picture
 from relay_server.video.states import LINKED, NEXT, Event, State
 
 STREAM_VIEWERS = 256
 """Most viewers of a stream."""
-
-FIRST_PICTURE_SECONDS = 10.0
-"""A viewer that has got no picture by then is told why; one that has got some waits on."""
 
 LINGER_SECONDS = 1.0
 """A stream goes on for so long after its last viewer."""
@@ -33,8 +33,8 @@ REOPEN_SECONDS = 0.5
 MOST_REOPEN_SECONDS = 5.0
 """Pause before a broken link is asked for anew; it doubles each time, until a picture comes."""
 
-KEY_SECONDS = 0.5
-"""The robot is asked for a key frame no more often than this, whoever comes."""
+TELL_SECONDS = 0.1
+"""Viewers are told no more often what is sent; the newest counts, and a robot could say it a thousand times at once."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,13 @@ class Hooks:
     :param issue_ticket: makes the ticket the robot joins with
     :param busy: called when the robot can't make one stream more: the hub moves the viewers to another stream,
         if there is one; who stays is told the robot's reason
+    :param left: called when somebody has left, but not all
     :param closed: called once, when it is over
     """
 
     issue_ticket: Callable[[Stream], str]
     busy: Callable[[Stream], None]
+    left: Callable[[Stream], None]
     closed: Callable[[Stream], None]
 
 
@@ -77,51 +79,62 @@ class Stream:
         self._hooks = hooks
         self.state = State.NEW
         self.viewers: set[Viewer] = set()
+        self.wishes: dict[Viewer, Wish] = {}
+        """What each of them came for."""
         self.newest: Picture | None = None
         self.told: link.Playing | None = None
         """What the robot sends at present, once it has said so."""
         self._link: VideoLink | None = None
         self._lateness = Lateness()
-        self._patience: dict[Viewer, Timer] = {}
-        """Of those who have not got any picture."""
-        self._unready: set[Viewer] = set()
-        """Those who can't show anything but a picture that stands alone."""
+        self._patience = Patience(clock, self._due, self._in_vain)
+        self._keys = Keys(clock, self._ask_for_key)
+        self._late = False
+        """Whether the newest picture came too late for everybody."""
+        self._viewers_told: link.Playing | None = None
+        self._telling: Timer | None = None
         self._timer: Timer | None = None
         self._pause = REOPEN_SECONDS
-        self._key_timer: Timer | None = None
-        self._key_asked = -KEY_SECONDS
         robot.watchers.append(self)
 
     # --- viewers ------------------------------------------------------------------------------------------
 
-    def attach(self, viewer: Viewer) -> None:
+    def attach(self, viewer: Viewer, wish: Wish | None = None) -> None:
         """Somebody begins to watch; he is told nothing before this has returned.
 
+        :param wish: what he came for; by default this stream, from its next picture on
         :raises Unavailable: too many watch
         """
         if len(self.viewers) >= STREAM_VIEWERS:
             raise Unavailable(f"{STREAM_VIEWERS} viewers watch this stream already")
         self.viewers.add(viewer)
-        self._unready.add(viewer)
-        self._patience[viewer] = self._clock.callLater(FIRST_PICTURE_SECONDS, self._in_vain, viewer)
+        self.wishes[viewer] = wish or Wish(self.settings)
+        self._keys.enters([viewer])
+        self._patience.begins(viewer)
         self._happen(Event.WANTED)
         self._look_for_camera()
         if self.state in LINKED:
             self._clock.callLater(0, self._greet, viewer)
-            self._want_key()
+            self._want_key(viewer)
 
     def detach(self, viewer: Viewer) -> None:
         """Somebody watches no more; nothing is told to him from now on."""
         if viewer in self.viewers:
             self._drop(viewer)
-            if not self.viewers:
+            if self.viewers:
+                self._hooks.left(self)
+            else:
                 self._happen(Event.LEFT)
 
     def start_anew(self, viewer: Viewer) -> None:
-        """A viewer has left out a picture: what follows is no use to him before one that stands alone."""
-        if viewer in self.viewers:
-            self._unready.add(viewer)
-            self._want_key()
+        """A viewer has left out a picture of H.264: what follows is no use to him before one that stands alone."""
+        if viewer not in self.viewers:
+            return
+        if self._link is None:
+            self._keys.enters([viewer])
+        elif self._late:
+            self._keys.wants(viewer)
+        else:
+            self._keys.left_out(viewer)
 
     def shut(self, error: SwitchboardError) -> None:
         """It is over at once.
@@ -135,45 +148,64 @@ class Stream:
         for viewer in told:
             viewer.ended(error)
 
-    def move(self, stream: Stream) -> None:
-        """The viewers watch another stream from now on, but for those it does not take."""
-        for viewer in list(self.viewers):
-            try:
-                stream.attach(viewer)
-            except Unavailable:
-                continue
-            self._drop(viewer)
-            viewer.moved(stream)
+    def move(self, viewer: Viewer, stream: Stream) -> None:
+        """A viewer watches another stream from now on, unless that does not take him."""
+        try:
+            stream.attach(viewer, self.wishes[viewer])
+        except Unavailable:
+            return
+        self.detach(viewer)
+        viewer.moved(stream)
 
     def _drop(self, viewer: Viewer) -> None:
         self.viewers.discard(viewer)
-        self._unready.discard(viewer)
-        cancel(self._patience.pop(viewer, None))
+        self.wishes.pop(viewer, None)
+        self._keys.leaves(viewer)
+        self._patience.ends(viewer)
 
     def _greet(self, viewer: Viewer) -> None:
-        """Who comes later is told what the others know."""
+        """Who comes later is told what the others know.
+
+        Who wanted to is shown the newest picture of a slow camera, too, as everybody is one that its publisher keeps;
+        its stamp tells how old it is.
+        """
         if viewer in self.viewers and self.told is not None:
             viewer.playing(self.told)
-        newest = self.newest
-        if newest is not None and newest.key and self._clock.seconds() <= newest.good_until:
-            self._show(newest, [viewer] if viewer in self._unready else [])
+        newest, now = self.newest, self._clock.seconds()
+        if viewer not in self.viewers or newest is None or not newest.key or not self._keys.waits(viewer):
+            return
+        kept = self.told is not None and self.told.latched
+        due = self._due() or (UNKNOWN_SECONDS if newest.number <= 1 else 0.0)
+        if now <= newest.good_until:
+            self._show(newest, [viewer])
+        elif kept or (self.wishes[viewer].newest and now - newest.good_until + STALE_SECONDS <= due):
+            self._show(structs.replace(newest, good_until=now + STALE_SECONDS), [viewer])
 
     def _show(self, picture: Picture, viewers: list[Viewer]) -> None:
         for viewer in viewers:
-            if picture.key:
-                self._unready.discard(viewer)
             # One may leave while another is shown the picture.
-            if viewer in self.viewers and viewer not in self._unready:
-                cancel(self._patience.pop(viewer, None))
+            if viewer not in self.viewers:
+                continue
+            if picture.key:
+                self._keys.shown(viewer)
+            if not self._keys.waits(viewer):
+                self._patience.ends(viewer)
                 viewer.picture(picture)
 
-    def _in_vain(self, viewer: Viewer) -> None:
-        """No picture has come for him."""
-        error = self._why_none()
+    def _due(self) -> float:
+        """Seconds from one picture to the next; 0: not known, or there is no link on which any could come."""
+        return between(self.settings, self._named(), self.told) if self.state in LINKED else 0.0
+
+    def _in_vain(self, viewer: Viewer, waited: float) -> None:
+        """No picture has come for him.
+
+        :param waited: seconds
+        """
+        error = self._why_none(waited)
         self.detach(viewer)
         viewer.ended(error)
 
-    def _why_none(self) -> SwitchboardError:
+    def _why_none(self, waited: float) -> SwitchboardError:
         robot = self.robot.name
         if self.robot.control is None:
             return Unavailable(f"robot {robot} is offline")
@@ -181,7 +213,7 @@ class Stream:
             return NotFound(NO_CAMERA)
         if self.state is State.OPENING:
             return NothingCame(f"robot {robot} does not open the video of {self.camera}")
-        return NothingCame(f"camera {self.camera} has given no picture for {FIRST_PICTURE_SECONDS:g} s")
+        return NothingCame(f"camera {self.camera} has given no picture for {waited:.0f} s")
 
     # --- the robot ----------------------------------------------------------------------------------------
 
@@ -205,7 +237,13 @@ class Stream:
             video_link.close("this stream is not being opened")
             return
         self._link = video_link
+        # Its clock may have been set while it was away.
+        self._lateness = Lateness()
         self._happen(Event.JOINED)
+
+    def part(self) -> None:
+        """A part of a picture came over the link; the rest is still on its way."""
+        self._patience.coming()
 
     def picture(self, frame: VideoFrame) -> None:
         """A picture came over the link.
@@ -220,22 +258,40 @@ class Stream:
         except MalformedMessage as error:
             # The link is told by whoever broke off, not by us.
             self._link = None
-            self.shut(Unavailable(f"robot {self.robot.name} sent what is no picture: {error}"))
+            self.shut(self._not_so(f"robot {self.robot.name} sent what is no picture: {error}"))
             raise
         self._pause = REOPEN_SECONDS
         self.newest = picture
+        self._late = self._clock.seconds() > picture.good_until
         self._show(picture, list(self.viewers))
 
     def message(self, message: link.RobotVideo) -> None:
         """A message came over the link; pings and farewells are the connection's."""
         if isinstance(message, link.Playing):
             self.told = message
-            for viewer in list(self.viewers):
-                viewer.playing(message)
+            if self._telling is None or not self._telling.active():
+                self._tell()
         elif isinstance(message, link.NotPlaying):
+            reason = message.reason or f"robot {self.robot.name} can't show {self.camera}"
             if message.busy:
                 self._hooks.busy(self)
-            self.shut(Unavailable(message.reason or f"robot {self.robot.name} can't show {self.camera}"))
+                self.shut(Unavailable(reason))
+            else:
+                self.shut(self._not_so(reason))
+
+    def _tell(self) -> None:
+        """Tell the viewers the newest of what the robot says it sends, and then nothing for a while."""
+        told = self.told
+        if told is None or told == self._viewers_told:
+            return
+        self._viewers_told = told
+        self._telling = self._clock.callLater(TELL_SECONDS, self._tell)
+        for viewer in list(self.viewers):
+            viewer.playing(told)
+
+    def _not_so(self, reason: str) -> Unavailable:
+        """The robot can't show it in this form; of H.264, there is another one that it may."""
+        return NotMade(reason) if self.settings.codec == "h264" else Unavailable(reason)
 
     def lost(self, video_link: VideoLink) -> None:
         """The link has ended."""
@@ -250,31 +306,29 @@ class Stream:
                 raise MalformedMessage("a picture came before 'playing', which tells its size")
             width, height = self.told.width, self.told.height
         stamp, now = frame.stamp / 1e9, self._clock.seconds()
+        # What its publisher keeps may be old through no fault of the network's, and no other one may follow.
+        kept = self.told is not None and self.told.latched and self.told.source_fps < OFTEN
+        late = 0.0 if kept else self._lateness.of(stamp, now)
         return Picture(
             number=frame.number,
             stamp=stamp,
-            good_until=now + STALE_SECONDS - self._lateness.of(stamp, now),
+            good_until=now + STALE_SECONDS - late,
             codec=self.settings.codec,
             width=width,
             height=height,
             key=seen.key,
             body=frame.body,
+            reduced=self.told.reduced if self.told is not None else 0.0,
         )
 
     # --- key frames ---------------------------------------------------------------------------------------
 
-    def _want_key(self) -> None:
-        if self.settings.codec != "h264" or (self._key_timer is not None and self._key_timer.active()):
-            return
-        wait = self._key_asked + KEY_SECONDS - self._clock.seconds()
-        if wait > 0:
-            self._key_timer = self._clock.callLater(wait, self._ask_for_key)
-        else:
-            self._ask_for_key()
+    def _want_key(self, viewer: Viewer) -> None:
+        if self.settings.codec == "h264":
+            self._keys.wants(viewer)
 
     def _ask_for_key(self) -> None:
-        if self._link is not None and self._unready:
-            self._key_asked = self._clock.seconds()
+        if self._link is not None:
             self._link.send(link.KeyFrame())
 
     # --- life ---------------------------------------------------------------------------------------------
@@ -297,12 +351,16 @@ class Stream:
             self._end(before)
 
     def _look_for_camera(self) -> None:
+        if self.robot.control is not None and self._named() is not None:
+            self._happen(Event.CAMERA_THERE)
+
+    def _named(self) -> link.Camera | None:
+        """The camera as the robot tells of it."""
         names = {self.camera}
         if self.settings.transport == "compressed":
             # Some cameras publish nothing else; image_transport's users name them by their raw topic all the same.
             names.add(link.compressed_of(self.camera))
-        if self.robot.control is not None and any(each.name in names for each in self.robot.cameras):
-            self._happen(Event.CAMERA_THERE)
+        return next((each for each in self.robot.cameras if each.name in names), None)
 
     def _open_later(self, event: Event) -> None:
         pause = 0.0
@@ -326,9 +384,11 @@ class Stream:
         broken, self._link = self._link, None
         if broken is not None:
             broken.close(event.value)
-        self.newest = self.told = None
-        self._unready |= self.viewers
-        cancel(self._key_timer)
+        self.newest = self.told = self._viewers_told = None
+        self._late = False
+        self._keys.enters(self.viewers)
+        self._keys.rest()
+        cancel(self._telling)
 
     def _end(self, before: State) -> None:
         if before is not State.WAITING and self.robot.control is not None:

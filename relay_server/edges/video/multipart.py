@@ -23,6 +23,7 @@ from relay_server.edges.video.viewing import (
     Progress,
     Waiting,
     narrow,
+    tell_instead,
 )
 from relay_server.rounds import Round, Rounds
 from relay_server.video import Picture
@@ -40,10 +41,9 @@ LEAVING_SECONDS = 2.0
 """What was sent before the end has so long to go out; over TLS the peer, too, has to say something."""
 
 
-def part(picture: Picture, reduced: float) -> bytes:
+def part(picture: Picture) -> bytes:
     """One part, and the delimiter behind it: browsers show a part when the next begins.
 
-    :param reduced: how far the picture is below what was asked for, 0 to 1
     :returns: nothing for a picture that holds the delimiter: browsers look for that, not at the length, and what
         follows it would be a part as the robot likes it, of the relay's own site
     """
@@ -53,7 +53,7 @@ def part(picture: Picture, reduced: float) -> bytes:
         CONTENT_TYPES[picture.codec],
         len(picture.body),
         picture.stamp,
-        b"X-Reduced: %.3f\r\n" % reduced if reduced > 0 else b"",
+        b"X-Reduced: %.3f\r\n" % picture.reduced if picture.reduced > 0 else b"",
     )
     return b"".join((head, picture.body, b"\r\n", _DELIMITER))
 
@@ -78,7 +78,6 @@ class Multipart:
         self._writer: Writer | None = None
         self._waiting = Waiting(clock.seconds)
         self._round = Round(self._look, LOOK_SECONDS)
-        self._reduced = 0.0
         self._full = False
         self._again: Timer | None = None
 
@@ -90,8 +89,12 @@ class Multipart:
         self._send()
 
     def playing(self, playing: link.Playing) -> None:
-        """Told with the pictures."""
-        self._reduced = playing.reduced
+        """What they are like the pictures say themselves."""
+
+    def instead(self, other: dict[str, Any]) -> None:
+        """The head of the answer tells it; afterwards it can't be told any more."""
+        if self._writer is None:
+            tell_instead(self._request, other)
 
     def ended(self, error: SwitchboardError) -> None:
         """In words if nothing was sent yet; else the connection says it by its end."""
@@ -128,7 +131,7 @@ class Multipart:
                 self._again = self._clock.callLater(AGAIN_SECONDS, self._look_again)
             return
         for picture in self._waiting.take():
-            made = self._made.of(picture, self._reduced)
+            made = self._made.of(picture)
             if not made:
                 continue
             writer = self._writer or self._begin()

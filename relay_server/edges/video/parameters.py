@@ -17,6 +17,8 @@ FIELDS = 64
 
 MOST_FPS = 1000
 
+_QUALITY = link.VideoSettings().quality
+
 Kind = Literal["stream", "snapshot", "ws"]
 
 _TYPES: dict[Kind, tuple[str, ...]] = {
@@ -73,7 +75,8 @@ def asked(query: str, kind: Kind) -> Asked:
         link.VideoSettings(
             width=given.side("width"),
             height=given.side("height"),
-            quality=given.whole("quality", 80, 1, 100),
+            # PNG loses nothing, and what it may mean of it elsewhere is how long it is compressed.
+            quality=_QUALITY if form == "png" else max(1, given.whole("quality", _QUALITY, 0, 100)),
             fps=given.decimal("fps", 0, MOST_FPS),
             crop=_crop(given.text("crop", "0,0,0,0")),
             rotate=given.one_of("rotate", _ANGLES, 0),

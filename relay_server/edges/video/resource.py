@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import html
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
+from msgspec import Meta
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.logger import Logger
 from twisted.python.failure import Failure
@@ -17,6 +18,7 @@ from twisted.web.server import NOT_DONE_YET, Request
 
 from relay_protocol import jsontext, link
 from relay_protocol.errors import Refused, SwitchboardError
+from relay_protocol.limits import PICTURE_SIDE
 from relay_server.access import Principal
 from relay_server.auth import Opening
 from relay_server.clock import Clock
@@ -26,9 +28,32 @@ from relay_server.edges.site import wants_websocket
 from relay_server.edges.video.multipart import CONTENT_TYPE, Multipart, part
 from relay_server.edges.video.parameters import asked
 from relay_server.edges.video.snapshot import Snapshot
-from relay_server.edges.video.viewing import CONTENT_TYPES, Made
+from relay_server.edges.video.viewing import CONTENT_TYPES, Made, tell_instead
+from relay_server.openapi import Answer, Credential, Operation, Parameter, described, query
+from relay_server.openapi.kept import Cameras
 from relay_server.rounds import Rounds
 from relay_server.watching import Screen, Watching
+
+_PATH = "/robots/{robot}/video"
+_TOPIC = Parameter("topic", "the camera", required=True)
+_HOW = (
+    query("width", "pixels; of one alone the other follows", Annotated[int, Meta(ge=-1, le=PICTURE_SIDE)]),
+    query("height", "pixels", Annotated[int, Meta(ge=-1, le=PICTURE_SIDE)]),
+    query("quality", "of JPEG; 80 where left out", Annotated[int, Meta(ge=0, le=100)]),
+    query("fps", "most pictures per second; 0 is all there are", Annotated[float, Meta(ge=0, le=1000)]),
+    query("crop", "`x,y,width,height` in pixels of the camera"),
+    query("rotate", "degrees, clockwise", Literal["0", "90", "180", "270"]),
+    query("invert", "turned by 180 degrees, with any value that does not say no"),
+    query("stamp", "the time burned in", Literal["", "true", "1", "false", "0"]),
+    query("type", "form of the pictures", Literal["mjpeg", "ros_compressed", "png"]),
+    query("qos_profile", "of the subscription", Literal["", "default", "sensor_data", "system_default"]),
+    query("default_transport", "which of a camera's topics", Literal["", "raw", "compressed"]),
+)
+_SHOWN = {
+    "X-Timestamp": "Unix seconds at the robot",
+    "X-Reduced": "how far it is below what was asked for, 0 to 1",
+    "X-Instead": "in what another form differs that is shown, because the robot is at its limit",
+}
 
 _METHODS = (b"GET", b"HEAD")
 _OWN_PAGES = (None, b"same-origin", b"none")
@@ -118,6 +143,19 @@ class Video(Resource):
         running.addErrback(self._failed, request)
         return NOT_DONE_YET
 
+    @described(
+        Operation(
+            method="GET",
+            path=f"{_PATH}/ws",
+            tag="video",
+            summary="A camera over a websocket",
+            parameters=(_TOPIC, *_HOW, query("codec", "of the pictures", Literal["jpeg", "h264"])),
+            answers={101: Answer("a websocket (SPEC section 1.8)")},
+            errors=(426,),
+            credential=Credential.VIEWER,
+            lasts="It is a websocket.",
+        )
+    )
     def _to_websocket(self, request: Request) -> Any:
         if wants_websocket(request):
             return self._websocket.render(request)
@@ -126,11 +164,34 @@ class Video(Resource):
 
     # --- answers ------------------------------------------------------------------------------------------
 
+    @described(
+        Operation(
+            method="GET",
+            path=f"{_PATH}/cameras",
+            tag="video",
+            summary="The cameras the caller may view",
+            answers={200: Answer("cameras", Cameras)},
+            credential=Credential.VIEWER,
+        )
+    )
     async def _cameras(self, request: Request, robot: str) -> bytes:
         cameras = await self._desk.cameras(await self._principal(request, Opening(robot, video=True)), robot)
         request.setHeader(b"content-type", b"application/json")
         return jsontext.encode({"cameras": cameras})
 
+    @described(
+        Operation(
+            method="GET",
+            path=f"{_PATH}/stream",
+            tag="video",
+            summary="A camera as pictures that follow each other",
+            parameters=(_TOPIC, *_HOW),
+            answers={200: Answer("JPEG after JPEG", media=("multipart/x-mixed-replace",))},
+            errors=(504,),
+            credential=Credential.VIEWER,
+            lasts="It goes on until the viewer leaves.",
+        )
+    )
     async def _stream(self, request: Request, robot: str) -> bytes | None:
         wanted = asked(_query(request), "stream")
         principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
@@ -152,6 +213,17 @@ class Video(Resource):
             screen.gone()
         return None
 
+    @described(
+        Operation(
+            method="GET",
+            path=f"{_PATH}/stream_viewer",
+            tag="video",
+            summary="A page with that in it",
+            parameters=(_TOPIC, *_HOW),
+            answers={200: Answer("the page", media=("text/html",))},
+            credential=Credential.NONE,
+        )
+    )
     async def _stream_viewer(self, request: Request, robot: str) -> bytes:
         """Nothing of the robot is in it: who may see the stream is asked when the page asks for that."""
         query = _query(request)
@@ -159,6 +231,19 @@ class Video(Resource):
         request.setHeader(b"content-type", b"text/html; charset=utf-8")
         return _VIEWER.format(title=html.escape(f"{camera} of {robot}"), query=html.escape(query)).encode()
 
+    @described(
+        Operation(
+            method="GET",
+            path=f"{_PATH}/snapshot",
+            tag="video",
+            summary="One picture",
+            parameters=(_TOPIC, *_HOW),
+            answers={200: Answer("the picture", media=("image/jpeg", "image/png"), headers=_SHOWN)},
+            errors=(504,),
+            credential=Credential.VIEWER,
+            lasts="It waits for a picture, 10 s or longer of a slow camera.",
+        )
+    )
     async def _snapshot(self, request: Request, robot: str) -> bytes:
         wanted = asked(_query(request), "snapshot")
         principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
@@ -176,8 +261,9 @@ class Video(Resource):
             watching.leave()
         request.setHeader(b"content-type", CONTENT_TYPES[picture.codec])
         request.setHeader(b"x-timestamp", b"%.6f" % picture.stamp)
-        if screen.reduced > 0:
-            request.setHeader(b"x-reduced", b"%.3f" % screen.reduced)
+        if picture.reduced > 0:
+            request.setHeader(b"x-reduced", b"%.3f" % picture.reduced)
+        tell_instead(request, screen.other)
         return picture.body
 
     # --- who asks -----------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from twisted.internet.defer import Deferred
 
@@ -19,9 +20,10 @@ class Snapshot:
 
     def __init__(self, seconds: Callable[[], float]) -> None:
         self._seconds = seconds
+        self.other: dict[str, Any] = {}
+        """The parameters by which it differs from what was asked for."""
         self.done: Deferred[Picture] = Deferred()
         """The picture; fails when there is none."""
-        self.reduced = 0.0
 
     def picture(self, picture: Picture) -> None:
         """The first one that is not old already is it."""
@@ -29,8 +31,11 @@ class Snapshot:
             self.done.callback(picture)
 
     def playing(self, playing: link.Playing) -> None:
-        """Told with the picture."""
-        self.reduced = playing.reduced
+        """What it is like the picture says itself."""
+
+    def instead(self, other: dict[str, Any]) -> None:
+        """The head of the answer tells it."""
+        self.other = other
 
     def ended(self, error: SwitchboardError) -> None:
         """There is none."""

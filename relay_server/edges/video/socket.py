@@ -5,9 +5,10 @@ Who comes in, how it is closed and pinged is as for every client's websocket.
 
 from __future__ import annotations
 
+import functools
 import secrets
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 from urllib.parse import unquote
 
 import msgspec
@@ -57,7 +58,7 @@ class VideoGate(Gate, Protocol):
         """Have a camera shown to somebody who was admitted, which uses the admission up."""
 
 
-def framed(picture: Picture, reduced: float) -> bytes:
+def framed(picture: Picture) -> bytes:
     """Both messages of a picture as websocket frames. What is reduced ``playing`` tells."""
     head = {
         "op": "picture",
@@ -70,6 +71,16 @@ def framed(picture: Picture, reduced: float) -> bytes:
         "key": picture.key,
     }
     return wsframe.text(jsontext.encode(head)) + wsframe.binary(picture.body)
+
+
+@functools.lru_cache(maxsize=64)
+def told(playing: link.Playing, instead: tuple[tuple[str, Any], ...] = ()) -> bytes:
+    """The message that says what is sent from now on; made once for all who watch.
+
+    :param instead: parameters by which what is shown differs from what was asked for, and what they are in it
+    """
+    message = {"op": "playing", **msgspec.structs.asdict(playing), "instead": dict(instead) or None}
+    return wsframe.text(jsontext.encode(message))
 
 
 class VideoClient:
@@ -98,6 +109,7 @@ class VideoClient:
         self._waiting = Waiting(shared.clock.seconds, self._start_anew)
         self._under_way: int | None = None
         """Number of the last picture that was sent and that the viewer has not taken."""
+        self._instead: tuple[tuple[str, Any], ...] = ()
         self._heard_at = shared.clock.seconds()
         self._mistakes = 0
         self._ended = False
@@ -182,8 +194,11 @@ class VideoClient:
 
     def playing(self, playing: link.Playing) -> None:
         """Told between pictures; the latest counts."""
-        told = {"op": "playing", **msgspec.structs.asdict(playing)}
-        self.outbox.data("playing", wsframe.text(jsontext.encode(told)), depth=1)
+        self.outbox.data("playing", told(playing, self._instead), depth=1)
+
+    def instead(self, other: dict[str, Any]) -> None:
+        """Told with what is played, which comes next."""
+        self._instead = tuple(other.items())
 
     def ended(self, error: SwitchboardError) -> None:
         """There is nothing to see, or no more."""

@@ -13,6 +13,9 @@ import sys
 import termios
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import urlencode
+
+from twisted.web.server import Request
 
 from relay_protocol.limits import KIB, MIB
 from relay_server.video import Picture
@@ -125,25 +128,33 @@ class Progress:
 class Made:
     """What was made of a picture last: all viewers that are ready get it at the same time, and the same bytes."""
 
-    def __init__(self, make: Callable[[Picture, float], bytes]) -> None:
+    def __init__(self, make: Callable[[Picture], bytes]) -> None:
         self._make = make
-        self._of: tuple[Picture, float] | None = None
+        self._of: Picture | None = None
         self._bytes = b""
 
-    def of(self, picture: Picture, reduced: float = 0.0) -> bytes:
-        """The bytes for a picture.
-
-        :param reduced: how far it is below what was asked for
-        """
-        if self._of is None or self._of[0] is not picture or self._of[1] != reduced:
-            self._bytes = self._make(picture, reduced)
-            self._of = (picture, reduced)
+    def of(self, picture: Picture) -> bytes:
+        """The bytes for a picture."""
+        if self._of is not picture:
+            self._bytes = self._make(picture)
+            self._of = picture
         return self._bytes
+
+
+def tell_instead(request: Request, other: dict[str, Any]) -> None:
+    """Have the head of an answer tell that another form of a camera is shown than was asked for.
+
+    :param other: the parameters by which it differs, if any
+    """
+    if other:
+        request.setHeader(b"x-instead", urlencode(other).encode("ascii"))
+    else:
+        request.responseHeaders.removeHeader(b"x-instead")
 
 
 def narrow(transport: Any) -> Any:
     """Keep what waits for a viewer out of the kernel; returns the TCP connection under a transport, if there is one."""
-    tcp = _tcp_of(transport)
+    tcp = tcp_of(transport)
     if tcp is not None:
         handle = tcp.getHandle()
         handle.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
@@ -168,7 +179,7 @@ def unsent(tcp: Any) -> int:
     return left + int(struct.unpack("i", answer)[0])
 
 
-def _tcp_of(transport: Any) -> Any:
+def tcp_of(transport: Any) -> Any:
     """The connection itself, through TLS; ``None`` in memory."""
     while transport is not None:
         handle = getattr(transport, "getHandle", lambda: None)()

@@ -1,0 +1,90 @@
+"""``switchboard program``."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from typing import Any
+
+import click
+
+from relay_db import queries
+from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.scopes import Scope
+from relay_server import passwords
+from relay_server.cli.app import App, examples, json_option, pass_app, user_of
+from relay_server.cli.output import show, tell
+from relay_server.cli.text import moment
+
+
+@click.group()
+def program() -> None:
+    """Programs that get tokens by a key and a secret, over Digest or OAuth 2.0."""
+
+
+@program.command(
+    epilog=examples(
+        "switchboard program add ann --label 'nightly report'",
+        "switchboard program add ann --scope 'viewer publish:/lights@rover' --json",
+    )
+)
+@click.argument("user")
+@click.option(
+    "--scope", help="What its tokens may be used for at most: viewer, operator@rover, publish:/lights …"
+)
+@click.option("--label", default="", help="What it is, one line.")
+@json_option
+@pass_app
+def add(app: App, user: str, scope: str | None, label: str, as_json: bool) -> None:
+    """Add a program that acts as USER. Its secret is shown once and not stored."""
+    checked = None if scope is None else str(Scope(scope))
+    key, secret, now = f"swp_{secrets.token_hex(12)}", passwords.new_token(), time.time()
+    with app.change() as change:
+        found = change.user(user)
+        if found.disabled:
+            raise Invalid(f"user '{found.name}' is disabled; enable it first")
+        known = passwords.verifier(key, secret)
+        number = queries.add_program(
+            change.session, found.id, key, known, scope=checked, label=label, now=now
+        )
+        change.audit("program.add", found.name, id=number, key=key, scope=checked, label=label)
+    answer = {"key": key, "secret": secret, "id": number, "user": found.name, "scope": checked}
+    tell(as_json, answer, f"key     {key}\nsecret  {secret}")
+    if not as_json:
+        click.echo("The secret is not shown again.", err=True)
+
+
+@program.command("list", epilog=examples("switchboard program list", "switchboard program list --user ann"))
+@click.option("--user", metavar="NAME", help="Only programs of this user.")
+@json_option
+@pass_app
+def list_(app: App, user: str | None, as_json: bool) -> None:
+    """List programs, without their secrets."""
+    with app.reading() as session:
+        programs = queries.list_programs(session, None if user is None else user_of(session, user).id)
+    cells = (
+        (str(each.id), each.user, each.key, each.scope or "all", moment(each.created), each.label)
+        for each in programs
+    )
+    columns = ("id", "user", "key", "scope", "created", "label")
+    show(as_json, (_json(each) for each in programs), columns, cells)
+
+
+@program.command(epilog=examples("switchboard program revoke 3"))
+@click.argument("number", metavar="ID", type=click.IntRange(min=1, max=2**31 - 1))
+@json_option
+@pass_app
+def revoke(app: App, number: int, as_json: bool) -> None:
+    """Make the program of number ID and its secret worthless; its tokens end, and what they opened is cut at once."""
+    with app.change() as change:
+        if not queries.remove_program(change.session, number):
+            raise NotFound(f"there is no program {number}; see 'switchboard program list'")
+        change.audit("program.revoke", str(number))
+    tell(as_json, {"id": number, "revoked": True}, f"Revoked program {number}.")
+
+
+def _json(record: queries.ProgramRecord) -> dict[str, Any]:
+    row = record._asdict()
+    for hidden in ("user_id", "verifier"):
+        del row[hidden]
+    return row

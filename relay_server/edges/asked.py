@@ -1,0 +1,78 @@
+"""What a request to a resource asks for, in its address and its headers."""
+
+from __future__ import annotations
+
+from twisted.web.server import Request
+from werkzeug.http import parse_dict_header, parse_etags
+
+from relay_protocol.errors import Invalid
+
+WAIT = 60.0
+"""Longest that a request may wait for something, seconds."""
+
+APPLIED = "preference-applied"
+"""The header of an answer that names what was preferred, and is so (RFC 7240 section 3)."""
+
+
+def query_of(request: Request) -> dict[str, str]:
+    """The parameters of the address.
+
+    :raises Invalid: a parameter twice, or not in UTF-8
+    """
+    found = {}
+    for name, values in request.args.items():
+        if len(values) > 1:
+            raise Invalid(f"the parameter '{name.decode(errors='replace')[:40]}' is there more than once")
+        try:
+            found[name.decode()] = values[0].decode()
+        except UnicodeDecodeError as error:
+            raise Invalid(f"a parameter is not in UTF-8: {error.reason}") from None
+    return found
+
+
+def number_in(query: dict[str, str], name: str, least: float, most: float) -> float | None:
+    """One of the parameters.
+
+    :raises Invalid: it is no number, or outside of its bounds
+    """
+    if name not in query:
+        return None
+    number = _number(query[name])
+    if not least <= number <= most:
+        raise Invalid(f"'{name}' must be a number from {least:g} to {most:g}")
+    return number
+
+
+def known_tags(request: Request) -> frozenset[str]:
+    """The entity tags that the asker has already (``If-None-Match``)."""
+    tags = parse_etags(request.getHeader("if-none-match"))
+    return frozenset(f'"{each}"' for each in tags.as_set(include_weak=True))
+
+
+def wait_preferred(request: Request) -> float:
+    """How long an answer may be waited for, seconds, as ``Prefer: wait`` says (RFC 7240 section 4.3).
+
+    The answer is told that it is so. What is no number is passed over, as preferences are, and no wait is longer than
+    :data:`WAIT`.
+    """
+    said = parse_dict_header(", ".join(request.requestHeaders.getRawHeaders("prefer", [])))
+    text = next((text for name, text in said.items() if name.lower() == "wait"), None)
+    seconds = _number((text or "").partition(";")[0])
+    if not seconds >= 0:
+        return 0.0
+    seconds = min(seconds, WAIT)
+    request.setHeader(APPLIED, f"wait={seconds:g}")
+    return seconds
+
+
+def streams(request: Request) -> bool:
+    """Whether what happens is wanted as server-sent events."""
+    return "text/event-stream" in (request.getHeader("accept") or "")
+
+
+def _number(text: str) -> float:
+    """What stands there; no number is ``nan``."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")

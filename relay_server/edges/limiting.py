@@ -1,0 +1,74 @@
+"""How many requests one user may send, and one network from which nobody is known (SPEC sections 1.13 and 5).
+
+The headers are those of draft-ietf-httpapi-ratelimit-headers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable
+
+from twisted.web.server import Request
+
+from relay_protocol.errors import SwitchboardError
+from relay_server.bucket import Buckets
+from relay_server.limiter import network_of
+
+BURST_SECONDS = 10.0
+"""What is allowed in so long may come at once."""
+
+KEPT = 10_000
+"""Users, and networks, whose requests are counted; the longest unseen are forgotten first."""
+
+
+class TooManyRequests(SwitchboardError):
+    """Further requests are refused for ``retry_after`` seconds."""
+
+    code = "too_many_requests"
+
+    def __init__(self, who: str, retry_after: float) -> None:
+        super().__init__(f"too many requests of {who}; try again in {int(retry_after) + 1} s")
+        self.retry_after = retry_after
+
+
+class RequestLimits:
+    """Counts requests, each once, and tells in its answer what is left.
+
+    :param rate: requests a second of one user or network in the long run; 0 for as many as come
+    :param seconds: a monotonic clock
+    """
+
+    def __init__(self, rate: float, seconds: Callable[[], float]) -> None:
+        self._rate = rate
+        self._burst = max(1.0, rate * BURST_SECONDS)
+        self._users = Buckets(rate, self._burst, KEPT, seconds)
+        self._networks = Buckets(rate, self._burst, KEPT, seconds)
+
+    def of_user(self, request: Request, user: int) -> None:
+        """Count it for who has proved who he is.
+
+        :raises TooManyRequests: he has sent too many
+        """
+        self._count(request, self._users, user, "user", "yours")
+
+    def of_network(self, request: Request) -> None:
+        """Count it for the network it comes from.
+
+        :raises TooManyRequests: too many came from there
+        """
+        network = network_of(getattr(request.getClientAddress(), "host", "local"))
+        self._count(request, self._networks, network, "network", "your network")
+
+    def _count(self, request: Request, buckets: Buckets, who: Hashable, name: str, words: str) -> None:
+        if self._rate <= 0 or request.__dict__.get("counted"):
+            # Whoever reads a stream is proved again and again.
+            return
+        request.counted = True
+        bucket = buckets.of(who)
+        passes = bucket.take()
+        whole = math.ceil((self._burst - bucket.left) / self._rate)
+        policy = f'"{name}";q={int(self._burst)};w={math.ceil(self._burst / self._rate)}'
+        request.setHeader("ratelimit-policy", policy)
+        request.setHeader("ratelimit", f'"{name}";r={int(bucket.left)};t={whole}')
+        if not passes:
+            raise TooManyRequests(words, bucket.wait)

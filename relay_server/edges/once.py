@@ -1,0 +1,62 @@
+"""Requests with an ``Idempotency-Key`` (SPEC section 1.13): what they ask for is done once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import msgspec
+from twisted.internet.defer import Deferred
+from twisted.web.server import Request
+
+from relay_protocol.rights import Operation
+from relay_server.channel import resolve
+from relay_server.resources import (
+    KEY_HEADER,
+    Asker,
+    Idempotency,
+    Owner,
+    Reply,
+    ResourceDesk,
+    Target,
+    key_in,
+)
+from relay_server.session.calling import URGENT
+
+Work = Callable[[], Coroutine[Deferred[Any], Any, Reply]]
+
+
+class Once:
+    """What requests with a key were answered."""
+
+    def __init__(self, memory: Idempotency, desk: ResourceDesk) -> None:
+        self._memory = memory
+        self._desk = desk
+
+    async def reply(
+        self, request: Request, asker: Asker, operation: Operation, name: str, work: Work
+    ) -> Reply:
+        """Do what a request asks for, unless it was done already.
+
+        :param operation: that it is, on the resource of that name
+        :raises SwitchboardError: as ``work``, or the key can't be, or stands for something else
+        """
+        if operation is Operation.CALL and resolve(name) in URGENT:
+            # Who stops a robot with a key that he has used before means it.
+            return await work()
+        key = key_in(request.requestHeaders.getRawHeaders(KEY_HEADER, []))
+        if key is None:
+            return await work()
+        address = request.path.decode("ascii", "replace")
+        request.content.seek(0)
+        body = request.content.read()
+        target = Target(Owner.of(asker.principal), asker.robot, address, key)
+        return await self._memory.once(target, body, work, lambda: self._desk.may(asker, operation, name))
+
+
+def send(request: Request, reply: Reply) -> Any:
+    """A reply, as the API answers with it."""
+    request.setResponseCode(reply.status)
+    if reply.location:
+        request.setHeader("location", reply.location)
+    return msgspec.Raw(reply.body) if reply.body else None

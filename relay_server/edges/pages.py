@@ -1,0 +1,216 @@
+"""The page's stream over a websocket (``/api/v1/robots/stream``, SPEC section 1.7).
+
+Browsers allow six connections to a host over HTTP/1.1, of all tabs together, and a stream of server-sent events holds
+one for ever; of websockets they allow hundreds. Who comes in, and how it is closed, is as for every client's websocket.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from autobahn.websocket.types import ConnectionRequest
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.logger import Logger
+
+from relay_protocol.errors import SwitchboardError
+from relay_server import closing, wsframe
+from relay_server.access import Principal
+from relay_server.auth import BadCredentials, Opening, session_token
+from relay_server.clock import Clock
+from relay_server.edges.gate import code_of
+from relay_server.edges.telling import STALL_SECONDS, Source, Telling
+from relay_server.edges.websocket import ClientFactory, ClientProtocol
+from relay_server.origins import Origins
+from relay_server.outbox import Outbox
+from relay_server.rounds import Round, Rounds
+from relay_server.session import ClientTransport, Timing
+
+MESSAGE_BYTES = 125
+"""A page has nothing to say: what is larger is not even read."""
+
+
+class PageDesk(Protocol):
+    """What is asked for; the composition root's."""
+
+    timing: Timing
+
+    async def token(self, token: str) -> Principal:
+        """The principal of a token."""
+
+    def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call ``listener`` when something about robots may have changed; returns what ends that."""
+
+
+@dataclass(frozen=True)
+class Known(Principal):
+    """Somebody, with the token that proved it: it is asked again and again whether that still counts."""
+
+    token: str = field(default="", repr=False)
+
+
+class PageGate:
+    """Who may come in: whoever proves who he is. A :class:`relay_server.edges.gate.Gate`.
+
+    :param cookie: name of the session cookie
+    :param sources: what is told, by the name of the event
+    """
+
+    def __init__(
+        self, clock: Clock, desk: PageDesk, origins: Origins, cookie: str, sources: Mapping[str, Source]
+    ) -> None:
+        self.accepting = True
+        self.clock = clock
+        self.desk = desk
+        self.sources = sources
+        self.rounds = Rounds(clock)
+        self._origins = origins
+        self._cookie = cookie
+        self._open: set[PageClient] = set()
+
+    async def bearer(self, token: str) -> Principal:
+        """The principal of an access token."""
+        return Known(**vars(await self.desk.token(token)), token=token)
+
+    async def ticket(self, ticket: str, asked: Opening) -> Principal:
+        """A ticket opens something of one robot."""
+        raise BadCredentials("a ticket opens a robot, and this is about all of them; send an access token")
+
+    async def cookie(self, header: str, origin: str | None, host: str) -> Principal | None:
+        """The principal of a session cookie, ``None`` when there is no such cookie."""
+        token = session_token(self._origins, self._cookie, header, origin, host)
+        return None if token is None else await self.bearer(token)
+
+    async def admit(self, principal: Principal, robot: str, address: str) -> Any:
+        """Everybody may be told of his robots, though he has none. What this returns is for :meth:`open`."""
+        return principal
+
+    def open(self, admission: Any, transport: ClientTransport, opened_ns: int) -> PageClient:
+        """Begin to tell somebody who was admitted."""
+        client = PageClient(self, transport, admission.token, self._open.discard)
+        self._open.add(client)
+        return client
+
+    def turn_away(self, admission: Any) -> None:
+        """Nothing was taken for him."""
+
+    def say_goodbye(self, reason: str) -> None:
+        """Refuse newcomers and close what is open: the relay is going down."""
+        self.accepting = False
+        for client in list(self._open):
+            client.close(closing.GOING_AWAY, reason)
+
+
+class PageClient:
+    """What goes on over one page's websocket.
+
+    :param token: whose page it is
+    :param ended: told when this is over
+    """
+
+    log = Logger()
+    not_before = 0
+    """A page commands nothing."""
+
+    def __init__(
+        self, gate: PageGate, transport: ClientTransport, token: str, ended: Callable[[PageClient], None]
+    ) -> None:
+        desk = gate.desk
+        self.outbox = Outbox(transport.send, gate.clock.seconds, self.cut)
+        self._clock = gate.clock
+        self._rounds = gate.rounds
+        self._timing = desk.timing
+        self._transport = transport
+        self._ended = ended
+        self._telling = Telling(
+            gate.clock, self, lambda: desk.token(token), dict(gate.sources), desk.on_change
+        )
+        self._running: Deferred[None] | None = None
+        self._pinging = Round(self._ping, self._timing.client_ping)
+        self._heard_at = gate.clock.seconds()
+
+    # --- Occupant -----------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Tell, from now on."""
+        self._rounds.start(self._pinging)
+        self._running = Deferred.fromCoroutine(self._telling.run())
+        self._running.addErrback(self._over)
+
+    def message(self, payload: bytes, *, since: int | None = None) -> None:
+        """There is nothing to say here."""
+        self.close(closing.INVALID, "say nothing here: what there is to tell is told unasked")
+
+    def pong(self, payload: bytes) -> None:
+        """It is still there."""
+        self._heard_at = self._clock.seconds()
+
+    def pause(self) -> None:
+        """The transport's buffer is full."""
+        self.outbox.pause()
+        if self._running is not None:
+            self._telling.pause()
+
+    def resume(self) -> None:
+        """The transport takes bytes again."""
+        self.outbox.resume()
+        if self._running is not None:
+            self._telling.resume()
+
+    def close(self, code: int, reason: str) -> None:
+        """Close the websocket, and end."""
+        self._transport.close(code, reason)
+        self.end()
+
+    def end(self) -> None:
+        """The websocket is gone, or goes."""
+        self._pinging.stop()
+        self.outbox.close()
+        self._ended(self)
+        running, self._running = self._running, None
+        if running is not None:
+            running.cancel()
+
+    # --- Page ---------------------------------------------------------------------------------------------
+
+    def tell(self, event: str, body: bytes) -> None:
+        """One event."""
+        head = b'{"event":"' + event.encode() + b'","data":'
+        self.outbox.control(wsframe.text_of(head, body, b"}"))
+
+    def cut(self) -> None:
+        """It takes nothing any more."""
+        self.close(closing.TOO_SLOW, f"for {STALL_SECONDS:g} s nothing was taken")
+
+    def _over(self, failure: Any) -> None:
+        error = failure.value
+        if isinstance(error, SwitchboardError):
+            self.close(code_of(error), str(error))
+        elif not isinstance(error, CancelledError):
+            self.log.failure("a page can't be told any more", failure)
+            self.close(closing.INTERNAL, "the relay failed; its log tells more")
+
+    def _ping(self) -> None:
+        """Keep the way open, and see whether somebody is there."""
+        silent = self._clock.seconds() - self._heard_at
+        if silent > max(self._timing.client_ping * 3, self._timing.stall_limit):
+            self.close(closing.TOO_SLOW, f"no answer to pings for {silent:.0f} s")
+        else:
+            self._transport.ping(b"")
+
+
+class PageProtocol(ClientProtocol):
+    """The websocket of one page."""
+
+    takes = MESSAGE_BYTES
+
+    def _asked_for(self, request: ConnectionRequest) -> Opening:
+        # All robots: there is none of this name.
+        return Opening("")
+
+
+class PageFactory(ClientFactory):
+    """Builds a :class:`PageProtocol` for each websocket; its gate is a :class:`PageGate`."""
+
+    protocol = PageProtocol

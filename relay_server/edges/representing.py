@@ -1,0 +1,183 @@
+"""Resources in the form a request wants, and out of the form its body has (SPEC section 1.13, Forms)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Annotated, Any, ParamSpec, TypeVar
+from urllib.parse import urlsplit
+
+import msgspec
+from msgspec import Meta
+from rdflib import Graph
+from twisted.web.server import Request
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Unavailable
+from relay_protocol.limits import NAME
+from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.resources import Asker, ResourceDesk
+from relay_server.resources.describing import Place, camera_graph, members_graph, param_graph, state_graph
+from relay_server.resources.forms import FORMS, JSON, Form, sent, tags_of, wanted
+from relay_server.resources.states import Param, State, tag_of
+from relay_server.resources.syntax import read, write
+from relay_server.resources.values import Meant, message_in, value_in
+from relay_server.store import Threads
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+TypeName = Annotated[str, Meta(max_length=NAME)]
+
+
+class Message(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of what is said on a topic; ``type`` for one that nobody knows yet."""
+
+    value: msgspec.Raw
+    type: TypeName = ""
+
+
+class Value(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of a parameter that is set."""
+
+    value: msgspec.Raw
+
+
+class Workshop(Threads):
+    """Where RDF is written and read: it takes long, and one at a time leaves the reactor its turns.
+
+    :param reactor: calls results back
+    """
+
+    def __init__(self, reactor: Any) -> None:
+        super().__init__(reactor, "forms", 1, 1, "too much is being converted; try again in a moment")
+        self._closed = False
+
+    def close(self) -> None:
+        """Begin nothing more; what waits for its turn fails."""
+        self._closed = True
+
+    async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """As above.
+
+        :raises Unavailable: as above, or the relay goes down
+        """
+        if self._closed:
+            raise Unavailable("the relay is going down")
+        return await super().run(work, *args, **kwargs)
+
+
+class Representing:
+    """The forms of one robot's resources.
+
+    :param part: the collection they are in
+    """
+
+    def __init__(self, api: Api, desk: ResourceDesk, robot: str, part: str) -> None:
+        self._api = api
+        self._desk = desk
+        self._robot = robot
+        self._part = part
+
+    def form(self, request: Request, *more: Form) -> Form:
+        """The form in which to answer.
+
+        :param more: forms there are of just this resource
+        :raises NotAcceptable: the request takes none
+        """
+        request.setHeader(b"vary", b"Accept")
+        return wanted(request.getHeader("accept"), (*FORMS, *more))
+
+    async def state(self, request: Request, asker: Asker, state: State, form: Form) -> Any:
+        """What a topic says."""
+        if form is JSON:
+            return _tagged(request, state.etag, state.json())
+        background = await self._desk.background(asker, state)
+        make = partial(state_graph, state, background, self._place(request))
+        return await self._written(request, asker, make, form, state.etag)
+
+    async def param(self, request: Request, asker: Asker, param: Param, form: Form) -> Any:
+        """A parameter."""
+        if self._known(request, form.tag(param.etag)):
+            return STREAMED
+        if form is JSON:
+            return _tagged(request, param.etag, param.json())
+        return await self._written(
+            request, asker, partial(param_graph, param, self._place(request)), form, param.etag
+        )
+
+    async def members(self, request: Request, asker: Asker, page: Mapping[str, Any], form: Form) -> Any:
+        """A page of the collection."""
+        return await self._told(request, asker, page, partial(members_graph, self._part), form)
+
+    async def camera(self, request: Request, asker: Asker, camera: Mapping[str, Any], form: Form) -> Any:
+        """A camera."""
+        return await self._told(request, asker, camera, camera_graph, form)
+
+    async def message(self, request: Request, asker: Asker, name: str) -> Message:
+        """The message in a request's body.
+
+        :raises UnknownForm: it is in none that is read
+        :raises Invalid: there is none that can be read; in words
+        """
+        form = sent(request.getHeader("content-type"))
+        if form is JSON:
+            return body_of(request, Message)
+        meant: Meant = await self._read(request, asker, name, form, message_in)
+        return Message(msgspec.Raw(jsontext.encode(meant.value)), meant.type)
+
+    async def value(self, request: Request, asker: Asker, name: str) -> bytes:
+        """The value of a parameter in a request's body, as JSON; see :meth:`message`."""
+        form = sent(request.getHeader("content-type"))
+        if form is JSON:
+            return bytes(body_of(request, Value).value)
+        return jsontext.encode(await self._read(request, asker, name, form, value_in))
+
+    async def _read(
+        self, request: Request, asker: Asker, name: str, form: Form, find: Callable[[Graph, str], Any]
+    ) -> Any:
+        address = self._place(request).of(self._part, name)
+        body = request.content.read()
+        return await self._desk.made(asker, lambda: find(read(body, form, address), urlsplit(address).path))
+
+    async def _told(
+        self,
+        request: Request,
+        asker: Asker,
+        facts: Mapping[str, Any],
+        graph: Callable[[Mapping[str, Any], Place], Graph],
+        form: Form,
+    ) -> Any:
+        """What is the same as long as its JSON is."""
+        body = jsontext.encode(facts)
+        etag = tag_of(body)
+        if self._known(request, form.tag(etag)):
+            return STREAMED
+        if form is JSON:
+            return _tagged(request, etag, body)
+        make = partial(graph, facts, self._place(request))
+        return await self._written(request, asker, make, form, etag)
+
+    async def _written(
+        self, request: Request, asker: Asker, make: Callable[[], Graph], form: Form, etag: str
+    ) -> bytes:
+        body = await self._desk.made(asker, lambda: write(make(), form))
+        request.setHeader(b"etag", form.tag(etag).encode())
+        request.setHeader(b"content-type", f"{form.media}; charset=utf-8".encode())
+        return body
+
+    def _known(self, request: Request, tag: str) -> bool:
+        """Whether who asks has it already, which he is told then."""
+        if tag not in tags_of(request.getHeader("if-none-match")):
+            return False
+        request.setHeader(b"etag", tag.encode())
+        request.setResponseCode(304)
+        return True
+
+    def _place(self, request: Request) -> Place:
+        return Place(self._api.base(request), self._robot)
+
+
+def _tagged(request: Request, etag: str, body: bytes) -> Any:
+    request.setHeader(b"etag", etag.encode())
+    return msgspec.Raw(body)

@@ -1,0 +1,292 @@
+"""Below ``/api/v1/robots/<robot>``: ``topics``, ``services``, ``actions`` and ``params`` (SPEC section 1.13)."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
+
+import msgspec
+from klein import Klein
+from twisted.internet.defer import DeferredList
+from twisted.internet.task import LoopingCall
+from twisted.web.resource import IResource
+from twisted.web.server import Request
+from werkzeug.exceptions import HTTPException
+from werkzeug.exceptions import NotFound as NothingHere
+
+from relay_protocol import jsontext
+from relay_protocol.rights import Operation
+from relay_server.channel import resolve
+from relay_server.clock import Clock, as_twisted
+from relay_server.edges import cameras, goals
+from relay_server.edges import resource_operations as operations
+from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.asked import WAIT, known_tags, number_in, query_of
+from relay_server.edges.flow import Flow
+from relay_server.edges.goals import Giving
+from relay_server.edges.once import Once, send
+from relay_server.edges.representing import Representing
+from relay_server.edges.resource_operations import THROTTLE_MS, Call
+from relay_server.frontdesk import FrontDesk
+from relay_server.inside import Guests, MaybeDone
+from relay_server.openapi import described
+from relay_server.resources import (
+    HEADER,
+    Asker,
+    CameraDesk,
+    Following,
+    GoalDesk,
+    Idempotency,
+    Listing,
+    Moments,
+    Reply,
+    ResourceDesk,
+    Wanted,
+    see_known,
+)
+from relay_server.resources.forms import EVENTS, Form, of_any_form
+from relay_server.session.calling import URGENT
+from relay_server.store import Threads
+
+PARTS = ("topics", "services", "actions", "params")
+"""The addresses below a robot's that are served here."""
+
+QUIET_SECONDS = 5.0
+"""How often a stream says that it goes on."""
+
+
+class RobotResources:
+    """Resources of one robot, for one request.
+
+    :param part: one of :data:`PARTS`
+    """
+
+    app = Klein()
+
+    def __init__(
+        self,
+        clock: Clock,
+        desk: ResourceDesk,
+        moments: Moments,
+        once: Once,
+        giving: Giving,
+        part: str,
+        api: Api,
+        robot: str,
+    ) -> None:
+        self._clock = clock
+        self._desk = desk
+        self._moments = moments
+        self._once = once
+        self._giving = giving
+        self._part = part
+        self._api = api
+        self._robot = robot
+        self._forms = Representing(api, desk, robot, part)
+
+    @app.route("/", methods=["GET"])
+    @described(*operations.MEMBERS)
+    def members(self, request: Request) -> Any:
+        return self._answer(request, self._members(request))
+
+    async def _members(self, request: Request) -> Any:
+        asker, form = await self._asker(request), self._forms.form(request)
+        listing = Listing.of(query_of(request))
+        if self._part == "params":
+            page = await self._desk.params(asker, listing)
+        else:
+            page = await self._desk.members(asker, self._part, listing)
+        return await self._forms.members(request, asker, page, form)
+
+    @app.route("/<path:name>", methods=["GET"])
+    @described(*operations.ONE)
+    def one(self, request: Request, name: str) -> Any:
+        if self._part not in ("topics", "params"):
+            raise NothingHere
+        return self._answer(request, self._one(request, name))
+
+    async def _one(self, request: Request, name: str) -> Any:
+        asker = await self._asker(request)
+        if self._part == "params":
+            form = self._forms.form(request)
+            return await self._forms.param(request, asker, await self._desk.param(asker, name), form)
+        form = self._forms.form(request, EVENTS)
+        if form is EVENTS:
+            await self._stream(request, asker, name)
+            return STREAMED
+        state, known = await self._desk.state(asker, name, _wanted(request, form))
+        if known:
+            request.setHeader("etag", form.tag(state.etag))
+            request.setResponseCode(304)
+            return STREAMED
+        return await self._forms.state(request, asker, state, form)
+
+    async def _stream(self, request: Request, asker: Asker, name: str) -> None:
+        query = query_of(request)
+        see_known(query, "throttle_ms")
+        throttle = number_in(query, "throttle_ms", 0.0, THROTTLE_MS) or 0.0
+        left = request.notifyFinish()
+        left.addErrback(lambda failure: None)
+        # What is there already comes at once.
+        for header, value in (("content-type", "text/event-stream"), ("x-accel-buffering", "no")):
+            request.setHeader(header, value)
+        request.setHeader(HEADER, self._moments.now())
+
+        def tell(body: bytes) -> None:
+            _tell(request, b"message", body)
+
+        async with self._desk.follow(asker, name, throttle, tell) as following:
+            request.write(b": this stream goes on until you leave\n\n")
+            request.registerProducer(Flow(following), True)
+            looking = LoopingCall(_look, request, following)
+            looking.clock = as_twisted(self._clock)
+            looking.start(QUIET_SECONDS, now=False)
+            try:
+                await DeferredList([left, following.over], fireOnOneCallback=True, consumeErrors=True)
+            finally:
+                looking.stop()
+                request.unregisterProducer()
+        if following.reason is not None and not request._disconnected:
+            _tell(request, b"ended", jsontext.encode(str(following.reason)))
+
+    @app.route("/<path:name>", methods=["PUT", "POST", "DELETE"])
+    @described(*operations.CHANGE)
+    def change(self, request: Request, name: str) -> Any:
+        method = request.method.decode()
+        ways = {
+            ("topics", "PUT"): self._publish,
+            ("topics", "POST"): self._publish,
+            ("services", "POST"): self._call,
+            ("actions", "POST"): self._give,
+            ("params", "PUT"): self._set,
+            ("params", "DELETE"): self._remove,
+        }
+        way = ways.get((self._part, method))
+        if way is None:
+            raise NothingHere
+        return self._answer(request, way(request, name))
+
+    async def _publish(self, request: Request, name: str) -> Any:
+        asker, moment = await self._asker(request), self._moment(request)
+        body = await self._forms.message(request, asker, name)
+
+        async def work() -> Reply:
+            await self._desk.publish(asker, name, body.value, body.type, moment)
+            return Reply(204)
+
+        return send(request, await self._once.reply(request, asker, Operation.PUBLISH, name, work))
+
+    async def _call(self, request: Request, name: str) -> Any:
+        asker = await self._asker(request, passes=resolve(name) in URGENT)
+        body, moment = body_of(request, Call), self._moment(request)
+
+        async def work() -> Reply:
+            values = await self._desk.call(asker, name, body.args, body.type, body.timeout, moment)
+            return Reply(200, jsontext.encode({"values": msgspec.Raw(values)}))
+
+        return send(request, await self._once.reply(request, asker, Operation.CALL, name, work))
+
+    async def _give(self, request: Request, name: str) -> Any:
+        return await self._giving.give(request, await self._asker(request), name, self._moment(request))
+
+    async def _set(self, request: Request, name: str) -> Any:
+        asker = await self._asker(request)
+        value = await self._forms.value(request, asker, name)
+        await self._desk.set_param(asker, name, value, of_any_form(request.getHeader("if-match")))
+
+    async def _remove(self, request: Request, name: str) -> Any:
+        match = of_any_form(request.getHeader("if-match"))
+        await self._desk.remove_param(await self._asker(request), name, match)
+
+    # --- requests and answers -----------------------------------------------------------------------------
+
+    def _answer(self, request: Request, work: Awaitable[Any]) -> Any:
+        async def dated() -> Any:
+            try:
+                answer = await work
+            except MaybeDone as error:
+                # Nothing is done by reading.
+                raise error.reason if request.method in (b"GET", b"HEAD") else error from None
+            finally:
+                request.setHeader(HEADER, self._moments.now())
+            if not isinstance(answer, bytes):
+                return answer
+            # It is no JSON. All headers are there now.
+            request.write(answer)
+            return STREAMED
+
+        return self._api.answer(request, dated())
+
+    async def _asker(self, request: Request, *, passes: bool = False) -> Asker:
+        address = getattr(request.getClientAddress(), "host", "local")
+        return Asker(await self._api.principal(request, passes=passes), self._robot, address)
+
+    def _moment(self, request: Request) -> int | None:
+        return self._moments.read(request.getHeader(HEADER))
+
+    @app.handle_errors(HTTPException)
+    def unrouted(self, request: Request, failure: Any) -> bytes:
+        answer: bytes = self._api.unrouted(request, failure)
+        return answer
+
+
+def parts(
+    clock: Clock,
+    front: FrontDesk,
+    threads: Threads,
+    moments: Moments,
+    clock_ns: Callable[[], int],
+    wall: Callable[[], float],
+) -> dict[str, Callable[[Api, str], IResource]]:
+    """What serves the addresses below a robot's :data:`PARTS`, its goals and its cameras.
+
+    :param threads: do what takes long
+    :param clock_ns: monotonic nanoseconds
+    :param wall: Unix time in seconds
+    """
+    guests = Guests(clock, front, clock_ns)
+    desk = ResourceDesk(clock, guests, threads, clock_ns, wall)
+    pursued = GoalDesk(clock, guests, desk, wall)
+    once = Once(Idempotency(clock), desk)
+    shared = clock, desk, moments, once, Giving(pursued, once)
+    below = {part: partial(_below, *shared, part) for part in PARTS}
+    shown = partial(cameras.below, CameraDesk(front.cameras), moments, desk)
+    return {**below, "goals": partial(goals.below, clock, pursued, moments), "cameras": shown}
+
+
+def _below(
+    clock: Clock,
+    desk: ResourceDesk,
+    moments: Moments,
+    once: Once,
+    giving: Giving,
+    part: str,
+    api: Api,
+    robot: str,
+) -> IResource:
+    resources = RobotResources(clock, desk, moments, once, giving, part, api, robot)
+    resource: IResource = resources.app.resource()
+    return resource
+
+
+def _look(request: Request, following: Following) -> None:
+    """Keep a stream alive on which nothing is said, and find out whether it still is."""
+    request.write(b":\n\n")
+    # Last: it may end the stream, and then the request is finished.
+    following.look()
+
+
+def _tell(request: Request, event: bytes, body: bytes) -> None:
+    request.write(b"event: " + event + b"\ndata: " + body + b"\n\n")
+
+
+def _wanted(request: Request, form: Form) -> Wanted:
+    query = query_of(request)
+    see_known(query, "wait", "max_age")
+    wait = number_in(query, "wait", 0.0, WAIT)
+    return Wanted(
+        Wanted().wait if wait is None else wait,
+        number_in(query, "max_age", 0.0, 1e9),
+        form.bases(known_tags(request)),
+    )

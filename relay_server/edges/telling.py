@@ -1,0 +1,155 @@
+"""What a page is told of its robots, and when: at every change, and so often that silence means a lost relay.
+
+Nothing here touches a socket. Two edges carry it: ``stream`` as server-sent events, ``pages`` over a websocket.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, Protocol
+
+from twisted.internet.defer import Deferred
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Unavailable
+from relay_server.access import Principal
+from relay_server.clock import Clock, Timer, cancel, looping, sleep
+
+STREAM_SECONDS = 5.0
+"""Something is told at least so often (SPEC section 1.7)."""
+
+COALESCE_SECONDS = 0.25
+QUIET_SECONDS = 3.0
+"""Without a change it is looked again after so long."""
+
+LOOK_SECONDS = 1.5
+"""A look that takes longer is told to be under way, again and again. With the pauses before it, that is in time."""
+
+STALL_SECONDS = 5.0
+"""A page that takes nothing for so long is cut."""
+
+FIRST = "robots"
+"""The event that every look tells; the others are told when they are another list."""
+
+UNKNOWN = "unknown"
+"""The event that says that the relay lives and can't tell the others, and why."""
+
+NO_ANSWER = "the database does not answer"
+
+Source = Callable[[Principal], Awaitable[list[dict[str, Any]]]]
+"""What somebody may see of something now."""
+
+
+class Page(Protocol):
+    """Who is told."""
+
+    def tell(self, event: str, body: bytes) -> None:
+        """Pass one event on.
+
+        :param body: JSON
+        """
+
+    def cut(self) -> None:
+        """It takes nothing any more: end the connection."""
+
+
+class Telling:
+    """Tells one page. Each event has the name of its source, and holds a list under that name.
+
+    :param principal: whose page it is; asked again each time, for that may be over
+    :param on_change: has a listener called at every change; returns what ends that
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        page: Page,
+        principal: Callable[[], Awaitable[Principal]],
+        sources: Mapping[str, Source],
+        on_change: Callable[[Callable[[], None]], Callable[[], None]],
+    ) -> None:
+        self._clock = clock
+        self._page = page
+        self._principal = principal
+        self._sources = sources
+        self._on_change = on_change
+        self._told: dict[str, list[dict[str, Any]]] = {}
+        self._dirty = False
+        """Whether anything has changed since what was told last was looked up."""
+        self._wake: Deferred[None] | None = None
+        self._stalled: Timer | None = None
+        """Cuts the page; there while it takes nothing."""
+
+    async def run(self) -> None:
+        """Until this is cancelled, or the credentials end.
+
+        :raises Refused: they have ended
+        """
+        forget = self._on_change(self._changed)
+        try:
+            while True:
+                await self._look()
+                await sleep(self._clock, COALESCE_SECONDS)
+                await self._until_change()
+        finally:
+            forget()
+            cancel(self._stalled)
+
+    def pause(self) -> None:
+        """The page takes nothing for now."""
+        if self._stalled is None:
+            self._stalled = self._clock.callLater(STALL_SECONDS, self._page.cut)
+
+    def resume(self) -> None:
+        """It does again."""
+        cancel(self._stalled)
+        self._stalled = None
+        self._changed()
+
+    # --- telling ------------------------------------------------------------------------------------------
+
+    async def _look(self) -> None:
+        self._dirty = False
+        slow = looping(self._clock, lambda: self._unknown(NO_ANSWER))
+        slow.start(LOOK_SECONDS, now=False)
+        try:
+            principal = await self._principal()
+            found = [(name, await source(principal)) for name, source in self._sources.items()]
+        except Unavailable as error:
+            # The next look may do better.
+            self._unknown(str(error))
+            return
+        finally:
+            slow.stop()
+        for name, now in found:
+            # Once it is paused nothing more is told: it would only wait, and be old by then.
+            if self._stalled is None and (name == FIRST or now is not self._told.get(name)):
+                self._told[name] = now
+                self._page.tell(name, jsontext.encode({name: now}))
+
+    def _unknown(self, reason: str) -> None:
+        if self._stalled is None:
+            self._page.tell(UNKNOWN, jsontext.encode({"reason": reason}))
+
+    # --- waiting ------------------------------------------------------------------------------------------
+
+    def _changed(self) -> None:
+        self._dirty = True
+        self._wake_up()
+
+    def _wake_up(self) -> None:
+        wake, self._wake = self._wake, None
+        if wake is not None:
+            wake.callback(None)
+
+    async def _until_change(self) -> None:
+        if self._dirty:
+            return
+        wake: Deferred[None] = Deferred()
+        self._wake = wake
+        timer = self._clock.callLater(QUIET_SECONDS, self._wake_up)
+        try:
+            await wake
+        finally:
+            self._wake = None
+            cancel(timer)

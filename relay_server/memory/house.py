@@ -1,0 +1,95 @@
+"""The memory, put together: what notes, what writes, what looks after it, and whom people ask."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from twisted.logger import Logger
+
+from relay_db.queries import AlertRecord, MemoryRecord
+from relay_protocol.errors import SwitchboardError
+from relay_server.access import Access
+from relay_server.clock import within
+from relay_server.config import Settings
+from relay_server.journal import Journal
+from relay_server.memory.desk import MemoryDesk, Recent
+from relay_server.memory.noticing import Noticing
+from relay_server.memory.quota import Quota
+from relay_server.memory.writer import Writer
+from relay_server.registry import Registry
+from relay_server.store import Store
+
+KEEP_SECONDS = 2.0
+"""What waits has so long to be written when the relay goes down."""
+
+
+class Telling(Protocol):
+    """Where alerts are told; see :class:`relay_server.alerts.hub.Alerts`."""
+
+    def listen(self, listener: Callable[[str, AlertRecord], None]) -> None:
+        """Have somebody told."""
+
+
+class MemoryHouse(Collector):
+    """All that a relay has for its memory; and its figures for Prometheus.
+
+    :param reactor: Twisted's
+    """
+
+    log = Logger()
+
+    def __init__(
+        self,
+        reactor: Any,
+        store: Store,
+        access: Access,
+        registry: Registry,
+        journal: Journal,
+        alerts: Telling,
+        settings: Settings,
+    ) -> None:
+        self._clock = reactor
+        self._recent = Recent()
+        self._quota = Quota(reactor, store, time.time, settings.events_of_source, settings.events_kept)
+        self._writer = Writer(reactor, store, time.time, self._written)
+        noticing = Noticing(self._writer, registry, time.time, reactor.seconds)
+        self.desk = MemoryDesk(store, access, self._writer, self._quota, self._recent, time.time)
+        self.note = noticing.note
+        """Keeps an event that the relay has put together, if there is room; nobody waits for it."""
+        journal.witness(noticing.happened)
+        alerts.listen(noticing.alert)
+
+    async def start(self) -> None:
+        """Begin to look after it.
+
+        :raises Unavailable: the database can't be asked
+        """
+        await self._quota.start()
+
+    async def keep(self) -> None:
+        """Keep what waits, if the database takes it soon, and look after it no more."""
+        self._quota.stop()
+        late = f"the database has not taken them within {KEEP_SECONDS:g} s"
+        try:
+            await within(self._clock, KEEP_SECONDS, self._writer.flush(), late)
+        except SwitchboardError as error:
+            self.log.error("the latest events could not be kept: {reason}", reason=str(error))
+
+    def collect(self) -> Iterator[Metric]:
+        """One reading."""
+        writer = self._writer
+        yield GaugeMetricFamily(
+            "switchboard_events_waiting", "Events that wait to be written", writer.waiting
+        )
+        yield CounterMetricFamily("switchboard_events_written", "Events that were written", writer.written)
+        yield CounterMetricFamily(
+            "switchboard_events_dropped", "Events of the relay's own that were not kept", writer.dropped
+        )
+
+    def _written(self, events: list[MemoryRecord]) -> None:
+        self._quota.written(events)
+        self._recent.written(events)

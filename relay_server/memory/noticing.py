@@ -1,0 +1,120 @@
+"""What leaves an event by itself: what the journal and the alerts tell, in the words of the memory.
+
+Nothing here is done for a sample, and nothing waits: what finds no room, or comes too often, is counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from relay_db.base import canonical_json
+from relay_db.models import NAME
+from relay_db.names import recorded
+from relay_db.queries import DEFAULT_REALM, AlertRecord, NewMemory
+from relay_db.queries.recalling import OURS
+from relay_server.bucket import Buckets
+from relay_server.memory.limits import DATA, NOTED, NOTED_A_SECOND, NOTED_AT_ONCE
+from relay_server.memory.writer import Writer
+from relay_server.registry import Registry
+
+KINDS = frozenset(
+    {
+        "robot.online",
+        "robot.offline",
+        "robot.stopped",
+        "robot.resumed",
+        "robot.suppressed",
+        "robot.inhibited",
+        "client.joined",
+        "client.left",
+        "control.taken",
+        "control.granted",
+        "control.released",
+        "control.lost",
+        "control.requested",
+        "control.withdrawn",
+        "control.lapsed",
+        "control.refused",
+        "motion.begun",
+        "call.begun",
+        "call.ended",
+        "goal.begun",
+        "goal.ended",
+        "login.refused",
+    }
+)
+"""What of the journal is noted (SPEC section 1.14)."""
+
+_UNTOLD = frozenset({"robot", "user", "address"})
+"""Fields that an event has in other places, or that are not everybody's who may see the robot."""
+
+_GUARDED = frozenset({"stale", "diagnostics"})
+"""Kinds of alerts whose words take further rights (SPEC section 1.10); that there is one does not."""
+
+
+class Noticing:
+    """See the module's text.
+
+    :param wall: Unix time in seconds
+    :param seconds: a monotonic clock
+    """
+
+    def __init__(
+        self,
+        writer: Writer,
+        registry: Registry,
+        wall: Callable[[], float],
+        seconds: Callable[[], float],
+    ) -> None:
+        self._writer = writer
+        self._registry = registry
+        self._wall = wall
+        self._buckets = Buckets(NOTED_A_SECOND, NOTED_AT_ONCE, NOTED, seconds)
+
+    def happened(self, kind: str, source: str, robot_id: int | None, data: Mapping[str, Any]) -> None:
+        """An event of the journal, whether it is kept there or not."""
+        if kind not in KINDS:
+            return
+        who, _, name = source.partition(":")
+        user = name if who == "user" else None
+        if robot_id is None:
+            self._note(kind, None, user, data)
+        else:
+            self._note(kind, robot_id, user, {k: v for k, v in data.items() if k not in _UNTOLD})
+
+    def alert(self, what: str, alert: AlertRecord) -> None:
+        """An alert has begun, become worse, or is over."""
+        data = {"alert": alert.id, "alert_kind": alert.kind, "level": alert.level}
+        if alert.kind not in _GUARDED:
+            data |= {"about": alert.about, "text": alert.text}
+        self._note(f"alert.{what}", alert.robot_id, None, data)
+
+    def note(self, event: NewMemory) -> None:
+        """What another part of this relay has put together."""
+        if self._buckets.take((event.robot_id, event.user)):
+            self._writer.note(event)
+        else:
+            self._writer.drop(event.realm)
+
+    def _note(self, kind: str, robot_id: int | None, user: str | None, data: Mapping[str, Any]) -> None:
+        robot = None if robot_id is None else self._registry.find(robot_id)
+        if robot_id is not None and robot is None:
+            # It was removed: nobody may see this any more.
+            return
+        realm = DEFAULT_REALM if robot is None else robot.realm
+        if not self._buckets.take((robot_id, user)):
+            self._writer.drop(realm)
+            return
+        source = OURS if robot is None else f"{OURS}:{robot.name}"
+        text = _text(data)
+        self._writer.note(
+            NewMemory(realm, self._wall(), source, kind, robot_id, user and recorded(user, NAME), text)
+        )
+
+
+def _text(data: Mapping[str, Any]) -> str:
+    """Data as it is kept; words are cut, and what is too large all the same is left out."""
+    cut = {name: recorded(value) if isinstance(value, str) else value for name, value in data.items()}
+    text = canonical_json(cut)
+    return text if len(text) <= DATA else canonical_json({"left_out": len(text)})

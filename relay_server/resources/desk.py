@@ -1,0 +1,363 @@
+"""What HTTP asks about a robot's resources, done by a connection that is judged as any client's is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+from twisted.internet.defer import CancelledError, Deferred
+from twisted.python.failure import Failure
+
+from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.rights import Operation
+from relay_server.access import Principal
+from relay_server.channel import resolve
+from relay_server.clock import Clock, to_the_end, within
+from relay_server.control import NotDone
+from relay_server.inside import Guest, Guests
+from relay_server.inside.publishing import Speaker, may_move, type_of
+from relay_server.local.catalogue import RELAY, ROSAPI
+from relay_server.local.view import view
+from relay_server.moments import NEEDED, MomentNeeded, TooOld
+from relay_server.resources import params
+from relay_server.resources.background import Background, background
+from relay_server.resources.following import Following
+from relay_server.resources.listing import Listing
+from relay_server.resources.states import Param, State, see_match
+from relay_server.resources.turns import Turns
+from relay_server.session import Session
+from relay_server.session.calling import RESUME, moves_by
+from relay_server.session.share import Share
+from relay_server.store import Threads
+from relay_server.video import NothingCame
+
+T = TypeVar("T")
+
+READY_SECONDS = 5.0
+"""A robot has so long to begin publishing a topic."""
+
+KINDS = ("topics", "services", "actions")
+"""Collections that are in the robot's graph."""
+
+
+class Asker(NamedTuple):
+    """Who asks, of which robot, from where."""
+
+    principal: Principal
+    robot: str
+    address: str
+
+
+class Wanted(NamedTuple):
+    """Which state of a topic is wanted.
+
+    :param wait: seconds for which it may be waited
+    :param max_age: seconds since the relay got it, at most; ``None`` for however long
+    :param unlike: entity tags of those that are known already
+    """
+
+    wait: float = 2.0
+    max_age: float | None = None
+    unlike: frozenset[str] = frozenset()
+
+
+class ResourceDesk:
+    """See the module's text.
+
+    :param threads: do what takes long, one piece at a time
+    :param clock_ns: the relay's monotonic nanoseconds
+    :param wall: Unix time in seconds
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        guests: Guests,
+        threads: Threads,
+        clock_ns: Callable[[], int],
+        wall: Callable[[], float],
+    ) -> None:
+        self._clock = clock
+        self._guests = guests
+        self._threads = threads
+        self._clock_ns = clock_ns
+        self._wall = wall
+        self._turns = Turns()
+
+    async def members(self, asker: Asker, kind: str, listing: Listing) -> dict[str, Any]:
+        """A page of one of :data:`KINDS`.
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        async with self._guests.at(*asker) as guest:
+            robot = guest.session.robot
+            members = getattr(view(guest.session), kind)
+            page, after = listing.page(members, lambda each: each.types)
+            motion = robot.description.motion
+            moves: dict[str, Callable[[str, list[str]], bool]] = {
+                "topics": lambda name, types: any(robot.is_motion(name, each) for each in types),
+                "services": lambda name, types: motion.moves_by_service(name),
+                "actions": lambda name, types: motion.moves_by_action(name),
+            }
+            return {
+                kind: [
+                    {"name": name, **msgspec.to_builtins(each), "moves": moves[kind](name, each.types)}
+                    for name, each in page
+                ],
+                "next": after,
+                "online": robot.control is not None,
+            }
+
+    async def state(self, asker: Asker, name: str, wanted: Wanted) -> tuple[State, bool]:
+        """The newest state of a topic, and whether it is known already, since there is none but those that are.
+
+        :raises NotFound: no such robot or topic, or no right on it
+        :raises Refused: the topic may not be heard
+        :raises Unavailable: the robot is offline
+        :raises NothingCame: nobody has said anything there in time
+        """
+        async with self._guests.at(*asker) as guest:
+            topic = resolve(name)
+            type_name = known_type(guest.session, topic)
+            feed = guest.feed(topic, type_name)
+            until = self._clock.seconds() + wanted.wait
+            known: State | None = None
+            number = 0
+            while True:
+                now = self._clock.seconds()
+                heard = await feed.after(number, max(0.0, until - now))
+                guest.client.check(topic)
+                if heard is None:
+                    break
+                number = heard.number
+                now = self._clock.seconds()
+                if wanted.max_age is not None and now - heard.at > wanted.max_age:
+                    continue
+                state = State(topic, type_name, self._wall() - (now - heard.at), heard.body)
+                if state.etag not in wanted.unlike:
+                    return state, False
+                known = state
+                if wanted.wait <= 0:
+                    break
+            if known is not None:
+                return known, True
+            # The right to hear it may have been withdrawn meanwhile.
+            guest.feed(topic, type_name)
+            raise NothingCame(f"nobody has said anything on {topic} within {wanted.wait:g} s")
+
+    async def background(self, asker: Asker, state: State) -> Background:
+        """What is to be known of a topic beside its state."""
+        async with self._guests.at(*asker) as guest:
+            return await background(guest.session, state.topic, state.type)
+
+    async def made(self, asker: Asker, work: Callable[[], T]) -> T:
+        """Do something in a thread, on the account of who asks for it.
+
+        :raises Refused: he has used up his share of the processor, now or when it would be his turn
+        :raises Unavailable: too much waits already, of his or of all; or the relay goes down
+        """
+        async with self._guests.at(*asker) as guest:
+            share = guest.session.share
+            share.check()
+            making = Deferred.fromCoroutine(self._counted(asker.principal.user_id, share, work))
+            # To the end, so that it is counted for who leaves before.
+            waiting = to_the_end(making)
+            making.addErrback(_nobody_waits)
+            return await waiting
+
+    async def _counted(self, user: int, share: Share, work: Callable[[], T]) -> T:
+        spent = 0.0
+
+        def timed() -> T:
+            nonlocal spent
+            began = time.thread_time()
+            try:
+                return work()
+            finally:
+                spent = time.thread_time() - began
+
+        async with self._turns.turn(user):
+            # Again: what was made meanwhile may have used it up.
+            share.check()
+            try:
+                return await self._threads.run(timed)
+            finally:
+                share.took(spent)
+
+    @asynccontextmanager
+    async def follow(
+        self, asker: Asker, name: str, throttle_ms: float, tell: Callable[[bytes], None]
+    ) -> AsyncIterator[Following]:
+        """Have every message of a topic told, as long as the block lasts.
+
+        :param throttle_ms: least time between two; the newest counts
+        :raises SwitchboardError: as :meth:`state`
+        """
+        async with self._guests.visit(*asker) as (session, client):
+            topic = resolve(name)
+            following = Following(session, client, topic)
+            following.begin(known_type(session, topic), throttle_ms, tell)
+            yield following
+
+    async def publish(
+        self, asker: Asker, name: str, body: msgspec.Raw, type_name: str, moment: int | None
+    ) -> None:
+        """Say something on a topic.
+
+        :param body: JSON of the message
+        :param type_name: of the topic; empty for the one it has
+        :param moment: the relay's monotonic nanoseconds before which it can't have been asked for
+        :raises MomentNeeded: it moves the robot, and no moment is named
+        :raises TooOld: it moves the robot, and may be too old
+        :raises SwitchboardError: it is refused, or can't be done
+        """
+        async with self._guests.at(*asker) as guest:
+            topic, session = resolve(name), guest.session
+            session.judge(Operation.PUBLISH, topic)
+            speaker = Speaker(self._clock, guest.client, session, topic)
+            if session.robot.control is None:
+                # Which refuses it. Who commands a robot that is away has to let go when it is back.
+                speaker.say_now(body, moment)
+            named = type_of(session, topic, type_name)
+            if not may_move(session, topic, named):
+                saying, late = speaker.say(body, named), f"the robot does not publish {topic} in time"
+                await within(self._clock, READY_SECONDS, saying, late)
+                return
+            try:
+                since = self.dated(guest, moment)
+            except Refused:
+                # It counts as a command in vain all the same.
+                with suppress(SwitchboardError):
+                    speaker.advertise(named)
+                    speaker.say_now(body, moment)
+                raise
+            left = session.robot.description.motion.deadline_ms / 1000 - (self._clock_ns() - since) / 1e9
+            await speaker.command(body, named, since, left)
+
+    async def call(
+        self, asker: Asker, name: str, args: msgspec.Raw, type_name: str, seconds: float, moment: int | None
+    ) -> bytes:
+        """Call a service; JSON of what it answers.
+
+        :param args: JSON
+        :param seconds: it may take
+        :raises MomentNeeded: it moves the robot or lets it move again, and no moment is named
+        :raises NotDone: it has not answered, or says why not
+        :raises SwitchboardError: as :meth:`publish`
+        """
+        async with self._guests.at(*asker) as guest:
+            service = resolve(name)
+            if not type_name and service not in view(guest.session).services:
+                see_online(guest.session)
+                name = guest.session.robot.name
+                raise NotFound(f"there is no service {service} on robot {name}, or you have no right on it")
+            if service == RESUME and moment is None:
+                raise MomentNeeded(f"this lets the robot move again: {NEEDED}")
+            if moves_by(guest.session.robot.description.motion, service):
+                self.dated(guest, moment)
+            answer = await guest.client.call(service, args, type_name, seconds, moment)
+            if not answer.result:
+                raise NotDone(str(answer.read))
+            return bytes(answer.values)
+
+    async def may(self, asker: Asker, operation: Operation, name: str) -> None:
+        """See that something may be done now, without doing it.
+
+        :raises NotFound: no such robot, or no right on it
+        :raises Refused: it may not
+        """
+        resource = resolve(name)
+        async with self._guests.permit(*asker) as permit:
+            verdict = permit.judge(operation, resource)
+        # The relay's own services are open to all who have a right on the robot.
+        own = operation is Operation.CALL and resource.startswith((f"{RELAY}/", f"{ROSAPI}/"))
+        if not (verdict.allowed or own):
+            raise Refused(verdict.reason)
+
+    # --- parameters ---------------------------------------------------------------------------------------
+
+    async def params(self, asker: Asker, listing: Listing) -> dict[str, Any]:
+        """A page of the names of parameters.
+
+        :raises SwitchboardError: as :meth:`state`
+        """
+        async with self._guests.at(*asker) as guest:
+            members = dict.fromkeys(await params.names(guest), "")
+            page, after = listing.page(members, lambda each: [each])
+            return {"params": [{"name": name} for name, _ in page], "next": after}
+
+    async def param(self, asker: Asker, name: str) -> Param:
+        """A parameter.
+
+        :param name: ``<node>:<parameter>``
+        :raises NotFound: there is none
+        """
+        async with self._guests.at(*asker) as guest:
+            return Param(name, await params.value(guest, name))
+
+    async def set_param(self, asker: Asker, name: str, json: bytes, match: str | None) -> None:
+        """Set a parameter.
+
+        :param match: only if it still has this value: entity tags, as in ``If-Match``
+        :raises NotAsBefore: it has another
+        :raises NotDone: its node says why not
+        """
+        async with self._guests.at(*asker) as guest:
+            await self._see_same(guest, name, match)
+            await params.set_value(guest, name, json)
+
+    async def remove_param(self, asker: Asker, name: str, match: str | None) -> None:
+        """Delete a parameter; see :meth:`set_param`."""
+        async with self._guests.at(*asker) as guest:
+            await self._see_same(guest, name, match)
+            await params.remove(guest, name)
+
+    @staticmethod
+    async def _see_same(guest: Guest, name: str, match: str | None) -> None:
+        if match is not None:
+            see_match(Param(name, await params.value(guest, name)).etag, match)
+
+    def dated(self, guest: Guest, moment: int | None) -> int:
+        """When something that moves the robot can have been asked for at the earliest.
+
+        :param moment: the relay's monotonic nanoseconds, as the asker names it
+        :raises MomentNeeded: he does not
+        :raises TooOld: that is too long ago
+        """
+        if moment is None:
+            raise MomentNeeded(f"this moves the robot: {NEEDED}")
+        age_ms = (self._clock_ns() - moment) / 1e6
+        deadline_ms = guest.session.robot.description.motion.deadline_ms
+        if age_ms > deadline_ms:
+            raise TooOld(
+                f"this may have been sent {age_ms:.0f} ms ago; the robot takes nothing older than {deadline_ms} ms. "
+                "Give back the 'switchboard-moment' of this answer"
+            )
+        return moment
+
+
+def _nobody_waits(failure: Failure) -> None:
+    """Why something was not made, when who asked has left: that is no failure of the relay."""
+    failure.trap(SwitchboardError, CancelledError)
+
+
+def known_type(session: Session, topic: str) -> str:
+    """The type of a topic that the asker may know of.
+
+    :raises NotFound: there is none
+    :raises Unavailable: the robot is offline
+    """
+    known = view(session).topics.get(topic)
+    if known is not None and known.types:
+        return known.types[0]
+    see_online(session)
+    raise NotFound(f"there is no topic {topic} on robot {session.robot.name}, or you have no right on it")
+
+
+def see_online(session: Session) -> None:
+    """:raises Unavailable: the robot is offline"""
+    if session.robot.control is None:
+        raise Unavailable(f"robot {session.robot.name} is offline")

@@ -1,0 +1,34 @@
+"""Robots that may not be here any more: cut when their key was revoked, forgotten when they were removed."""
+
+from __future__ import annotations
+
+from twisted.logger import Logger
+
+from relay_db import queries
+from relay_protocol.errors import NotFound, Unavailable
+from relay_server.control import Desks
+from relay_server.registry import Registry
+from relay_server.store import Store
+from relay_server.video import Videos
+
+log = Logger()
+
+
+async def retire(store: Store, registry: Registry, desks: Desks, videos: Videos) -> None:
+    """Cut robots whose key was revoked, forget those that were removed.
+
+    :raises Unavailable: the database can't be asked
+    """
+    links = [(robot, robot.control) for robot in registry]
+    keys = {(robot.robot_id, robot.key) for robot, control in links if control is not None}
+    live = await store.read(queries.live_keys, keys)
+    there = {record.id for record in await store.read(queries.list_robots)}
+    for robot, control in links:
+        if robot.robot_id not in there:
+            registry.forget(robot.robot_id)
+            desks.forget(robot.robot_id)
+            videos.end(robot, NotFound("this robot was removed from the relay"))
+        elif control is not None and robot.control is control and (robot.robot_id, robot.key) not in live:
+            log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
+            control.close("the robot's key is not accepted any more")
+            videos.end(robot, Unavailable("the robot's key is not accepted any more"))
