@@ -38,7 +38,7 @@ export default defineConfig({
   },
   server: {
     proxy: {
-      '/api': relay,
+      '/api': { target: relay, ws: true },
       '/robots': { target: relay, ws: true },
     },
   },

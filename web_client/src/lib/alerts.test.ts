@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest'
-import { type Alert, isWorse, leftOpen, line, merged, News, REMEMBERED, STREAMED, summary, waiting, worst } from './alerts'
+import { type Alert, AT_ONCE, gather, isWorse, leftOpen, line, merged, News, REMEMBERED, STREAMED, summary, waiting, worst } from './alerts'
 
 function alert(id: string, more: Partial<Alert> = {}): Alert {
   return {
@@ -137,6 +137,37 @@ it('puts what is told meanwhile into the list, the latest first and only what fi
   expect(ids({ robot: '', state: 'all' })).toEqual(['b', 'c', 'a'])
   expect(ids({ robot: 'rover', state: 'open' })).toEqual(['b', 'a'])
   expect(ids({ robot: '', state: 'over' })).toEqual([])
+})
+
+describe('a long list', () => {
+  /** A relay with so many alerts; what it was asked. */
+  function relay(count: number) {
+    const all = Array.from({ length: count }, (_, i) => alert(`${i}`))
+    const asked: [number, string | null][] = []
+    async function ask(limit: number, before: string | null) {
+      asked.push([limit, before])
+      const from = Number(before ?? 0)
+      const alerts = all.slice(from, from + limit)
+      return Promise.resolve({ alerts, next: from + limit < count ? String(from + limit) : null })
+    }
+    return { all, asked, ask }
+  }
+
+  it('is asked for in parts until it is as long as is wanted', async () => {
+    const { all, asked, ask } = relay(2000)
+    expect(await gather(ask, 1200)).toEqual({ alerts: all.slice(0, 1200), next: '1200' })
+    expect(asked).toEqual([
+      [AT_ONCE, null],
+      [AT_ONCE, '500'],
+      [200, '1000'],
+    ])
+  })
+
+  it('ends where there is no more', async () => {
+    const { all, asked, ask } = relay(600)
+    expect(await gather(ask, 1200)).toEqual({ alerts: all, next: null })
+    expect(asked).toHaveLength(2)
+  })
 })
 
 it('notices an alert that is told no more though it was not over', () => {

@@ -26,6 +26,33 @@ export interface Filter {
   state: 'all' | 'open' | 'over'
 }
 
+/** A part of a list, the latest first.
+ *
+ * `next`: what asks for the part after it; null where there is none
+ */
+export interface Page {
+  alerts: Alert[]
+  next: string | null
+}
+
+/** The relay gives no more at a time. */
+export const AT_ONCE = 500
+
+/** A list up to a length, however many answers that takes.
+ *
+ * @param ask gives a part: how many at most, and after what
+ */
+export async function gather(ask: (limit: number, before: string | null) => Promise<Page>, most: number): Promise<Page> {
+  const alerts: Alert[] = []
+  let next: string | null = null
+  do {
+    const page = await ask(Math.min(most - alerts.length, AT_ONCE), next)
+    alerts.push(...page.alerts)
+    next = page.next
+  } while (next !== null && alerts.length < most)
+  return { alerts, next }
+}
+
 /** How many alerts a page knows that it has told of. */
 export const REMEMBERED = 2000
 

@@ -26,6 +26,9 @@ export function ending(code: number, reason: string): Ending {
   return code === 4403 ? withReason(known, reason) : known
 }
 
+/** Of the codes only this one says that JPEG may do where H.264 does not. */
+export const NOT_AS_H264 = 4415
+
 const VIDEO_ENDINGS: Record<number, Ending> = {
   1001: ENDINGS[1001]!,
   4400: { after: 'give_up', words: 'The camera can’t be shown like that.' },
@@ -33,6 +36,7 @@ const VIDEO_ENDINGS: Record<number, Ending> = {
   4403: { after: 'give_up', words: 'You have no right to view this camera.' },
   4404: { after: 'give_up', words: 'There is no camera of this name for you.' },
   4408: { after: 'retry', words: 'This connection was too slow for the pictures.' },
+  [NOT_AS_H264]: { after: 'retry', words: 'The robot can’t make H.264 of this camera.' },
   4429: { after: 'give_up', words: 'The relay shows no more pictures for now.' },
   4503: { after: 'retry', words: 'The camera can’t be shown now.' },
 }

@@ -1,5 +1,5 @@
 /** The state of the cockpit: link, rights, chosen topics, and what there is to see. One instance per open cockpit. */
-import { cameras as fetchCameras, currentSession, robot as fetchRobot, robotSocket } from './api'
+import { cameras as fetchCameras, robot as fetchRobot, robotSocket } from './api'
 import { app } from './app.svelte'
 import type { Ending } from './closing'
 import type { Control } from './control'
@@ -131,6 +131,10 @@ export class Cockpit implements Bridge {
     return this.latency.isLate(performance.now()) || this.link.isStalled
   }
 
+  isRobotLate(): boolean {
+    return this.latency.isRobotLate(performance.now())
+  }
+
   private whyNot(): string | null {
     if (this.linkState === 'ended') return this.ending?.words ?? 'The connection is closed.'
     if (this.robotState === 'offline') return 'The robot is offline.'
@@ -161,17 +165,9 @@ export class Cockpit implements Bridge {
     else this.lostMs ??= performance.now()
     if (state === 'open') void this.fetchTopics()
     if (state === 'waiting' || state === 'ended') this.linkGone()
-    if (state === 'waiting') void this.checkSession()
+    // A refused handshake tells the page nothing; it may be about a session that is over, or another user's by now.
+    if (state === 'waiting') app.checkSession()
     if (state === 'ended' && why?.after === 'login') app.toLogin(why.words)
-  }
-
-  /** A refused websocket handshake tells the page nothing, so it asks whether it is still logged in. */
-  private async checkSession(): Promise<void> {
-    try {
-      if ((await currentSession()) === null) app.toLogin('Your session has ended. Please log in again.')
-    } catch {
-      // The relay is away; the link goes on trying.
-    }
   }
 
   private linkGone(): void {

@@ -8,20 +8,23 @@ import {
   type Request,
   secondsLeft,
   sentenceOf,
+  silenced,
   standing,
+  suppressor,
   topOf,
   whoMayResume,
   whyLost,
   within,
 } from './control'
 
-const holder = (user: string, you = false): Holder => ({ user, client: 7, since: 1000, you })
-const request = (user: string, you = false): Request => ({ ...holder(user, you), why: '', until: 1030 })
+const holder = (user: string, you = false): Holder => ({ user, client: 7, since: 1000, you, implicit: false })
+const request = (user: string, you = false): Request => ({ user, client: 7, since: 1000, you, why: '', until: 1030 })
 
 function control(more: Partial<Control> = {}): Control {
   const you = { client: 3, may_control: true, may_resume: false }
   const state = more.request ? 'requested' : more.holder ? 'held' : 'free'
-  return { robot: 'r', state, holder: null, request: null, stopped: null, moving: false, limits: {}, you, ...more }
+  const nothing = { holder: null, request: null, stopped: null, moving: false, suppressed: [], inhibited: [], limits: {} }
+  return { robot: 'r', state, ...nothing, you, ...more }
 }
 
 const stands = (told: Control | null, level: 'operator' | 'owner' = 'operator', now = 1010) =>
@@ -46,6 +49,13 @@ describe('how one stands to control', () => {
     expect(stands(told, 'owner', 1029)).toBe('waiting')
     expect(stands(told, 'owner', 1030)).toBe('ripe')
     expect(stands(told, 'operator', 1030)).toBe('waiting')
+  })
+
+  it('whoever asked takes over from a program that answers nobody', () => {
+    const program = { ...holder('bob'), implicit: true }
+    const told = control({ holder: program, request: request('ann', true) })
+    expect(stands(told, 'operator', 1029)).toBe('waiting')
+    expect(stands(told, 'operator', 1030)).toBe('ripe')
   })
 
   it('only this connection’s own control counts as one’s own', () => {
@@ -91,6 +101,27 @@ describe('the words', () => {
     expect(holderBadge(control())).toBeNull()
     expect(holderBadge(control({ holder: holder('ann', true) }))).toBe('You have control')
     expect(holderBadge(control({ holder: holder('bob') }))).toBe('bob has control')
+  })
+})
+
+describe('topics that others have their hands on', () => {
+  const suppressed = [{ resource: '/cmd_vel', sources: [9], by: 'runaway' }]
+  const inhibited = [
+    { resource: '/scan', hold: true, by: 'olga' },
+    { resource: '/odom', hold: false, by: '' },
+  ]
+  const told = control({ suppressed, inhibited })
+
+  it('are commanded by somebody, unless that is oneself', () => {
+    expect(suppressor(told, '/cmd_vel')).toBe('runaway')
+    expect(suppressor(control({ suppressed: [{ ...suppressed[0]!, sources: [3] }] }), '/cmd_vel')).toBeNull()
+    expect([suppressor(told, '/other'), suppressor(told, null), suppressor(null, '/cmd_vel')]).toEqual([null, null, null])
+  })
+
+  it('are told apart by whether they say their last value or nothing', () => {
+    expect(silenced(told, '/scan')).toBe('held by olga')
+    expect(silenced(told, '/odom')).toBe('inhibited by somebody')
+    expect([silenced(told, '/other'), silenced(told, null), silenced(null, '/scan')]).toEqual([null, null, null])
   })
 })
 

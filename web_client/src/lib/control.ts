@@ -3,7 +3,7 @@ import type { Limits } from './drive'
 import { people } from './format'
 import type { Level } from './types'
 
-export interface Holder {
+interface Person {
   user: string
   /** The number of the connection. */
   client: number
@@ -12,9 +12,14 @@ export interface Holder {
   you: boolean
 }
 
-export interface Request extends Holder {
+export interface Holder extends Person {
+  /** Whether a command took it, of a program that answers nobody. */
+  implicit: boolean
+}
+
+export interface Request extends Person {
   why: string
-  /** From then on an owner takes over by asking again. */
+  /** From then on an owner, or of an implicit holder anybody, takes over by asking again. */
   until: number
 }
 
@@ -24,6 +29,21 @@ export interface Stopped {
   since: number
   /** Whether the robot has confirmed it. */
   told: boolean
+}
+
+/** A topic that others command than who has control. */
+export interface Suppressed {
+  resource: string
+  /** Numbers of the connections that do. */
+  sources: number[]
+  by: string
+}
+
+/** A topic that says nothing, or with `hold` its last value again and again. */
+export interface Inhibited {
+  resource: string
+  hold: boolean
+  by: string
 }
 
 export interface LevelLimits {
@@ -38,6 +58,8 @@ export interface Control {
   request: Request | null
   stopped: Stopped | null
   moving: boolean
+  suppressed: Suppressed[]
+  inhibited: Inhibited[]
   limits: Partial<Record<Level, LevelLimits>>
   you: { client: number | null; may_control: boolean; may_resume: boolean }
 }
@@ -54,7 +76,8 @@ export function standing(control: Control | null, me: string, level: Level | nul
   const { holder, request } = control
   if (holder === null) return 'free'
   if (holder.you) return request === null ? 'yours' : 'asked'
-  if (request?.you) return level === 'owner' && now >= request.until ? 'ripe' : 'waiting'
+  const comesDue = level === 'owner' || holder.implicit
+  if (request?.you) return comesDue && now >= request.until ? 'ripe' : 'waiting'
   return holder.user === me ? 'elsewhere' : 'held'
 }
 
@@ -97,6 +120,20 @@ export function whyLost(after: Control, offline: boolean): string {
   if (offline) return 'Control went with the robot’s link. Take it anew when the robot is back.'
   if (after.holder === null) return 'You no longer have control. It is free: take it to drive on.'
   return `${after.holder.user} has control now.`
+}
+
+/** Who commands a topic in the place of who has control, when that is not this page; null for nobody. */
+export function suppressor(control: Control | null, topic: string | null): string | null {
+  const found = control?.suppressed.find(({ resource }) => resource === topic)
+  const own = control?.you.client ?? null
+  return found === undefined || (own !== null && found.sources.includes(own)) ? null : found.by
+}
+
+/** That a topic does not say how things are now, in words; null when it does. */
+export function silenced(control: Control | null, topic: string | null): string | null {
+  const found = control?.inhibited.find(({ resource }) => resource === topic)
+  if (found === undefined) return null
+  return `${found.hold ? 'held' : 'inhibited'} by ${found.by || 'somebody'}`
 }
 
 /** Who may let a stopped robot move again, for those who may not. */

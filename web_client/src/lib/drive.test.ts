@@ -192,7 +192,7 @@ it('obeys the most exact of the inputs that are held', () => {
 })
 
 describe('obstacles', () => {
-  it.each<StopReason>(['link_late', 'link_closed', 'not_allowed', 'control_lost', 'robot_stopped'])('%s refuses a new hold', (reason) => {
+  it.each<StopReason>(['link_late', 'robot_late', 'link_closed', 'not_allowed', 'control_lost', 'robot_stopped'])('%s refuses a new hold', (reason) => {
     obstacle = reason
     expect(drive.grab('joystick', now)).toBe(reason)
     drive.steer('joystick', 0, 1, now)

@@ -39,6 +39,7 @@ export const LETTING_GO = {
   gamepad_gone: 'Stopped: the gamepad is gone.',
   tilt_silent: 'Stopped: the phone no longer tells how it is held.',
   link_late: 'Stopped: the link is late. Take hold again when it has recovered.',
+  robot_late: 'Stopped: the robot is late. Take hold again when it has recovered.',
   link_closed: 'Stopped: the connection was lost.',
   topic_changed: 'Stopped: the command topic was changed.',
 } as const

@@ -9,9 +9,24 @@ import { fullType } from './topics'
 import type { Level, TopicInfo, Twist } from './types'
 
 const ORDER = 'switchboard_msgs/srv/Order'
+const REPLY = 'switchboard_msgs/srv/Reply'
+const STOP = 'switchboard_msgs/srv/Stop'
 const USUAL: Limits = { linear: 0.5, angular: 1 }
 
-type Order = 'take_control' | 'release_control' | 'grant_control' | 'refuse_control' | 'stop' | 'resume'
+type Order = 'take_control' | 'release_control' | 'grant_control' | 'refuse_control' | 'resume'
+
+interface Answer {
+  success: boolean
+  message: string
+}
+
+/** How far a stop that was given here has come; in words they win over all others. */
+const ENDINGS = {
+  going: 'Stopping…',
+  done: 'The robot is stopped.',
+  later: 'The robot is away. It is stopped as soon as it is back.',
+  unsure: 'The stop is not confirmed. Press STOP again, or stop the robot where it is.',
+} as const
 
 /** What the helm asks of the cockpit around it. */
 export interface Bridge {
@@ -25,6 +40,8 @@ export interface Bridge {
   /** Unix time in seconds, by the relay's clock, as often as the page shows it. */
   readonly unixS: number
   isLate(): boolean
+  /** The relay answers in time and the robot does not. */
+  isRobotLate(): boolean
 }
 
 export class Helm {
@@ -33,6 +50,9 @@ export class Helm {
   driving = $state(false)
   /** Why driving ended the last time, in words. */
   words = $state<string | null>(null)
+  /** What becomes of the last stop that was given here; null when that is over. */
+  ending = $state<keyof typeof ENDINGS | null>(null)
+  readonly stopWords = $derived(this.ending === null ? null : ENDINGS[this.ending])
   /** Changes when every input must let go of the hand that holds it. */
   letGo = $state(0)
   /** Whether the control that has the focus takes keys that would else drive or stop. */
@@ -51,6 +71,8 @@ export class Helm {
   readonly mayControl = $derived.by(() => this.control?.you.may_control ?? this.bridge.level !== 'viewer')
   readonly mayResume = $derived(this.control?.you.may_resume === true)
   readonly stopped = $derived(this.control?.stopped ?? null)
+  /** Who commands the chosen topic though he has no control; null for nobody. */
+  readonly suppressor = $derived.by(() => control.suppressor(this.control, this.bridge.motion?.name ?? null))
   /** What the robot allows this user at most. */
   readonly top = $derived.by(() => control.topOf(this.control, this.bridge.level))
   readonly limits = $derived(control.within(this.chosen, this.top))
@@ -60,6 +82,7 @@ export class Helm {
   private readonly drive: Drive
   private givingAway = false
   private lossTold: string | null = null
+  private presses = 0
 
   constructor(private readonly bridge: Bridge) {
     this.chosen = recall<Limits>(`limits:${bridge.name}`, USUAL)
@@ -77,6 +100,7 @@ export class Helm {
     this.words = null
     const reason = this.drive.grab(source, performance.now())
     if (reason !== null) this.words = this.blocked ?? stopWords(reason)
+    else if (this.ending !== 'going') this.ending = null
     return reason === null
   }
 
@@ -119,6 +143,8 @@ export class Helm {
   private obstacle(): StopReason | null {
     if (!this.bridge.link.isOpen) return 'link_closed'
     if (this.bridge.isLate()) return 'link_late'
+    // Its watchdog has stopped it by then: when it hears again nothing shall move it but a new grip.
+    if (this.bridge.isRobotLate()) return 'robot_late'
     return this.blocked === null ? null : 'not_allowed'
   }
 
@@ -146,6 +172,8 @@ export class Helm {
     else if (this.driving && this.blocked !== null && this.isMine) this.drive.stop('not_allowed')
     // What was said when it was stopped here is over, whoever resumed it.
     if (before?.stopped && told.stopped === null) this.words = null
+    if (told.stopped === null) this.mayMove(before)
+    else if (told.stopped.told) this.stands()
     if (control.isYours(before) && !this.isMine) this.lost()
     else if (this.lossTold !== null && this.words === this.lossTold) this.tellLoss(told)
     if (this.isMine !== control.isYours(before) || told.request?.you) this.answer = null
@@ -156,6 +184,19 @@ export class Helm {
     this.drive.stop('link_closed')
     this.control = null
     this.answer = null
+  }
+
+  /** It is not stopped, or was resumed; what was told of it before may be older than a stop that was given here. */
+  private mayMove(before: control.Control | null): void {
+    const resumed = before !== null && before.stopped !== null
+    const meanwhile = before === null && this.ending !== 'unsure'
+    if ((resumed || meanwhile) && this.ending !== 'going') this.ending = null
+  }
+
+  /** The robot has confirmed that it is stopped. */
+  private stands(): void {
+    app.settle([this.bridge.name])
+    if (this.ending === 'later' || this.ending === 'unsure') this.ending = 'done'
   }
 
   private lost(): void {
@@ -181,9 +222,10 @@ export class Helm {
     return this.order('release_control')
   }
 
-  grant(): Promise<void> {
+  /** @param client the connection that asked, as it was shown: another may have asked since */
+  grant(client: number): Promise<void> {
     this.handOver()
-    return this.order('grant_control')
+    return this.order('grant_control', '', client)
   }
 
   private handOver(): void {
@@ -192,15 +234,16 @@ export class Helm {
     this.givingAway = true
   }
 
-  refuse(why = ''): Promise<void> {
-    return this.order('refuse_control', why)
+  refuse(client: number): Promise<void> {
+    return this.order('refuse_control', '', client)
   }
 
-  private async order(order: Order, why = ''): Promise<void> {
+  private async order(order: Order, why = '', client?: number): Promise<void> {
     this.busy = order
     this.answer = null
     try {
-      await this.call(order, why)
+      const args = client === undefined ? { why } : { why, client }
+      await this.call<Answer>(`/relay/${order}`, client === undefined ? ORDER : REPLY, args)
     } catch (error) {
       this.givingAway = false
       // A request that was placed is told by `/relay/control`, before this or after; it is no failure.
@@ -210,11 +253,10 @@ export class Helm {
     }
   }
 
-  private async call(order: Order, why: string, timeoutS?: number): Promise<string> {
-    const link = this.bridge.link
-    const answer = await link.call<object, { success: boolean; message: string }>(`/relay/${order}`, ORDER, { why }, timeoutS)
+  private async call<A extends Answer>(service: string, type: string, args: object, timeoutS?: number): Promise<A> {
+    const answer = await this.bridge.link.call<object, A>(service, type, args, timeoutS)
     if (!answer.success) throw new NotDone(answer.message)
-    return answer.message
+    return answer
   }
 
   // Stop
@@ -223,25 +265,35 @@ export class Helm {
   async stop(): Promise<void> {
     this.drive.stop('stop_button')
     this.letGo += 1
-    this.words = 'Stopping…'
+    this.ending = 'going'
+    const press = ++this.presses
     try {
-      // The websocket's answer does not tell whether the robot has heard of it.
-      const unheard = (): boolean => this.bridge.offline || this.control?.stopped?.told === false
-      const ways = [this.call('stop', '', SWITCH_S).then(unheard), api.stopRobot(this.bridge.name)]
-      const later = await control.byAnyWay(ways, (error) => error instanceof NotDone || error instanceof api.Refusal)
-      this.words = later ? 'The robot is away. It is stopped as soon as it is back.' : 'The robot is stopped.'
+      const asked = this.call<Answer & { done: boolean }>('/relay/stop', STOP, { why: '' }, SWITCH_S)
+      const ways = [asked.then(({ done }) => !done), api.stopRobot(this.bridge.name)]
+      const later = await control.byAnyWay(ways, inWords)
+      app.settle([this.bridge.name])
+      this.ending = later ? 'later' : 'done'
     } catch (error) {
-      this.words = null
-      app.tell('error', `The stop is not confirmed. ${words(error)}`)
+      // Of one that was pressed again the last press tells.
+      if (press === this.presses && this.ending === 'going') this.notConfirmed(error)
     }
+  }
+
+  private notConfirmed(error: unknown): void {
+    const byRobot = error instanceof NotDone || (error instanceof api.Refusal && error.byRobot)
+    const known = this.stopped?.told === true && this.bridge.link.isOpen && !this.bridge.isLate()
+    this.ending = known ? 'done' : 'unsure'
+    // What the robot could not do is told, though it stands.
+    if (byRobot || !known) app.tell('error', `The stop is not confirmed. ${words(error)}`, null, byRobot ? [] : [this.bridge.name])
   }
 
   async resume(): Promise<void> {
     this.busy = 'resume'
     try {
-      if (this.bridge.link.isOpen) await this.call('resume', '', SWITCH_S)
+      if (this.bridge.link.isOpen) await this.call<Answer>('/relay/resume', ORDER, { why: '' }, SWITCH_S)
       else await api.resumeRobot(this.bridge.name)
       this.words = null
+      this.ending = null
     } catch (error) {
       app.tell('error', `The robot stays stopped. ${words(error)}`)
     } finally {
@@ -250,11 +302,16 @@ export class Helm {
   }
 }
 
-/** Seconds that a stop or a resume may take: a switch in the robot's hardware has five, the relay waits ten. */
-const SWITCH_S = 12
+/** Seconds that a stop or a resume may take: the relay waits 14 for the robot, which may have switches to throw. */
+const SWITCH_S = 16
 
 /** The relay took an order and did not do it. */
 class NotDone extends Error {}
+
+/** Whether an error tells more than that nothing was heard. */
+function inWords(error: unknown): boolean {
+  return error instanceof NotDone || error instanceof api.Refusal
+}
 
 function words(error: unknown): string {
   return error instanceof Error ? error.message : String(error)

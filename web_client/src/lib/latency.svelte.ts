@@ -3,7 +3,6 @@ import { type Legs, Median, PING_DRIVING_MS, PING_IDLE_MS, PingTracker, RelayClo
 import { Gate } from './meter'
 import type { Link } from './ros'
 
-const ROBOT_PING_MS = 1000
 /** A link without an answer for so long is dialled anew. */
 const SILENT_MS = 6000
 /** Longer than the silence above, so that a silent link is seen as one. Seconds. */
@@ -28,7 +27,8 @@ export class Latency {
   private readonly robotTrips = new Median()
   private readonly idleGate = new Gate(PING_IDLE_MS)
   private readonly drivingGate = new Gate(PING_DRIVING_MS)
-  private readonly robotGate = new Gate(ROBOT_PING_MS)
+  private readonly robotIdleGate = new Gate(PING_IDLE_MS)
+  private readonly robotDrivingGate = new Gate(PING_DRIVING_MS)
   private readonly robotSilence = new Silence()
   private robotPingOut = false
 
@@ -36,6 +36,11 @@ export class Latency {
 
   isLate(nowMs: number): boolean {
     return this.pings.isLate(nowMs)
+  }
+
+  /** Whether the robot has left a ping unanswered for too long to be driven. */
+  isRobotLate(nowMs: number): boolean {
+    return this.robotSilence.isLate(nowMs)
   }
 
   /** What the relay told of the way from it to the robot. */
@@ -54,7 +59,8 @@ export class Latency {
   /** Pings, when it is time to. */
   tick(nowMs: number, driving: boolean, robotThere: boolean): void {
     if ((driving ? this.drivingGate : this.idleGate).open(nowMs)) void this.pingRelay(nowMs)
-    if (!this.robotPingOut && robotThere && this.robotGate.open(nowMs)) void this.pingRobot(nowMs)
+    const robotGate = driving ? this.robotDrivingGate : this.robotIdleGate
+    if (!this.robotPingOut && robotThere && robotGate.open(nowMs)) void this.pingRobot(nowMs)
     if (this.pings.silentFor(nowMs) > SILENT_MS) this.link.abandon()
   }
 

@@ -2,8 +2,8 @@
 
 export const PONG_TIMEOUT_MS = 500
 
-/** A robot from which no answer came for so long may no longer be there. */
-export const ROBOT_LATE_MS = 1500
+/** A robot from which no answer came for so long may no longer be there; its watchdog has long stopped it. */
+export const ROBOT_LATE_MS = 1000
 
 /** How often to ping while driving and otherwise. */
 export const PING_DRIVING_MS = 200

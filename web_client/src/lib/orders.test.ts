@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest'
-import { after, type Do, Lines, NOTHING_YET, type Order, orderOf, stopWords, table, targets, unmatchedWords } from './orders'
+import { after, type Do, Lines, NOTHING_YET, type Order, missedWords, orderOf, stopEnd, table, targets, unmatchedWords } from './orders'
 
 const ANSWER =
   '{"do":"stop","robots":["a","b"]}\n{"robot":"b","ok":true,"message":"","values":null,"pending":true,"seconds":0.1}\n' +
@@ -74,28 +74,61 @@ describe('the form', () => {
 
   it('says what is missing', () => {
     expect(orderOf([], form)).toContain('Choose robots')
-    expect(orderOf(Array.from({ length: 65 }, (_, i) => `r${i}`), form)).toContain('At most 64')
     expect(orderOf(['a'], { ...form, name: ' ' })).toBe('Which service?')
     expect(orderOf(['a'], { ...form, body: '{' })).toBe('That is no JSON.')
     expect(orderOf(['a'], { ...form, do: 'set' })).toBe('Which value?')
   })
 })
 
-it('says what became of a stop: who is stopped, who will be, and who may not be', () => {
-  const result = (robot: string, ok: boolean, pending = false) => ({ robot, ok, message: '', values: null, pending, seconds: 0 })
-  const words = (...results: ReturnType<typeof result>[]) => stopWords({ ...NOTHING_YET, meant: ['a', 'b'], results, done: true })
-  expect(words(result('a', true), result('b', true))).toEqual({ kind: 'info', words: '2 robots are stopped.' })
-  expect(words(result('a', true), result('b', true, true)).words).toBe(
-    '1 robot is stopped. 1 robot is away, and will be stopped when back.',
+describe('how much one order may mean', () => {
+  const stop = { do: 'stop', name: '', type: '', body: '', why: '' } as const
+  const many = (count: number, what = (i: number) => `rover-${i}`) => Array.from({ length: count }, (_, i) => what(i))
+
+  it('is a thousand names: all that a page shows', () => {
+    expect(orderOf(many(1000), stop)).toEqual({ robots: many(1000), do: 'stop' })
+    expect(orderOf(many(1001), stop)).toContain('At most 1000 names')
+  })
+
+  it.each([(i: number) => `rover-${i}*`, (i: number) => `r?${i}`, (i: number) => `r[${i}]`, (i: number) => `group:${i}`])(
+    'is 64 patterns and groups: %s',
+    (what) => {
+      expect(orderOf([...many(64, what), ...many(100)], stop)).toMatchObject({ do: 'stop' })
+      expect(orderOf(many(65, what), stop)).toContain('At most 64 patterns and groups')
+    },
   )
-  const failed = { kind: 'error', words: expect.stringContaining('Not confirmed to be stopped: b.') as string }
-  expect(words(result('a', true), result('b', false))).toEqual(failed)
-  expect(words(result('a', true))).toEqual(failed)
 })
 
-it('says that nothing is known of a stop whose answer ends before it began', () => {
-  const { kind, words } = stopWords(NOTHING_YET)
-  expect(kind).toBe('error')
-  expect(words).toContain('No robot is known to be stopped')
-  expect(words).toContain('Press STOP again')
+describe('what became of a stop', () => {
+  const result = (robot: string, ok: boolean, pending = false) => ({ robot, ok, message: '', values: null, pending, seconds: 0 })
+  const end = (missed: string, ...results: ReturnType<typeof result>[]) =>
+    stopEnd({ ...NOTHING_YET, meant: ['a', 'b'], missed, results, done: true })
+
+  it('is who is stopped, and who will be, for a moment', () => {
+    expect(end('', result('a', true), result('b', true))).toEqual({ kind: 'info', words: '2 robots are stopped.', until: null })
+    expect(end('', result('a', true), result('b', true, true)).words).toBe(
+      '1 robot is stopped. 1 robot is away, and will be stopped when back.',
+    )
+  })
+
+  it('is who may not be, until he is', () => {
+    const words = expect.stringContaining('Not confirmed to be stopped: b.') as string
+    expect(end('', result('a', true), result('b', false))).toEqual({ kind: 'error', words, until: ['b'] })
+    expect(end('', result('a', true))).toEqual({ kind: 'error', words, until: ['b'] })
+  })
+
+  it('is not all, where the relay could not look up all', () => {
+    const words = expect.stringContaining('2 robots are stopped. Others of yours may not be reached by it. No answer.') as string
+    expect(end('no answer', result('a', true), result('b', true))).toEqual({ kind: 'error', words, until: [] })
+    expect(end('no answer', result('a', true))).toMatchObject({ kind: 'error', until: [] })
+    const told = after(NOTHING_YET, { do: 'stop', robots: ['a'], unmatched: [], missed: 'no answer' })
+    expect(missedWords(told)).toContain('No answer.')
+    expect(missedWords(after(NOTHING_YET, { do: 'stop', robots: ['a'], missed: 3 }))).toBe('')
+  })
+
+  it('is not known where the answer ends before it began', () => {
+    const { kind, words, until } = stopEnd(NOTHING_YET)
+    expect([kind, until]).toEqual(['error', []])
+    expect(words).toContain('No robot is known to be stopped')
+    expect(words).toContain('Press STOP again')
+  })
 })

@@ -1,5 +1,5 @@
 /** One order to many robots: what is asked, and the lines of the answer (protocol/SPEC.md 1.11). */
-import { people } from './format'
+import { people, sentence } from './format'
 
 export type Do = 'stop' | 'resume' | 'call' | 'publish' | 'set'
 
@@ -30,12 +30,14 @@ export interface Progress {
   meant: string[] | null
   /** What of the order means no robot. */
   unmatched: string[]
+  /** Why robots may be meant that are not told, in the relay's words; empty when none are. */
+  missed: string
   results: Result[]
   /** Whether the answer came whole. */
   done: boolean
 }
 
-export const NOTHING_YET: Progress = { meant: null, unmatched: [], results: [], done: false }
+export const NOTHING_YET: Progress = { meant: null, unmatched: [], missed: '', results: [], done: false }
 
 /** The lines of an answer as they come, in whatever pieces. */
 export class Lines {
@@ -61,11 +63,11 @@ function parsed(text: string): object[] {
 
 /** What is known after one more line. */
 export function after(progress: Progress, line: object): Progress {
-  const { robots, unmatched, robot, done } = line as Record<'robots' | 'unmatched' | 'robot' | 'done', unknown>
+  const { robots, unmatched, missed, robot, done } = line as Record<string, unknown>
   if (done === true) return { ...progress, done: true }
   if (typeof robot === 'string') return { ...progress, results: [...progress.results, line as Result] }
-  if (Array.isArray(robots)) return { ...progress, meant: words(robots), unmatched: words(unmatched) }
-  return progress
+  if (!Array.isArray(robots)) return progress
+  return { ...progress, meant: words(robots), unmatched: words(unmatched), missed: typeof missed === 'string' ? missed : '' }
 }
 
 function words(list: unknown): string[] {
@@ -75,6 +77,11 @@ function words(list: unknown): string[] {
 /** What of an order means no robot, in a sentence; empty where all of it means some. */
 export function unmatchedWords({ unmatched }: Progress): string {
   return unmatched.length === 0 ? '' : `No robot of yours is meant by ${people(unmatched, 5)}.`
+}
+
+/** That robots may have been left out of an order, and why; empty where none were. */
+export function missedWords({ missed }: Progress): string {
+  return missed === '' ? '' : `Others of yours may not be reached by it. ${sentence(missed)}`
 }
 
 /** What became of each robot that is meant: its result, or null while there is none. */
@@ -99,6 +106,14 @@ export interface Form {
   why: string
 }
 
+/** What the relay takes (SPEC 1.11). */
+const TARGETS = 1000
+const PATTERNS = 64
+
+function isName(target: string): boolean {
+  return !target.startsWith('group:') && !/[*?[]/.test(target)
+}
+
 /** What an order is about, as the relay calls it; with that, whatever else a kind of order may have (SPEC 1.11). */
 const SUBJECTS = { call: 'service', publish: 'topic', set: 'name' } as const
 const BODIES = { call: 'args', publish: 'msg', set: 'value' } as const
@@ -115,7 +130,8 @@ export const FIELDS: Record<Do, readonly (keyof Omit<Form, 'do'>)[]> = {
 /** The order a form asks for, or what is missing in words. */
 export function orderOf(robots: string[], form: Form): Order | string {
   if (robots.length === 0) return 'Choose robots, or write their names or a pattern.'
-  if (robots.length > 64) return 'At most 64 names and patterns go into one order.'
+  if (robots.length > TARGETS) return `At most ${TARGETS} names go into one order. A pattern means more: * all your robots.`
+  if (robots.filter((each) => !isName(each)).length > PATTERNS) return `At most ${PATTERNS} patterns and groups go into one order.`
   const said = (field: 'name' | 'type' | 'body' | 'why') => (FIELDS[form.do].includes(field) ? form[field].trim() : '')
   const [name, type, why] = [said('name'), said('type'), said('why')]
   const order: Order = { robots, do: form.do, ...(type === '' ? {} : { type }), ...(why === '' ? {} : { why }) }
@@ -131,18 +147,32 @@ export function orderOf(robots: string[], form: Form): Order | string {
 
 const AGAIN = 'Press STOP again, or stop them where they are.'
 
-/** What became of an order to stop, in a sentence. */
-export function stopWords(progress: Progress): { kind: 'info' | 'error'; words: string } {
+/** What became of an order to stop: what to say, and until when (`Toast.until`). */
+export interface StopEnd {
+  kind: 'info' | 'error'
+  words: string
+  until: readonly string[] | null
+}
+
+export function stopEnd(progress: Progress): StopEnd {
   const rows = table(progress)
-  if (rows.length === 0) return { kind: 'error', words: `No robot is known to be stopped: the answer broke off. ${AGAIN}` }
+  if (rows.length === 0) {
+    return { kind: 'error', words: `No robot is known to be stopped: the answer broke off. ${AGAIN}`, until: [] }
+  }
+  const missed = missedWords(progress)
   const failed = rows.filter(({ result }) => result?.ok !== true).map(({ robot }) => robot)
-  if (failed.length > 0) return { kind: 'error', words: `Not confirmed to be stopped: ${people(failed, 5)}. ${AGAIN}` }
+  if (failed.length > 0) {
+    const words = [`Not confirmed to be stopped: ${people(failed, 5)}. ${AGAIN}`, missed].filter(Boolean).join(' ')
+    return { kind: 'error', words, until: missed === '' ? failed : [] }
+  }
   const later = rows.filter(({ result }) => result?.pending === true).length
   const now = rows.length - later
   const robots = (count: number) => (count === 1 ? '1 robot is' : `${count} robots are`)
   const sentences = [
     now > 0 || later === 0 ? `${robots(now)} stopped.` : '',
     later > 0 ? `${robots(later)} away, and will be stopped when back.` : '',
+    missed,
   ]
-  return { kind: 'info', words: sentences.filter(Boolean).join(' ') }
+  const words = sentences.filter(Boolean).join(' ')
+  return missed === '' ? { kind: 'info', words, until: null } : { kind: 'error', words, until: [] }
 }

@@ -8,15 +8,20 @@ const RUNNING_MS = 1000
 const QUIET_MS = 5000
 /** For who has no right to any of it: one may be given to him. */
 const DENIED_MS = 15_000
+/** Shown at first, and so many more each time older ones are asked for. */
+const PAGE = 100
 
 export class Recordings {
   /** Those the user may have, the latest first; null before the relay told them. */
   list = $state.raw<Recording[] | null>(null)
+  /** Whether there are older ones than are in the list. */
+  more = $state(false)
   /** What could be recorded now; null before the relay told it. */
   possible = $state.raw<Possible | null>(null)
   private timer: ReturnType<typeof setTimeout> | undefined
   private closed = false
   private askedMs = -Infinity
+  private most = PAGE
 
   constructor(readonly robot: string) {}
 
@@ -33,6 +38,12 @@ export class Recordings {
   async start(ask: RecordingAsk): Promise<void> {
     await api.startRecording(this.robot, ask)
     await this.look(true)
+  }
+
+  /** Has older ones in the list as well. */
+  async older(): Promise<void> {
+    this.most += PAGE
+    await this.look(false)
   }
 
   async stop(id: string): Promise<void> {
@@ -69,7 +80,9 @@ export class Recordings {
         this.askedMs = performance.now()
         this.possible = await api.recordable(this.robot)
       }
-      this.list = await api.recordings(this.robot)
+      const { list, more } = await api.recordings(this.robot, this.most)
+      this.list = list
+      this.more = more
     } catch {
       // Asked again in a moment; a lost relay or right is told by the cockpit's own link.
     }

@@ -2,7 +2,7 @@ import { describe, expect, it } from 'vitest'
 import { contents, fitting, obstacle, pictureTopic, progress, sizes } from './recordings'
 import type { Possible, Recording } from './types'
 
-const POSSIBLE: Possible = { topics: ['/odom'], cameras: [], denied: '', megabytes: 10_000, left: 4000 }
+const POSSIBLE: Possible = { topics: ['/odom'], cameras: [], denied: '', megabytes: 10_000, left: 4000, full: '' }
 
 function recording(given: Partial<Recording>): Recording {
   return {
@@ -41,6 +41,9 @@ describe('why nothing can be recorded', () => {
     expect(full?.words).toContain('take all 10 GB they may have')
     expect(full?.command).toContain('--recordings-gb')
     expect(obstacle({ ...POSSIBLE, megabytes: 0, left: 0 }, true)?.words).toContain('keeps no recordings')
+    expect(obstacle({ ...POSSIBLE, left: 0, full: 'the disk is nearly full' }, true)).toEqual({
+      words: 'The disk is nearly full.',
+    })
     expect(obstacle(POSSIBLE, true)?.words).toContain('offline')
     expect(obstacle({ ...POSSIBLE, topics: [] }, false)?.words).toContain('nothing to record')
   })

@@ -53,6 +53,7 @@ export function obstacle(possible: Possible, offline: boolean): Obstacle | null 
   if (possible.denied !== '') return { words: `You may not record this robot. ${sentence(possible.denied)}` }
   const command = 'switchboard serve --recordings-gb'
   if (possible.megabytes === 0) return { words: 'This relay keeps no recordings. It would with room for them:', command }
+  if (possible.full !== '') return { words: sentence(possible.full) }
   if (possible.left < 1) {
     const all = fileSize(possible.megabytes * 1e6)
     return {

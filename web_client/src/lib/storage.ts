@@ -16,3 +16,23 @@ export function remember(key: string, value: object): void {
     // Private windows and full storage: the choice lasts as long as the page.
   }
 }
+
+/** Words for this tab when it is loaded anew. */
+export function leave(key: string, words: string): void {
+  try {
+    sessionStorage.setItem(`switchboard:${key}`, words)
+  } catch {
+    // Then nothing is said.
+  }
+}
+
+/** What was left, once. */
+export function left(key: string): string | null {
+  try {
+    const words = sessionStorage.getItem(`switchboard:${key}`)
+    sessionStorage.removeItem(`switchboard:${key}`)
+    return words
+  } catch {
+    return null
+  }
+}

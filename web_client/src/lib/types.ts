@@ -72,7 +72,8 @@ export interface Robot {
   quality?: Quality | null
   /** Who has control. */
   holder?: string | null
-  stopped?: { by: string; why: string } | null
+  /** `told`: whether the robot has confirmed it. */
+  stopped?: { by: string; why: string; since?: number; told: boolean } | null
   host: string
   platform: string
   distro: string
@@ -140,6 +141,8 @@ export interface Possible {
   megabytes: number
   /** How much of that is left. */
   left: number
+  /** Why there can't be one more, however small; may be empty. */
+  full: string
 }
 
 export interface RecordingAsk {

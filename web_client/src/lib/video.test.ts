@@ -1,11 +1,14 @@
 import { afterEach, beforeEach, expect, it, vi } from 'vitest'
 import { videoSocket } from './api'
-import { videoEnding } from './closing'
+import { NOT_AS_H264, videoEnding } from './closing'
+import { moment } from './format'
 import { codecName, h264Missing } from './h264'
 import {
   age,
+  ageWords,
   type Close,
   fileName,
+  insteadWords,
   missedAfter,
   MOST_PANES,
   parameters,
@@ -13,7 +16,10 @@ import {
   type PictureHeader,
   PLAIN,
   restored,
+  silence,
   SILENT_MS,
+  silentAfter,
+  sinceWhen,
   VideoLink,
 } from './video'
 
@@ -54,14 +60,59 @@ it('misses a picture after a second, or later where they come slowly', () => {
   expect(missedAfter(15, { fps: 0, source_fps: 30 })).toBe(1000)
   expect(missedAfter(1, { fps: 1, source_fps: 30 })).toBe(2500)
   expect(missedAfter(0, { fps: 0, source_fps: 0.5 })).toBe(5000)
+  expect(missedAfter(0, null, 0.05)).toBe(50_000)
+  expect(missedAfter(15, { fps: 0, source_fps: 30 }, 0.05)).toBe(1000)
 })
 
+const live = { stamp: 1000, kept: false, drawnMs: 500 }
+const kept = { ...live, kept: true }
+
 it('tells the age by the relay’s clock, and not at all when the robot’s can’t be right', () => {
-  expect(age(1000, 1_000_080)).toBe(80)
-  expect(age(1000, 999_950)).toBe(0)
-  expect(age(1000, null)).toBeNull()
-  expect(age(1000, 990_000)).toBeNull()
-  expect(age(1000, 1_060_000)).toBeNull()
+  expect(age(live, 1_000_080)).toBe(80)
+  expect(age(live, 999_950)).toBe(0)
+  expect(age(live, null)).toBeNull()
+  expect(age(live, 990_000)).toBeNull()
+  expect(age(live, 1_060_000)).toBeNull()
+})
+
+it('takes one that was kept for as old as its stamp says', () => {
+  expect(age(kept, 1_060_000)).toBe(60_000)
+  expect(age(kept, 999_950)).toBe(0)
+  expect(age(kept, 990_000)).toBeNull()
+})
+
+it('counts from the stamp of a picture that was kept, and else from when it was drawn', () => {
+  expect(silence(kept, 500, 1_050_000)).toBe(50_000)
+  expect(silence(kept, 2500, 1_052_000)).toBe(52_000)
+  expect(silence(live, 2500, 1_052_000)).toBe(2000)
+  // The robot's clock is ahead: it was taken no later than it was drawn.
+  expect(silence(kept, 2500, 900_000)).toBe(2000)
+})
+
+it('says since when there is no picture', () => {
+  expect(sinceWhen(live, 1999, 1_001_499, 1000)).toBe('No picture since 1 s')
+  expect(sinceWhen(kept, 1500, 1_051_000, 1000)).toBe('No picture since 51 s')
+  expect(sinceWhen(live, 120_500, 1_120_000, 1000)).toBe('No picture since 2 min')
+  expect(sinceWhen(live, 7_200_500, 8_200_000, 1000)).toBe('No picture since 2 h')
+})
+
+it('says no more than when it was of one that nothing but its publisher keeps so long', () => {
+  const hour = sinceWhen(kept, 1500, 4_601_000, 1000)
+  expect(hour).toBe(`Picture of ${moment(1000, 4601)}, by the robot’s clock`)
+  expect(sinceWhen(kept, 60_500, 4_660_000, 1000)).toBe(hour)
+  // What began as the newest does not become another one while it is shown.
+  expect(sinceWhen(kept, 60_500, 1_100_000, 1000)).toBe('No picture since 100 s')
+  // One in two minutes.
+  expect(sinceWhen(kept, 500, 1_400_000, 300_000)).toBe('No picture since 6 min')
+})
+
+it('lets the age of a picture grow while it is shown', () => {
+  expect(ageWords(null, 0)).toBe('age unknown')
+  expect(ageWords(0.4, 0)).toBe('< 1 ms old')
+  expect(ageWords(80, 900)).toBe('80 ms old')
+  expect(ageWords(80, 2000)).toBe('2 s old')
+  expect(ageWords(45_000, 0)).toBe('45 s old')
+  expect(ageWords(45_000, 3500)).toBe('48 s old')
 })
 
 it('names a snapshot after robot, camera and time', () => {
@@ -77,7 +128,7 @@ it('says in words why a camera’s pictures ended', () => {
   expect(videoEnding(4404, 'there is no such camera').words).toBe('There is no camera of this name for you.')
   expect(videoEnding(4401, 'x').after).toBe('login')
   for (const code of [4400, 4404, 4429]) expect(videoEnding(code, '').after).toBe('give_up')
-  for (const code of [1001, 1006, 1011, 4408, 4503, 4999]) expect(videoEnding(code, '').after).toBe('retry')
+  for (const code of [1001, 1006, 1011, 4408, NOT_AS_H264, 4503, 4999]) expect(videoEnding(code, '').after).toBe('retry')
 })
 
 it('says why there is no H.264', () => {
@@ -108,13 +159,16 @@ class FakeSocket {
   close(code = 1005) {
     this.closed = code
   }
-  picture(number: number) {
-    this.onmessage({ data: JSON.stringify({ op: 'picture', number, stamp: 1, codec: 'jpeg', key: true }) })
+  picture(number: number, stamp = number) {
+    this.onmessage({ data: JSON.stringify({ op: 'picture', number, stamp, codec: 'jpeg', key: true }) })
     this.onmessage({ data: new ArrayBuffer(8) })
   }
 }
 
-function opened(picture: (header: PictureHeader) => Promise<void> = () => Promise.resolve()) {
+function opened(
+  picture: (header: PictureHeader) => Promise<void> = () => Promise.resolve(),
+  silentMs: () => number = () => SILENT_MS,
+) {
   const sockets: FakeSocket[] = []
   const states: [string, number | null][] = []
   const events = {
@@ -122,11 +176,12 @@ function opened(picture: (header: PictureHeader) => Promise<void> = () => Promis
     playing: vi.fn(),
     picture: vi.fn(picture),
   }
-  const link = new VideoLink('ws://r', events, () => {
+  const dial = () => {
     const socket = new FakeSocket()
     sockets.push(socket)
     return socket as unknown as WebSocket
-  })
+  }
+  const link = new VideoLink('ws://r', events, silentMs, dial)
   link.open()
   sockets[0]!.onopen()
   return { link, sockets, states, events }
@@ -150,6 +205,27 @@ it('takes a picture only when it was drawn', async () => {
   drawn()
   await vi.advanceTimersByTimeAsync(0)
   expect(sockets[0]!.sent).toEqual(['{"op":"took","number":7}'])
+})
+
+it('takes the first picture of a connection, and of what the robot begins anew, for one that may have been kept', async () => {
+  const { sockets, events } = opened()
+  for (const number of [5, 6, 9, 1, 2]) sockets[0]!.picture(number)
+  sockets[0]!.onclose({ code: 1006, reason: '' })
+  await vi.advanceTimersByTimeAsync(500)
+  for (const number of [3, 4]) sockets[1]!.picture(number)
+  const told = events.picture.mock.calls.map(([header]) => [header.number, header.kept])
+  expect(told.filter(([, kept]) => kept)).toEqual([
+    [5, true],
+    [1, true],
+    [3, true],
+  ])
+  expect(told.length).toBe(7)
+})
+
+it('takes a picture that comes once more for no newer one', () => {
+  const { sockets, events } = opened()
+  for (const [number, stamp] of [[1, 100], [2, 101], [7, 101], [8, 102]] as const) sockets[0]!.picture(number, stamp)
+  expect(events.picture.mock.calls.map(([header]) => header.kept)).toEqual([true, false, true, false])
 })
 
 it('hands on what the robot says about its stream', () => {
@@ -197,6 +273,19 @@ it('dials anew when a connection falls silent', async () => {
   expect(sockets.length).toBe(2)
 })
 
+it('waits as long for a slow camera as the relay does, and a little longer', async () => {
+  let missed = 1000
+  const { sockets } = opened(undefined, () => silentAfter(missed))
+  missed = missedAfter(0, null, 0.05)
+  sockets[0]!.onmessage({ data: '{"op":"playing","source_fps":0.05}' })
+  await vi.advanceTimersByTimeAsync(50_000)
+  expect(sockets[0]!.closed).toBeNull()
+  await vi.advanceTimersByTimeAsync(5501)
+  expect(sockets.length).toBe(2)
+  expect(silentAfter(1000)).toBe(SILENT_MS)
+  expect(silentAfter(2.5e6)).toBe(125_000)
+})
+
 it('is quiet once it is closed', async () => {
   let drawn = () => undefined as void
   const { link, sockets, states } = opened(() => new Promise((done) => (drawn = done)))
@@ -209,4 +298,9 @@ it('is quiet once it is closed', async () => {
   expect(sockets[0]!.sent).toEqual([])
   expect(states.length).toBe(before)
   expect(sockets.length).toBe(1)
+})
+
+it('tells in what the form differs that is shown in the place of another', () => {
+  expect(insteadWords({ width: 0, quality: 60 })).toContain('asked for (width the camera’s own, quality 60), until')
+  expect(insteadWords({ stamp: true })).toContain('asked for, until')
 })

@@ -1,6 +1,7 @@
 /** Watching a camera: what may be asked for, and the websocket its pictures come by (protocol/SPEC.md 1.8 and 2.6). */
 import { pause } from './backoff'
 import { type Ending, videoEnding } from './closing'
+import { milliseconds, moment } from './format'
 import { STALE_MS } from './meter'
 import type { LinkState } from './ros'
 
@@ -10,6 +11,8 @@ export interface Camera {
   name: string
   /** Of its topic; empty for a camera without ROS. */
   type: string
+  /** Pictures per second, as they came when somebody watched; null: not known. */
+  fps?: number | null
 }
 
 /** What one pane shows. */
@@ -33,6 +36,8 @@ export interface PictureHeader {
   codec: string
   /** Whether it stands alone. */
   key: boolean
+  /** Whether it may have been kept before it was sent, so that its stamp alone tells how old it is; told by the link. */
+  kept: boolean
 }
 
 /** What the robot sends from now on. */
@@ -45,6 +50,18 @@ export interface Playing {
   /** How far below what was asked for: 0 as asked, 1 the least there is. */
   reduced: number
   source_fps: number
+  /** Of another form that is shown in the place of the one asked for: in what it differs; null: it is as asked. */
+  instead?: Record<string, unknown> | null
+}
+
+/** Another form of the camera in words. */
+export function insteadWords(instead: Record<string, unknown>): string {
+  const words = { width: 'width', height: 'height', quality: 'quality', fps: 'pictures per second' }
+  const known = Object.entries(words).filter(([name]) => name in instead)
+  // What is as the camera has it is told as 0.
+  const told = known.map(([name, word]) => `${word} ${instead[name] === 0 ? 'the camera’s own' : String(instead[name])}`)
+  const form = told.length > 0 ? ` (${told.join(', ')})` : ''
+  return `The robot shows as many streams as it can. This is one that others asked for${form}, until there is a place.`
 }
 
 // Few values, because viewers who want the same share a stream and its cost.
@@ -97,26 +114,82 @@ export function parameters(camera: string, wish: Omit<Wish, 'camera'>): string {
   return query.toString()
 }
 
-/** How long after a picture the next one is missed, in milliseconds: a slow stream is not a broken one. */
-export function missedAfter(wanted: number, playing: Pick<Playing, 'fps' | 'source_fps'> | null): number {
-  const rates = [wanted, playing?.fps ?? 0, playing?.source_fps ?? 0].filter((rate) => rate > 0)
+/** How long after a picture the next one is missed, in milliseconds: a slow stream is not a broken one.
+ *
+ * @param told pictures per second the camera gave before, 0: not known
+ */
+export function missedAfter(
+  wanted: number,
+  playing: Pick<Playing, 'fps' | 'source_fps'> | null,
+  told: number = 0,
+): number {
+  const rates = [wanted, playing?.fps ?? 0, playing?.source_fps || told].filter((rate) => rate > 0)
   return Math.max(STALE_MS, 2500 / Math.min(...rates))
 }
 
 /** The robot's clock may differ from the relay's by so much without anybody minding. */
 const CLOCK_SLACK_MS = 100
 const OLDEST_MS = 10_000
+/** Robot and relay keep a picture so long where they don't know when the next one is due, 30 s each. */
+const KEPT_MS = 60_000
+/** Else, together, until 3.5 pictures' time have passed, of which {@link missedAfter} waits for 2.5. */
+const KEPT_MISSED = 1.5
+/** From here on an age grows while one looks at it; below, it is how late the picture came. */
+const GROWS_MS = 2000
 
-/** How old a picture is, in milliseconds; null when nobody can tell.
+/** A picture on the screen. Moments are of the page's clock, in milliseconds. */
+export interface Drawn extends Pick<PictureHeader, 'stamp' | 'kept'> {
+  drawnMs: number
+}
+
+/** How old a picture was as it was drawn, in milliseconds; null when nobody can tell.
  *
- * @param stamp Unix time at the robot, seconds
- * @param unixMs the time now by the relay's clock; null when it is not known
+ * @param unixMs the relay's time then; null when it is not known
  */
-export function age(stamp: number, unixMs: number | null): number | null {
+export function age(picture: Pick<PictureHeader, 'stamp' | 'kept'>, unixMs: number | null): number | null {
   if (unixMs === null) return null
-  const found = unixMs - stamp * 1000
-  // The relay passes on no such picture: what is wrong is the robot's clock.
-  return found < -CLOCK_SLACK_MS || found > OLDEST_MS ? null : Math.max(0, found)
+  const found = unixMs - picture.stamp * 1000
+  // Of those that come as they are made the relay passes on none so old: what is wrong is the robot's clock.
+  return found < -CLOCK_SLACK_MS || (found > OLDEST_MS && !picture.kept) ? null : Math.max(0, found)
+}
+
+/** For how long there has been no newer picture, in milliseconds.
+ *
+ * @param unixMs the relay's time now, or the nearest there is to it
+ */
+export function silence(picture: Drawn, nowMs: number, unixMs: number): number {
+  const shownMs = nowMs - picture.drawnMs
+  return picture.kept ? Math.max(shownMs, unixMs - picture.stamp * 1000) : shownMs
+}
+
+/** What is said of a picture after which the next one is missed.
+ *
+ * @param unixMs the relay's time now, or the nearest there is to it
+ */
+export function sinceWhen(picture: Drawn, nowMs: number, unixMs: number, missedMs: number): string {
+  const silentMs = silence(picture, nowMs, unixMs)
+  const foundMs = silentMs - (nowMs - picture.drawnMs)
+  // Its publisher keeps it, and nothing need be wrong with the camera; or the robot's clock was never set.
+  if (foundMs > Math.max(KEPT_MS, KEPT_MISSED * missedMs)) {
+    return `Picture of ${moment(picture.stamp, unixMs / 1000)}, by the robot’s clock`
+  }
+  return `No picture since ${span(silentMs)}`
+}
+
+/** The age of a picture in words.
+ *
+ * @param ageMs as it was drawn; null when nobody can tell
+ * @param shownMs for how long it has been shown
+ */
+export function ageWords(ageMs: number | null, shownMs: number): string {
+  if (ageMs === null) return 'age unknown'
+  return `${ageMs + shownMs < GROWS_MS ? milliseconds(ageMs) : span(ageMs + shownMs)} old`
+}
+
+function span(ms: number): string {
+  const seconds = Math.floor(ms / 1000)
+  if (seconds < 120) return `${seconds} s`
+  return seconds < 7200 ? `${Math.floor(seconds / 60)} min` : `${Math.floor(seconds / 3600)} h`
 }
 
 /** What a snapshot is called: robot, camera and the picture's time in UTC.
@@ -130,6 +203,17 @@ export function fileName(robot: string, camera: string, stamp: number): string {
 
 /** A connection on which nothing comes for so long is dialled anew; the relay ends one without pictures earlier. */
 export const SILENT_MS = 15_000
+/** So long the relay waits for the first picture of the slowest camera. */
+const MOST_MISSED_MS = 120_000
+const SLACK_MS = 5000
+
+/** How long nothing may come, in milliseconds.
+ *
+ * @param missedMs how long after a picture the next one is missed
+ */
+export function silentAfter(missedMs: number): number {
+  return Math.max(SILENT_MS, Math.min(missedMs, MOST_MISSED_MS) + SLACK_MS)
+}
 
 export type Close = Pick<CloseEvent, 'code' | 'reason'>
 
@@ -138,7 +222,7 @@ export interface VideoEvents {
   state(state: LinkState, why: Ending | null, close: Close | null): void
   playing(playing: Playing): void
   /** Resolves when the picture is on the screen or given up; the next one comes after that. */
-  picture(header: PictureHeader, body: ArrayBuffer): Promise<void>
+  picture(picture: PictureHeader, body: ArrayBuffer): Promise<void>
 }
 
 export class VideoLink {
@@ -148,9 +232,11 @@ export class VideoLink {
   private retry: ReturnType<typeof setTimeout> | undefined
   private silence: ReturnType<typeof setTimeout> | undefined
 
+  /** @param silentMs how long nothing may come, asked whenever something has come */
   constructor(
     private readonly url: string,
     private readonly events: VideoEvents,
+    private readonly silentMs: () => number = () => SILENT_MS,
     private readonly dial: (url: string) => WebSocket = (url) => new WebSocket(url),
   ) {}
 
@@ -159,6 +245,7 @@ export class VideoLink {
     this.become('connecting')
     const socket = this.dial(this.url)
     let header: PictureHeader | null = null
+    let before = { number: Infinity, stamp: 0 }
     socket.binaryType = 'arraybuffer'
     this.socket = socket
     socket.onopen = () => {
@@ -170,8 +257,12 @@ export class VideoLink {
       this.listen(socket)
       if (typeof data === 'string') {
         const message = JSON.parse(data) as { op: string }
-        if (message.op === 'picture') header = message as unknown as PictureHeader
-        else if (message.op === 'playing') this.events.playing(message as unknown as Playing)
+        if (message.op === 'picture') {
+          header = message as unknown as PictureHeader
+          // The first for us, or for the relay (what the robot begins anew it counts anew), or the same once more.
+          header.kept = header.number <= before.number || header.stamp <= before.stamp
+          before = header
+        } else if (message.op === 'playing') this.events.playing(message as unknown as Playing)
       } else if (header !== null) {
         void this.take(socket, header, data)
         header = null
@@ -194,11 +285,11 @@ export class VideoLink {
     socket?.close(1000)
   }
 
-  private async take(socket: WebSocket, header: PictureHeader, body: ArrayBuffer): Promise<void> {
+  private async take(socket: WebSocket, picture: PictureHeader, body: ArrayBuffer): Promise<void> {
     // Not at `open`: a refused handshake is accepted, then closed, and would be tried again without a pause.
     this.attempt = 0
-    await this.events.picture(header, body)
-    if (socket === this.socket) socket.send(JSON.stringify({ op: 'took', number: header.number }))
+    await this.events.picture(picture, body)
+    if (socket === this.socket) socket.send(JSON.stringify({ op: 'took', number: picture.number }))
   }
 
   /** A dead connection may take minutes to report its own end. */
@@ -207,7 +298,7 @@ export class VideoLink {
     this.silence = setTimeout(() => {
       socket.close()
       this.closed(socket, { code: 1006, reason: '' })
-    }, SILENT_MS)
+    }, this.silentMs())
   }
 
   private closed(socket: WebSocket, close: Close): void {

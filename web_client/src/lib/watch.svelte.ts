@@ -1,5 +1,5 @@
 /** The user's robots and their alerts, followed for as long as he is logged in, whatever page is shown. */
-import { currentSession, watchFleet } from './api'
+import { fleetStream } from './api'
 import { type Alert, News, standing, summary, waiting, worst } from './alerts'
 import { app } from './app.svelte'
 import { Lots } from './lots'
@@ -7,7 +7,6 @@ import { notify } from './notify'
 import { ALERTS } from './route'
 import type { Robot } from './types'
 
-const RETRY_MS = 2000
 /** A loss shorter than this is not spoken of. */
 const LOSS_SHOWN_S = 1
 const TONES = { error: 'error', warning: 'warning', info: 'info' } as const
@@ -17,8 +16,12 @@ class Watch {
   robots = $state.raw<Robot[] | null>(null)
   /** Those that are open, or were over a moment ago; the latest first. */
   alerts = $state.raw<Alert[]>([])
-  /** Since when there is no connection, Unix seconds. */
+  /** Since when nothing is known of how things are, Unix seconds: there is no connection, or the relay itself can't tell. */
   lostSince = $state<number | null>(null)
+  /** Why the relay, which is there, can't tell how things are. */
+  unknown = $state<string | null>(null)
+  /** What the relay said when it last closed the connection; empty for nothing. */
+  why = $state('')
 
   /** How many alerts nobody looks after. */
   readonly waiting = $derived(waiting(this.alerts))
@@ -28,56 +31,56 @@ class Watch {
     app.tell(TONES[worst(standing(lot)) ?? 'info'], summary(lot), { path: ALERTS, label: 'Show alerts' })
     notify(lot)
   })
-  private end: () => void = () => {}
-  private retry: ReturnType<typeof setTimeout> | undefined
 
   /** Begins, and goes on until the returned function is called. */
   open(): () => void {
     this.news = new News()
-    this.follow()
+    const stream = fleetStream(
+      {
+        robots: (list) => this.takeRobots(list),
+        alerts: (list) => this.takeAlerts(list),
+        unknown: (why) => this.lose(0, why),
+        silent: (ms) => this.lose(ms, null),
+        gone: (why) => {
+          this.why = why
+          this.lose(0, null)
+          // A refusal may be about a session that is over, or another user's by now.
+          app.checkSession()
+        },
+      },
+      location,
+    )
+    const retry = () => stream.retryNow()
+    window.addEventListener('online', retry)
+    stream.open()
     return () => {
-      this.end()
-      clearTimeout(this.retry)
+      window.removeEventListener('online', retry)
+      stream.close()
       this.lots.end()
       this.robots = null
       this.alerts = []
-      this.lostSince = null
+      this.lostSince = this.unknown = null
+      this.why = ''
     }
   }
 
-  /** Whether there has been no connection for so long that the page says so; at a Unix time in seconds. */
+  /** Whether nothing has been known for so long that the page says so; at a Unix time in seconds. */
   isLost(now: number): boolean {
     return this.lostSince !== null && now - this.lostSince > LOSS_SHOWN_S
   }
 
-  private follow(): void {
-    this.end()
-    this.end = watchFleet({
-      robots: (list) => {
-        this.robots = list
-        this.lostSince = null
-      },
-      alerts: (list) => this.take(list),
-      lost: (final) => {
-        this.lostSince ??= Date.now() / 1000
-        if (final) this.retry = setTimeout(() => void this.again(), RETRY_MS)
-      },
-    })
+  private lose(msAgo: number, unknown: string | null): void {
+    this.lostSince ??= (Date.now() - msAgo) / 1000
+    this.unknown = unknown
   }
 
-  private async again(): Promise<void> {
-    try {
-      if ((await currentSession()) === null) {
-        app.toLogin('Your session has ended. Please log in again.')
-        return
-      }
-    } catch {
-      // The relay is away; the next attempt tells.
-    }
-    this.follow()
+  private takeRobots(list: Robot[]): void {
+    this.robots = list
+    this.lostSince = this.unknown = null
+    this.why = ''
   }
 
-  private take(list: Alert[]): void {
+  private takeAlerts(list: Alert[]): void {
     this.alerts = list
     this.lots.add(this.news.take(list))
   }

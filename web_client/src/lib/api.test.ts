@@ -1,0 +1,163 @@
+import { afterEach, beforeEach, describe, expect, it, vi } from 'vitest'
+import { currentSession, giveOrder, Refusal, resumeRobot, STOP_PATIENCE_MS, stopRobot, Unreachable } from './api'
+
+interface Asked {
+  path: string
+  init: RequestInit
+  answer: (response: Response) => void
+}
+
+let asked: Asked[]
+
+beforeEach(() => {
+  vi.useFakeTimers()
+  asked = []
+  // As a browser does it: what is given up fails, the body too.
+  vi.stubGlobal('fetch', (path: string, init: RequestInit) => {
+    return new Promise<Response>((answer, reject) => {
+      init.signal?.addEventListener('abort', () => reject(new DOMException('', 'AbortError')))
+      asked.push({ path, init, answer })
+    })
+  })
+})
+
+afterEach(() => {
+  vi.useRealTimers()
+  vi.unstubAllGlobals()
+})
+
+/** How a promise stands: its value or its error, or nothing yet. */
+function outcome<T>(work: Promise<T>): unknown[] {
+  const found: unknown[] = []
+  work.then(
+    (value) => found.push(value),
+    (error: unknown) => found.push(error),
+  )
+  return found
+}
+
+/** The lines of an answer, given one after the other. */
+function lines(signal: AbortSignal | null | undefined) {
+  let out!: ReadableStreamDefaultController<Uint8Array>
+  const body = new ReadableStream<Uint8Array>({ start: (controller) => void (out = controller) })
+  signal?.addEventListener('abort', () => out.error(new DOMException('', 'AbortError')))
+  const say = (line: object) => out.enqueue(new TextEncoder().encode(`${JSON.stringify(line)}\n`))
+  return { response: new Response(body), say, end: () => out.close(), fail: () => out.error(new TypeError('network error')) }
+}
+
+describe('a stop of one robot', () => {
+  it('that is never answered is given up, later than the relay ever answers', async () => {
+    const found = outcome(stopRobot('rover'))
+    await vi.advanceTimersByTimeAsync(21_500)
+    expect(found).toEqual([])
+    await vi.advanceTimersByTimeAsync(STOP_PATIENCE_MS - 21_500)
+    expect(found).toEqual([expect.any(Unreachable)])
+  })
+
+  it('goes out though the page is left, and waits for nothing once it is answered', async () => {
+    const found = outcome(stopRobot('rover'))
+    expect(asked[0]?.init).toMatchObject({ method: 'POST', keepalive: true })
+    asked[0]?.answer(new Response('{}', { status: 202 }))
+    await vi.advanceTimersByTimeAsync(0)
+    expect(found).toEqual([true])
+    expect(vi.getTimerCount()).toBe(0)
+  })
+
+  it('tells what the robot said from what nobody knows', async () => {
+    const found = [409, 503].map((status) => outcome(stopRobot(String(status))))
+    asked.forEach(({ path, answer }) => answer(new Response('{}', { status: Number(path.split('/').at(-2)) })))
+    await vi.advanceTimersByTimeAsync(0)
+    expect(found.flat().map((error) => (error as Refusal).byRobot)).toEqual([true, false])
+  })
+})
+
+describe('an order to many', () => {
+  const STOP = { robots: ['*'], do: 'stop' } as const
+
+  it('to stop is given up when nothing more comes of its answer, however long that has gone on', async () => {
+    const told: object[] = []
+    const found = outcome(giveOrder({ ...STOP, robots: ['*'] }, (line) => told.push(line)))
+    const answer = lines(asked[0]?.init.signal)
+    asked[0]?.answer(answer.response)
+    for (const robot of ['a', 'b', 'c']) {
+      await vi.advanceTimersByTimeAsync(STOP_PATIENCE_MS - 1)
+      answer.say({ robot })
+    }
+    await vi.advanceTimersByTimeAsync(STOP_PATIENCE_MS - 1)
+    expect([found, told.length]).toEqual([[], 3])
+    await vi.advanceTimersByTimeAsync(1)
+    expect(found).toEqual([expect.any(Unreachable)])
+  })
+
+  it('of another kind is waited for as long as it takes, unless it is ended', async () => {
+    const ending = new AbortController()
+    const found = outcome(giveOrder({ robots: ['*'], do: 'publish', topic: '/mode' }, () => {}, ending.signal))
+    await vi.advanceTimersByTimeAsync(300_000)
+    expect(found).toEqual([])
+    ending.abort()
+    await vi.advanceTimersByTimeAsync(0)
+    expect(found).toEqual([expect.any(Unreachable)])
+  })
+
+  it('whose answer breaks off is told in words', async () => {
+    const found = outcome(giveOrder({ ...STOP, robots: ['*'] }, () => {}))
+    const answer = lines(asked[0]?.init.signal)
+    asked[0]?.answer(answer.response)
+    await vi.advanceTimersByTimeAsync(0)
+    answer.fail()
+    await vi.advanceTimersByTimeAsync(0)
+    expect(found).toEqual([expect.any(Unreachable)])
+    expect(vi.getTimerCount()).toBe(0)
+  })
+
+  it('to stop goes out though the page is left, as far as browsers allow', () => {
+    const robots = (count: number) => Array.from({ length: count }, (_, i) => `rover-${i}-of-a-large-house-with-many-halls`)
+    for (const count of [1, 1000]) void giveOrder({ robots: robots(count), do: 'stop' }, () => {})
+    void giveOrder({ robots: ['*'], do: 'publish', topic: '/mode' }, () => {})
+    expect(asked.map(({ init }) => init.keepalive)).toEqual([true, false, false])
+  })
+})
+
+describe('what moves a robot, or lets it move again', () => {
+  const ways: [string, () => Promise<void>, string, string][] = [
+    ['one robot', () => resumeRobot('rover'), '/api/v1/robots/rover/control', '/api/v1/robots/rover/resume'],
+    ...(['resume', 'call', 'set'] as const).map((what): [string, () => Promise<void>, string, string] => [
+      what,
+      () => giveOrder({ robots: ['*'], do: what }, () => {}),
+      '/api/v1/fleet/groups',
+      '/api/v1/fleet',
+    ]),
+  ]
+
+  it.each(ways)('gives back the moment of an answer that was asked for just before: %s', async (_, act, asks, does) => {
+    void outcome(act())
+    await vi.advanceTimersByTimeAsync(0)
+    expect(asked.map(({ path, init }) => [init.method, path])).toEqual([['GET', asks]])
+    asked[0]?.answer(new Response('{}', { headers: { 'switchboard-moment': 'ff.1' } }))
+    await vi.advanceTimersByTimeAsync(0)
+    expect(asked[1]?.path).toBe(does)
+    expect(new Headers(asked[1]?.init.headers).get('switchboard-moment')).toBe('ff.1')
+    expect(new Headers(asked[1]?.init.headers).get('content-type')).toBe('application/json')
+  })
+
+  it.each(ways)('is not asked for when that took long: %s', async (_, act) => {
+    const found = outcome(act())
+    await vi.advanceTimersByTimeAsync(2_000)
+    expect(found).toEqual([expect.any(Unreachable)])
+    // A page that was frozen has its timers late.
+    const again = outcome(act())
+    vi.setSystemTime(Date.now() + 60_000)
+    vi.spyOn(performance, 'now').mockReturnValue(performance.now() + 60_000)
+    asked[1]?.answer(new Response('{}', { headers: { 'switchboard-moment': 'ff.1' } }))
+    await vi.advanceTimersByTimeAsync(0)
+    expect(again).toEqual([expect.any(Unreachable)])
+    expect(asked).toHaveLength(2)
+    vi.restoreAllMocks()
+  })
+})
+
+it('who is logged in is not waited for for ever', async () => {
+  const found = outcome(currentSession())
+  await vi.advanceTimersByTimeAsync(10_000)
+  expect(found).toEqual([expect.any(Unreachable)])
+})
