@@ -11,6 +11,7 @@ from twisted.internet import reactor
 
 from relay_db.engine import Database
 from relay_server.store import Store
+from tests.relay_server.front_desk import Desk
 from tests.relay_server.memory import Time, World
 
 
@@ -47,7 +48,15 @@ def database(upgraded: Path, tmp_path: Path) -> Database:
 @pytest.fixture
 def store(database: Database) -> Iterator[Store]:
     """The store of a relay, running on the reactor of the tests."""
-    running = Store(reactor, database)  # type: ignore[arg-type]
+    running = Store(reactor, database)  # type: ignore[arg-type]  # to mypy it is a module
     running.start()
     yield running
     running.stop()
+
+
+@pytest.fixture
+def front(store: Store) -> Iterator[Desk]:
+    """A desk with ann, who operates rover and knows nothing of hidden."""
+    made = Desk(store)
+    yield made
+    made.auth.stop()

@@ -233,6 +233,7 @@ class World:
             ControlRules(),
             self.registry.changed,
             lambda: 1.7e9 + self.clock.seconds(),
+            self.now_ns,
         )
         self.control = self.control_link()
         self.link = MemoryLink()
@@ -361,7 +362,12 @@ def fails(work: Any) -> str:
     return str(errors[0])
 
 
+async def hangs(*_: object, **__: object) -> None:
+    """Stand for any request that is never answered, as of a database that is locked."""
+    await Deferred()
+
+
 __all__ = [
     "ADD", "FIBONACCI", "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink",
-    "Person", "Presence", "Time", "Unavailable", "World", "fails", "text", "words",
+    "Person", "Presence", "Time", "Unavailable", "World", "fails", "hangs", "text", "words",
 ]  # fmt: skip

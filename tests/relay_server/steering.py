@@ -117,13 +117,23 @@ class Place:
         self.record = MemoryRecord()
         self.changes = 0
         self.desk = Desk(
-            self.clock, self.robot, self.record, rules or ControlRules(), self._changed, self.wall
+            self.clock,
+            self.robot,
+            self.record,
+            rules or ControlRules(),
+            self._changed,
+            self.wall,
+            self.now_ns,
         )
         self.link = ControlLink(self.desk.told)
 
     def wall(self) -> float:
         """Unix time."""
         return 1.7e9 + self.clock.seconds()
+
+    def now_ns(self) -> int:
+        """The clock in nanoseconds."""
+        return round(self.clock.seconds() * 1e9)
 
     def _changed(self) -> None:
         self.changes += 1

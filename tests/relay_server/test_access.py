@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pytest
@@ -47,7 +47,7 @@ class Hall:
 
     async def permit(self) -> Permit:
         """A permit whose holder notes what it is told."""
-        permit = await self.access.permit(self.principal, self.robot.id)
+        permit = await self.access.permit(self.principal, self.robot)
         assert permit is not None
         permit.on_change = lambda: self.told.append("changed")
         permit.on_revoke = lambda error: self.told.append(f"{type(error).__name__}: {error}")
@@ -79,7 +79,7 @@ async def test_a_permit_judges_by_the_rights_in_the_database(store: Store) -> No
     assert permit.judge(Operation.SUBSCRIBE, "/scan").allowed
     assert not permit.judge(Operation.PUBLISH, "/cmd_vel").allowed
     await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
-    assert await hall.access.permit(hall.principal, hall.robot.id) is None
+    assert await hall.access.permit(hall.principal, hall.robot) is None
 
 
 @pytest_twisted.ensureDeferred
@@ -157,7 +157,7 @@ async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: Sto
     hall = await Hall(store).open()
     slow = SlowStore(store)
     hall.access._store = slow  # type: ignore[assignment]
-    asking = Deferred.fromCoroutine(hall.access.permit(hall.principal, hall.robot.id))
+    asking = Deferred.fromCoroutine(hall.access.permit(hall.principal, hall.robot))
     await slow.read_done
     await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
     await hall.access.refresh()
@@ -187,7 +187,7 @@ async def test_no_permit_for_a_token_that_ended_since_it_was_proved(store: Store
     hall = await Hall(store).open()
     await store.write(queries.revoke_token, hall.principal.token_id)
     with pytest.raises(BadCredentials, match="session was ended"):
-        await hall.access.permit(hall.principal, hall.robot.id)
+        await hall.access.permit(hall.principal, hall.robot)
 
 
 @pytest_twisted.ensureDeferred
@@ -223,6 +223,36 @@ async def test_a_token_is_remembered_while_it_counts(store: Store, ended: str) -
 
 
 @pytest_twisted.ensureDeferred
+async def test_what_is_remembered_follows_what_its_user_may(store: Store) -> None:
+    """Who was made an administrator is one at the next request, and who is none any more is not."""
+    hall = await Hall(store).open()
+    hall.access.remember(HASH, hall.principal, hall.access.refreshed)
+    for admin in (True, False):
+        await store.write(queries.set_admin, hall.user.id, admin)
+        await hall.access.refresh()
+        assert hall.access.remembered(HASH) == replace(hall.principal, admin=admin)
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_remembered_proves_nothing_without_a_look_at_the_database(store: Store) -> None:
+    """Nor one that is too long ago; one that began before another and ended after it takes nothing away."""
+    seconds = 50.0
+    hall = await Hall(store).open()
+    access = Access(store, lambda: hall.now, lambda: seconds)
+    access.remember(HASH, hall.principal, access.refreshed)
+    assert access.proves(HASH) is None
+    access.in_step(50.0)
+    access.in_step(49.0)
+    seconds += module.IN_STEP_SECONDS
+    assert access.proves(HASH) == hall.principal
+    seconds += 0.1
+    assert access.proves(HASH) is None
+    access.in_step(seconds)
+    hall.now = 5000.0
+    assert access.proves(HASH) is None
+
+
+@pytest_twisted.ensureDeferred
 async def test_a_token_that_was_looked_up_before_a_change_is_not_remembered(store: Store) -> None:
     """The change may have been about just that."""
     hall = await Hall(store).open()
@@ -237,8 +267,10 @@ async def test_what_is_remembered_is_bounded(store: Store, monkeypatch: pytest.M
     """The longest unused is forgotten."""
     monkeypatch.setattr(module, "PROVED", 2)
     hall = await Hall(store).open()
-    for token_hash in ("a", "b", "a", "c"):
+    for token_hash in ("a", "b", "c"):
         hall.access.remember(token_hash, hall.principal, hall.access.refreshed)
+        # To be asked for is to be used.
+        assert hall.access.remembered("a")
     assert [token_hash for token_hash in "abc" if hall.access.remembered(token_hash)] == ["a", "c"]
 
 
@@ -262,3 +294,54 @@ async def test_who_has_a_right_is_known_without_the_database(store: Store) -> No
     await store.write(queries.revoke_right, robot, user_id=hall.user.id)
     await access.refresh()
     assert not access.knows(hall.principal, robot)
+
+
+async def _with_scope(hall: Hall, scope: str) -> Principal:
+    """Ann by a token for less."""
+    hash = "cd" * 32
+    await hall.store.write(
+        queries.create_token, hall.user.id, hash, kind="access", expires=None, now=hall.now, scope=scope
+    )
+    record = await hall.store.read(queries.principal_by_token, hash, hall.now)
+    assert record is not None
+    return Principal.of(record)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_scope_narrows_what_a_token_opens(store: Store) -> None:
+    """The permit judges by both, and goes on to when the rights change."""
+    hall = await Hall(store).open()
+    await hall.grant("operator")
+    narrow = await _with_scope(hall, "viewer call:/dock@rover")
+    permit = await hall.access.permit(narrow, hall.robot)
+    assert permit is not None
+    assert permit.judge(Operation.CALL, "/dock").allowed
+    assert not permit.judge(Operation.PUBLISH, "/cmd_vel").allowed
+    assert hall.access.knows(narrow, hall.robot.id)
+    await hall.grant("owner")
+    await hall.access.refresh()
+    assert permit.judge(Operation.CALL, "/dock").allowed
+    assert not permit.judge(Operation.PUBLISH, "/cmd_vel").allowed
+    await hall.grant("viewer")
+    await hall.access.refresh()
+    assert not permit.judge(Operation.CALL, "/dock").allowed
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_outside_the_scope_is_not_there(store: Store) -> None:
+    """Neither in the list nor by name, however well the user's other tokens know it."""
+    hall = await Hall(store).open()
+    narrow = await _with_scope(hall, "owner@other")
+    assert await hall.access.permit(hall.principal, hall.robot) is not None
+    assert [record.name for record, _ in await hall.access.robots(hall.principal)] == ["rover"]
+    assert await hall.access.robots(narrow) == []
+    assert await hall.access.permit(narrow, hall.robot) is None
+    assert not hall.access.knows(narrow, hall.robot.id)
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_administrators_token_administers_if_its_scope_says_so(store: Store) -> None:
+    """One to look at robots is no key to the house."""
+    hall = await Hall(store).open()
+    await store.write(queries.set_admin, hall.user.id, True)
+    assert not (await _with_scope(hall, "owner")).admin

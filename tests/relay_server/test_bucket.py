@@ -31,3 +31,14 @@ def test_each_takes_from_a_bucket_of_his_own() -> None:
     assert [buckets.take("ann"), buckets.take("bob")] == [False, True]
     clock.advance(1)
     assert buckets.take("ann")
+
+
+def test_what_is_left_is_told() -> None:
+    """Also of the bucket of one of many, who keeps his."""
+    clock = Clock()
+    buckets = Buckets(0.5, 3, 10, clock.seconds)
+    assert buckets.of("ann").left == 3
+    assert buckets.take("ann")
+    clock.advance(1)
+    assert buckets.of("ann").left == 2.5
+    assert buckets.of("bob").left == 3

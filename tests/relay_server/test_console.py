@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import pytest_twisted
-from twisted.internet.defer import Deferred
 
 from relay_db import queries
 from relay_protocol import link
@@ -17,58 +14,47 @@ from relay_server.access import Principal
 from relay_server.console import CONFIRM_SECONDS, NOT_ALL_KNOWN, NOT_CONFIRMED, Console
 from relay_server.control import Answer
 from relay_server.frontdesk import LOOKUP_SECONDS
-from relay_server.store import Store
+from tests.relay_server.front_desk import HERE, Desk
+from tests.relay_server.memory import hangs
 from tests.relay_server.steering import outcome, result
-from tests.relay_server.test_frontdesk import HERE, Desk
 
 ROBOT = "rover"
+LATER = 1 << 62
+"""Sent after all there was."""
 
 
 class Place:
     """A front desk with three users, and the console in front of it."""
 
-    def __init__(self, store: Store) -> None:
-        self.made = Desk(store)
-        self.world = self.made.world
+    def __init__(self, front: Desk) -> None:
+        self.front = front
+        self.world = front.world
         self.console = Console(
-            self.world.clock, self.made.desk, self.made.access, self.world.desks, self.world.registry, store
+            self.world.clock, front.desk, front.access, self.world.desks, self.world.registry, front.store
         )
-        with store.database.begin() as s:
+        with front.store.database.begin() as s:
             self.users = {}
             for name, level in (("olga", "owner"), ("vic", "viewer"), ("eve", "")):
                 self.users[name] = queries.add_user(s, name, None)
                 if level:
-                    queries.grant_right(s, self.made.rover.id, level, user_id=self.users[name].id)
-        self.users["ann"] = self.made.ann
+                    queries.grant_right(s, self.front.rover.id, level, user_id=self.users[name].id)
+        self.users["ann"] = self.front.ann
 
-    async def principal(self, name: str) -> Principal:
+    async def principal(self, name: str, scope: str | None = None) -> Principal:
         """Somebody with a token."""
-        user = self.users[name]
-        token = f"token of {name}"
-        await self.made.store.write(
-            queries.create_token,
-            user.id,
-            hashlib.sha256(token.encode()).hexdigest(),
-            kind="access",
-            label="",
-            expires=None,
-            now=1000.0,
-        )
-        return await self.made.desk.token(token)
+        return await self.front.by_token(self.users[name], scope)
 
     def robot_comes(self) -> None:
         """The robot that the database knows registers."""
-        robot = self.world.registry.presence(self.made.rover.id, ROBOT, "default")
+        robot = self.world.registry.presence(self.front.rover.id, ROBOT, "default")
         self.world.robot = robot
         self.world.robot_comes()
 
 
 @pytest.fixture
-def place(store: Store) -> Iterator[Place]:
+def place(front: Desk) -> Place:
     """A place."""
-    made = Place(store)
-    yield made
-    made.made.auth.stop()
+    return Place(front)
 
 
 @pytest_twisted.ensureDeferred
@@ -81,8 +67,8 @@ async def test_everybody_with_a_right_stops_and_owners_resume(place: Place) -> N
     with pytest.raises(NotFound):
         await console.stop(eve, ROBOT, "", HERE)
     with pytest.raises(Refused, match="only who has control"):
-        await console.resume(vic, ROBOT, "", HERE)
-    await console.resume(olga, ROBOT, "all clear", HERE)
+        await console.resume(vic, ROBOT, "", HERE, LATER)
+    await console.resume(olga, ROBOT, "all clear", HERE, LATER)
     assert [type(each) for each in place.world.control.said] == [link.Stop, link.Resume]
     assert [note[:2] for note in place.world.record.notes] == [
         ("robot.stopped", "vic"),
@@ -98,7 +84,7 @@ async def test_a_robot_that_is_away_will_be_stopped(place: Place) -> None:
     assert outcome.done is False
     assert outcome.stopped is not None
     assert outcome.stopped["told"] is False
-    (robot,) = await place.made.desk.overview.robots(vic)
+    (robot,) = await place.front.desk.overview.robots(vic)
     assert (robot["holder"], robot["stopped"]["why"]) == (None, "smoke")
 
 
@@ -107,7 +93,7 @@ async def test_users_act_for_all_of_their_connections(place: Place) -> None:
     """Who has control by one of them gives it back, hands it over and keeps it from anywhere."""
     place.robot_comes()
     console, ann, olga = place.console, (await place.principal("ann")), (await place.principal("olga"))
-    session, _ = await place.made.opens(ann)
+    session, _ = await place.front.opens(ann)
     desk = place.world.desks.of(place.world.robot)
     assert (await desk.take(session, "")).success
     told = await console.control(ann, ROBOT, HERE)
@@ -121,12 +107,29 @@ async def test_users_act_for_all_of_their_connections(place: Place) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_token_to_look_does_nothing_with_its_users_control(place: Place) -> None:
+    """Neither gives it back nor resumes the robot by it; stopping is for all."""
+    place.robot_comes()
+    console, looks = place.console, (await place.principal("ann", "viewer"))
+    session, _ = await place.front.opens(await place.principal("ann"))
+    desk = place.world.desks.of(place.world.robot)
+    assert (await desk.take(session, "")).success
+    not_yours = Answer(False, "you have no control of this robot")
+    for do in (console.release, console.grant, console.refuse):
+        assert await do(looks, ROBOT, "", HERE) == not_yours
+    assert (await console.stop(looks, ROBOT, "smoke", HERE)).done is True
+    with pytest.raises(Refused, match="may resume it"):
+        await console.resume(looks, ROBOT, "", HERE, LATER)
+    assert desk.lease.holder is not None
+
+
+@pytest_twisted.ensureDeferred
 async def test_an_owner_takes_control_from_anybody(place: Place) -> None:
     """Nobody else does; the record says who did."""
     place.robot_comes()
     console = place.console
     ann, olga, vic = [await place.principal(name) for name in ("ann", "olga", "vic")]
-    session, _ = await place.made.opens(ann)
+    session, _ = await place.front.opens(ann)
     desk = place.world.desks.of(place.world.robot)
     await desk.take(session, "")
     assert not (await console.release(vic, ROBOT, "", HERE)).success
@@ -141,7 +144,7 @@ async def test_an_owner_who_asks_for_control_takes_it_from_the_holder_all_the_sa
     """His request is over, too; that of others who release is all that is taken back."""
     place.robot_comes()
     console, (ann, olga) = place.console, [await place.principal(name) for name in ("ann", "olga")]
-    (holds, _), (asks, _) = await place.made.opens(ann), await place.made.opens(olga)
+    (holds, _), (asks, _) = await place.front.opens(ann), await place.front.opens(olga)
     desk = place.world.desks.of(place.world.robot)
     await desk.take(holds, "")
     assert not (await desk.take(asks, "")).success
@@ -160,7 +163,7 @@ async def test_what_is_suppressed_obeys_all_connections_of_the_caller(place: Pla
     place.robot_comes()
     console, ann, olga = place.console, (await place.principal("ann")), (await place.principal("olga"))
     await console.suppress(olga, ROBOT, "/cmd_vel", 100, HERE)
-    first, second = (await place.made.opens(olga))[0], (await place.made.opens(olga))[0]
+    first, second = (await place.front.opens(olga))[0], (await place.front.opens(olga))[0]
     await console.suppress(olga, ROBOT, "/cmd_vel", 100, HERE)
     await console.inhibit(olga, ROBOT, "/scan", 1000, True, HERE)
     with pytest.raises(Refused, match="needs the level owner"):
@@ -173,13 +176,13 @@ async def test_what_is_suppressed_obeys_all_connections_of_the_caller(place: Pla
 async def test_what_is_inhibited_is_no_longer_than_the_caller_has_the_right(place: Place) -> None:
     """The robot is told when that is revoked; nothing stays open when the time is over."""
     place.robot_comes()
-    olga, access = await place.principal("olga"), place.made.access
+    olga, access = await place.principal("olga"), place.front.access
     await place.console.inhibit(olga, ROBOT, "/scan", 1000, False, HERE)
     place.world.clock.advance(2)
     assert not access._permits
     await place.console.inhibit(olga, ROBOT, "/scan", 60_000, False, HERE)
-    with place.made.store.database.begin() as s:
-        queries.revoke_right(s, place.made.rover.id, user_id=olga.user_id)
+    with place.front.store.database.begin() as s:
+        queries.revoke_right(s, place.front.rover.id, user_id=olga.user_id)
     await access.refresh()
     assert [each.ms for each in place.world.control.all(link.Inhibit)] == [1000, 60_000, 0]
     assert not access._permits
@@ -192,7 +195,7 @@ async def test_on_the_relays_own_machine_all_robots_are_stopped(place: Place) ->
     told = await place.console.stop_here(None, "fire", "root")
     assert told == ([{"robot": "hidden", "done": False}, {"robot": ROBOT, "done": True}], "")
     assert place.world.record.notes[0][1] == "root"
-    await place.console.resume_here("hidden", "", "root")
+    await place.console.resume_here("hidden", "", "root", LATER)
     assert place.world.record.stops == {}
     with pytest.raises(NotFound, match="there is no robot 'mule'"):
         await place.console.stop_here("mule", "", "root")
@@ -206,11 +209,8 @@ class Hung:
     """A database that answers nothing more."""
 
     def __init__(self, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-        async def never(*_: Any, **__: Any) -> Any:
-            await Deferred()
-
-        monkeypatch.setattr(place.made.store, "read", never)
-        monkeypatch.setattr(place.made.store, "write", never)
+        monkeypatch.setattr(place.front.store, "read", hangs)
+        monkeypatch.setattr(place.front.store, "write", hangs)
 
 
 @pytest_twisted.ensureDeferred
@@ -222,8 +222,8 @@ async def test_who_is_known_stops_a_robot_without_the_database(
     vic = await place.principal("vic")
     await place.console.control(vic, ROBOT, HERE)
     ann = await place.principal("ann")
-    session, _ = await place.made.opens(ann)
-    await place.made.access.refresh()
+    session, _ = await place.front.opens(ann)
+    await place.front.access.refresh()
     await place.console.control(vic, ROBOT, HERE)
     Hung(place, monkeypatch)
     for who in (vic, ann):
@@ -240,7 +240,7 @@ async def test_who_is_not_known_is_told_soon_that_nobody_can_say(
     place.robot_comes()
     vic, eve = await place.principal("vic"), await place.principal("eve")
     await place.console.control(vic, ROBOT, HERE)
-    await place.made.access.refresh()
+    await place.front.access.refresh()
     Hung(place, monkeypatch)
     asked = [outcome(place.console.stop(who, ROBOT, "", HERE)) for who in (vic, eve)]
     place.world.clock.advance(LOOKUP_SECONDS - 0.1)
@@ -250,7 +250,7 @@ async def test_who_is_not_known_is_told_soon_that_nobody_can_say(
         assert isinstance(error, Unavailable)
         assert "by 'switchboard stop' on the relay's machine" in str(error)
     assert not place.world.control.all(link.Stop)
-    assert not place.made.access._permits
+    assert not place.front.access._permits
 
 
 @pytest_twisted.ensureDeferred
@@ -290,7 +290,7 @@ async def test_a_robot_that_does_not_come_to_an_end_holds_up_no_answer_about_the
     async def no_others(*_: Any) -> list[Any]:
         return []
 
-    monkeypatch.setattr(place.made.store, "read", no_others)
+    monkeypatch.setattr(place.front.store, "read", no_others)
     hidden = place.world.registry.presence(2, "hidden", "default")
     assert hidden.control is None
     place.robot_comes()
@@ -323,11 +323,11 @@ async def test_an_admission_is_given_back(place: Place) -> None:
     vic = await place.principal("vic")
     for work in (
         place.console.control(vic, ROBOT, HERE),
-        place.console.resume(vic, ROBOT, "", HERE),
+        place.console.resume(vic, ROBOT, "", HERE, LATER),
         place.console.suppress(vic, ROBOT, "/x", 100, HERE),
     ):
         try:
             await work
         except Refused:
             continue
-    assert not place.made.access._permits
+    assert not place.front.access._permits

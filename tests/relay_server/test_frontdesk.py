@@ -2,95 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
-
 import pytest
 import pytest_twisted
-from twisted.internet import reactor
-from twisted.internet.defer import Deferred
 
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
-from relay_server import closing, limiter, passwords
-from relay_server.access import Access, BadCredentials, Principal
-from relay_server.auth import Authenticator, Opening, TooManyTries
-from relay_server.frontdesk import LOOKUP_SECONDS, NO_ROBOT, NOT_LOOKED_UP, FrontDesk
-from relay_server.journal import Journal
-from relay_server.origins import Origins
-from relay_server.session import Session, Timing
-from relay_server.store import Store
+from relay_server import closing, limiter
+from relay_server.access import IN_STEP_SECONDS, BadCredentials
+from relay_server.auth import Opening, TooManyTries
+from relay_server.frontdesk import LOOKUP_SECONDS, NO_ROBOT, NOT_LOOKED_UP
 from relay_server.video import Picture
-from tests.relay_server.memory import MemoryClient, World
+from tests.relay_server.front_desk import HERE, Desk
+from tests.relay_server.memory import hangs
 from tests.relay_server.steering import outcome, result
 
-PASSWORD = "correct horse"
-HERE = "192.0.2.1"
 HOST = "127.0.0.1:9090"
-
-
-class Desk:
-    """A front desk, and what it is made of."""
-
-    def __init__(self, store: Store) -> None:
-        self.store = store
-        self.world = World()
-        self.access = Access(store, self.wall)
-        self.auth = Authenticator(reactor, store, self.world.clock.seconds, self.wall)  # type: ignore[arg-type]
-        self.auth.start()
-        self.desk = FrontDesk(
-            self.world.clock,
-            store,
-            self.auth,
-            self.access,
-            self.world.registry,
-            self.world.channels,
-            self.world.videos,
-            self.world.desks,
-            Journal(store, self.wall),
-            Origins("http"),
-            Timing(2.0, 0.1, 5.0),
-            cookie="sb",
-            clock_ns=self.world.now_ns,
-            wall=self.wall,
-        )
-        with store.database.begin() as session:
-            ann = queries.add_user(session, "ann", passwords.hash_password(PASSWORD))
-            rover = queries.add_robot(session, "rover", "in the shed")
-            queries.add_robot(session, "hidden")
-            queries.grant_right(session, rover.id, "operator", user_id=ann.id)
-        self.ann, self.rover = ann, rover
-
-    def wall(self) -> float:
-        """Unix time."""
-        return 1000.0 + self.world.clock.seconds()
-
-    async def logged_in(self) -> tuple[Principal, str]:
-        """Ann's principal by a fresh session, and its token."""
-        _, token = await self.desk.password("ann", PASSWORD, HERE)
-        return await self.desk.token(token), token
-
-    async def opens(self, principal: Principal) -> tuple[Session, MemoryClient]:
-        """A websocket of this principal."""
-        client = MemoryClient()
-        admission = await self.desk.admit(principal, "rover", HERE)
-        session = self.desk.open(admission, client, self.world.now_ns())
-        session.start()
-        return session, client
-
-    async def events(self, kind: str) -> list[Any]:
-        """What was recorded of a kind, once what is being written is written."""
-        await self.store.write(queries.revision)
-        return [each for each in await self.store.read(queries.list_events) if each.kind == kind]
-
-
-@pytest.fixture
-def front(store: Store) -> Iterator[Desk]:
-    """A desk with ann, who operates rover and knows nothing of hidden."""
-    made = Desk(store)
-    yield made
-    made.auth.stop()
 
 
 @pytest_twisted.ensureDeferred
@@ -261,18 +188,42 @@ async def test_health_is_whether_the_database_answers(front: Desk, monkeypatch: 
 
 
 @pytest_twisted.ensureDeferred
+async def test_who_was_proved_is_known_while_the_database_is_looked_at(
+    front: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the last look is too long ago it is asked again; tokens that nobody has shown it is asked about anyway."""
+    principal, token = await front.logged_in()
+    front.access.in_step(front.world.clock.seconds())
+    monkeypatch.setattr(front.store, "read", hangs)
+    assert result(front.desk.token(token)) == principal
+    assert outcome(front.desk.token("unknown")) == []
+    front.world.clock.advance(IN_STEP_SECONDS)
+    assert result(front.desk.token(token)) == principal
+    front.world.clock.advance(0.1)
+    assert outcome(front.desk.token(token)) == []
+    front.access.in_step(front.world.clock.seconds())
+    assert result(front.desk.token(token)) == principal
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_has_logged_out_is_known_no_more(front: Desk) -> None:
+    """However lately the database was looked at."""
+    principal, token = await front.logged_in()
+    front.access.in_step(front.world.clock.seconds())
+    await front.desk.logout(principal)
+    with pytest.raises(BadCredentials):
+        await front.desk.token(token)
+
+
+@pytest_twisted.ensureDeferred
 async def test_who_stops_robots_need_not_wait_for_the_database(
     front: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where his token has proved him before and has not ended since; else that is told soon."""
-
-    async def never(*_: Any) -> None:
-        await Deferred()
-
     principal, token = await front.logged_in()
     ended, other = await front.logged_in()
     await front.desk.logout(ended)
-    monkeypatch.setattr(front.store, "read", never)
+    monkeypatch.setattr(front.store, "read", hangs)
     assert result(front.desk.urgent_token(token)) == principal
     asked = [outcome(front.desk.urgent_token(each)) for each in (other, "unknown")]
     front.world.clock.advance(LOOKUP_SECONDS - 0.1)

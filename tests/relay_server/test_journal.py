@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import pytest_twisted
+from twisted.logger import capturedLogs
 
 from relay_db import queries
 from relay_server import journal as module
@@ -39,6 +40,24 @@ async def test_a_burst_is_kept_and_what_comes_too_fast_is_counted(
     assert not journal.event("x", "relay", cause="192.0.2.1", n=-2)
     assert [data["n"] for data in await kept(journal, store, "x")] == [*range(BURST), -1]
     assert await kept(journal, store, "events.suppressed") == [{"cause": "192.0.2.1", "count": 30}]
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_listens_and_fails_undoes_nothing(journal: Journal, store: Store) -> None:
+    """The event is kept, others hear of it, and whoever caused it goes on; the log tells."""
+    heard: list[str] = []
+
+    def fails(kind: str, robot_id: int | None, data: dict[str, Any]) -> None:
+        raise KeyError(kind)
+
+    journal.listen(fails)
+    journal.listen(lambda kind, robot_id, data: heard.append(kind))
+    with capturedLogs() as logs:
+        assert journal.event("x", "relay", cause="a", n=1)
+        journal.tell("y", 1)
+    assert heard == ["x", "y"]
+    assert [each["log_failure"].type for each in logs] == [KeyError, KeyError]
+    assert await kept(journal, store, "x") == [{"n": 1}]
 
 
 @pytest_twisted.ensureDeferred

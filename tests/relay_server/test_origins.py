@@ -78,3 +78,25 @@ def test_an_address_holds_so_many_connections_and_no_more() -> None:
     cap.leave("a")
     cap.leave("b")
     assert not cap._counts
+
+
+@pytest.mark.parametrize(
+    ("host", "base"),
+    [
+        ("127.0.0.1:9090", "http://127.0.0.1:9090"),
+        ("[::1]:9090", "http://[::1]:9090"),
+        ("robots.example", "https://robots.example"),
+        ("robots.example:443", "https://robots.example:443"),
+        ("robots.example:9090", "http://robots.example:9090"),
+    ],
+)
+def test_addresses_are_those_that_people_see(host: str, base: str) -> None:
+    """Behind a proxy with TLS, those of the origin it is listed by."""
+    assert Origins("http", ["https://robots.example"]).base(host) == base
+
+
+@pytest.mark.parametrize("host", ["", "a b", "a/b", "a:b", '"', "a" * 300, "user@host", "http://a"])
+def test_what_is_no_host_makes_no_address(host: str) -> None:
+    """It would stand in every answer."""
+    with pytest.raises(Invalid, match="Host"):
+        Origins("http").base(host)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -12,9 +11,8 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound
 from relay_server.linkmeter import Reading
-from relay_server.store import Store
+from tests.relay_server.front_desk import Desk
 from tests.relay_server.memory import MemoryLink
-from tests.relay_server.test_frontdesk import Desk
 
 
 class Measured(MemoryLink):
@@ -23,14 +21,6 @@ class Measured(MemoryLink):
     def reading(self) -> Reading:
         """A fifth of a second."""
         return Reading(rtt=0.2, p95=0.25, jitter=0.01, lately=0.2, quality="fair")
-
-
-@pytest.fixture
-def front(store: Store) -> Iterator[Desk]:
-    """A desk with ann, who operates rover and knows nothing of hidden."""
-    made = Desk(store)
-    yield made
-    made.auth.stop()
 
 
 @pytest_twisted.ensureDeferred
@@ -83,6 +73,34 @@ async def test_the_list_of_robots_tells_how_good_links_are_and_how_many_are_ther
 
 
 @pytest_twisted.ensureDeferred
+async def test_the_charge_of_a_robot_that_is_away_is_not_told(front: Desk) -> None:
+    """To nobody: what it had before it went is not what it has."""
+    ann, _ = await front.logged_in()
+    session, _ = await front.opens(ann)
+    robot = session.robot
+    front.world.registry.registered(robot, Measured())
+    robot.health = link.Health(battery=0.5)
+
+    async def told() -> list[object]:
+        (listed,), people, (shown,) = (
+            await front.desk.robots(ann),
+            await front.desk.overview.people(ann, "rover"),
+            front.desk.status(),
+        )
+        return [
+            listed["battery"],
+            people["battery"],
+            shown["battery"],
+            (shown["health"] or {}).get("battery"),
+        ]
+
+    assert await told() == [0.5] * 4
+    front.world.registry.lost(robot, robot.control)  # type: ignore[arg-type]  # it has one
+    assert await told() == [None] * 4
+    session.end()
+
+
+@pytest_twisted.ensureDeferred
 async def test_the_administrator_sees_every_link(front: Desk) -> None:
     """The robot's, and those of its clients, with what was dropped."""
     ann, _ = await front.logged_in()
@@ -95,4 +113,27 @@ async def test_the_administrator_sees_every_link(front: Desk) -> None:
     (there,) = shown["clients"]
     assert (there["link"]["quality"], there["link"]["rtt_ms"], there["robot_rtt_ms"]) == ("good", 20.0, 220.0)
     assert len(await front.store.read(queries.list_robots)) == 2
+    session.end()
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_has_a_hand_on_topics_is_told(front: Desk) -> None:
+    """Whom one may not know of a topic of is not told; the administrator is told of all."""
+    ann, _ = await front.logged_in()
+    session, _ = await front.opens(ann)
+    front.world.registry.registered(session.robot, Measured())
+    session.robot.safety = link.Safety(
+        suppressed=[link.Suppressed(resource="/cmd_vel", sources=[9], by="runaway", ms=100)],
+        inhibited=[link.Inhibited(resource="/secret", hold=True, by="olga", ms=900)],
+    )
+    commands = [{"resource": "/cmd_vel", "by": "runaway", "hold": False}]
+    holds = [{"resource": "/secret", "by": "olga", "hold": True}]
+    for deny, seen in (((), holds), (("*:/secret",), [])):
+        with front.store.database.begin() as s:
+            queries.grant_right(s, front.rover.id, "operator", user_id=ann.user_id, deny=deny)
+        await front.access.refresh()
+        (told,) = await front.desk.overview.robots(ann)
+        assert (told["suppressed"], told["inhibited"]) == (commands, seen)
+    (known,) = front.desk.overview.status()
+    assert (known["suppressed"], known["inhibited"]) == (commands, holds)
     session.end()

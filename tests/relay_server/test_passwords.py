@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from relay_protocol.errors import Invalid
@@ -118,3 +122,31 @@ def test_a_code_is_taken_however_it_is_typed(typed: str) -> None:
     """Case, dashes and blanks don't matter."""
     assert passwords.normalise_code(typed) == "K7QF92MBX4TCHW6P"
     assert passwords.code_hash(typed) == passwords.token_hash("K7QF92MBX4TCHW6P")
+
+
+AT_ONCE = """
+import sys, threading
+from relay_server import passwords
+sys.setswitchinterval(1e-6)
+together = threading.Barrier(8)
+def first():
+    together.wait()
+    passwords.verify_password("correct horse", None)
+    verified.append(1)
+verified = []
+threads = [threading.Thread(target=first) for _ in range(8)]
+for each in threads:
+    each.start()
+for each in threads:
+    each.join()
+print(len(verified))
+"""
+
+
+def test_many_may_be_the_first_to_log_in() -> None:
+    """All at once, in a process that has loaded nothing yet."""
+    environment = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ran = subprocess.run(
+        [sys.executable, "-c", AT_ONCE], env=environment, capture_output=True, text=True, check=True
+    )
+    assert (ran.stdout, ran.stderr) == ("8\n", "")

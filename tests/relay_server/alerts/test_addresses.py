@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol.errors import Invalid
-from relay_server.alerts.addresses import allowed, networks
+from relay_server.alerts.addresses import Fence, allowed, networks
 
 
 @pytest.mark.parametrize("address", ["8.8.8.8", "93.184.215.14", "2606:2800:21f:cb07::1", "64:ff9b::808:808"])
@@ -43,6 +43,41 @@ def test_an_administrator_can_allow_networks() -> None:
     assert allowed("fd00:7::9", also)
     assert not allowed("192.168.8.9", also)
     assert not allowed("fd00:8::9", also)
+
+
+HOME = networks(["2606:2800:21f:cb07::/64", "93.184.215.0/24"])
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["2606:2800:21f:cb07::9", "93.184.215.14", "::ffff:93.184.215.14", "64:ff9b::5db8:d70e"],
+)
+def test_networks_the_machine_is_in_are_refused_though_all_the_world_may_send_there(address: str) -> None:
+    """Also where IPv6 carries the address; an administrator can allow them by name."""
+    assert allowed(address)
+    assert not allowed(address, attached=HOME)
+    assert allowed(address, HOME, attached=HOME)
+    assert allowed("2606:2800:21f:cb08::9", attached=HOME)
+
+
+def test_what_is_denied_is_so_within_what_is_allowed() -> None:
+    """An administrator names one machine of a network, or a network of public addresses behind a router."""
+    never = networks(["10.0.0.7/32", "93.184.215.0/24", "2606:2800:21f::/48"])
+    also = networks(["10.0.0.0/8", "93.184.215.0/28"])
+    for address in ("10.0.0.7", "93.184.215.14", "2606:2800:21f:1::9"):
+        assert not allowed(address, also, never)
+    assert allowed("10.0.0.8", also, never)
+    assert allowed("8.8.8.8", also, never)
+
+
+def test_where_the_machine_is_counts_as_it_is_when_something_is_judged() -> None:
+    """Interfaces come and go while the relay runs."""
+    now = list(HOME)
+    fence = Fence(lambda: now, never=networks(["8.8.8.8/32"]))
+    asked = ["8.8.8.8", "93.184.215.14", "8.8.4.4"]
+    assert fence.passed(asked) == ["8.8.4.4"]
+    now.clear()
+    assert fence.passed(asked) == ["93.184.215.14", "8.8.4.4"]
 
 
 @pytest.mark.parametrize("text", ["", "intranet", "192.168.7.1/24", "10.0.0.0/33"])

@@ -250,6 +250,45 @@ def test_a_flood_hides_nothing_the_relay_knows_itself(scene: Scene, kind: str) -
     assert scene.book.lasts(ROBOT, kind) is not None
 
 
+def test_a_flood_hides_no_process_that_died(scene: Scene) -> None:
+    """Its camera's, its guard's: so many parts have a place of their own."""
+    for each in range(kinds.OPEN + 50):
+        scene.tell("diagnostics", f"part {each}", "warning")
+    assert scene.tell("module", "guard") == ["module begun"]
+    assert scene.tell("module", "camera") == ["module begun"]
+    assert len(scene.book.open_of(ROBOT)) == kinds.OPEN + 3
+
+
+def test_the_places_beside_a_flood_are_few(scene: Scene) -> None:
+    """Whatever parts a robot makes up, and however soon each is well again; one that comes back keeps its place."""
+    for each in range(kinds.OPEN):
+        scene.tell("diagnostics", f"part {each}", "warning")
+    for each in range(100):
+        scene.now += 0.001
+        scene.tell("module", f"made up {each}")
+        scene.over("module", f"made up {each}")
+    known = [each for each in scene.book if each.kind == kinds.MODULE]
+    assert len(known) == kinds.RESERVE
+    scene.now += kinds.REJOIN_SECONDS
+    for each in range(kinds.OPEN):
+        scene.tell("diagnostics", f"more {each}", "warning")
+    assert scene.tell("module", "made up 0") == ["module begun"]
+
+
+def test_a_flood_is_as_bad_as_the_worst_it_hides(scene: Scene) -> None:
+    """A rule for errors, and one with quiet hours, must hear of it; it is a warning at least."""
+    for each in range(kinds.OPEN + 1):
+        scene.tell("diagnostics", f"part {each}", "info")
+    flood = scene.book.lasts(ROBOT, kinds.FLOOD)
+    assert flood is not None
+    assert flood.level == "warning"
+    assert scene.tell("diagnostics", "fire", "error") == ["flood worse"]
+    assert scene.tell("diagnostics", "dust", "warning") == []
+    flood = scene.book.lasts(ROBOT, kinds.FLOOD)
+    assert flood is not None
+    assert (flood.level, flood.times) == ("error", 3)
+
+
 def test_new_alerts_of_a_robot_come_at_a_bounded_rate(scene: Scene) -> None:
     """Also when each is over at once: what is remembered of a robot stays small."""
     for each in range(5000):
@@ -293,6 +332,24 @@ def test_an_earlier_relays_alerts_go_on(scene: Scene) -> None:
     later.now += 60
     assert later.tell() == []
     assert later.only.id == "a1"
+    assert later.over() == ["offline over"]
+
+
+@pytest.mark.parametrize("set_back", [0.0, 3600.0])
+def test_what_was_over_before_it_came_again_does_not_outlive_a_restart(scene: Scene, set_back: float) -> None:
+    """Nor does its being forgotten touch what lasts, whatever the clock was set to in between."""
+    scene.tell()
+    scene.over()
+    scene.now += kinds.REJOIN_SECONDS
+    scene.set = -set_back
+    scene.tell()
+    later = Scene()
+    later.now, later.set = scene.now, scene.set
+    later.book.load(scene.book.take_changed(), later.moment)
+    assert (later.only.id, later.only.over) == ("a2", None)
+    later.now += kinds.SHOWN_SECONDS + 1
+    assert later.sweep() == []
+    assert later.tell() == []
     assert later.over() == ["offline over"]
 
 

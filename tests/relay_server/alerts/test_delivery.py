@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import AsyncIterator, Collection
+from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from typing import Any
 
@@ -47,9 +48,10 @@ class Scene:
         self.asks = 0
         self._names = 0
         self.office = Office(
-            self.clock, self.wall, lambda: 0.0, self._name, self._send, self._known, self._lasts
+            self.clock, self.wall, lambda: 0.0, self._name, self._send, self._known, self._lasts, self._room
         )
         self.places = DeferredSemaphore(2)
+        self.rooms = DeferredSemaphore(4)
 
     def wall(self) -> float:
         """Unix time."""
@@ -73,8 +75,13 @@ class Scene:
         self._names += 1
         return f"d{self._names}"
 
-    async def _send(self, rule: AlertRuleRecord, message: Message, doubtful: bool) -> None:
-        self.doubtful.append(doubtful)
+    @asynccontextmanager
+    async def _room(self, rule: AlertRuleRecord, doubtful: bool) -> AsyncIterator[None]:
+        async with self.rooms:
+            self.doubtful.append(doubtful)
+            yield
+
+    async def _send(self, rule: AlertRuleRecord, message: Message) -> None:
         if self.hangs:
             self.hanging.append(Deferred())
             await self.hanging[-1]
@@ -221,6 +228,23 @@ def test_who_has_lost_the_right_is_told_nothing(scene: Scene) -> None:
     scene.wait(60)
     assert len(scene.got) == 1
     assert way.waiting == 0
+
+
+@pytest.mark.parametrize("wait", ["places", "rooms"])
+def test_who_loses_the_right_while_a_message_waits_is_told_nothing(scene: Scene, wait: str) -> None:
+    """Behind messages that hang, his own or others' on the same way; what he may still know of is told."""
+    semaphore: DeferredSemaphore = getattr(scene, wait)
+    taken = [semaphore.acquire() for _ in range(semaphore.limit)]
+    way = scene.delivery()
+    way.offer(begun("a1"))
+    way.offer(begun("a2"))
+    scene.wait(30)
+    assert scene.got == []
+    scene.unknown = {"a1"}
+    for _ in taken:
+        semaphore.release()
+    assert scene.told() == [["a2 begun"]]
+    assert semaphore.tokens == semaphore.limit
 
 
 def test_an_error_waits_for_no_pause(scene: Scene) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import pytest_twisted
 from twisted.internet.defer import Deferred
+from twisted.logger import capturedLogs, formatEvent
 
 from relay_db import queries
 from relay_protocol import link
@@ -14,8 +15,9 @@ from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds
 from relay_server.alerts.desk import PAGE, REFUSED, AlertDesk, TooOften
-from relay_server.alerts.hub import ABSENT_SECONDS, AGAIN_SECONDS, TIDY_EVERY, Alerts
+from relay_server.alerts.hub import ABSENT_SECONDS, AGAIN_SECONDS, KEEP_SECONDS, TIDY_EVERY, Alerts
 from relay_server.alerts.message import Message
+from relay_server.alerts.position import Position
 from relay_server.alerts.rules import Ask
 from relay_server.alerts.senses import Thresholds
 from relay_server.alerts.ways import Ways
@@ -25,7 +27,7 @@ from relay_server.store import Store
 from tests.relay_server.alerts.made_up import alert
 from tests.relay_server.alerts.receiver import REACTOR
 from tests.relay_server.edges.robot_ends import until
-from tests.relay_server.memory import World
+from tests.relay_server.memory import World, hangs
 
 
 class Scene:
@@ -69,7 +71,7 @@ class Scene:
             thresholds, self._send,
         )  # fmt: skip
 
-    async def _send(self, rule: Any, message: Message, doubtful: bool) -> None:
+    async def _send(self, rule: Any, message: Message) -> None:
         self.sent.append(message)
 
     def says(self, kind: str, **data: Any) -> None:
@@ -154,6 +156,28 @@ async def test_what_somebody_may_not_see_hides_nothing_from_him(
     assert reads == 4
     assert len(await scene.desk.all(scene.people["ann"], limit=500)) == 500
     assert await scene.desk.all(scene.people["vic"], "rover", False) == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_list_goes_on_with_what_is_older(scene: Scene) -> None:
+    """For each by what he may see, though what the list ended with is there no more, or was told again meanwhile."""
+    rows = [
+        alert(f"{number:03}", robot_id=scene.number, kind=kind, last=2e9 - number // 2)
+        for number, kind in enumerate(["module", "diagnostics"] * (PAGE // 2 + 10))
+    ]
+    with scene.store.database.begin() as s:
+        queries.save_alerts(s, rows)
+    ann, vic = scene.people["ann"], scene.people["vic"]
+    listed: list[str] = []
+    before: Position | None = None
+    while page := await scene.desk.all(ann, limit=100, before=before):
+        listed += [each["id"] for each in page]
+        before = Position(page[-1]["last"], page[-1]["id"])
+        with scene.store.database.begin() as s:
+            queries.save_alerts(s, [alert(page[-1]["id"], robot_id=scene.number, last=3e9)])
+    assert listed == [each.id for each in rows]
+    (oldest,) = await scene.desk.all(vic, limit=100, before=Position(2e9 - len(rows) // 2 + 2, "z"))
+    assert oldest["kind"] == "module"
 
 
 @pytest_twisted.ensureDeferred
@@ -296,7 +320,34 @@ async def test_another_relay_goes_on_where_one_was_killed(scene: Scene) -> None:
     later._absent = {scene.number: ("rover", "default")}
     scene.world.clock.pump([0.25] * int(4 * ABSENT_SECONDS + 8))
     assert later.lasts(scene.robot, "offline") == "error"
-    await later.stop()
+    later.hush()
+    await later.keep()
+
+
+@pytest_twisted.ensureDeferred
+async def test_control_lost_as_a_relay_was_killed_is_told_by_the_robot(scene: Scene) -> None:
+    """In its words, and by each registration once more until that is heard; it is over when somebody takes control."""
+    text = "ann lost control while the robot moved: its link to the relay was lost"
+    for _ in range(2):
+        scene.says("robot.alert", level="warning", text=text, alert_kind="control", about="", over=False)
+    (told,) = await scene.desk.all(scene.people["vic"])
+    assert (told["kind"], told["level"], told["text"], told["count"]) == ("control", "error", text, 2)
+    scene.says("control.taken")
+    assert await scene.desk.all(scene.people["vic"], open=True) == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_of_a_loss_of_control_that_a_relay_has_seen_it_needs_no_word(scene: Scene) -> None:
+    """What it told, and somebody acknowledged, does not come back when the robot does."""
+    scene.says("control.taken")
+    scene.says("control.lost", user="ann", why="the robot's link was lost", moving=True)
+    (told,) = await scene.desk.all(scene.people["ann"])
+    await scene.desk.acknowledge(scene.people["ann"], told["id"])
+    scene.says("robot.alert", level="error", text="x", alert_kind="control", about="", over=False)
+    assert await scene.desk.all(scene.people["ann"], open=True) == []
+    scene.says("robot.alert", level="error", text="x", alert_kind="control", about="goals", over=False)
+    (other,) = await scene.desk.all(scene.people["ann"], open=True)
+    assert (other["kind"], other["about"]) == ("robot", "goals")
 
 
 @pytest_twisted.ensureDeferred
@@ -314,7 +365,8 @@ async def test_a_daemon_that_began_anew_has_forgotten_what_it_told(scene: Scene)
     scene.says("robot.alert", level="error", text="x", alert_kind="diagnostics", about="arm", over=False)
     scene.world.clock.pump([0.25] * int(4 * AGAIN_SECONDS + 1))
     assert scene.alerts.lasting(scene.robot, "diagnostics") == ["arm"]
-    await scene.alerts.stop()
+    scene.alerts.hush()
+    await scene.alerts.keep()
 
 
 @pytest.mark.parametrize("says_so", [False, True])
@@ -342,7 +394,8 @@ async def test_a_daemon_that_begins_anew_while_a_part_is_in_error_is_no_news(
     (motor,) = [each for each in scene.alerts.book if each.kind == "diagnostics"]
     assert (motor.over, motor.news, motor.times) == (None, 1, 2)
     assert scene.alerts.lasting(scene.robot, "gripper") == []
-    await scene.alerts.stop()
+    scene.alerts.hush()
+    await scene.alerts.keep()
 
 
 @pytest_twisted.ensureDeferred
@@ -390,7 +443,8 @@ async def test_pages_are_told_when_there_is_something_else_to_show(scene: Scene)
     assert scene.alerts.version == before + 2
     scene.world.clock.pump([0.25] * TIDY_EVERY)
     assert scene.alerts.version > before + 2
-    await scene.alerts.stop()
+    scene.alerts.hush()
+    await scene.alerts.keep()
 
 
 @pytest_twisted.ensureDeferred
@@ -401,7 +455,8 @@ async def test_what_a_robot_tells_no_more_is_over_also_for_another_relay(scene: 
     for kind, about in parts:
         scene.says("robot.alert", alert_kind=kind, about=about, **told)
     scene.says("robot.stopped", user="ann", why="")
-    await scene.alerts.stop()
+    scene.alerts.hush()
+    await scene.alerts.keep()
     scene.alerts = later = scene.begin()
     await later.start()
     scene.says("robot.online")
@@ -417,7 +472,47 @@ async def test_what_a_robot_tells_no_more_is_over_also_for_another_relay(scene: 
             ("gripper", "left"),
             ("stop", ""),
         }
-    await later.stop()
+    later.hush()
+    await later.keep()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_was_removed_is_not_remembered(scene: Scene) -> None:
+    """Whether it had alerts or not."""
+    await scene.alerts.start()
+    scene.world.robot_comes()
+    scene.robot.description = link.Describe(started=1.0)
+    scene.says("robot.online")
+    scene.says("control.taken")
+    scene.world.clock.pump([0.25] * 4)
+    alerts = scene.alerts
+    kept = (alerts._came, alerts._daemons, alerts._untold, alerts._steered)
+    assert [list(each) for each in (alerts._came, alerts._daemons, alerts._steered)] == [[scene.number]] * 3
+    scene.says("robot.online")
+    await alerts.refresh()
+    assert scene.number in alerts._steered
+    await scene.store.write(queries.remove_robot, scene.number)
+    await alerts.refresh()
+    assert not any(kept)
+    alerts.hush()
+    await alerts.keep()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_relay_that_goes_waits_a_moment_for_its_database(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not for as long as that hangs."""
+    scene.says("robot.stopped", user="ann", why="")
+    monkeypatch.setattr(scene.store, "write", hangs)
+    scene.alerts.hush()
+    kept = Deferred.fromCoroutine(scene.alerts.keep())
+    scene.world.clock.advance(KEEP_SECONDS - 0.1)
+    assert not kept.called
+    with capturedLogs() as logs:
+        scene.world.clock.advance(0.2)
+    assert kept.called
+    assert "not taken them within 3 s" in str(formatEvent(logs[-1]))
 
 
 @pytest_twisted.ensureDeferred

@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 import pytest_twisted
 from switchboard_hook import MailServer
+from twisted.internet.defer import CancelledError, Deferred
 
 from relay_protocol.errors import Invalid
-from relay_server.alerts.addresses import networks
-from relay_server.alerts.mailing import Mailing
+from relay_server.alerts.addresses import Fence, networks
+from relay_server.alerts.mailing import DOUBTFUL, THREADS, Mailing
 from relay_server.alerts.message import Message, Notice, Undelivered
 from relay_server.alerts.names import Names
 from relay_server.alerts.ways import Ways, check_schemes
@@ -32,7 +33,7 @@ def server() -> Iterator[MailServer]:
 async def mailing() -> AsyncIterator[Mailing]:
     """Sends by mail alone, also to this machine."""
     names = Names(REACTOR)
-    made = Mailing(REACTOR, names.addresses, ["mailto"], networks(["127.0.0.0/8"]))
+    made = Mailing(REACTOR, names.addresses, ["mailto"], Fence(frozenset, networks(["127.0.0.0/8"])))
     names.start()
     made.start()
     yield made
@@ -51,12 +52,11 @@ def by(url: str) -> Any:
     return rule(channel="apprise", url=url, secret="")
 
 
-@pytest.mark.parametrize("doubtful", [False, True])
 @pytest_twisted.ensureDeferred
-async def test_a_message_arrives_by_mail(mailing: Mailing, server: MailServer, doubtful: bool) -> None:
+async def test_a_message_arrives_by_mail(mailing: Mailing, server: MailServer) -> None:
     """With a subject of one line, whatever a robot says."""
     evil = alert(kind="module", about="arm\r\nBcc: eve@x.example", text="gone\r\nX-Evil: yes")
-    await mailing.send(by(url(server)), message(Notice(evil, "begun")), doubtful)
+    await mailing.send(by(url(server)), message(Notice(evil, "begun")))
     (mail,) = server.mails
     assert "Subject: rover: error: module arm" in mail
     assert "\nBcc:" not in mail
@@ -68,13 +68,13 @@ async def test_a_message_arrives_by_mail(mailing: Mailing, server: MailServer, d
 async def test_a_server_in_a_network_that_is_not_allowed_is_not_reached(server: MailServer) -> None:
     """By address or by name."""
     names = Names(REACTOR)
-    mailing = Mailing(REACTOR, names.addresses, ["mailto"], ())
+    mailing = Mailing(REACTOR, names.addresses, ["mailto"], Fence(frozenset))
     names.start()
     mailing.start()
     try:
         for host in ("127.0.0.1", "localhost"):
             with pytest.raises(Undelivered, match="does not send to"):
-                await mailing.send(by(url(server, host)), message(), False)
+                await mailing.send(by(url(server, host)), message())
     finally:
         mailing.stop()
         names.stop()
@@ -89,9 +89,9 @@ async def test_only_allowed_services_are_taken(mailing: Mailing, server: MailSer
         with pytest.raises(Invalid):
             await mailing.check(wrong)
     with pytest.raises(Undelivered, match="may not have the parameter 'wkd'"):
-        await mailing.send(by(url(server) + "&WKD=yes"), message(), False)
+        await mailing.send(by(url(server) + "&WKD=yes"), message())
     with pytest.raises(Undelivered, match="does not allow"):
-        await mailing.send(by("json://example.org/x"), message(), False)
+        await mailing.send(by("json://example.org/x"), message())
 
 
 @pytest_twisted.ensureDeferred
@@ -102,9 +102,33 @@ async def test_a_server_that_is_not_there_is_told_in_words(
     server = MailServer()
     server.stop()
     with caplog.at_level(logging.DEBUG), pytest.raises(Undelivered, match="did not take") as error:
-        await mailing.send(by(url(server) + "&pass=topsecret&user=ann"), message(), False)
+        await mailing.send(by(url(server) + "&pass=topsecret&user=ann"), message())
     assert error.value.again
     assert "topsecret" not in caplog.text
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_message_waits_for_a_thread_before_it_is_judged(mailing: Mailing) -> None:
+    """Those that did not arrive before get half of them; who gives up waiting leaves no place taken."""
+    there: list[bool] = []
+    leave: Deferred[None] = Deferred()
+
+    async def stays(doubtful: bool) -> None:
+        async with mailing.room(doubtful):
+            there.append(doubtful)
+            await leave
+
+    staying = [Deferred.fromCoroutine(stays(True)) for _ in range(THREADS)]
+    assert there == [True] * DOUBTFUL
+    staying += [Deferred.fromCoroutine(stays(False)) for _ in range(THREADS)]
+    assert there == [True] * DOUBTFUL + [False] * (THREADS - DOUBTFUL)
+    for each in (staying.pop(DOUBTFUL), staying.pop()):
+        each.addErrback(lambda failure: failure.trap(CancelledError))
+        each.cancel()
+    leave.callback(None)
+    for each in staying:
+        await each
+    assert sorted(there) == [False] * (THREADS - 1) + [True] * (THREADS - 1)
 
 
 def test_a_long_message_says_how_many_more_there_are() -> None:

@@ -9,7 +9,7 @@ import pytest
 import pytest_twisted
 
 from relay_protocol.errors import Invalid
-from relay_server.alerts.addresses import networks
+from relay_server.alerts.addresses import Fence, networks
 from relay_server.alerts.mailing import Mailing
 from relay_server.alerts.message import Undelivered
 from relay_server.alerts.names import Names
@@ -31,8 +31,8 @@ class Scene:
         self.hook = Hook()
         self.port = serve(self.hook)
         self.names = Names(REACTOR)
-        nets = networks([allowed] if allowed else [])
-        self.mailing = Mailing(REACTOR, self.names.addresses, list(PARAMETERS), nets)
+        fence = Fence(frozenset, networks([allowed] if allowed else []))
+        self.mailing = Mailing(REACTOR, self.names.addresses, list(PARAMETERS), fence)
         self.names.start()
         self.mailing.start()
 
@@ -44,7 +44,7 @@ class Scene:
     async def fails(self, url: str) -> Undelivered:
         """Why a message by this URL does not arrive."""
         with pytest.raises(Undelivered) as error:
-            await self.mailing.send(rule(channel="apprise", url=url, secret=""), message(), False)
+            await self.mailing.send(rule(channel="apprise", url=url, secret=""), message())
         return error.value
 
     async def close(self) -> None:
@@ -156,7 +156,7 @@ async def test_urls_as_people_write_them_are_taken(scene: Scene, url: str) -> No
 def test_a_service_that_was_not_looked_at_can_not_be_allowed(scheme: str) -> None:
     """Push services read key files, others ask addresses of the user's choice; the words name what there is."""
     with pytest.raises(Invalid, match=f"'{scheme}' is no service that a relay can allow.*mailtos.*slack"):
-        Mailing(REACTOR, Names(REACTOR).addresses, ["mailtos", scheme], ())
+        Mailing(REACTOR, Names(REACTOR).addresses, ["mailtos", scheme], Fence(frozenset))
 
 
 def test_the_lists_have_nothing_that_names_a_file_or_an_address() -> None:

@@ -15,7 +15,7 @@ from twisted.internet.task import deferLater
 
 from relay_protocol.errors import Invalid
 from relay_server.alerts import webhook as module
-from relay_server.alerts.addresses import networks
+from relay_server.alerts.addresses import Fence, networks
 from relay_server.alerts.message import Undelivered
 from relay_server.alerts.names import Names
 from relay_server.alerts.webhook import ANSWER_BYTES, Webhooks, parse, signature
@@ -56,7 +56,8 @@ class Scene:
 
 def sender(resolver: Any = None, allowed: Any = LOOPBACK, trust: Any = None) -> Webhooks:
     """Sends to this machine alone, unless told otherwise."""
-    made = Webhooks(REACTOR, resolver or Resolver(["127.0.0.1"]), allowed, lambda: 1700000000.9, trust)
+    fence = Fence(frozenset, allowed)
+    made = Webhooks(REACTOR, resolver or Resolver(["127.0.0.1"]), fence, lambda: 1700000000.9, trust)
     made.relay = "relay-1"
     return made
 

@@ -66,6 +66,7 @@ class FakeRelay(socketserver.ThreadingUnixStreamServer):
     :ivar asked: requests so far, as ``METHOD /path``
     :ivar answer: status code and body for ``GET /status``
     :ivar ordered: bodies of ``POST /fleet``, ``/stop`` and ``/resume`` so far
+    :ivar sent: when these say that they were sent
     :ivar lines: status code and body for the first of these
     :ivar motion: the same for the others; status 0 hangs up
     :ivar may_answer: while this is not set the others have no answer
@@ -79,6 +80,7 @@ class FakeRelay(socketserver.ThreadingUnixStreamServer):
         self.asked: list[str] = []
         self.answer: tuple[int, bytes] = (200, b"{}")
         self.ordered: list[Any] = []
+        self.sent: list[int] = []
         self.lines: tuple[int, bytes] = (200, b"")
         self.motion: tuple[int, bytes] = (200, b"{}")
         self.may_answer = threading.Event()
@@ -101,6 +103,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.path in ("/fleet", "/stop", "/resume"):
             length = int(self.headers["Content-Length"])
             self.server.ordered.append(json.loads(self.rfile.read(length)))
+            self.server.sent.append(int(self.headers["Switchboard-Sent"]))
             status, body = self.server.lines if self.path == "/fleet" else self.server.motion
             self.server.may_answer.wait(30)
             if not status or self.server.gone:

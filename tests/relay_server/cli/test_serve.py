@@ -28,3 +28,22 @@ def test_a_request_for_control_lapses_after_the_grace_time(cli: Any, began: list
     for options in (("--control-grace", "60"), ("--control-request", "30"), ("--control-request", "90000")):
         assert "in between owners take over" in cli.fails("serve", *options)
     assert len(began) == 2
+
+
+def test_the_room_of_recordings_is_not_less_than_nothing(cli: Any, began: list[Settings]) -> None:
+    """Neither what they may take nor what they leave free of the disk."""
+    cli.ok("serve")
+    cli.ok("serve", "--recordings-gb", "0.5", "--recordings-reserve-gb", "2.5")
+    found = [(each.recordings, each.recordings_reserve) for each in began]
+    assert found == [(10 * 10**9, 10**9), (500_000_000, 2_500_000_000)]
+    for option in ("--recordings-gb", "--recordings-reserve-gb"):
+        assert "must not be less than 0" in cli.fails("serve", option, "-1")
+    assert len(began) == 2
+
+
+def test_requests_are_limited_unless_they_are_not(cli: Any, began: list[Settings]) -> None:
+    """By so many a second; 0 is for no limit, less is none."""
+    cli.ok("serve")
+    cli.ok("serve", "--requests-per-second", "0")
+    assert [each.requests for each in began] == [500, 0]
+    assert "--requests-per-second must be from 0" in cli.fails("serve", "--requests-per-second", "-1")

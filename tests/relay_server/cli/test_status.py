@@ -70,6 +70,31 @@ def test_status_shows_who_is_online_and_with_whom(live: Any, relay: Any) -> None
     assert relay.asked == ["GET /status", "GET /status"]
 
 
+def test_status_tells_who_has_a_hand_on_topics(live: Any, relay: Any) -> None:
+    """Beside who has control, also where nobody has."""
+    hands = {
+        "suppressed": [{"resource": "/cmd_vel", "by": "runaway", "hold": False}],
+        "inhibited": [
+            {"resource": "/scan", "by": "olga", "hold": True},
+            {"resource": "/odom", "by": "otto", "hold": False},
+        ],
+    }
+    for holder, words in ({"user": "ann"}, "ann"), (None, "–"):
+        relay.answer = (200, json.dumps(_answer(name="rover", holder=holder, **hands)).encode())
+        _, columns, _, row = live.ok("status").splitlines()
+        told = dict(zip(_words(columns), _words(row), strict=True))["control"]
+        assert told == f"{words}; runaway commands /cmd_vel; olga holds /scan; otto inhibits /odom"
+
+
+def test_status_does_not_say_stopped_of_a_robot_that_has_not_heard_of_it(live: Any, relay: Any) -> None:
+    """It may go on moving until it has."""
+    for told, words in ((False, "being stopped by bob"), (True, "bob")):
+        answer = _answer(name="rover", stopped={"by": "bob", "why": "", "since": 7.0, "told": told})
+        relay.answer = (200, json.dumps(answer).encode())
+        _, columns, _, row = live.ok("status").splitlines()
+        assert dict(zip(_words(columns), _words(row), strict=True))["stopped"] == words
+
+
 def test_status_of_one_robot_tells_who_exactly(live: Any, relay: Any) -> None:
     """Each connection, and each camera that is watched; of others nothing."""
     answer = _rover()

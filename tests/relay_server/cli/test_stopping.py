@@ -9,6 +9,7 @@ import pytest
 
 from relay_db import queries
 from relay_db.engine import Database
+from relay_protocol.clocks import now_ns
 from relay_server.cli import relaysocket, stopping
 from relay_server.cli.app import os_user
 
@@ -86,9 +87,19 @@ def test_a_relay_that_runs_is_asked(live: Any, relay: Any) -> None:
     assert relay.asked == ["POST /stop", "POST /resume"]
 
 
+def test_an_order_says_when_it_was_given(live: Any, relay: Any) -> None:
+    """By the machine's clock, which the relay reads too: one that was frozen does not do later what was meant now."""
+    before = now_ns()
+    live.ok("resume", "rover")
+    live("robot", "call", "rover", "/reset")
+    assert relay.asked == ["POST /resume", "POST /fleet"]
+    first, second = relay.sent
+    assert before < first < second < now_ns()
+
+
 def test_what_a_relay_refuses_is_told(live: Any, relay: Any) -> None:
     """With the exit code that fits."""
-    for status, code in ((404, 1), (409, 1), (503, 3)):
+    for status, code in ((404, 1), (409, 1), (412, 1), (503, 3)):
         relay.motion = (status, json.dumps({"detail": "in its own words"}).encode())
         assert live.fails("resume", "rover", code=code) == "Error: in its own words\n"
     relay.motion = (200, b"<html>")

@@ -13,6 +13,7 @@ from relay_server.control import ControlRules, State
 from relay_server.control import desk as module
 from relay_server.control.orders import WAITING
 from relay_server.control.record import Actor
+from relay_server.control.terms import REST_SECONDS
 from tests.relay_server.steering import Connection, Place, outcome, result
 
 
@@ -62,6 +63,20 @@ def test_a_robot_that_does_not_answer_is_free_again_and_its_asker_is_told(place:
     assert ann.told == ["you did not get control of rover: robot rover did not answer within 3 s"]
     place.link.answers(place.link.orders(link.Control)[0])
     assert not place.desk.passes(ann, "/cmd_vel"), "an answer that comes too late gives nothing"
+
+
+def test_who_waits_for_a_robot_that_does_not_answer_is_whom_it_obeys(place: Place) -> None:
+    """What was taken back as a precaution is not taken back from him."""
+    place.link.silent = True
+    ann, bob = place.connection("ann"), place.connection("bob")
+    first, second = outcome(place.desk.take(ann, "")), outcome(place.desk.take(bob, ""))
+    place.clock.advance(3.1)
+    assert isinstance(first[0], Unavailable)
+    assert place.link.holders == [ann.number, 0, bob.number]
+    place.link.answers(place.link.orders(link.Control)[-1])
+    assert second[0].success
+    assert place.desk.lease.held_by(bob)
+    assert place.record.kinds == ["control.lost", "control.taken"]
 
 
 def test_a_robot_that_refuses_is_free(place: Place) -> None:
@@ -146,7 +161,7 @@ def test_the_holder_hands_over(place: Place) -> None:
 
 
 def test_the_holder_keeps_it(place: Place) -> None:
-    """The one who asked is told why, and may ask again."""
+    """The one who asked is told why, and may ask again in a while."""
     ann, bob = place.holding("ann"), place.connection("bob")
     result(place.desk.take(bob, ""))
     assert place.desk.refuse(ann, "in a narrow lane").success
@@ -154,8 +169,96 @@ def test_the_holder_keeps_it(place: Place) -> None:
     assert place.desk.lease.request is None
     assert place.desk.passes(ann, "/cmd_vel")
     assert place.record.kinds[-1] == "control.refused"
+    place.clock.advance(REST_SECONDS)
     assert not result(place.desk.take(bob, "")).success
     assert place.desk.lease.requested_by(bob)
+
+
+def test_who_was_refused_does_not_ask_again_at_once(place: Place) -> None:
+    """By no connection of his; others ask, and somebody else he may ask as well."""
+    ann, bob, eve = place.holding("ann"), place.connection("bob"), place.connection("eve")
+    again = place.connection("bob")
+    again.permit = bob.permit
+    result(place.desk.take(bob, ""))
+    place.desk.refuse(ann, "")
+    place.clock.advance(0.5)
+    for each in (bob, again):
+        with pytest.raises(Refused, match="ann has just kept control of rover; ask again in 10 s"):
+            result(place.desk.take(each, ""))
+    assert place.desk.lease.request is None
+    assert place.record.kinds[-1] == "control.refused"
+    result(place.desk.take(eve, ""))
+    place.desk.grant(ann, "")
+    assert not result(place.desk.take(bob, "")).success
+    assert place.desk.lease.requested_by(bob)
+
+
+def test_users_who_rest_are_bounded(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more than that those who were refused first may ask again."""
+    monkeypatch.setattr(module, "USERS", 2)
+    ann = place.holding("ann")
+    asking = [place.connection(name) for name in ("bob", "eve", "tom")]
+    for each in asking:
+        result(place.desk.take(each, ""))
+        place.desk.refuse(ann, "")
+    for each in asking[1:]:
+        with pytest.raises(Refused):
+            result(place.desk.take(each, ""))
+    assert not result(place.desk.take(asking[0], "")).success
+
+
+def test_an_answer_goes_to_who_is_meant(place: Place) -> None:
+    """Somebody else may have asked while it was on its way: he gets neither control nor a refusal by it."""
+    ann, bob, olga = place.holding("ann"), place.connection("bob"), place.connection("olga", Level.OWNER)
+    result(place.desk.take(bob, ""))
+    result(place.desk.take(olga, ""))
+    words = "who you mean asks for control no more; olga does, and has no answer yet"
+    assert place.desk.grant(ann, "", bob.number) == (False, words)
+    assert place.desk.refuse(ann, "", bob.number) == (False, words)
+    assert place.desk.lease.requested_by(olga)
+    assert place.desk.grant(ann, "", olga.number).success
+    assert place.desk.lease.held_by(olga)
+
+
+def test_a_program_that_answers_nobody_gives_way_after_the_grace_time(place: Place) -> None:
+    """It took the robot by a command: who asks for it, and asks once more, has it. Both are told."""
+    program, ann = place.connection("program"), place.connection("ann")
+    result(place.desk.claimed(program))
+    assert not result(place.desk.take(ann, "")).success
+    place.clock.advance(29)
+    answer = result(place.desk.take(ann, ""))
+    assert answer == (
+        False,
+        "program has control and was asked for it already; after 1 s ask again to take over",
+    )
+    place.clock.advance(1)
+    assert result(place.desk.take(ann, "")) == (True, "you have control")
+    assert place.desk.lease.held_by(ann)
+    assert program.told[-1] == "you have lost control of rover: ann has taken over"
+    with pytest.raises(Refused, match=r"let go for 0\.5 s"):
+        place.desk.claim(program)
+
+
+@pytest.mark.parametrize("how", ["asked", "granted", "asked once more"])
+def test_who_has_asked_for_control_himself_is_not_taken_over(place: Place, how: str) -> None:
+    """But by an owner, as ever."""
+    ann, bob = place.connection("ann"), place.connection("bob")
+    if how == "asked":
+        result(place.desk.take(ann, ""))
+    elif how == "granted":
+        program = place.connection("program")
+        result(place.desk.claimed(program))
+        result(place.desk.take(ann, ""))
+        place.desk.grant(program, "")
+    else:
+        result(place.desk.claimed(ann))
+        assert place.desk.lease.holder is not None
+        assert place.desk.lease.holder.implicit
+        assert result(place.desk.take(ann, "")) == (True, "you have control")
+    assert not result(place.desk.take(bob, "")).success
+    place.clock.advance(31)
+    assert not result(place.desk.take(bob, "")).success
+    assert place.desk.lease.held_by(ann)
 
 
 def test_only_the_holder_answers(place: Place) -> None:
@@ -257,6 +360,7 @@ def test_an_answer_to_a_request_is_no_lapse(place: Place) -> None:
     ann, bob, olga = place.holding("ann"), place.connection("bob"), place.connection("olga", Level.OWNER)
     result(place.desk.take(bob, ""))
     place.desk.refuse(ann, "")
+    place.clock.advance(REST_SECONDS)
     result(place.desk.take(bob, ""))
     place.desk.grant(ann, "")
     result(place.desk.take(olga, ""))
@@ -436,6 +540,7 @@ def test_whoever_is_told_may_leave_by_that(place: Place) -> None:
     assert place.desk.lease.held_by(ann)
     bob = place.connection("bob")
     bob.when_told = lambda: place.desk.left(bob)
+    place.clock.advance(REST_SECONDS)
     result(place.desk.take(bob, ""))
     ann.when_told = lambda: place.desk.left(ann)
     place.desk.left(ann)

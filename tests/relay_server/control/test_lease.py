@@ -30,7 +30,7 @@ def test_nobody_has_control_before_the_robot_has_agreed() -> None:
     assert asked.coming_to(ANN)
     assert not asked.held_by(ANN)
     assert held().held_by(ANN)
-    assert held().holder == (ANN, 2.0)
+    assert held().holder == (ANN, 2.0, False)
 
 
 def test_a_hand_over_leaves_nobody_in_between() -> None:

@@ -7,11 +7,20 @@ import pytest
 from relay_db.queries import StopRecord
 from relay_protocol import link
 from relay_protocol.errors import Unavailable
-from relay_server.control import Actor, NotDone
+from relay_server.cli import relaysocket
+from relay_server.console import CONFIRM_SECONDS
+from relay_server.control import Actor, NotDone, StoppedSince
 from relay_server.control import stopping as module
+from relay_server.control.stopping import STOP_SECONDS
+from relay_server.fleet import desk
+from relay_server.frontdesk import LOOKUP_SECONDS
+from robot_client.hardware import DYING, PATIENCE
+from tests.relay_server.memory import World
 from tests.relay_server.steering import Place, outcome, result
 
 ANN = Actor("ann", "user:ann", 7, "192.0.2.7", 3)
+LATER = 1 << 62
+"""Sent after all there was."""
 
 
 def test_a_robot_that_is_there_is_stopped_at_once() -> None:
@@ -31,7 +40,7 @@ def test_what_the_robot_has_done_is_known_before_it_says_so_of_itself() -> None:
     stopped = place.desk.standing.stopped
     assert stopped is not None
     assert (stopped.by, stopped.why, stopped.told) == ("ann", "smoke", True)
-    result(place.desk.stopping.resume(ANN, ""))
+    result(place.desk.stopping.resume(ANN, "", LATER))
     assert place.desk.standing.stopped is None
     place.offline()
     result(place.desk.stopping.stop(ANN, "smoke"))
@@ -72,16 +81,28 @@ def test_a_robot_that_is_away_is_told_before_anything_else() -> None:
 
 
 def test_a_robot_that_says_nothing_is_told_again_when_it_is_back() -> None:
-    """Ten seconds are waited, because hardware may take its time; then the asker knows that it is not done yet."""
+    """Some seconds are waited, because hardware may take its time; then the asker knows that it is not done yet."""
     place = Place().online()
     place.link.silent = True
     asked = outcome(place.desk.stopping.stop(ANN, ""))
-    place.clock.advance(10.1)
+    place.clock.advance(STOP_SECONDS - 0.1)
+    assert asked == []
+    place.clock.advance(0.2)
     assert asked == [False]
     place.offline()
     place.online()
     assert len(place.link.orders(link.Stop)) == 1
     assert place.record.stops == {}
+
+
+def test_a_stop_is_waited_for_as_long_as_it_may_take_a_robot() -> None:
+    """In the middle of a resume it throws its switches twice, and the way there and back takes a moment; who waits for
+    the relay waits longer.
+    """
+    assert 2 * (PATIENCE + DYING) + 1 <= STOP_SECONDS
+    assert STOP_SECONDS < CONFIRM_SECONDS
+    assert STOP_SECONDS + LOOKUP_SECONDS < desk.STOP_SECONDS
+    assert CONFIRM_SECONDS + LOOKUP_SECONDS < relaysocket._MOTION_SECONDS
 
 
 def test_what_of_it_could_not_be_done_is_told_and_the_robot_is_stopped_all_the_same() -> None:
@@ -95,7 +116,7 @@ def test_what_of_it_could_not_be_done_is_told_and_the_robot_is_stopped_all_the_s
     place.online()
     place.desk.told(link.Safety(stopped=link.Stopped(by="ann", since=5.0)))
     assert place.link.said == []
-    result(place.desk.stopping.resume(ANN, ""))
+    result(place.desk.stopping.resume(ANN, "", LATER))
     assert place.record.stops == {}
 
 
@@ -107,7 +128,7 @@ def test_a_robot_that_could_not_keep_its_stop_is_told_again_when_it_has_forgotte
     for _ in range(2):
         place.offline()
         with pytest.raises(Unavailable, match="may be stopped"):
-            result(place.desk.stopping.resume(ANN, ""))
+            result(place.desk.stopping.resume(ANN, "", LATER))
         place.online()
         place.link.unable = "no space left on device"
         place.desk.told(link.Safety())
@@ -139,7 +160,7 @@ def test_a_stop_keeps_the_holder() -> None:
     ann = place.holding()
     result(place.desk.stopping.stop(ANN, ""))
     assert place.desk.passes(ann, "/cmd_vel")
-    assert result(place.desk.stopping.resume(ANN, "")) is None
+    assert result(place.desk.stopping.resume(ANN, "", LATER)) is None
     assert place.desk.passes(ann, "/cmd_vel")
     assert place.link.holders == [ann.number]
 
@@ -148,7 +169,7 @@ def test_resume_takes_back_a_stop_that_was_not_told() -> None:
     """The robot hears nothing of it when it comes."""
     place = Place()
     result(place.desk.stopping.stop(ANN, ""))
-    result(place.desk.stopping.resume(ANN, "all clear"))
+    result(place.desk.stopping.resume(ANN, "all clear", LATER))
     assert place.desk.standing.stopped is None
     assert place.record.stops == {}
     assert place.record.kinds == ["robot.stopped", "robot.resumed"]
@@ -163,14 +184,78 @@ def test_a_robot_that_stopped_and_left_is_resumed_when_it_is_back() -> None:
     place.desk.told(link.Safety(stopped=link.Stopped(by="ann", since=5.0)))
     place.offline()
     with pytest.raises(Unavailable, match="offline, and stopped"):
-        result(place.desk.stopping.resume(ANN, ""))
+        result(place.desk.stopping.resume(ANN, "", LATER))
     assert place.desk.standing.stopped is not None
 
 
 def test_a_robot_that_is_away_and_was_told_nothing_is_not_resumed() -> None:
     """It may stand since before the relay began."""
     with pytest.raises(Unavailable, match="may be stopped: it can be resumed when it is back"):
-        result(Place().desk.stopping.resume(ANN, ""))
+        result(Place().desk.stopping.resume(ANN, "", LATER))
+
+
+def test_what_the_robot_has_resumed_is_over_whatever_the_database_says() -> None:
+    """Whoever asked is told so, it is on record, and nobody stops the robot again; the order goes when it can."""
+    place = Place().online()
+    place.link.unable = "the contactor does not answer"
+    outcome(place.desk.stopping.stop(ANN, "smoke"))
+    place.link.unable = ""
+    place.record.fails = Unavailable("the database is locked")
+    assert result(place.desk.stopping.resume(ANN, "all clear", LATER)) is None
+    assert place.desk.standing.stopped is None
+    assert place.record.kinds == ["robot.stopped", "robot.resumed"]
+    place.offline()
+    place.online()
+    place.desk.told(link.Safety())
+    assert place.link.said == []
+    place.clock.advance(module.PUT_AWAY_SECONDS)
+    assert list(place.record.stops) == [1]
+    place.record.fails = None
+    place.clock.advance(module.PUT_AWAY_SECONDS)
+    assert place.record.stops == {}, "a later relay would stop the robot by it"
+
+
+def test_a_stop_that_was_told_is_put_away_however_long_the_database_is_lost() -> None:
+    """Else a later relay would stop a robot that was resumed meanwhile."""
+    place = Place().online()
+    place.link.silent = True
+    asked = outcome(place.desk.stopping.stop(ANN, "smoke"))
+    place.record.fails = Unavailable("the database is locked")
+    place.link.answers(place.link.orders(link.Stop)[0])
+    assert asked == [True]
+    place.link.silent = False
+    result(place.desk.stopping.resume(ANN, "", LATER))
+    assert list(place.record.stops) == [1]
+    place.record.fails = None
+    place.clock.advance(module.PUT_AWAY_SECONDS)
+    assert place.record.stops == {}
+
+
+def test_a_stop_that_is_written_after_it_was_over_is_put_away() -> None:
+    """The robot was resumed before the database had kept its order."""
+    place = Place().online()
+    place.record.hold = True
+    place.link.unable = "the contactor does not answer"
+    outcome(place.desk.stopping.stop(ANN, "smoke"))
+    place.link.unable = ""
+    result(place.desk.stopping.resume(ANN, "", LATER))
+    (held,) = place.record.held
+    held.callback(None)
+    assert place.record.stops == {}
+
+
+def test_an_order_of_the_database_that_is_over_is_put_away() -> None:
+    """It was kept though nobody could say so at the time; one that waits for its robot stays."""
+    place = Place().online()
+    result(place.desk.stopping.stop(ANN, "smoke"))
+    over = StopRecord(1, "ann", "smoke", place.wall())
+    place.record.stops[1] = over
+    assert not place.desk.stopping.expect(over, 0)
+    assert place.record.stops == {}
+    place.offline()
+    result(place.desk.stopping.stop(ANN, "again"))
+    assert not place.desk.stopping.expect(place.record.stops[1], 0)
+    assert list(place.record.stops) == [1]
 
 
 def test_a_stop_that_is_ordered_while_the_robot_resumes_stands() -> None:
@@ -179,7 +264,7 @@ def test_a_stop_that_is_ordered_while_the_robot_resumes_stands() -> None:
     result(place.desk.stopping.stop(ANN, "one"))
     place.online()
     place.link.silent = True
-    resuming = outcome(place.desk.stopping.resume(ANN, ""))
+    resuming = outcome(place.desk.stopping.resume(ANN, "", LATER))
     stopping = outcome(place.desk.stopping.stop(ANN, "two"))
     place.link.answers(place.link.orders(link.Resume)[0])
     assert resuming == [None]
@@ -193,11 +278,11 @@ def test_orders_of_the_database_are_told_once() -> None:
     place = Place().online()
     stopping = place.desk.stopping
     order = StopRecord(1, "root", "maintenance", 1.8e9)
-    assert stopping.expect(order)
+    assert stopping.expect(order, 0)
     stopping.came()
     assert [each.why for each in place.link.orders(link.Stop)] == ["maintenance"]
-    assert not stopping.expect(order)
-    assert not stopping.expect(None)
+    assert not stopping.expect(order, 0)
+    assert not stopping.expect(None, 0)
     assert place.desk.standing.stopped == ("root", "maintenance", order.at, True)
 
 
@@ -205,10 +290,10 @@ def test_an_order_that_is_given_by_a_clock_that_was_set_back_counts() -> None:
     """Orders are told apart, not put in order, by their moments."""
     place = Place().online()
     result(place.desk.stopping.stop(ANN, ""))
-    result(place.desk.stopping.resume(ANN, ""))
-    assert place.desk.stopping.expect(StopRecord(1, "root", "maintenance", 5.0))
+    result(place.desk.stopping.resume(ANN, "", LATER))
+    assert place.desk.stopping.expect(StopRecord(1, "root", "maintenance", 5.0), 0)
     assert place.desk.standing.stopped is not None
-    assert not place.desk.stopping.expect(StopRecord(1, "root", "maintenance", 5.0))
+    assert not place.desk.stopping.expect(StopRecord(1, "root", "maintenance", 5.0), 0)
 
 
 def test_a_stop_that_is_not_kept_is_not_said_to_be() -> None:
@@ -264,7 +349,7 @@ def test_who_stops_a_stopped_robot_again_and_again_does_not_fill_the_record() ->
     result(place.desk.stopping.stop(ann, ""))
     assert place.record.kinds == ["robot.stopped"] * (3 + module.AGAIN_AT_ONCE)
     for _ in range(5):
-        result(place.desk.stopping.resume(bob, ""))
+        result(place.desk.stopping.resume(bob, "", LATER))
         result(place.desk.stopping.stop(ann, "again"))
         assert place.record.notes[-1][:3] == ("robot.stopped", "ann", "again")
     assert place.record.stops == {}
@@ -278,3 +363,52 @@ def test_a_stop_that_waits_for_its_robot_is_on_record_a_few_times_a_minute() -> 
         assert not result(place.desk.stopping.stop(ann, f"the {number}"))
     assert place.record.kinds == ["robot.stopped"] * (1 + module.AGAIN_AT_ONCE)
     assert place.record.stops[1].why == "the 49"
+
+
+def test_a_stop_is_not_lifted_by_what_was_asked_for_before_it() -> None:
+    """However it was held up; whoever asks once more is heard."""
+    place = Place().online()
+    stopping = place.desk.stopping
+    result(stopping.stop(ANN, "smoke"))
+    asked = place.now_ns()
+    place.clock.advance(60)
+    result(stopping.stop(Actor("vic", "user:vic", 8), "a child"))
+    with pytest.raises(StoppedSince, match="rover was stopped, or may have been, after you asked for this"):
+        result(stopping.resume(ANN, "all clear", asked))
+    assert place.link.orders(link.Resume) == []
+    assert stopping.stopped is not None
+    result(stopping.resume(ANN, "all clear", place.now_ns()))
+    assert place.link.orders(link.Resume)
+    assert stopping.stopped is None
+
+
+def test_a_stop_that_the_robot_tells_of_counts_from_then_on() -> None:
+    """By whomever it was stopped, and also one that came back stopped; that it goes on telling of it does not."""
+    place = Place().online()
+    asked = place.now_ns()
+    place.clock.advance(1)
+    stopped = link.Safety(stopped=link.Stopped(by="the robot", since=5.0))
+    place.desk.told(stopped)
+    told = place.now_ns()
+    place.clock.advance(1)
+    place.desk.told(stopped)
+    with pytest.raises(StoppedSince):
+        result(place.desk.stopping.resume(ANN, "", asked))
+    result(place.desk.stopping.resume(ANN, "", told))
+
+
+def test_a_stop_that_the_database_tells_of_counts_from_when_it_was_read() -> None:
+    """Somebody at another machine has ordered it, when nobody here had asked for this robot yet."""
+    world = World()
+    asked = world.now_ns()
+    world.clock.advance(1)
+    order = StopRecord(1, "root", "maintenance", 5.0)
+    world.desks.expect([order])
+    read = world.now_ns()
+    world.clock.advance(1)
+    world.desks.expect([order])
+    stopping = world.desks.of(world.robot).stopping
+    with pytest.raises(StoppedSince):
+        result(stopping.resume(ANN, "", asked))
+    result(stopping.resume(ANN, "", read))
+    assert stopping.stopped is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import ChainMap
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +20,13 @@ from relay_server.access import BadCredentials, Principal
 from relay_server.auth import Opening, TooManyTries
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
+from relay_server.edges.documents import Documents
+from relay_server.edges.limiting import RequestLimits
+from relay_server.edges.pages import PageFactory, PageGate
 from relay_server.edges.site import Missing, Portal, RelaySite, Robots, Root
 from relay_server.edges.websocket import ClientFactory
 from relay_server.origins import Origins
+from relay_server.session import Timing
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 ROOT = Principal(2, "root", "main", True, 2, None)
@@ -31,6 +36,8 @@ ORIGIN = f"http://{HOST}"
 
 class MemoryDesk:
     """Knows the tokens ``ann`` and ``root`` and one robot."""
+
+    timing = Timing(2.0, 0.1, 6.0)
 
     def __init__(self) -> None:
         self.tokens = {"ann": ANN, "root": ROOT}
@@ -143,6 +150,7 @@ def api_of(
     events: dict[str, Any] | None = None,
     *,
     tls: bool = False,
+    limits: RequestLimits | None = None,
 ) -> Api:
     """The API in front of a desk."""
     return Api(
@@ -155,23 +163,44 @@ def api_of(
         cookie="sb",
         secure=tls,
         events=events,
+        limits=limits,
     )
 
 
 class World:
-    """The site of a relay, and connections to it."""
+    """The site of a relay, and connections to it.
 
-    def __init__(self, folder: Path, tls: bool = False) -> None:
-        self.clock = Clock()
+    :param clock: a reactor, for who listens on a real port
+    :param rate: requests a second of one user or network; 0 for as many as come
+    :param documented: whether it tells of the API
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        tls: bool = False,
+        clock: Any = None,
+        *,
+        rate: float = 0.0,
+        documented: bool = False,
+    ) -> None:
+        self.clock: Any = clock or Clock()
         self.desk = MemoryDesk()
         self.cap = AddressCap(4)
         origins = Origins("https" if tls else "http")
         self.below: dict[str, Any] = {}
         self.beside: dict[str, Any] = {}
         self.events: dict[str, Any] = {}
-        api = api_of(self.clock, self.desk, origins, self.below, self.beside, self.events, tls=tls)
+        limits = RequestLimits(rate, self.clock.seconds)
+        parts = self.below, self.beside, self.events
+        api = api_of(self.clock, self.desk, origins, *parts, tls=tls, limits=limits)
         websocket = WebSocketResource(ClientFactory(self.clock, lambda: 0, self.desk, self.cap))  # type: ignore[arg-type]
-        root = Root(Robots(websocket, Missing(), "1.2.3"), api.app.resource(), Portal(folder))
+        sources = ChainMap(self.events, {"robots": self.desk.robots})
+        self.pages = PageGate(self.clock, self.desk, origins, "sb", sources)
+        told = WebSocketResource(PageFactory(self.clock, lambda: 0, self.pages, self.cap))
+        robots = Robots(websocket, Missing(), "1.2.3")
+        documents = Documents(limits, "1.2.3", "sb").app.resource() if documented else None
+        root = Root(robots, api.app.resource(), Missing(), Portal(folder), told, documents)
         self.site = RelaySite(root, self.clock, self.cap, tls)
 
     def connect(self) -> Transport:

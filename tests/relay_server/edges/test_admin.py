@@ -12,6 +12,7 @@ from twisted.web.server import Site
 from relay_protocol.errors import Unavailable
 from relay_server.console import Halted
 from relay_server.edges.admin import AdminSocket
+from relay_server.edges.fleet import SENT_HEADER
 from tests.relay_server.edges.http_client import Answer, Transport, parse
 
 
@@ -32,9 +33,9 @@ class Stopping:
             raise self.halted
         return self.halted
 
-    async def resume_here(self, robot: str, why: str, by: str) -> None:
+    async def resume_here(self, robot: str, why: str, by: str, sent: int) -> None:
         """Keep it."""
-        self.asked.append((robot, why, by))
+        self.asked.append((robot, why, by, sent))
 
 
 async def nothing(*_: object) -> None:
@@ -47,16 +48,15 @@ def stopping() -> Stopping:
     return Stopping()
 
 
-def post(stopping: Stopping, path: str, body: bytes) -> Answer:
+def post(stopping: Stopping, path: str, body: bytes, sent: str = "") -> Answer:
     """One request on a connection of its own."""
     admin = AdminSocket(dict, nothing, nothing, stopping)
     site = Site(admin.app.resource(), reactor=Clock())
     transport = Transport()
     transport.protocol = site.buildProtocol(None)
     transport.protocol.makeConnection(transport)
-    head = (
-        f"POST {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n"
-    )
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: {len(body)}\r\n"
+    head += f"{SENT_HEADER}: {sent}\r\n\r\n" if sent else "\r\n"
     transport.protocol.dataReceived(head.encode() + body)
     return parse(transport.value())
 
@@ -83,6 +83,8 @@ def test_what_could_not_be_looked_up_is_told(stopping: Stopping) -> None:
 
 
 def test_one_robot_is_resumed(stopping: Stopping) -> None:
-    """With the reason."""
-    assert post(stopping, "/resume", b'{"by": "root", "robot": "rover", "why": "clear"}').status == 200
-    assert stopping.asked == [("rover", "clear", "root")]
+    """With the reason, and as old as it is; where nobody says how old that is, older than anything."""
+    order = b'{"by": "root", "robot": "rover", "why": "clear"}'
+    for sent in ("1234", "", "-5", "1e3", "9" * 50, "²"):
+        assert post(stopping, "/resume", order, sent).status == 200
+    assert stopping.asked == [("rover", "clear", "root", sent) for sent in (1234, 0, 0, 0, 0, 0)]

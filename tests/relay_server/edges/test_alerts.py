@@ -10,7 +10,7 @@ import pytest
 
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
-from relay_server.alerts import Ask
+from relay_server.alerts import Ask, Position
 from relay_server.alerts.desk import TooOften
 from relay_server.edges import alerts as module
 from tests.relay_server.edges.http_client import World
@@ -26,11 +26,11 @@ class Desk:
         self.asked: list[tuple[object, ...]] = []
 
     async def all(
-        self, principal: Principal, robot: str, open: bool | None, limit: int
+        self, principal: Principal, robot: str, open: bool | None, limit: int, before: Position | None
     ) -> list[dict[str, Any]]:
-        """One."""
-        self.asked.append((principal.name, robot, open, limit))
-        return [{"id": "a1"}]
+        """Three, or as many as are asked for."""
+        self.asked.append((principal.name, robot, open, limit, before))
+        return [{"id": f"a{each}", "last": 1e9 - each / 3} for each in range(min(limit, 3))]
 
     async def acknowledge(self, principal: Principal, alert_id: str) -> dict[str, Any]:
         """Only this."""
@@ -74,10 +74,15 @@ def world(tmp_path: Path, desk: Desk) -> World:
 
 def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     """With the words of the query, and the body's."""
-    assert world.ask("GET", HERE, **ANN).json == {"alerts": [{"id": "a1"}]}
+    listed = world.ask("GET", HERE, **ANN).json
+    assert ([each["id"] for each in listed["alerts"]], listed["next"]) == (["a0", "a1", "a2"], None)
     world.ask("GET", f"{HERE}?robot=rover&open=true&limit=5", **ANN)
     world.ask("GET", f"{HERE}?open=false", **ANN)
-    assert desk.asked == [("ann", "", None, 100), ("ann", "rover", True, 5), ("ann", "", False, 100)]
+    assert desk.asked == [
+        ("ann", "", None, 101, None),
+        ("ann", "rover", True, 6, None),
+        ("ann", "", False, 101, None),
+    ]
     assert world.ask("POST", f"{HERE}/a1/acknowledge", **ANN).json == {"id": "a1"}
     assert world.ask("GET", f"{HERE}/rules", **ANN).json == {"rules": []}
     answer = world.ask("POST", f"{HERE}/rules", {"channel": "portal", "group_s": 30}, **ANN)
@@ -88,9 +93,24 @@ def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     assert world.ask("POST", f"{HERE}/rules/7/test", **ANN).json["ok"]
 
 
+def test_a_list_goes_on_where_it_ended(world: World, desk: Desk) -> None:
+    """By what its answer says, to the last digit; where it has ended the answer says so."""
+    page = world.ask("GET", f"{HERE}?limit=2", **ANN).json
+    assert [each["id"] for each in page["alerts"]] == ["a0", "a1"]
+    world.ask("GET", f"{HERE}?limit=2&before={page['next']}", **ANN)
+    assert desk.asked[-1] == ("ann", "", None, 3, Position(1e9 - 1 / 3, "a1"))
+    assert world.ask("GET", f"{HERE}?limit=3", **ANN).json["next"] is None
+
+
 @pytest.mark.parametrize(
     ("method", "path", "body", "status"),
     [
+        ("GET", f"{HERE}?before=a1", None, 400),
+        ("GET", f"{HERE}?before=nan_a1", None, 400),
+        ("GET", f"{HERE}?before=1e999_a1", None, 400),
+        ("GET", f"{HERE}?before=1.5.2_a1", None, 400),
+        ("GET", f"{HERE}?before=1.5_%00", None, 400),
+        ("GET", f"{HERE}?before=1.5_{'a' * 33}", None, 400),
         ("GET", f"{HERE}?open=maybe", None, 400),
         ("GET", f"{HERE}?limit=0", None, 400),
         ("GET", f"{HERE}?limit=501", None, 400),

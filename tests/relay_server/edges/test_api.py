@@ -7,10 +7,8 @@ from typing import Any
 
 import pytest
 
-from relay_server.access import Principal
 from relay_server.auth import Opening
-from relay_server.edges import stream as module
-from tests.relay_server.edges.http_client import ORIGIN, World, parse
+from tests.relay_server.edges.http_client import ORIGIN, World
 
 SESSION = "/api/v1/session"
 COOKIE = {"Cookie": "sb=ann"}
@@ -84,6 +82,14 @@ def test_a_cookie_changes_nothing_without_the_own_origin(world: World, origin: s
     assert world.ask("POST", "/api/v1/tickets", {"robot": "rover"}, **COOKIE, **given).status == 403
     assert world.ask("GET", SESSION, **COOKIE, **given).status == 200
     assert world.ask("POST", "/api/v1/tickets", {"robot": "rover"}, Authorization="Bearer ann").status == 201
+
+
+def test_who_is_logged_in_is_told_while_the_database_hangs(world: World) -> None:
+    """As far as that is known without it: the portal shows its STOP by that."""
+    world.desk.up = False
+    answer = world.ask("GET", SESSION, **COOKIE)
+    assert (answer.status, answer.json["user"]) == (200, "ann")
+    assert world.ask("GET", "/api/v1/robots", **COOKIE).status == 503
 
 
 def test_logging_out_ends_the_session_and_takes_the_cookie_back(world: World) -> None:
@@ -177,126 +183,3 @@ def test_a_fault_of_ours_shows_no_insides(world: World) -> None:
     answer = world.ask("POST", SESSION, {"code": "break"})
     assert answer.status == 500
     assert b"insides" not in answer.body
-
-
-# --- the stream -------------------------------------------------------------------------------------------
-
-
-def streaming(world: World) -> Any:
-    """A client that follows the robots."""
-    transport = world.connect()
-    world.send(
-        transport, b"GET /api/v1/robots/stream HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer ann\r\n\r\n"
-    )
-    assert parse(transport.value()).headers["content-type"] == "text/event-stream"
-    return transport
-
-
-def events(transport: Any) -> list[str]:
-    """Names of the events that came since the last time."""
-    lines = transport.value().decode().splitlines()
-    transport.clear()
-    return [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
-
-
-def test_the_stream_tells_at_once_then_at_every_change_and_every_few_seconds(world: World) -> None:
-    """Changes in quick succession are told once."""
-    transport = streaming(world)
-    assert events(transport) == ["robots"]
-    world.clock.advance(module.COALESCE_SECONDS)
-    world.desk.changed()
-    assert events(transport) == ["robots"]
-    for _ in range(10):
-        world.desk.changed()
-    assert events(transport) == []
-    world.clock.advance(module.COALESCE_SECONDS)
-    assert events(transport) == ["robots"]
-    world.clock.advance(module.COALESCE_SECONDS)
-    assert events(transport) == []
-    world.clock.advance(module.STREAM_SECONDS)
-    assert events(transport) == ["robots"]
-
-
-def test_what_changes_while_the_stream_is_being_told_is_told_after_it(world: World) -> None:
-    """It may have come too late for what was looked up already."""
-    seen: list[dict[str, Any]] = []
-
-    async def alerts(principal: Principal) -> list[dict[str, Any]]:
-        now = list(seen)
-        if not seen:
-            seen.append({"id": "a1"})
-            world.desk.changed()
-        return now
-
-    world.events["alerts"] = alerts
-    transport = streaming(world)
-    assert b'data: {"alerts":[]}' in transport.value()
-    world.clock.advance(module.COALESCE_SECONDS)
-    assert b'data: {"alerts":[{"id":"a1"}]}' in transport.value()
-
-
-def test_other_events_are_told_at_once_and_when_they_are_another_list(world: World) -> None:
-    """Each under its name; robots are told all the time."""
-    shown: list[dict[str, Any]] = [{"id": "a1"}]
-
-    async def alerts(principal: Principal) -> list[dict[str, Any]]:
-        assert principal.name == "ann"
-        return shown
-
-    world.events["alerts"] = alerts
-    transport = streaming(world)
-    assert b'event: alerts\ndata: {"alerts":[{"id":"a1"}]}\n\n' in transport.value()
-    assert events(transport) == ["robots", "alerts"]
-    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
-    assert events(transport) == ["robots"]
-    shown = []
-    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
-    assert events(transport) == ["robots", "alerts"]
-
-
-def test_a_client_that_leaves_its_stream_leaves_nothing_behind(world: World) -> None:
-    """Neither a listener nor a timer, at whatever moment."""
-    for seconds in (0.0, module.COALESCE_SECONDS):
-        transport = streaming(world)
-        world.clock.advance(seconds)
-        transport.loseConnection()
-        assert world.desk.listeners == []
-        world.clock.advance(0)
-        assert not world.clock.getDelayedCalls()
-
-
-def test_the_stream_ends_with_the_credentials(world: World) -> None:
-    """The client is told, so that it does not just try again."""
-    transport = streaming(world)
-    del world.desk.tokens["ann"]
-    events(transport)
-    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
-    assert events(transport) == ["ended"]
-    assert world.desk.listeners == []
-
-
-def test_a_database_that_is_away_does_not_end_the_stream(world: World) -> None:
-    """What is open goes on, and tells again when it can."""
-    transport = streaming(world)
-    events(transport)
-    world.desk.up = False
-    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
-    assert transport.value() == b""
-    world.desk.up = True
-    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS])
-    assert events(transport) == ["robots"]
-
-
-def test_a_client_that_takes_nothing_of_its_stream_is_cut(world: World) -> None:
-    """Nothing piles up for it meanwhile."""
-    transport = streaming(world)
-    events(transport)
-    transport.producer.pauseProducing()
-    for _ in range(3):
-        world.clock.advance(module.COALESCE_SECONDS)
-        world.desk.changed()
-    assert transport.value() == b""
-    assert transport.connected
-    world.clock.pump([module.COALESCE_SECONDS, module.STREAM_SECONDS] * 2)
-    assert not transport.connected
-    assert world.desk.listeners == []

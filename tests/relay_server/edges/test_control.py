@@ -11,8 +11,9 @@ import pytest
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Principal
 from relay_server.console import Outcome
-from relay_server.control import Answer, NotDone
+from relay_server.control import Answer, NotDone, StoppedSince
 from relay_server.edges import control as module
+from relay_server.moments import HEADER, Moments
 from tests.relay_server.edges.http_client import ORIGIN, World
 
 HERE = "/api/v1/robots/rover"
@@ -48,14 +49,14 @@ class Console:
         self._keep("release", principal, robot, why, address)
         return Answer(True, "control is given back")
 
-    async def grant(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+    async def grant(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
         """Keep it."""
-        self._keep("grant", principal, robot, why, address)
+        self._keep("grant", principal, robot, why, address, client)
         return Answer(False, "nobody asks for control")
 
-    async def refuse(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+    async def refuse(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
         """Keep it."""
-        self._keep("refuse", principal, robot, why, address)
+        self._keep("refuse", principal, robot, why, address, client)
         return Answer(True, "you keep control")
 
     async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
@@ -65,9 +66,9 @@ class Console:
         self._keep("stop", principal, robot, why, address)
         return Outcome(self.done, {**STOPPED, "told": self.done})
 
-    async def resume(self, principal: Principal, robot: str, why: str, address: str) -> None:
+    async def resume(self, principal: Principal, robot: str, why: str, address: str, sent: int) -> None:
         """Keep it."""
-        self._keep("resume", principal, robot, why, address)
+        self._keep("resume", principal, robot, why, address, sent)
 
     async def suppress(self, principal: Principal, robot: str, resource: str, ms: int, address: str) -> None:
         """Keep it."""
@@ -86,11 +87,16 @@ class Site(World):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.console = Console()
-        self.below.update({part: partial(module.below, self.console, part) for part in module.PARTS})
+        self.now = 1000
+        self.moments = Moments(lambda: self.now)
+        self.below.update(
+            {part: partial(module.below, self.console, self.moments, part) for part in module.PARTS}
+        )
 
     def post(self, part: str, body: Any = None, **headers: str) -> Any:
         """One request with ann's token."""
-        return self.ask("POST", f"{HERE}/{part}", body, **{**ANN, **headers})
+        dated = {HEADER: self.moments.now()} if part == "resume" else {}
+        return self.ask("POST", f"{HERE}/{part}", body, **{**ANN, **dated, **headers})
 
 
 @pytest.fixture
@@ -115,12 +121,14 @@ def test_control_is_given_back_handed_over_and_kept(site: Site) -> None:
         "message": "control is given back",
     }
     assert site.post("control/grant").json["success"] is False
-    assert site.post("control/refuse").json["success"] is True
+    assert site.post("control/refuse", {"why": "no", "client": 7}).json["success"] is True
     assert site.console.asked == [
         ("release", "rover", "done", "192.0.2.9"),
-        ("grant", "rover", "", "192.0.2.9"),
-        ("refuse", "rover", "", "192.0.2.9"),
+        ("grant", "rover", "", "192.0.2.9", 0),
+        ("refuse", "rover", "no", "192.0.2.9", 7),
     ]
+    assert site.post("control/grant", {"client": -1}).status == 400
+    assert site.post("control/grant", {"client": "bob"}).status == 400
     assert site.post("control/take").status == 404
     assert site.post("control").status == 404
 
@@ -134,6 +142,28 @@ def test_a_stop_says_whether_it_is_done(site: Site) -> None:
     assert (answer.status, answer.json["stopped"]["told"]) == (202, False)
     assert site.post("resume", {"why": "clear"}).json == {"stopped": None}
     assert [asked[0] for asked in site.console.asked] == ["stop", "stop", "resume"]
+
+
+def test_who_resumes_says_when_he_asks(site: Site) -> None:
+    """By the moment of an answer about control; every one of these has one, also of what was refused."""
+    told = [
+        site.ask("GET", f"{HERE}/control", **ANN),
+        site.post("stop"),
+        site.ask("POST", f"{HERE}/resume", **ANN),
+    ]
+    assert [each.status for each in told] == [200, 200, 428]
+    assert told[2].json["code"] == "moment_needed"
+    site.now += 1
+    for each in told:
+        moment = each.headers[HEADER]
+        assert site.ask("POST", f"{HERE}/resume", **ANN, **{HEADER: moment}).status == 200
+    site.console.fails = NotDone("no contactor")
+    assert site.post("stop").headers[HEADER] == site.moments.now()
+    site.console.fails = StoppedSince("rover was stopped after you asked for this")
+    refused = site.post("resume")
+    assert (refused.status, refused.json["code"]) == (412, "stopped_since")
+    assert [asked[-1] for asked in site.console.asked if asked[0] == "resume"] == [1000] * 3
+    assert site.ask("POST", f"{HERE}/resume", **ANN, **{HEADER: "ff.0"}).status == 428
 
 
 @pytest.mark.parametrize(
@@ -188,8 +218,9 @@ def test_bodies_that_make_no_sense_are_refused(site: Site, body: Any) -> None:
 
 def test_a_body_that_is_no_json_is_refused_but_for_none_at_all(site: Site) -> None:
     """Also one that says to be something else."""
-    assert site.ask("POST", f"{HERE}/resume", raw=b"{", **ANN).status == 400
-    assert site.ask("POST", f"{HERE}/resume", raw=b"why=x", **ANN, Content_Type="text/plain").status == 400
+    dated = {**ANN, HEADER: site.moments.now()}
+    assert site.ask("POST", f"{HERE}/resume", raw=b"{", **dated).status == 400
+    assert site.ask("POST", f"{HERE}/resume", raw=b"why=x", **dated, Content_Type="text/plain").status == 400
     assert site.post("resume", {"why": "x" * 5000}).status == 400
     assert site.console.asked == []
 

@@ -18,9 +18,11 @@ from relay_server.access import Principal
 from relay_server.edges import fleet as module
 from relay_server.fleet import Order, Plan, Result
 from relay_server.fleet.result import Outcome
+from relay_server.moments import HEADER, MomentNeeded, Moments, TooOld
 from tests.relay_server.edges.http_client import HOST, Transport, World, parse
 
 HERE = "/api/v1/fleet"
+MOMENTS = Moments(lambda: 1000)
 ANN = {"Authorization": "Bearer ann"}
 STOP = {"robots": ["*"], "do": "stop"}
 SET = {"robots": ["*"], "do": "set", "name": "/driver:speed", "value": 1}
@@ -31,6 +33,7 @@ class Desk:
 
     def __init__(self) -> None:
         self.orders: list[tuple[str, Order, str]] = []
+        self.sent: list[int | None] = []
         self.busy = False
         self.ended: list[str] = []
         self.tells: Callable[[Result], Awaitable[None]] | None = None
@@ -40,12 +43,13 @@ class Desk:
         """One."""
         return [{"name": "cleaners", "robots": ["rover"], "of": asker.name}]
 
-    async def plan(self, asker: Principal, order: Order, address: str) -> Plan:
+    async def plan(self, asker: Principal, order: Order, address: str, sent: int | None = None) -> Plan:
         """Two robots, whatever is asked."""
         order.check()
         if order.robots == ["nobody"]:
             raise NotFound("the order means no robot that you have a right on")
         self.orders.append((asker.name, order, address))
+        self.sent.append(sent)
         robots = {name: RobotRecord(1, name, "main", "") for name in ("rover", "tank")}
         return Plan(order, asker, address, robots, ["x"])
 
@@ -85,7 +89,7 @@ def desk() -> Desk:
 def world(tmp_path: Path, desk: Desk) -> World:
     """A site that takes orders."""
     made = World(tmp_path)
-    made.beside["fleet"] = partial(module.beside, made.clock, desk)
+    made.beside["fleet"] = partial(module.beside, made.clock, desk, MOMENTS)
     return made
 
 
@@ -125,7 +129,9 @@ def test_an_order_that_can_not_be_begun_is_told_by_its_status(world: World, desk
     cases: list[tuple[dict[str, Any], int]] = [
         ({**STOP, "robots": ["nobody"]}, 404),
         ({**STOP, "do": "dance"}, 400),
-        ({**STOP, "service": "/start"}, 400),
+        ({**STOP, "robots": "*"}, 400),
+        ({**SET, "service": "/start"}, 400),
+        ({**SET, "new": 1}, 400),
     ]
     for body, status in cases:
         answer = world.ask("POST", HERE, body, **ANN)
@@ -136,6 +142,13 @@ def test_an_order_that_can_not_be_begun_is_told_by_its_status(world: World, desk
     assert world.ask("POST", HERE, STOP, Cookie="sb=ann").status == 403
     assert world.ask("GET", HERE, **ANN).status == 405
     assert world.ask("GET", f"{HERE}/other", **ANN).status == 404
+
+
+def test_a_stop_is_begun_whatever_else_it_says(world: World, desk: Desk) -> None:
+    """A field of a later release, or a typing error, keeps no robot moving."""
+    ordered(world, {**STOP, "new": 1, "service": "/start", "timeout": None, "why": "fire"})
+    order = desk.orders[0][1]
+    assert (order.do, order.robots, order.why) == ("stop", STOP["robots"], "fire")
 
 
 def test_who_hangs_up_ends_the_order(world: World, desk: Desk) -> None:
@@ -211,3 +224,32 @@ def test_without_orders_there_is_nothing_there(world: World) -> None:
     """As at any other address."""
     del world.beside["fleet"]
     assert world.ask("POST", HERE, STOP, **ANN).status == 404
+
+
+def test_an_order_is_dated_by_the_moment_it_gives_back(world: World, desk: Desk) -> None:
+    """Every answer has one, also while it still goes on; a stop needs none, and is not held up by what is none."""
+    groups = world.ask("GET", f"{HERE}/groups", **ANN)
+    assert groups.headers[HEADER] == MOMENTS.now()
+    desk.over.callback(None)
+    answer = world.ask("POST", HERE, SET, **ANN, **{HEADER: groups.headers[HEADER]})
+    assert (answer.status, answer.headers[HEADER]) == (200, MOMENTS.now())
+    for order, moment, status in ((SET, "", 200), (SET, "ff.0", 428), (STOP, "ff.0", 200)):
+        dated = {HEADER: moment} if moment else {}
+        answer = world.ask("POST", HERE, order, **ANN, **dated)
+        assert (answer.status, answer.headers[HEADER]) == (status, MOMENTS.now())
+    assert desk.sent == [1000, None, None]
+
+
+@pytest.mark.parametrize(("error", "status"), [(MomentNeeded("say when"), 428), (TooOld("too old"), 412)])
+def test_an_order_that_may_be_old_is_not_begun(
+    world: World, desk: Desk, monkeypatch: pytest.MonkeyPatch, error: Exception, status: int
+) -> None:
+    """The answer says so by its status."""
+
+    async def plan(*_: object) -> Plan:
+        raise error
+
+    monkeypatch.setattr(desk, "plan", plan)
+    answer = world.ask("POST", HERE, SET, **ANN)
+    assert (answer.status, answer.json["detail"]) == (status, str(error))
+    assert answer.headers[HEADER] == MOMENTS.now()

@@ -12,7 +12,10 @@ from twisted.internet.defer import CancelledError, Deferred
 from relay_server.access import Principal
 from relay_server.console import Outcome
 from relay_server.edges import control
+from relay_server.moments import HEADER, Moments
 from tests.relay_server.edges.http_client import HOST, World
+
+MOMENTS = Moments(lambda: 1000)
 
 
 class Console:
@@ -29,7 +32,7 @@ class Console:
         await self._wait()
         return Outcome(True, {"by": principal.name})
 
-    async def resume(self, principal: Principal, robot: str, why: str, address: str) -> None:
+    async def resume(self, principal: Principal, robot: str, why: str, address: str, sent: int) -> None:
         """Wait, then resume it."""
         self.asked.append((robot, why))
         await self._wait()
@@ -53,7 +56,7 @@ def console() -> Console:
 def world(tmp_path: Path, console: Any) -> World:
     """A site at which robots are stopped and resumed."""
     made = World(tmp_path)
-    made.below.update({part: partial(control.below, console, part) for part in control.PARTS})
+    made.below.update({part: partial(control.below, console, MOMENTS, part) for part in control.PARTS})
     return made
 
 
@@ -61,7 +64,9 @@ def leaves(world: World, part: str) -> None:
     """Somebody gives an order, and is gone."""
     body = '{"why": "smoke"}'
     head = f"POST /api/v1/robots/rover/{part} HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\n"
-    head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+    head += (
+        f"{HEADER}: {MOMENTS.now()}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+    )
     transport = world.connect()
     world.send(transport, (head + body).encode())
     transport.loseConnection()

@@ -68,6 +68,7 @@ class Desk:
     def __init__(self) -> None:
         self.asks: list[Ask] = []
         self.deleted: list[str] = []
+        self.pages: list[tuple[int, str]] = []
         self.file = File()
 
     async def start(self, principal: Principal, robot: str, ask: Ask, address: str) -> dict[str, Any]:
@@ -80,9 +81,12 @@ class Desk:
         """One topic."""
         return {"topics": ["/odom"]}
 
-    async def all(self, principal: Principal, robot: str, address: str) -> list[dict[str, Any]]:
+    async def all(
+        self, principal: Principal, robot: str, address: str, limit: int, before: str
+    ) -> dict[str, Any]:
         """The one."""
-        return [await self.one(principal, robot, "a", address)]
+        self.pages.append((limit, before))
+        return {"recordings": [await self.one(principal, robot, "a", address)], "next": None}
 
     async def one(self, principal: Principal, robot: str, id: str, address: str) -> dict[str, Any]:
         """Only this."""
@@ -136,7 +140,7 @@ def received(world: World, file: File, **headers: str) -> Answer:
 
 def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     """With and without a slash at the end of the first."""
-    assert world.ask("GET", HERE, **ANN).json == {"recordings": [{"id": "a"}]}
+    assert world.ask("GET", HERE, **ANN).json == {"recordings": [{"id": "a"}], "next": None}
     answer = world.ask("POST", HERE, {"topics": ["/odom"], "seconds": 5}, **ANN)
     assert (answer.status, answer.headers["location"]) == (201, f"{HERE}/a")
     assert desk.asks == [Ask(topics=["/odom"], seconds=5.0)]
@@ -174,6 +178,17 @@ def test_an_ask_beyond_the_bounds_is_refused(world: World, desk: Desk, body: dic
     assert desk.asks == []
 
 
+def test_the_list_comes_in_pages(world: World, desk: Desk) -> None:
+    """Of 100, unless another size is asked for; no page is beyond the bounds."""
+    for asked in ("", "?limit=500", "?limit=1&before=17.5_a", "?before=17.5_a"):
+        assert world.ask("GET", HERE + asked, **ANN).status == 200
+    assert desk.pages == [(100, ""), (500, ""), (1, "17.5_a"), (100, "17.5_a")]
+    for wrong in ("0", "501", "-1", "many", "9" * 20, "%C2%B2"):
+        answer = world.ask("GET", f"{HERE}?limit={wrong}", **ANN)
+        assert (answer.status, answer.json["detail"]) == (400, "'limit' is a number from 1 to 500")
+    assert len(desk.pages) == 4
+
+
 def test_nobody_asks_without_a_credential(world: World, desk: Desk) -> None:
     """Nor with a cookie from another page."""
     assert world.ask("GET", HERE).status == 401
@@ -209,6 +224,22 @@ def test_who_takes_nothing_of_a_file_is_waited_for_and_then_cut(world: World, de
     world.clock.advance(module.STALL_SECONDS)
     assert not transport.connected
     assert not desk.file.open
+
+
+@pytest.mark.parametrize(
+    "error", [OSError("it was deleted"), Unavailable("too much at once"), KeyError("surprise")], ids=repr
+)
+@pytest.mark.parametrize("parts", [0, 1])
+def test_nothing_but_the_file_is_ever_in_it(world: World, desk: Desk, error: Exception, parts: int) -> None:
+    """Whatever fails once it was promised, and however little was sent, no words stand in its place."""
+    transport = fetch(world)
+    for _ in range(parts):
+        desk.file.gives()
+    desk.file.asked.pop()[2].errback(error)
+    assert not transport.connected
+    assert not desk.file.open
+    body = transport.value().partition(b"\r\n\r\n")[2]
+    assert body == CONTENT[: parts * module.PART_BYTES]
 
 
 @pytest.mark.parametrize("how", ["denied", "gone"])

@@ -15,6 +15,7 @@ from relay_protocol.frames import (
     encode_sample,
     encode_video,
 )
+from relay_server.edges.robot_video import QUESTIONS_AT_ONCE
 from relay_server.video import State, Stream
 from tests.relay_server.edges.robot_ends import Hall, Robot
 from tests.relay_server.video.watching import CAMERA, Watcher, jpeg
@@ -36,11 +37,28 @@ async def asked_to_show(hall: Hall) -> tuple[Robot, Stream, Watcher, str]:
 
 async def joined(hall: Hall) -> tuple[Robot, Stream, Watcher]:
     """A stream's link, open."""
-    _, stream, watcher, ticket = await asked_to_show(hall)
+    end, stream, watcher, _ = await linked(hall)
+    return end, stream, watcher
+
+
+async def linked(hall: Hall) -> tuple[Robot, Stream, Watcher, Robot]:
+    """A stream's link, open, and last the robot's control link."""
+    robot, stream, watcher, ticket = await asked_to_show(hall)
     end = hall.dial()
     end.says(link.Join(version=PROTOCOL_VERSION, ticket=ticket))
     assert end.hears()[0] == {"op": "joined", "channel": stream.name, "at": hall.world.now_ns()}
-    return end, stream, watcher
+    return end, stream, watcher, robot
+
+
+def passes(hall: Hall, robot: Robot, seconds: float) -> None:
+    """Time, in which the control link is not silent."""
+    robot.says(link.Ping(t=1))
+    hall.world.clock.advance(seconds)
+
+
+def long_jpeg(kilobytes: int) -> bytes:
+    """A picture with comments of about this size before it."""
+    return jpeg()[:2] + (b"\xff\xfe\x03\xfe" + bytes(1020)) * kilobytes + jpeg()[2:]
 
 
 @pytest_twisted.ensureDeferred
@@ -72,16 +90,56 @@ async def test_a_robot_joins_a_stream_and_pictures_flow(hall: Hall) -> None:
 async def test_a_picture_in_parts_is_one_picture_and_each_part_is_answered(hall: Hall) -> None:
     """One that breaks off is not shown, whatever way the next one comes."""
     end, _, watcher = await joined(hall)
-    body = jpeg()
+    body = long_jpeg(3)
     end.sends(encode_picture_part(1, 5, len(body), 0, body[:8]))
-    end.sends(encode_picture_part(1, 5, len(body), 8, body[8:20]))
+    end.sends(encode_picture_part(1, 5, len(body), 8, body[8:1032]))
     end.sends(encode_picture_part(2, 6, len(body), 0, body[:9]))
     end.sends(encode_picture_part(2, 6, len(body), 9, body[9:]))
     end.sends(encode_picture_part(3, 7, len(body), 0, body[:9]))
     end.sends(encode_video(4, 8, body))
     assert [(each.number, each.body) for each in watcher.pictures] == [(2, body), (4, body)]
     took = [(each["number"], each.get("upto")) for each in end.hears() if each["op"] == "took"]
-    assert took == [(1, 8), (1, 20), (2, 9), (2, None), (3, 9), (4, None)]
+    assert took == [(1, 8), (1, 1032), (2, 9), (2, None), (3, 9), (4, None)]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_picture_that_comes_in_parts_for_long_is_waited_for(hall: Hall) -> None:
+    """Longer than for one of which nothing is there."""
+    end, _, watcher, robot = await linked(hall)
+    body = long_jpeg(12)
+    for at in range(0, 10240, 1024):
+        end.sends(encode_picture_part(1, 5, len(body), at, body[at : at + 1024]))
+        passes(hall, robot, 4)
+    assert watcher.error is None
+    end.sends(encode_picture_part(1, 5, len(body), 10240, body[10240:]))
+    assert [each.body for each in watcher.pictures] == [body]
+
+
+@pytest.mark.parametrize("size", [1, 1023])
+@pytest_twisted.ensureDeferred
+async def test_parts_are_not_so_small_that_answers_cost_more_than_pictures(hall: Hall, size: int) -> None:
+    """But for the last, and the first by which a robot measures the round trip."""
+    end, stream, watcher = await joined(hall)
+    body = long_jpeg(3)
+    end.sends(encode_picture_part(1, 5, len(body), 0, body[:1]))
+    end.sends(encode_picture_part(1, 5, len(body), 1, body[1 : 1 + size]))
+    assert "at least 1024 bytes" in end.refusal()["reason"]
+    assert stream.state is not State.OPEN
+    assert watcher.error is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_begins_ever_new_pictures_by_one_byte_is_cut(hall: Hall) -> None:
+    """One a second is enough to measure the round trip."""
+    end, stream, _, robot = await linked(hall)
+    for number in range(20):
+        end.sends(encode_picture_part(number, 5, 5000, 0, b"\xff"))
+        passes(hall, robot, 1)
+    assert stream.state is State.OPEN
+    for number in range(QUESTIONS_AT_ONCE + 1):
+        end.sends(encode_picture_part(number, 5, 5000, 0, b"\xff"))
+    assert "at least 1024 bytes" in end.refusal()["reason"]
+    assert stream.state is not State.OPEN
 
 
 @pytest_twisted.ensureDeferred

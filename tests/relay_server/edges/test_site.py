@@ -8,7 +8,7 @@ import pytest
 
 from relay_protocol import limits
 from relay_server.edges import site as module
-from tests.relay_server.edges.http_client import World, parse
+from tests.relay_server.edges.http_client import Answer, World, parse
 
 GET = b"GET /healthz HTTP/1.1\r\nHost: x\r\n"
 
@@ -32,6 +32,14 @@ def world(folder: Path) -> World:
     return World(folder)
 
 
+def told(answer: Answer, status: int) -> None:
+    """An error is problem details (RFC 9457)."""
+    assert (answer.status, answer.json["status"]) == (status, status)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.json["title"]
+    assert answer.json["detail"]
+
+
 @pytest.mark.parametrize("sent", [b"", GET, GET + b"Content-Length: 10\r\n\r\nx"])
 def test_a_request_that_trickles_is_cut_by_an_absolute_deadline(world: World, sent: bytes) -> None:
     """Head or body: each byte buys no time."""
@@ -44,7 +52,7 @@ def test_a_request_that_trickles_is_cut_by_an_absolute_deadline(world: World, se
     assert transport.connected
     world.clock.advance(0.1)
     assert not transport.connected
-    assert parse(transport.value()).status == 408
+    told(parse(transport.value()), 408)
     assert not world.cap._counts
 
 
@@ -71,7 +79,7 @@ def test_a_body_that_is_too_large_is_refused(world: World, chunked: bool) -> Non
             world.send(transport, b"1000\r\n" + b"x" * 4096 + b"\r\n")
     else:
         world.send(transport, head + b"Content-Length: %d\r\n\r\n" % (module.BODY_BYTES + 1))
-    assert parse(transport.value()).status == 413
+    told(parse(transport.value()), 413)
     assert not transport.connected
 
 
@@ -79,7 +87,7 @@ def test_too_many_connections_of_one_address_are_refused(world: World) -> None:
     """With 429; what they send is not looked at; places are given back."""
     kept = [world.connect() for _ in range(4)]
     refused = world.connect()
-    assert parse(refused.value()).status == 429
+    told(parse(refused.value()), 429)
     assert not refused.connected
     kept[0].loseConnection()
     assert world.ask("GET", "/healthz").status == 200
@@ -174,3 +182,54 @@ def test_bytes_that_are_no_http_do_no_harm(world: World, data: bytes) -> None:
     world.clock.pump([limits.UNPROVEN_SECONDS, module.IDLE_SECONDS])
     assert not transport.connected
     assert not world.cap._counts
+
+
+@pytest.mark.parametrize("header", ["Authorization", "Cookie", "Origin", "Accept", "Content-Type"])
+def test_a_header_that_is_no_text_is_no_failure_of_the_relay(world: World, header: str) -> None:
+    """Its bytes that are no UTF-8 say nothing."""
+    transport = world.connect()
+    head = f"GET /api/v1/session HTTP/1.1\r\nHost: x\r\n{header}: Bearer ".encode()
+    world.send(transport, head + b"\xff\xfe\r\n\r\n")
+    assert parse(transport.value()).status in (401, 403)
+
+
+@pytest.mark.parametrize("host", ["a" * 64 + ".example", "a..b", "x" * 300])
+def test_a_host_that_can_not_be_one_is_told(world: World, host: str) -> None:
+    """In words, and by no failure of the relay."""
+    told(world.ask("GET", "/api/v1/session", Host=host), 400)
+
+
+@pytest.mark.parametrize("path", ["/api/v1/robots/%ff", "/api/%ff", "/healthz/%ff"])
+def test_an_address_that_is_no_text_is_told(world: World, path: str) -> None:
+    """In words."""
+    told(world.ask("GET", path), 400)
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "BREW"])
+@pytest.mark.parametrize("path", ["/", "/robots/rover", "/icon.svg"])
+def test_what_is_only_read_takes_no_other_method(world: World, method: str, path: str) -> None:
+    """It says which it takes."""
+    answer = world.ask(method, path)
+    told(answer, 405)
+    assert answer.headers["allow"] == "GET, HEAD"
+
+
+def test_a_method_that_an_address_of_the_api_does_not_take_is_told(world: World) -> None:
+    """With those that it takes."""
+    answer = world.ask("PATCH", "/api/v1/session")
+    told(answer, 405)
+    assert answer.headers["allow"] == "DELETE, GET, HEAD, POST"
+
+
+def test_what_is_no_request_is_told(world: World) -> None:
+    """In words, and the connection ends."""
+    transport = world.connect()
+    world.send(transport, b"what is this\r\n\r\n")
+    told(parse(transport.value()), 400)
+    assert not transport.connected
+
+
+@pytest.mark.parametrize("path", ["/api/v1//session", "/api//v1/session", "/api/v1/%2Fsession"])
+def test_a_slash_too_many_means_nothing(world: World, path: str) -> None:
+    """Names of ROS begin with one, also where it is escaped; nobody is sent about for it."""
+    assert world.ask("GET", path, Authorization="Bearer ann").json["user"] == "ann"

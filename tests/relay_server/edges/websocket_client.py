@@ -157,25 +157,28 @@ class Client:
     """A websocket client and the relay's end of it.
 
     :param tail: bytes sent in one piece with the handshake
+    :param factory: of the relay's end
     """
 
     def __init__(
         self,
-        gate: MemoryGate,
+        gate: Any,
         path: str = "/robots/rover",
         tail: bytes = b"",
         cap: AddressCap | None = None,
+        clock: Clock | None = None,
+        factory: type[ClientFactory] = ClientFactory,
         **headers: str,
     ) -> None:
         self.eof = False
-        self.clock = Clock()
+        self.clock = clock or Clock()
         self.cap = cap or AddressCap(5)
         self.cap.enter("192.168.1.1")
-        factory = ClientFactory(self.clock, lambda: round(self.clock.seconds() * 1e9), gate, self.cap)
+        made = factory(self.clock, lambda: round(self.clock.seconds() * 1e9), gate, self.cap)
         self.transport = Transport()
         protocols = [headers.pop("subprotocol")] if "subprotocol" in headers else None
         self.core = ClientProtocol(parse_uri(f"ws://relay:9090{path}"), subprotocols=protocols)  # type: ignore[arg-type]
-        self.end = factory.buildProtocol(None)
+        self.end = made.buildProtocol(None)
         self.transport.protocol = self.end
         self.end.makeConnection(self.transport)
         request = self.core.connect()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -12,22 +12,27 @@ import pytest_twisted
 from twisted.internet.defer import CancelledError, Deferred
 
 from relay_db import queries
+from relay_db.queries import RobotRecord
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_server.access import Principal
+from relay_server.control import Actor
 from relay_server.fleet import LOCAL, FleetDesk, Order, Result
 from relay_server.fleet import desk as module
 from relay_server.fleet.desk import Plan
-from relay_server.fleet.errand import MATCHING_SECONDS, SUBSCRIBER_SECONDS
 from relay_server.fleet.result import VALUES_BYTES
 from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP
+from relay_server.inside.publishing import MATCHING_SECONDS, SUBSCRIBER_SECONDS
 from relay_server.journal import Journal
+from relay_server.moments import MomentNeeded, TooOld
 from relay_server.session import Session
-from relay_server.store import Store
 from tests.relay_server.edges.robot_ends import until
-from tests.relay_server.memory import MOTION, STRING, TRIGGER, MemoryClient
+from tests.relay_server.front_desk import HERE, Desk
+from tests.relay_server.memory import MOTION, STRING, TRIGGER, MemoryClient, hangs
 from tests.relay_server.steering import outcome
-from tests.relay_server.test_frontdesk import HERE, Desk
+
+LATER = 1 << 62
+"""Sent after all there was."""
 
 
 def order(do: str, *robots: str, **fields: Any) -> Order:
@@ -54,10 +59,10 @@ class Given:
 class Fleet:
     """Orders given at a front desk, with ann who operates rover."""
 
-    def __init__(self, store: Store) -> None:
-        self.front = Desk(store)
-        self.world = self.front.world
-        self.journal = Journal(store, self.front.wall)
+    def __init__(self, front: Desk) -> None:
+        self.front = front
+        self.world = front.world
+        self.journal = Journal(front.store, front.wall)
         self.desk = self.new_desk()
 
     def new_desk(self) -> FleetDesk:
@@ -79,9 +84,12 @@ class Fleet:
         principal, _ = await self.front.logged_in()
         return principal
 
-    async def give(self, asker: Principal, given: Order) -> Given:
-        """Give an order; it is under way when this returns."""
-        plan = await self.desk.plan(asker, given, HERE)
+    async def give(self, asker: Principal, given: Order, ago: float = 0.0) -> Given:
+        """Give an order; it is under way when this returns.
+
+        :param ago: seconds since it was sent
+        """
+        plan = await self.desk.plan(asker, given, HERE, self.world.now_ns() - int(ago * 1e9))
         begun: list[None] = []
         results: list[Result] = []
 
@@ -134,11 +142,9 @@ class Fleet:
 
 
 @pytest.fixture
-def fleet(store: Store) -> Iterator[Fleet]:
+def fleet(front: Desk) -> Fleet:
     """Rover is in the database; nobody is there."""
-    made = Fleet(store)
-    yield made
-    made.front.auth.stop()
+    return Fleet(front)
 
 
 @pytest_twisted.ensureDeferred
@@ -168,7 +174,7 @@ async def test_an_order_means_a_thousand_robots_at_most(
     """More are told before anything is done; but a stop may mean all there are."""
     monkeypatch.setattr(module, "ROBOTS", 1)
     with pytest.raises(Invalid, match="means 2 robots; it may mean 1 at most"):
-        await fleet.desk.plan(LOCAL, order("resume", "*"), HERE)
+        await fleet.desk.plan(LOCAL, order("resume", "*"), HERE, LATER)
     assert list((await fleet.desk.plan(LOCAL, order("stop", "*"), HERE)).robots) == ["hidden", "rover"]
 
 
@@ -383,14 +389,10 @@ async def test_a_resume_has_as_long_as_a_stop(fleet: Fleet) -> None:
 @pytest_twisted.ensureDeferred
 async def test_a_resume_that_hangs_may_still_happen(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """So it is told."""
-
-    async def hangs(*_: object) -> None:
-        await Deferred()
-
     monkeypatch.setattr(fleet.desk._halting, "resume", hangs)
     given = await fleet.give(LOCAL, order("resume", timeout=1))
     await fleet.after(lambda: bool(given.results), 1.0)
-    assert given.words == "no answer within 15 s; it may still happen"
+    assert given.words == "no answer within 18 s; it may still happen"
 
 
 @pytest_twisted.ensureDeferred
@@ -409,7 +411,7 @@ async def test_a_right_that_is_revoked_ends_an_order(fleet: Fleet) -> None:
     await until(lambda: bool(fleet.sessions()))
     fleet.front.desk.say_goodbye("the relay is going down")
     await until(lambda: bool(given.results))
-    assert given.words == "the relay is going down"
+    assert given.words == "the relay is going down; it was sent before, and may have been done"
     given = await fleet.give(LOCAL, order("call", service="/reset"))
     await until(lambda: bool(given.results))
     assert given.words == "the relay is going down"
@@ -453,17 +455,15 @@ async def test_no_robot_that_is_here_waits_for_the_database_to_be_stopped(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch, who: str
 ) -> None:
     """Where the asker is known; once it has not answered for some seconds, these are all that are meant."""
-
-    async def never(*_: object, **__: object) -> None:
-        await Deferred()
-
     fleet.world.robot_comes()
     asker = await fleet.ann() if who == "ann" else LOCAL
     if who == "ann":
         await fleet.desk.groups(asker)
         fleet.front.access._robots.clear()
-        fleet.front.access.release(await fleet.front.access.permit(asker, 1))  # type: ignore[arg-type]
-    monkeypatch.setattr(fleet.front.store, "read", never)
+        permit = await fleet.front.access.permit(asker, RobotRecord(1, "rover", "default", ""))
+        assert permit is not None
+        fleet.front.access.release(permit)
+    monkeypatch.setattr(fleet.front.store, "read", hangs)
     asked = outcome(fleet.desk.plan(asker, order("stop", "*", "group:all", why="fire"), HERE))
     assert [each.why for each in fleet.world.control.all(link.Stop)] == ["fire"]
     assert asked == []
@@ -507,16 +507,12 @@ async def test_who_is_not_known_stops_nothing_without_the_database(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Which he is told soon; and an order to do something else stops nobody."""
-
-    async def never(*_: object) -> None:
-        await Deferred()
-
     fleet.world.robot_comes()
     ann = await fleet.ann()
-    monkeypatch.setattr(fleet.front.store, "read", never)
+    monkeypatch.setattr(fleet.front.store, "read", hangs)
     asked = [
         outcome(fleet.desk.plan(ann, order("stop", "*"), HERE)),
-        outcome(fleet.desk.plan(LOCAL, order("resume", "*"), HERE)),
+        outcome(fleet.desk.plan(LOCAL, order("resume", "*"), HERE, LATER)),
     ]
     fleet.world.clock.advance(LOOKUP_SECONDS)
     assert [str(error) for (error,) in asked] == [NOT_LOOKED_UP] * 2
@@ -547,6 +543,28 @@ async def test_who_controls_a_robot_may_resume_it(fleet: Fleet) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_token_to_look_does_not_resume_by_its_users_control(fleet: Fleet) -> None:
+    """Stopping is for all; by a token for as much the user may use the control that he has from anywhere."""
+    ann = await fleet.ann()
+    fleet.world.robot_comes()
+    session, _ = await fleet.front.opens(ann)
+    taken = Deferred.fromCoroutine(session.desk.take(session, ""))
+    await until(lambda: taken.called)
+    looks = await fleet.front.by_token(fleet.front.ann, "viewer")
+    assert (await carried_out(fleet, await fleet.desk.plan(looks, order("stop"), HERE))).outcome.ok
+    result = await carried_out(fleet, await fleet.desk.plan(looks, order("resume"), HERE, LATER))
+    assert (result.outcome.ok, result.outcome.message) == (
+        False,
+        "only who has control of the robot, and its owners, may resume it",
+    )
+    assert not fleet.world.control.all(link.Resume)
+    drives = await fleet.front.by_token(fleet.front.ann, "operator")
+    result = await carried_out(fleet, await fleet.desk.plan(drives, order("resume"), HERE, LATER))
+    assert result.outcome.ok, result.outcome.message
+    session.end()
+
+
+@pytest_twisted.ensureDeferred
 async def test_rights_count_as_they_are_when_a_robot_has_its_turn(fleet: Fleet) -> None:
     """Who owned it when the order was planned resumes it no more, nor does who has logged out stop what is away."""
     ann = await fleet.ann()
@@ -554,12 +572,12 @@ async def test_rights_count_as_they_are_when_a_robot_has_its_turn(fleet: Fleet) 
         queries.grant_right(s, fleet.front.rover.id, "owner", user_id=ann.user_id)
     await fleet.front.access.refresh()
     assert (await carried_out(fleet, await fleet.desk.plan(ann, order("stop"), HERE))).outcome.pending
-    plan = await fleet.desk.plan(ann, order("resume"), HERE)
+    plan = await fleet.desk.plan(ann, order("resume"), HERE, LATER)
     with fleet.front.store.database.begin() as s:
         queries.revoke_right(s, fleet.front.rover.id, user_id=ann.user_id)
         queries.grant_right(s, fleet.front.rover.id, "operator", user_id=ann.user_id)
     assert "its owners" in (await carried_out(fleet, plan)).outcome.message
-    resume, stop = [await fleet.desk.plan(ann, order(do), HERE) for do in ("resume", "stop")]
+    resume, stop = [await fleet.desk.plan(ann, order(do), HERE, LATER) for do in ("resume", "stop")]
     fleet.world.record.stops.clear()
     await fleet.front.desk.logout(ann)
     for plan in (resume, stop):
@@ -587,7 +605,7 @@ async def test_a_stop_counts_where_rights_can_not_be_looked_up_again(
 ) -> None:
     """By those of the plan; nothing moves again by them."""
     ann = await fleet.ann()
-    stop, resume = [await fleet.desk.plan(ann, order(do), HERE) for do in ("stop", "resume")]
+    stop, resume = [await fleet.desk.plan(ann, order(do), HERE, LATER) for do in ("stop", "resume")]
 
     async def locked(*_: object) -> None:
         raise Unavailable("the database is locked")
@@ -595,3 +613,78 @@ async def test_a_stop_counts_where_rights_can_not_be_looked_up_again(
     monkeypatch.setattr(fleet.front.access, "permit", locked)
     assert (await carried_out(fleet, stop)).outcome.pending
     assert (await carried_out(fleet, resume)).outcome.message == "the database is locked"
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_moves_robots_says_when_it_was_sent(fleet: Fleet) -> None:
+    """And is refused as a whole when that is too long ago for one of them; what moves none may be as old as it is."""
+    ann = await fleet.ann()
+    fleet.world.robot_comes()
+    moving = link.MotionPolicy(services=["/reset", "/driver/set_parameters"], actions=["/dock"])
+    fleet.world.robot.description = link.Describe(motion=moving)
+    now, late = fleet.world.now_ns(), (moving.deadline_ms + 1) * 1_000_000
+    for do, fields in (
+        ("call", {"service": "reset"}),
+        ("call", {"service": "/dock/_action/send_goal"}),
+        ("set", {"name": "driver:speed", "value": 1}),
+    ):
+        asked = order(do, **fields)
+        with pytest.raises(MomentNeeded, match="this moves rover: say when this was sent"):
+            await fleet.desk.plan(ann, asked, HERE)
+        with pytest.raises(TooOld, match=f"{moving.deadline_ms + 1} ms ago; rover takes nothing older"):
+            await fleet.desk.plan(ann, asked, HERE, now - late)
+        assert (await fleet.desk.plan(ann, asked, HERE, now)).robots
+    for asked in (order("resume"), order("call", service="relay/resume")):
+        with pytest.raises(MomentNeeded, match="lets robots move again"):
+            await fleet.desk.plan(ann, asked, HERE)
+        assert (await fleet.desk.plan(ann, asked, HERE, now - late)).robots
+    for asked in (
+        order("call", service="/lamp"),
+        order("call", service="no name"),
+        order("set", name="x:y", value=1),
+    ):
+        assert (await fleet.desk.plan(ann, asked, HERE)).robots
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_has_become_too_old_by_its_turn_moves_nothing(fleet: Fleet) -> None:
+    """The robots before it took their time: that is this robot's result, in words."""
+    fleet.world.robot_comes()
+    fleet.world.robot.description = link.Describe(motion=link.MotionPolicy(services=["/reset"]))
+    plan = await fleet.desk.plan(
+        await fleet.ann(), order("call", service="/reset"), HERE, fleet.world.now_ns()
+    )
+    fleet.world.clock.advance(1.5)
+    results: list[Result] = []
+
+    async def tell(result: Result) -> None:
+        results.append(result)
+
+    await fleet.desk.carry_out(plan, lambda: None, tell)
+    (told,) = results
+    assert not told.outcome.ok
+    assert told.outcome.message == (
+        "the turn of rover has come 1500 ms after this was sent, and it takes nothing older than 500 ms; give it once "
+        "more for this robot"
+    )
+    assert not fleet.world.control.all(link.Control)
+    assert not fleet.world.link.all(link.CallService)
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_old_order_to_resume_does_not_lift_a_newer_stop(fleet: Fleet) -> None:
+    """Nor does one of which nobody says when it was given; also by the service of that name."""
+    fleet.world.robot_comes()
+    asked = fleet.world.now_ns()
+    fleet.world.clock.advance(1)
+    vic = Actor("vic", "user:vic", 8)
+    await fleet.world.desks.of(fleet.world.robot).stopping.stop(vic, "a child")
+    for given in (order("resume"), order("call", service="/relay/resume")):
+        old = await fleet.give(LOCAL, given, ago=(fleet.world.now_ns() - asked) / 1e9)
+        await until(lambda old=old: bool(old.results))
+        assert "was stopped, or may have been, after you asked for this" in old.words
+        assert not old.results[0].outcome.ok
+    assert not fleet.world.control.all(link.Resume)
+    fresh = await fleet.give(LOCAL, order("resume"))
+    await until(lambda: bool(fresh.results))
+    assert fresh.results[0].outcome.ok

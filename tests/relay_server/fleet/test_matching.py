@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from relay_server.fleet import matching as module
 from relay_server.fleet.matching import Meant, meant
 
 ROBOTS = ("cleaner-1", "cleaner-2", "cleaner-10", "other")
@@ -35,6 +36,14 @@ GROUPS = {"cleaners": ("cleaner-1", "cleaner-2", "secret"), "mine": ("other",), 
 def test_names_patterns_and_groups(asked: list[str], robots: list[str], unmatched: list[str]) -> None:
     """Each robot once, none that may not be meant; what means none is told."""
     assert meant(asked, ROBOTS, GROUPS) == Meant(robots, unmatched)
+
+
+def test_a_name_is_looked_up_and_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand of them are not held against all robots, whether they mean one or none."""
+    compared: list[str] = []
+    monkeypatch.setattr(module, "fnmatchcase", lambda name, pattern: compared.append(pattern))
+    assert meant(["other", "tank", "Other"], ROBOTS, GROUPS) == Meant(["other"], ["tank", "Other"])
+    assert compared == []
 
 
 @given(st.lists(st.text("ab*?[]", max_size=5), max_size=4), st.sets(st.text("ab", min_size=1, max_size=4)))

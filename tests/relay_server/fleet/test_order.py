@@ -10,13 +10,16 @@ import pytest
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage
-from relay_server.fleet.order import Order
+from relay_server.fleet.order import PATTERNS, TARGETS, Order, StopOrder
 
 
 def order(**fields: Any) -> Order:
     """An order as it comes, checked."""
     body = json.dumps({"robots": ["*"], **fields}).encode()
-    made = jsontext.decode(msgspec.json.Decoder(Order), body)
+    if fields.get("do") == "stop":
+        made = jsontext.decode(msgspec.json.Decoder(StopOrder), body).order
+    else:
+        made = jsontext.decode(msgspec.json.Decoder(Order), body)
     made.check()
     return made
 
@@ -45,7 +48,7 @@ def test_what_can_be_ordered(fields: dict[str, Any], subject: str) -> None:
         ({"do": "publish", "msg": {}}, "'publish' needs 'topic'"),
         ({"do": "set", "name": "/a:b"}, "'set' needs 'value'"),
         ({"do": "set", "value": 1}, "'set' needs 'name'"),
-        ({"do": "stop", "service": "/start"}, "'service' does not go with 'stop'"),
+        ({"do": "resume", "service": "/start"}, "'service' does not go with 'resume'"),
         ({"do": "call", "service": "/start", "msg": {"a": 1}}, "'msg' does not go with 'call'"),
         ({"do": "publish", "topic": "/a", "value": 0}, "'value' does not go with 'publish'"),
         ({"do": "resume", "why": "x" * 501}, "'why' must be a string of 500 characters at most"),
@@ -68,6 +71,39 @@ def test_no_stop_is_refused_for_its_reason(why: Any, kept: str) -> None:
 
 
 @pytest.mark.parametrize(
+    "more",
+    [
+        {"wy": "typo"},
+        {"service": "/start"},
+        {"msg": 3},
+        {"timeout": 0},
+        {"timeout": "soon"},
+        {"new": {"a": [1]}},
+    ],
+)
+def test_no_stop_is_refused_for_what_does_not_go_with_it(more: dict[str, Any]) -> None:
+    """It is passed over: whoever sends it wants robots to stand."""
+    made = order(do="stop", why="fire", **more)
+    assert (made.robots, made.do, made.why, made.subject) == (["*"], "stop", "fire", "")
+
+
+def test_an_order_may_name_many_robots() -> None:
+    """As many as it may mean; a page that shows them all names each."""
+    names = [f"rover-{number}" for number in range(TARGETS)]
+    for do in ("stop", "resume"):
+        assert order(do=do, robots=names).robots == names
+
+
+@pytest.mark.parametrize("one", ["rover-*", "rover-?", "rover-[12]", "group:hall"])
+@pytest.mark.parametrize("do", ["stop", "resume"])
+def test_an_order_has_few_patterns(one: str, do: str) -> None:
+    """Each is held against all robots there are."""
+    order(do=do, robots=[one] * PATTERNS + ["tank"])
+    with pytest.raises(Invalid, match="64 patterns and groups at most"):
+        order(do=do, robots=[one] * (PATTERNS + 1))
+
+
+@pytest.mark.parametrize(
     "fields",
     [
         {},
@@ -75,11 +111,13 @@ def test_no_stop_is_refused_for_its_reason(why: Any, kept: str) -> None:
         {"do": "stop", "robots": []},
         {"do": "stop", "robots": [""]},
         {"do": "stop", "robots": "*"},
-        {"do": "stop", "robots": ["a"] * 65},
+        {"do": "stop", "robots": None},
+        {"do": "stop", "robots": ["a"] * (TARGETS + 1)},
         {"do": "stop", "robots": ["a" * 256]},
-        {"do": "stop", "timeout": 0},
-        {"do": "stop", "timeout": 301},
-        {"do": "stop", "wy": "typo"},
+        {"do": "resume", "robots": ["a"] * (TARGETS + 1)},
+        {"do": "resume", "timeout": 0},
+        {"do": "resume", "timeout": 301},
+        {"do": "resume", "wy": "typo"},
     ],
 )
 def test_what_is_no_order_is_malformed(fields: dict[str, Any]) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from relay_protocol import link
 from relay_server.local.catalogue import SERVICES, STATUS, TYPE_NAMES, TYPES
 
 SPEC = (Path(__file__).parents[3] / "protocol" / "SPEC.md").read_text("utf-8")
@@ -20,7 +22,14 @@ def test_the_contract_names_every_service_of_rosapi() -> None:
 
 
 @pytest.mark.parametrize(
-    "type_name", [STATUS, "switchboard_msgs/srv/Ping_Request", "switchboard_msgs/srv/Ping_Response"]
+    "type_name",
+    [
+        STATUS,
+        "switchboard_msgs/srv/Ping_Request",
+        "switchboard_msgs/srv/Ping_Response",
+        "switchboard_msgs/srv/Stop_Request",
+        "switchboard_msgs/srv/Stop_Response",
+    ],
 )
 def test_the_contract_names_every_field_of_the_relays_own_types(type_name: str) -> None:
     """Those that come from the robot are in section 2.4."""
@@ -28,6 +37,12 @@ def test_the_contract_names_every_field_of_the_relays_own_types(type_name: str) 
         section = SPEC if typedef["type"].endswith(("/Motion", "/Health")) else SECTION
         for field in typedef["fieldnames"]:
             assert f"`{field}`" in section, (typedef["type"], field)
+
+
+def test_the_status_has_all_that_a_robot_tells_of_its_health() -> None:
+    """Field by field, in their order."""
+    (told,) = (each for each in TYPES.typedefs(STATUS) if each["type"].endswith("/Health"))
+    assert told["fieldnames"] == [each.name for each in msgspec.structs.fields(link.Health)]
 
 
 def test_every_type_is_known_by_its_own_text() -> None:

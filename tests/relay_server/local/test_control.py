@@ -32,7 +32,7 @@ def told(person: Person) -> dict[str, Any]:
     return dict(person.hears("publish")[-1]["msg"])
 
 
-def test_control_is_taken_asked_for_and_handed_over(people: dict[str, Person]) -> None:
+def test_control_is_taken_asked_for_and_handed_over(world: World, people: dict[str, Person]) -> None:
     """As services like others."""
     ann, olga = people["ann"], people["olga"]
     assert ask(ann, "/relay/take_control", {"why": "delivery"}) == {
@@ -41,8 +41,18 @@ def test_control_is_taken_asked_for_and_handed_over(people: dict[str, Person]) -
     }
     assert ask(olga, "/relay/take_control", ["my turn"])["success"] is False
     assert ask(ann, "/relay/refuse_control")["success"] is True
+    assert "ask again in 10 s" in ask(olga, "/relay/take_control")
+    for _ in range(10):
+        world.clock.advance(1)
+        for each in people.values():
+            each.answers_pings()
     assert ask(olga, "/relay/take_control")["success"] is False
-    assert ask(ann, "/relay/grant_control")["success"] is True
+    wrong, right = ({"client": each.session.number} for each in (ann, olga))
+    assert "who you mean asks for control no more" in ask(ann, "/relay/grant_control", wrong)["message"]
+    assert (
+        "who you mean asks for control no more" in ask(ann, "/relay/refuse_control", ["", 10**9])["message"]
+    )
+    assert ask(ann, "/relay/grant_control", right)["success"] is True
     assert ask(ann, "/relay/release_control")["success"] is False
     assert ask(olga, "/relay/release_control")["success"] is True
 
@@ -52,6 +62,7 @@ def test_everybody_stops_but_not_everybody_resumes(world: World, people: dict[st
     assert ask(people["vic"], "/relay/stop", {"why": "smoke"}) == {
         "success": True,
         "message": "robot rover is stopped",
+        "done": True,
     }
     (order,) = world.control.all(link.Stop)
     assert (order.by, order.why) == ("vic", "smoke")
@@ -65,12 +76,28 @@ def test_everybody_stops_but_not_everybody_resumes(world: World, people: dict[st
 def test_a_robot_that_is_away_is_answered_in_words(world: World, people: dict[str, Person]) -> None:
     """A stop is kept; what can't be done is no failure of the call."""
     world.robot_goes()
-    assert "as soon as it can be reached" in ask(people["vic"], "/relay/stop")["message"]
+    assert ask(people["vic"], "/relay/stop") == {
+        "success": True,
+        "message": "robot rover will be stopped as soon as it can be reached",
+        "done": False,
+    }
     assert ask(people["ann"], "/relay/take_control") == {
         "success": False,
         "message": "robot rover is offline",
     }
     assert list(world.record.stops) == [1]
+
+
+def test_a_stop_that_the_robot_could_not_do_all_of_is_not_told_as_done(
+    world: World, people: dict[str, Person]
+) -> None:
+    """In the robot's words."""
+    world.control.obeys = lambda order: world.desks.of(world.robot).told(
+        link.Done(id=order.id, ok=False, reason="no contactor")
+    )
+    answer = ask(people["vic"], "/relay/stop")
+    assert (answer["success"], answer["done"]) == (False, False)
+    assert "no contactor" in answer["message"]
 
 
 def test_suppressing_and_inhibiting_take_rights_of_their_own(world: World, people: dict[str, Person]) -> None:
@@ -97,6 +124,7 @@ def test_suppressing_and_inhibiting_take_rights_of_their_own(world: World, peopl
         ("inhibit", {"resource": "/x", "hold": 1}, "'hold' must be true or false"),
         ("inhibit", {"resource": "/x", "ms": 60_001}, "must be 1 to 60000"),
         ("take_control", {"why": 7}, "give 'why'"),
+        ("grant_control", {"client": "bob"}, "must be a whole number"),
     ],
 )
 def test_arguments_that_make_no_sense_fail_the_call(
@@ -183,10 +211,21 @@ def test_status_tells_who_has_control_and_that_it_is_stopped(world: World, peopl
     """In short."""
     ann = people["ann"]
     ask(ann, "/relay/take_control")
-    world.desks.of(world.robot).told(link.Safety(stopped=link.Stopped(by="vic", since=5.0)))
+    safety = link.Safety(
+        stopped=link.Stopped(by="vic", since=5.0),
+        suppressed=[link.Suppressed(resource="/cmd_vel", sources=[9], by="runaway", ms=100)],
+        inhibited=[link.Inhibited(resource="/chatter", hold=True, by="olga", ms=900)],
+    )
+    world.desks.of(world.robot).told(safety)
     ann.says("subscribe", topic="/relay/status")
     status = told(ann)
-    assert status["control"] == {"state": "held", "holder": "ann", "you": True}
+    assert status["control"] == {
+        "state": "held",
+        "holder": "ann",
+        "you": True,
+        "suppressed": [{"resource": "/cmd_vel", "by": "runaway", "hold": False}],
+        "inhibited": [{"resource": "/chatter", "by": "olga", "hold": True}],
+    }
     assert status["stopped"] is True
 
 
@@ -211,3 +250,17 @@ def test_every_service_has_a_type_and_a_handler(people: dict[str, Person]) -> No
     details = ask(people["vic"], "/rosapi/message_details", {"type": "switchboard_msgs/Control"})
     assert details["typedefs"][0]["fieldnames"][:5] == ["robot", "state", "holder", "request", "stopped"]
     assert STRING not in shown
+
+
+def test_a_resume_from_before_a_stop_does_not_lift_it(world: World, people: dict[str, Person]) -> None:
+    """It was held up on its way: no ping has come back since. With the next pong its sender is heard."""
+    olga = people["olga"]
+    olga.answers_pings()
+    world.clock.advance(0.05)
+    ask(people["vic"], "/relay/stop", {"why": "a child"})
+    assert "rover was stopped, or may have been, after you asked for this" in ask(olga, "/relay/resume")
+    assert not world.control.all(link.Resume)
+    world.clock.advance(0.5)
+    olga.answers_pings()
+    assert ask(olga, "/relay/resume")["success"] is True
+    assert world.control.all(link.Resume)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,9 +11,10 @@ from typing import Any
 import pytest
 import pytest_twisted
 from twisted.internet import reactor
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred, DeferredLock
 
 from relay_db import queries
+from relay_db.queries import RobotRecord
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_server.access import Access, Principal
@@ -19,14 +22,19 @@ from relay_server.frontdesk import NO_ROBOT, Admission
 from relay_server.journal import Journal
 from relay_server.recording import Ask, Library, RecordingDesk, Recordings
 from relay_server.recording.desk import FETCH_SECONDS
-from relay_server.recording.recordings import FINISH_SECONDS, USER_RECORDINGS
+from relay_server.recording.mcap_file import McapFile
+from relay_server.recording.mender import PAUSE_SECONDS
+from relay_server.recording.recordings import FINISH_SECONDS, THREADS, USER_RECORDINGS, WAITING
+from relay_server.recording.rights import why_denied
 from relay_server.recording.writer import Writer
 from relay_server.store import Store
+from tests.relay_server.edges.robot_ends import until
 from tests.relay_server.memory import World, text
 from tests.relay_server.recording.reading import read
 
 HERE = "192.0.2.1"
 CHATTER = Ask(topics=["chatter"], megabytes=1)
+ROVER = RobotRecord(1, "rover", "default", "")
 
 
 class Doors:
@@ -41,7 +49,7 @@ class Doors:
     async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
         """Somebody who has a right on the robot."""
         record = await self._store.read(queries.find_robot, robot, principal.realm)
-        permit = None if record is None else await self._access.permit(principal, record.id)
+        permit = None if record is None else await self._access.permit(principal, record)
         if permit is None:
             raise NotFound(NO_ROBOT)
         self.inside += 1
@@ -64,6 +72,7 @@ class Desk:
         self.doors = Doors(store, self.access, self.world)
         self.recordings = self.begins()
         journal = Journal(store, self.wall)
+        # Doors are all of a front desk that it needs.
         self.desk = RecordingDesk(self.doors, self.recordings, store, journal, self.wall)  # type: ignore[arg-type]
         with store.database.begin() as session:
             self._robot = queries.add_robot(session, "rover").id
@@ -114,11 +123,32 @@ class Desk:
         for stamp, word in enumerate(words):
             self.world.channel.sample(number, text(word), stamp + 1)
 
+    def shows_pictures(self) -> None:
+        """The robot tells that its topic carries pictures now."""
+        image = link.Topic(types=["sensor_msgs/msg/Image"], publishers=["/eye"])
+        self.world.registry.graph(self.world.robot, link.Graph(topics={"/chatter": image}))
+
     async def recorded(self, who: Principal, *words: str) -> dict[str, Any]:
         """A recording that is finished."""
         begun = await self.desk.start(who, "rover", CHATTER, HERE)
         self.says(*words)
         return await self.desk.stop(who, "rover", begun["id"], HERE)
+
+    async def all(self, who: Principal) -> list[dict[str, Any]]:
+        """What is listed, when it is few."""
+        page = await self.desk.all(who, "rover", HERE)
+        assert page["next"] is None
+        return list(page["recordings"])
+
+    def breaks(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The disk fails when the next file is finished."""
+
+        def fails(file: McapFile) -> None:
+            monkeypatch.undo()
+            file.flush()
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(McapFile, "finish", fails)
 
     async def fetch(self, who: Principal, id: str) -> bytes:
         """The file."""
@@ -173,7 +203,7 @@ async def test_a_recording_is_begun_looked_at_stopped_and_fetched(desk: Desk, tm
     path.write_bytes(await desk.fetch(desk.bob, begun["id"]))
     assert [each.body for each in read(path)] == [text("a"), text("b")]
     assert path.stat().st_size == done["bytes"]
-    assert await desk.desk.all(desk.bob, "rover", HERE) == [done]
+    assert await desk.all(desk.bob) == [done]
     assert await desk.desk.one(desk.ann, "rover", begun["id"], HERE) == done
     assert desk.doors.inside == 0
 
@@ -192,7 +222,7 @@ async def test_who_does_what_is_on_record(desk: Desk) -> None:
     kinds = [each.kind for each in await desk.store.read(queries.list_events)]
     assert kinds == ["recording.ended", "recording.started"]
     assert list(desk.folder.iterdir()) == []
-    assert await desk.desk.all(desk.ann, "rover", HERE) == []
+    assert await desk.all(desk.ann) == []
 
 
 @pytest_twisted.ensureDeferred
@@ -216,7 +246,7 @@ async def test_who_may_not_see_or_record_it_does_not_find_it(desk: Desk) -> None
     assert "needs the level operator" in await failure(
         desk.desk.start(desk.eve, "rover", CHATTER, HERE), Refused
     )
-    assert await desk.desk.all(desk.eve, "rover", HERE) == []
+    assert await desk.all(desk.eve) == []
     for ask in (desk.desk.one, desk.desk.stop, desk.desk.delete, desk.desk.download):
         assert "no such recording" in await failure(ask(desk.eve, "rover", done["id"], HERE), NotFound)
         assert await failure(ask(desk.ann, "tank", done["id"], HERE), NotFound) == NO_ROBOT
@@ -234,6 +264,7 @@ async def test_what_could_be_recorded_is_told(desk: Desk) -> None:
         "denied": "",
         "megabytes": 5.0,
         "left": 5.0,
+        "full": "",
     }
     assert "/chatter" in found["topics"]
     await desk.recorded(desk.ann, "a")
@@ -260,9 +291,55 @@ async def test_pictures_are_not_to_be_had_by_recording_their_topic(desk: Desk) -
     assert "/eye/compressed" in (await desk.desk.possible(desk.bob, "rover", HERE))["topics"]
     desk.world.robot_goes()
     desk.recordings.library.open()
-    assert await desk.desk.all(desk.ann, "rover", HERE) == []
+    assert await desk.all(desk.ann) == []
     await failure(desk.desk.download(desk.ann, "rover", done["id"], HERE), NotFound)
-    assert [each["id"] for each in await desk.desk.all(desk.bob, "rover", HERE)] == [done["id"]]
+    assert [each["id"] for each in await desk.all(desk.bob)] == [done["id"]]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_topic_that_begins_to_carry_pictures_does_so_after_a_crash(desk: Desk) -> None:
+    """It is on the disk at once, so that who may not view them does not get what is recovered."""
+    begun = await desk.desk.start(desk.bob, "rover", CHATTER, HERE)
+    desk.shows_pictures()
+    async with desk.recordings._saving.setdefault(begun["id"], DeferredLock()):
+        # What was being saved has been.
+        found = Library(desk.folder, 10**6)
+        found.open()
+    (entry,) = found.of(1)
+    assert (entry.state.value, entry.pictures) == ("incomplete", ("/chatter",))
+    await desk.deny("ann", "view:/chatter")
+    permit = await desk.access.permit(desk.ann, ROVER)
+    assert permit is not None
+    assert "view on /chatter is denied" in why_denied(permit, entry)
+    done = await desk.desk.stop(desk.bob, "rover", begun["id"], HERE)
+    assert (done["state"], done["problems"]) == ("complete", [])
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_recording_is_put_on_record_by_one_thread_at_a_time(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may end while it is being saved: what is on the disk then is how it ended."""
+    begun = await desk.desk.start(desk.bob, "rover", CHATTER, HERE)
+    library = desk.recordings.library
+    save, go_on, texts = library.save, threading.Event(), list[bytes]()
+
+    def slowly(id: str, body: bytes) -> None:
+        texts.append(body)
+        go_on.wait(10)
+        save(id, body)
+
+    monkeypatch.setattr(library, "save", slowly)
+    desk.shows_pictures()
+    stopped = Deferred.fromCoroutine(desk.desk.stop(desk.bob, "rover", begun["id"], HERE))
+    await until(lambda: library.find(1, begun["id"]).state.value == "complete")
+    assert desk.recordings._threads._under_way == 1
+    go_on.set()
+    await stopped
+    again = Library(desk.folder, 10**6)
+    again.open()
+    (entry,) = again.of(1)
+    assert (len(texts), entry.state.value, entry.pictures) == (2, "complete", ("/chatter",))
 
 
 @pytest_twisted.ensureDeferred
@@ -286,9 +363,18 @@ async def test_a_right_that_is_revoked_ends_recording_and_download(desk: Desk) -
     assert denied == ["your right on this robot was revoked"]
     download.close()
     await desk.recordings.shut("over")
-    (found,) = [each for each in await desk.desk.all(desk.bob, "rover", HERE) if each["user"] == "ann"]
+    (found,) = [each for each in await desk.all(desk.bob) if each["user"] == "ann"]
     assert (found["state"], found["reason"]) == ("complete", "your right on this robot was revoked")
     assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_names_without_slash_are_taken_as_if_they_had_one(desk: Desk) -> None:
+    """Those of cameras like those of topics; what is named in both ways is recorded once."""
+    ask = Ask(topics=["chatter", "/chatter"], cameras=["camera", "/camera"], megabytes=1)
+    begun = await desk.desk.start(desk.ann, "rover", ask, HERE)
+    assert (begun["topics"], begun["cameras"]) == (("/chatter",), ("/camera",))
+    await desk.desk.stop(desk.ann, "rover", begun["id"], HERE)
 
 
 @pytest_twisted.ensureDeferred
@@ -298,6 +384,9 @@ async def test_what_can_not_be_recorded_leaves_nothing(desk: Desk) -> None:
         Ask(),
         Ask(topics=["no name"]),
         Ask(topics=["/camera/compressed"], cameras=["/camera"]),
+        Ask(topics=["/camera/compressed"], cameras=["camera"]),
+        Ask(cameras=["/"]),
+        Ask(cameras=["a\nb"]),
         Ask(topics=["/nowhere"], megabytes=1),
     ):
         await failure(desk.desk.start(desk.ann, "rover", ask, HERE), Invalid)
@@ -337,6 +426,124 @@ async def test_what_a_killed_relay_left_is_made_readable(desk: Desk) -> None:
     assert (found.state.value, found.messages, found.ended is not None) == ("recovered", 2, True)
     assert [each.body for each in read(path)] == [text("a"), text("b")]
     again.close()
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_breaks_off_is_mended_by_the_same_relay(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a while; until then it counts for what it takes of the disk."""
+    desk.breaks(monkeypatch)
+    broken = await desk.recorded(desk.ann, "a", "b")
+    assert (broken["state"], broken["reason"]) == ("incomplete", "stopped by ann")
+    size = (desk.folder / f"{broken['id']}.mcap").stat().st_size
+    assert desk.recordings.library.used == broken["bytes"] == size > 0
+    assert "not recovered yet" in await failure(
+        desk.desk.download(desk.ann, "rover", broken["id"], HERE), Unavailable
+    )
+    desk.world.clock.advance(PAUSE_SECONDS)
+    async with desk.recordings._mender._one_at_a_time:
+        # What was tried after the pause has been.
+        pass
+    found = await desk.desk.one(desk.ann, "rover", broken["id"], HERE)
+    assert (found["state"], found["messages"]) == ("recovered", 2)
+    (desk.folder / "copy").write_bytes(await desk.fetch(desk.ann, broken["id"]))
+    assert [each.body for each in read(desk.folder / "copy")] == [text("a"), text("b")]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_disk_that_is_nearly_full_takes_no_recording(desk: Desk) -> None:
+    """Who asks is told why, also before he asks for one; what runs is whole."""
+    begun = await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    ended: Deferred[None] = Deferred()
+    desk.recordings._ended[begun["id"]].append(lambda entry: ended.callback(None))
+    desk.says("a")
+    desk.recordings.library.reserve = 2**62
+    await ended
+    done = await desk.desk.one(desk.ann, "rover", begun["id"], HERE)
+    assert (done["state"], done["reason"], done["messages"]) == ("complete", "the disk is nearly full", 1)
+    words = await failure(desk.desk.start(desk.ann, "rover", CHATTER, HERE), Unavailable)
+    assert "the disk is nearly full" in words and "delete some recordings" in words
+    assert (await desk.desk.possible(desk.ann, "rover", HERE))["full"] == words
+    assert [each["id"] for each in await desk.all(desk.ann)] == [begun["id"]]
+    assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_asking_for_many_at_once_is_no_way_around_the_limits(desk: Desk) -> None:
+    """What is about to begin counts."""
+    permit = await desk.access.permit(desk.ann, ROVER)
+    assert permit is not None
+    robot, ends = desk.world.robot, list[str]()
+    asked = [desk.recordings.entry(CHATTER, robot, permit) for _ in range(5)]
+    begun = [
+        Deferred.fromCoroutine(
+            desk.recordings.start(each, robot, permit, lambda entry: ends.append(entry.id))
+        ).addErrback(lambda failure: str(failure.value))
+        for each in asked
+    ]
+    outcomes = [await each for each in begun]
+    assert outcomes[:USER_RECORDINGS] == [None] * USER_RECORDINGS
+    (words,) = outcomes[USER_RECORDINGS:]
+    assert words is not None and "recordings running" in words
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_just_being_begun_is_neither_stopped_nor_deleted(desk: Desk) -> None:
+    """Or it would run, and nobody knew of it."""
+    permit = await desk.access.permit(desk.ann, ROVER)
+    assert permit is not None
+    entry = desk.recordings.entry(CHATTER, desk.world.robot, permit)
+    starting = Deferred.fromCoroutine(
+        desk.recordings.start(entry, desk.world.robot, permit, lambda entry: None)
+    )
+    assert "being begun" in await failure(desk.recordings.delete(entry), Unavailable)
+    with pytest.raises(Unavailable, match="being begun"):
+        desk.recordings.stop(entry, "too early")
+    await starting
+    await desk.recordings.stop(entry, "enough")
+    await desk.recordings.delete(entry)
+    assert list(desk.folder.iterdir()) == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_downloads_wait_for_their_turn(desk: Desk) -> None:
+    """However many there are, none that has begun is refused; nor is who does something else meanwhile."""
+    done = await desk.recorded(desk.ann, "a")
+    path = desk.folder / f"{done['id']}.mcap"
+    go = threading.Event()
+    held = [Deferred.fromCoroutine(desk.recordings._threads.run(go.wait, 20)) for _ in range(THREADS)]
+    reads = [Deferred.fromCoroutine(desk.recordings.read(path, 0, 8)) for _ in range(2 * WAITING)]
+    for left in reads[::2]:
+        left.addErrback(lambda failure: failure.trap(CancelledError))
+        left.cancel()
+    starting = Deferred.fromCoroutine(desk.desk.start(desk.ann, "rover", CHATTER, HERE))
+    go.set()
+    for each in (*held, starting):
+        await each
+    assert {await each for each in reads[1::2]} == {path.read_bytes()[:8]}
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_long_list_comes_in_pages(desk: Desk) -> None:
+    """The latest first, of those one may have; what is deleted meanwhile moves nothing."""
+    for _ in range(7):
+        await desk.recorded(desk.ann, "a")
+        desk.world.clock.advance(0.5)
+    whole = await desk.all(desk.ann)
+    assert len(whole) == 7
+    page = await desk.desk.all(desk.ann, "rover", HERE, limit=3)
+    assert page["recordings"] == whole[:3]
+    await desk.desk.delete(desk.ann, "rover", whole[2]["id"], HERE)
+    page = await desk.desk.all(desk.ann, "rover", HERE, limit=3, before=page["next"])
+    assert page["recordings"] == whole[3:6]
+    page = await desk.desk.all(desk.ann, "rover", HERE, limit=1, before=page["next"])
+    assert page == {"recordings": whole[6:], "next": None}
+    assert await desk.desk.all(desk.eve, "rover", HERE, limit=1) == {"recordings": [], "next": None}
+    for wrong in ("yesterday", "inf_a", "nan_a", "_"):
+        assert "'before' is what" in await failure(
+            desk.desk.all(desk.ann, "rover", HERE, before=wrong), Invalid
+        )
 
 
 @pytest_twisted.ensureDeferred

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from relay_protocol.errors import Invalid, NotFound, Unavailable
+from relay_server.recording import library as module
 from relay_server.recording.library import Entry, Library, State, text_of
 
 
@@ -63,6 +64,56 @@ def test_it_is_all_there_after_a_new_start(library: Library, tmp_path: Path) -> 
     assert again.find(1, "a").reason == "the relay ended without warning"
     assert sorted(each.name for each in folder.iterdir()) == ["a.json", "b.json", "d.json"]
     assert folder.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("state", [State.RECORDING, State.INCOMPLETE])
+def test_what_broke_off_takes_the_room_that_its_file_has(
+    library: Library, tmp_path: Path, state: State
+) -> None:
+    """A relay that was killed wrote nothing down of that, nor did one that could not mend it."""
+    broken, unbegun = entry("a"), entry("b")
+    broken.state = unbegun.state = state
+    for each in (broken, unbegun):
+        library.save(each.id, text_of(each))
+    library.path(broken).write_bytes(bytes(2900))
+    again = Library(tmp_path / "recordings", 3000)
+    again.open()
+    assert (again.find(1, "a").bytes, again.find(1, "b").bytes) == (2900, 0)
+    assert (again.used, again.left) == (2900, 100)
+
+
+def test_a_copy_takes_room_too(library: Library) -> None:
+    """As long as it is there."""
+    library.copied = 2500
+    with pytest.raises(Unavailable, match="delete some"):
+        library.add(entry())
+    library.copied = 0
+    library.add(entry())
+
+
+def test_there_are_only_so_many(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one robot, and in all, however small; what is deleted makes place."""
+    monkeypatch.setattr(module, "ROBOT_KEPT", 2)
+    monkeypatch.setattr(module, "KEPT", 3)
+    for id in ("a", "b"):
+        library.add(entry(id, limit=1))
+    with pytest.raises(Unavailable, match=r"2 recordings of this robot are kept.*delete some of them"):
+        library.add(entry("c", limit=1))
+    library.add(entry("c", robot=2, limit=1))
+    with pytest.raises(Unavailable, match=r"3 recordings are kept.*in all: delete some, of any robot"):
+        library.add(entry("d", robot=2, limit=1))
+    library.forget(library.find(1, "a"))
+    assert library.full(1) == library.full(2) == ""
+    library.add(entry("d", robot=1, limit=1))
+    assert [each.id for each in library.of(1)] == ["d", "b"]
+
+
+def test_of_the_disk_some_stays_free(library: Library, tmp_path: Path) -> None:
+    """More than that is free here; more than any disk has is not."""
+    assert library.spare() > 0
+    assert not library.nearly_full()
+    careful = Library(tmp_path / "recordings", 3000, reserve=2**62)
+    assert careful.nearly_full()
 
 
 def test_a_deleted_recording_leaves_nothing(library: Library, tmp_path: Path) -> None:

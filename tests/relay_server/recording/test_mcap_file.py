@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from rosbags.interfaces import QosDurability, QosLiveliness, QosReliability
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from relay_server.recording.mcap_file import Full, McapFile, Track, mend
+from relay_server.recording.mcap_file import CHUNKS, Full, McapFile, Track, chunk_bytes, mend
 from tests.relay_server.memory import text
 from tests.relay_server.recording.reading import CHATTER, WORDS, profile, read
 
@@ -103,6 +103,13 @@ def test_a_file_is_never_larger_than_its_limit(tmp_path: Path, size: int, flush:
         file.finish()
     assert path.stat().st_size <= limit
     assert len(read(path)) == file.messages
+
+
+@pytest.mark.parametrize("size", [0, 10**9, 10**11])
+def test_a_large_file_has_large_chunks(size: int) -> None:
+    """So that not even the largest there may be has more of them than fit into memory; each fits as well."""
+    assert size / chunk_bytes(size) < CHUNKS + 1
+    assert 512 * 1024 <= chunk_bytes(size) < 7 * 10**6
 
 
 @pytest.mark.parametrize("cut", [1, 9, 40, 200])

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+from twisted.internet.defer import Deferred
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, Refused, Unavailable
+from relay_protocol.frames import VideoFrame
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
 from relay_server.recording import compressed
+from relay_server.recording import recorder as module
 from relay_server.recording.library import Entry, State
-from relay_server.recording.mcap_file import Track
-from relay_server.recording.recorder import AGAIN_SECONDS, Recorder, why_denied
+from relay_server.recording.mcap_file import McapFile, Track
+from relay_server.recording.recorder import AGAIN_SECONDS, HELD, STAMPS_END, Recorder
+from relay_server.recording.rights import why_denied
 from relay_server.recording.writer import Message, Outcome
 from tests.relay_server.memory import STRING, World, text
+from tests.relay_server.recording.reading import read
 from tests.relay_server.video import watching as video
 from tests.relay_server.video.watching import CAMERA, jpeg
 
@@ -74,20 +80,36 @@ class Desk:
         self.permit = Permit(principal, 1, Rules([Grant(Level.OPERATOR)]))
         self.over: list[Recorder] = []
         self.papers: list[Paper] = []
+        self.saved: list[tuple[str, ...]] = []
+        self.saving: list[Deferred[bool]] = []
         self.recorder = Recorder(
             world.clock,
             self.entry,
             self.permit,
             world.channel,
             world.videos,
-            self._paper,  # type: ignore[arg-type]
+            self._paper,  # type: ignore[arg-type]  # a writer without a file
             wall=lambda: 5.0,
+            changed=self._save,
             ended=self.over.append,
         )
 
     def _paper(self, ended: Callable[[Outcome], None]) -> Paper:
         self.papers.append(Paper(ended))
         return self.papers[-1]
+
+    def _save(self, entry: Entry) -> Deferred[bool]:
+        self.saved.append(entry.pictures)
+        self.saving.append(Deferred())
+        return self.saving[-1]
+
+    def shows_pictures(self, *topics: str) -> None:
+        """The robot tells that these topics carry pictures too now, and none of the others does."""
+        told = {}
+        for topic in self.entry.topics:
+            types = [STRING, "sensor_msgs/msg/Image"] if topic in topics else [STRING]
+            told[topic] = link.Topic(types=types, publishers=["/eye"])
+        self.world.registry.graph(self.world.robot, link.Graph(topics=told))
 
     @property
     def paper(self) -> Paper:
@@ -263,6 +285,104 @@ def test_pictures_of_a_topic_take_the_right_to_view_them(world: World) -> None:
     assert "view on /chatter is denied" in why_denied(desk.permit, desk.entry)
 
 
+def test_pictures_are_written_when_it_is_on_record_that_they_are(world: World) -> None:
+    """If the relay is killed at any time, who may have the file is known; what came meanwhile is not lost."""
+    desk, number = begun(world)
+    world.channel.sample(number, text("a"), 5)
+    assert desk.saved == []
+    desk.shows_pictures(HERE)
+    assert desk.saved == [(HERE,)]
+    for stamp in (6, 7):
+        world.channel.sample(number, text("b"), stamp)
+    desk.shows_pictures(HERE)
+    assert (desk.paper.bodies, len(desk.saved)) == ([text("a")], 1)
+    desk.saving[0].callback(True)
+    assert desk.paper.bodies == [text("a"), text("b"), text("b")]
+    assert [each.log_time for each in desk.paper.written] == [5, 6, 7]
+    world.channel.sample(number, text("c"), 8)
+    desk.shows_pictures(HERE)
+    desk.shows_pictures()
+    assert (desk.paper.bodies[3:], len(desk.saved), desk.entry.pictures) == ([text("c")], 1, (HERE,))
+    desk.recorder.count()
+    assert desk.entry.drops == 0
+
+
+def test_topics_found_one_after_the_other_are_all_put_on_record(world: World) -> None:
+    """What is being saved does not know of the second, so that one waits for the next time."""
+    other = "/map"
+    world.robot_comes()
+    desk = Desk(world, (HERE, other))
+    desk.shows_pictures()
+    desk.starts()
+    world.robot_joins()
+    number = desk.hears()
+    desk.shows_pictures(HERE)
+    desk.shows_pictures(HERE, other)
+    world.channel.sample(number, text("a"), 5)
+    assert desk.saved == [(HERE,)]
+    desk.saving[0].callback(True)
+    assert desk.saved == [(HERE,), (HERE, other)]
+    assert desk.paper.written == []
+    desk.saving[1].callback(True)
+    assert desk.paper.bodies == [text("a")]
+
+
+def test_what_can_not_be_put_on_record_is_tried_again(world: World) -> None:
+    """No pictures are written until it is; that they are missing is told, and they are counted."""
+    desk, number = begun(world)
+    desk.shows_pictures(HERE)
+    for _ in range(HELD + 2):
+        world.channel.sample(number, text("a"), 5)
+    for _ in range(3):
+        desk.saving[-1].callback(False)
+        world.clock.advance(AGAIN_SECONDS)
+    assert (len(desk.saved), desk.paper.written) == (4, [])
+    (problem,) = desk.entry.problems
+    assert "could not be put on record" in problem
+    desk.saving[-1].callback(True)
+    desk.recorder.count()
+    assert (len(desk.paper.written), desk.entry.drops) == (HELD, 2)
+
+
+def test_pictures_that_wait_take_little_memory(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However large each of them is."""
+    monkeypatch.setattr(module, "HELD_BYTES", 2 * len(text("a")))
+    desk, number = begun(world)
+    desk.shows_pictures(HERE)
+    for _ in range(3):
+        world.channel.sample(number, text("a"), 5)
+    desk.saving[0].callback(True)
+    desk.recorder.count()
+    assert (len(desk.paper.written), desk.entry.drops) == (2, 1)
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_a_recording_that_is_over_writes_nothing_that_waited(world: World, saved: bool) -> None:
+    """Nor does it try to put anything on record; that is done at its end."""
+    desk, number = begun(world)
+    desk.shows_pictures(HERE)
+    world.channel.sample(number, text("a"), 5)
+    desk.recorder.stop("enough")
+    desk.saving[0].callback(saved)
+    world.clock.advance(AGAIN_SECONDS)
+    desk.paper.ends()
+    assert (desk.paper.written, desk.entry.drops, len(desk.saved)) == ([], 1, 1)
+
+
+def test_pictures_that_began_while_it_was_begun_are_found(world: World) -> None:
+    """Between the wish and the beginning a file was written, and meanwhile the robot told of another type."""
+    world.robot_comes()
+    desk = Desk(world)
+    desk.shows_pictures(HERE)
+    desk.starts()
+    assert desk.saved == [(HERE,)]
+    other = Desk(world)
+    other.rights(f"view:{HERE}")
+    other.starts()
+    assert other.paper.closing
+    assert "view on /chatter is denied" in other.entry.reason
+
+
 def test_a_topic_that_is_not_there_is_refused_and_nothing_has_begun(world: World) -> None:
     """The robot is asked for nothing."""
     world.at_work()
@@ -304,6 +424,85 @@ def test_pictures_are_written_as_messages(world: World) -> None:
     assert second.log_time >= first.log_time
     desk.recorder.stop("enough")
     assert not stream.viewers
+
+
+@pytest.mark.parametrize("stamp", [2**31 * 10**9, 2**63, 2**64 - 1])
+def test_a_clock_that_can_not_be_breaks_nothing(world: World, stamp: int, tmp_path: Path) -> None:
+    """A picture's time that ROS can't hold is replaced by when it came; that is told once, and the file is whole."""
+    video.robot_comes(world)
+    desk = Desk(world, (), (CAMERA,))
+    desk.starts()
+    video.robot_joins(world)
+    (stream,) = world.videos.of(world.robot)
+    for number in (1, 2):
+        stream.picture(VideoFrame(number, stamp, jpeg()))
+    now = world.channel.now_ns()
+    assert [(each.log_time, each.publish_time) for each in desk.paper.written] == [(now, now)] * 2
+    assert desk.paper.bodies[0] == compressed.message(jpeg(), now, "jpeg")
+    assert [each.partition(":")[0] for each in desk.entry.problems] == [CAMERA]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        book = McapFile(file, 10**7, ros=True)
+        for message, body in zip(desk.paper.written, desk.paper.bodies, strict=True):
+            book.add(message.track, message.log_time, message.publish_time, body)
+        book.finish()
+    assert len(read(tmp_path / "a.mcap")) == 2
+
+
+@pytest.mark.parametrize("stamp", [STAMPS_END, 2**64 - 1])
+def test_a_sample_of_a_clock_that_can_not_be_has_the_time_it_came(world: World, stamp: int) -> None:
+    """Or players would wait for centuries."""
+    desk, number = begun(world)
+    for _ in range(2):
+        world.channel.sample(number, text("a"), stamp)
+    now = world.channel.now_ns()
+    assert [(each.log_time, each.publish_time) for each in desk.paper.written] == [(now, now)] * 2
+    assert [each.partition(":")[0] for each in desk.entry.problems] == [HERE]
+
+
+def test_the_last_time_there_is_is_kept(world: World) -> None:
+    """In January 2038."""
+    desk, number = begun(world)
+    world.channel.sample(number, text("a"), STAMPS_END - 1)
+    assert desk.paper.written[0].log_time == STAMPS_END - 1
+    assert desk.entry.problems == []
+
+
+def test_a_latched_sample_of_a_clock_that_can_not_be_comes_now(world: World) -> None:
+    """By both of its times."""
+    world.robot_comes()
+    person = world.person()
+    world.robot_joins()
+    person.says("subscribe", topic=HERE)
+    number = world.link.all(link.Subscribe)[0].number
+    world.subscribed(number, latched=True)
+    world.define()
+    world.channel.sample(number, text("old"), 2**64 - 1)
+    desk = Desk(world)
+    desk.starts()
+    (message,) = desk.paper.written
+    assert message.log_time == message.publish_time == world.channel.now_ns()
+
+
+def test_that_others_pictures_are_recorded_is_told(world: World) -> None:
+    """While the robot is at its limit; when there is a place again, what was asked for is recorded."""
+    video.robot_comes(world, streams=1)
+    viewer = video.Watcher(1)
+    stream = viewer.watch(world, link.VideoSettings(width=32, quality=60))
+    video.robot_joins(world)
+    video.shows(world, stream, 1)
+    desk = Desk(world, (), (CAMERA,))
+    desk.starts()
+    video.shows(world, stream, 2)
+    (problem,) = desk.entry.problems
+    assert problem.startswith(f"{CAMERA}: the robot is at its limit")
+    assert problem.endswith("width 32, quality 60")
+    viewer.leave()
+    video.robot_joins(world)
+    (own,) = world.videos.of(world.robot)
+    assert own.settings == link.VideoSettings()
+    video.shows(world, own, 1)
+    assert len(desk.paper.written) == 2
+    assert desk.entry.problems == [problem]
 
 
 def test_a_camera_that_is_not_to_be_had_is_asked_for_again(world: World) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import pytest_twisted
@@ -96,21 +97,24 @@ async def test_what_was_never_removed_stays(left: Left, at: float | None) -> Non
     assert left.files == ["a.json", "a.mcap"]
 
 
+@pytest.mark.parametrize("how", ["delete", "stop"])
 @pytest_twisted.ensureDeferred
-async def test_what_can_not_be_deleted_stays_for_now(left: Left, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The others go; the next time it is tried again."""
+async def test_what_can_not_be_deleted_stays_for_now(
+    left: Left, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """Nor what can't be stopped before; the others go, and the next time it is tried again."""
     rover = left.recording("a", "rover")
     left.recording("b", "rover")
     left.removes(rover, "rover")
     left.recordings.open()
-    delete = left.recordings.delete
+    does = getattr(left.recordings, how)
 
-    async def refuses(entry: Entry) -> None:
+    def refuses(entry: Entry, *reason: str) -> Any:
         if entry.id == "a":
-            raise Unavailable("it is being recovered")
-        await delete(entry)
+            raise Unavailable("not now")
+        return does(entry, *reason)
 
-    monkeypatch.setattr(left.recordings, "delete", refuses)
+    monkeypatch.setattr(left.recordings, how, refuses)
     await left.sweep()
     assert left.files == ["a.json", "a.mcap"]
     monkeypatch.undo()

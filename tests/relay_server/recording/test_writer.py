@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ from switchboard_waiting import wait_for
 from relay_protocol.errors import Invalid
 from relay_server.recording import writer as module
 from relay_server.recording.mcap_file import mend
-from relay_server.recording.writer import Message, Outcome, Writer
+from relay_server.recording.writer import Message, Outcome, Writer, flush_pause
 from tests.relay_server.memory import text
 from tests.relay_server.recording.reading import CHATTER, read
 
@@ -44,7 +45,8 @@ class Book:
         self.reactor = Reactor()
         self.path = path
         self.outcomes: list[Outcome] = []
-        self.writer = Writer(self.reactor, path, limit, True, self.outcomes.append)
+        self.nearly_full = False
+        self.writer = Writer(self.reactor, path, limit, True, lambda: self.nearly_full, self.outcomes.append)
 
     def put(self, word: str, make: Callable[[bytes], bytes] | None = None) -> bool:
         """A message."""
@@ -102,6 +104,70 @@ def test_what_can_not_be_made_is_counted(book: Book) -> None:
     assert book.writer.broken == 1
 
 
+@pytest.mark.parametrize("error", [struct.error, KeyError, OSError, MemoryError])
+def test_whatever_a_message_does_the_file_goes_on(book: Book, error: type[Exception]) -> None:
+    """One that can't be made is counted, also if nobody thought that it could fail so."""
+
+    def broken(body: bytes) -> bytes:
+        raise error("surprise")
+
+    book.writer.start()
+    for word in ("a", "b"):
+        book.put(word, broken)
+    book.put("c")
+    assert book.finish() == Outcome(True, "")
+    assert [each.body for each in read(book.path)] == [text("c")]
+    assert book.writer.broken == 2
+
+
+def test_what_is_being_written_keeps_its_place(book: Book, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By number and by bytes: what the thread has in hand is in memory still."""
+    begun, go = threading.Event(), threading.Event()
+
+    def slow(body: bytes) -> bytes:
+        begun.set()
+        assert go.wait(20)
+        return body
+
+    monkeypatch.setattr(module, "QUEUE_MESSAGES", 3)
+    book.writer.start()
+    assert book.put("a", slow)
+    assert begun.wait(20)
+    assert [book.put("b") for _ in range(3)] == [True, True, False]
+    monkeypatch.setattr(module, "QUEUE_MESSAGES", 1000)
+    monkeypatch.setattr(module, "QUEUE_BYTES", 3 * len(text("a")) + 1)
+    assert not book.put("c"), "there is place for two bytes at most"
+    go.set()
+    wait_for("all is written", lambda: book.put("d"))
+    book.finish()
+    assert len(read(book.path)) == 4
+
+
+def test_what_is_written_gives_its_place_back(book: Book, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of it: the queue is not smaller afterwards."""
+    book.writer.start()
+    for number in range(3 * module.BATCH):
+        assert book.put(f"{number}")
+    wait_for("all is written", lambda: book.writer.messages == 3 * module.BATCH)
+    monkeypatch.setattr(module, "QUEUE_MESSAGES", 1)
+    monkeypatch.setattr(module, "QUEUE_BYTES", len(text("a")))
+    wait_for("there is place for one", lambda: book.put("a"))
+    book.finish()
+    assert len(read(book.path)) == 3 * module.BATCH + 1
+
+
+def test_it_ends_whole_when_the_disk_is_nearly_full(book: Book, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if nothing comes."""
+    monkeypatch.setattr(module, "LOOK_SECONDS", 0.01)
+    book.put("a")
+    book.nearly_full = True
+    book.writer.start()
+    book.reactor.run()
+    assert book.outcomes == [Outcome(True, "the disk is nearly full")]
+    assert [each.body for each in read(book.path)] == [text("a")]
+    assert not book.put("late")
+
+
 def test_it_ends_by_itself_at_its_size(tmp_path: Path) -> None:
     """The file is whole."""
     book = Book(tmp_path / "a.mcap", 100_000)
@@ -124,8 +190,8 @@ def test_a_file_that_can_not_be_written_ends_it_in_words(tmp_path: Path) -> None
 
 
 def test_what_came_is_in_the_file_soon(book: Book, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A relay that is killed loses no more than comes in a second."""
-    monkeypatch.setattr(module, "FLUSH_SECONDS", 0.01)
+    """A relay that is killed loses no more than comes in a moment."""
+    monkeypatch.setattr(module, "FLUSH_SECONDS", (0.01, 0.01))
     book.writer.start()
     book.put("a")
     killed = tmp_path / "killed.mcap"
@@ -137,3 +203,13 @@ def test_what_came_is_in_the_file_soon(book: Book, monkeypatch: pytest.MonkeyPat
     wait_for("the message is in the file", lambda: book.path.exists() and kept())
     book.finish()
     assert len(read(book.path)) == 1
+
+
+def test_a_long_recording_is_flushed_less_often() -> None:
+    """So that its index does not grow with every second: it has some 9000 chunks by time in a day."""
+    assert [flush_pause(age) for age in (0, 60, 300, 600, 86400)] == [1, 1, 5, 10, 10]
+    age, flushes = 0.0, 0
+    while age < 86400:
+        age += flush_pause(age)
+        flushes += 1
+    assert flushes < 9000

@@ -180,6 +180,21 @@ def test_who_never_let_go_moves_nothing_by_taking_control(world: World) -> None:
     assert passed(world) == [ann.session.number] * 2
 
 
+def test_a_link_that_stalls_is_no_letting_go(world: World) -> None:
+    """What it holds up may have been sent without a pause; a ping answered since would tell that it was not."""
+    ann = losing(world)
+    world.robot.description = link.Describe(motion=link.MotionPolicy(types=[TWIST], deadline_ms=2000))
+    take(ann)
+    drive(ann)
+    world.wait(1.0)
+    ann.says("publish", topic="/cmd_vel", msg=GO)
+    assert ["let go first" in each for each in ann.told()] == [True, True]
+    assert passed(world) == []
+    world.wait(0.7, ann)
+    drive(ann)
+    assert passed(world) == [ann.session.number]
+
+
 def test_a_zero_is_letting_go(world: World) -> None:
     """With control, and before."""
     ann = losing(world)

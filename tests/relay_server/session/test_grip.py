@@ -14,6 +14,7 @@ STAMPED = "geometry_msgs/msg/TwistStamped"
 JOY = "sensor_msgs/msg/Joy"
 JOG = "control_msgs/msg/JointJog"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
 HEADER = {"stamp": {"sec": 7}, "frame_id": "base"}
 
 
@@ -33,6 +34,8 @@ HEADER = {"stamp": {"sec": 7}, "frame_id": "base"}
         (JOG, {"joint_names": ["a"], "displacements": [0.1]}, False),
         (TRAJECTORY, {"header": HEADER, "joint_names": ["a"]}, True),
         (TRAJECTORY, {"joint_names": ["a"], "points": [{"positions": [0.0]}]}, False),
+        (MULTI_DOF, {"header": HEADER, "joint_names": ["a"], "points": []}, True),
+        (MULTI_DOF, {"joint_names": ["a"], "points": [{"transforms": []}]}, False),
         ("some_msgs/msg/Motor", {"level": 0, "on": False}, True),
         ("some_msgs/msg/Motor", {"level": 0, "on": True}, False),
         ("some_msgs/msg/Motor", {"bytes": "AQ=="}, False),

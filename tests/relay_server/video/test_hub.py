@@ -13,8 +13,8 @@ from relay_server.video.hub import (
     STREAMS_AT_ONCE,
     USER_VIEWERS,
 )
-from relay_server.video.stream import STREAM_VIEWERS
-from tests.relay_server.memory import World
+from relay_server.video.stream import LINGER_SECONDS, STREAM_VIEWERS
+from tests.relay_server.memory import MemoryLink, World
 from tests.relay_server.video.watching import (
     CAMERA,
     OTHER,
@@ -99,7 +99,7 @@ def test_nobody_takes_all_streams_of_a_robot_for_himself(world: World) -> None:
 
 
 def test_of_a_robot_that_makes_few_streams_nobody_takes_all(world: World) -> None:
-    """Three quarters of those it says it makes, and all of one that makes but one."""
+    """Three quarters of those it says it makes, rounded up: all of one that makes but one or two."""
     robot_comes(world, streams=4)
     for width in (20, 30, 40):
         Watcher().watch(world, link.VideoSettings(width=width))
@@ -108,9 +108,23 @@ def test_of_a_robot_that_makes_few_streams_nobody_takes_all(world: World) -> Non
     Watcher(8).watch(world, link.VideoSettings(width=50))
     with pytest.raises(Unavailable, match="shows 4 streams already, the most it can"):
         Watcher(9).watch(world, link.VideoSettings(width=60))
-    world.videos.shut()
+    for streams in (1, 2):
+        world.videos.shut()
+        robot_comes(world, streams=streams)
+        for number in range(streams):
+            Watcher().watch(world, camera=f"/nowhere/{number}")
+        with pytest.raises(Unavailable, match=f"you have {streams} streams? of robot rover"):
+            Watcher().watch(world)
+
+
+def test_one_is_no_several(world: World) -> None:
+    """In the words for who gets nothing."""
     robot_comes(world, streams=1)
     Watcher().watch(world)
+    with pytest.raises(Unavailable, match="you have 1 stream of robot rover to yourself"):
+        Watcher().watch(world, camera=OTHER)
+    with pytest.raises(Unavailable, match="robot rover shows 1 stream already"):
+        Watcher(8).watch(world, camera=OTHER)
 
 
 def test_a_user_begins_streams_only_so_fast(world: World) -> None:
@@ -179,6 +193,36 @@ def test_when_the_robot_is_busy_the_nearest_stream_is_shared(world: World) -> No
     assert watcher not in small.viewers
 
 
+def test_who_is_moved_to_a_slow_stream_sees_its_newest_picture_if_he_asked_for_it(world: World) -> None:
+    """As who comes to it by himself does."""
+    robot_comes(world)
+    slow = showing(world, 32, 24, fps=0.05)
+    world.clock.advance(5)
+    watchers = {newest: Watcher(user=1) for newest in (True, False)}
+    wanted = link.VideoSettings(width=40, height=30)
+    for newest, watcher in watchers.items():
+        watcher.stream = world.videos.watch(world.robot, CAMERA, wanted, watcher, newest=newest)
+    robot_joins(world)
+    refused = watchers[True].stream
+    assert refused is not None
+    refused.message(link.NotPlaying(reason="two streams are all I can", busy=True))
+    world.clock.advance(0)
+    assert {watcher.stream for watcher in watchers.values()} == {slow}
+    assert {newest: watcher.numbers for newest, watcher in watchers.items()} == {True: [1], False: []}
+
+
+def test_of_streams_of_one_size_that_of_the_nearest_quality_and_rate_is_shared(world: World) -> None:
+    """Quality first; of the rate it is the time between two pictures that counts."""
+    robot_comes(world)
+    poor = showing(world, 32, 24, quality=20, fps=30)
+    slow, quick = showing(world, 32, 24, quality=70, fps=1), showing(world, 32, 24, quality=70, fps=15)
+    assert busy(world, link.VideoSettings(width=32, height=24, quality=30)).stream is poor
+    assert busy(world, link.VideoSettings(width=32, height=24, quality=80)).stream is quick
+    assert busy(world, link.VideoSettings(width=32, height=24, quality=80, fps=30)).stream is quick
+    assert busy(world, link.VideoSettings(width=32, height=24, quality=80, fps=1.2)).stream is slow
+    assert busy(world, link.VideoSettings(width=48, height=36, quality=20)).stream is poor
+
+
 def test_a_picture_that_is_turned_otherwise_is_not_near(world: World) -> None:
     """It would mislead who drives by it."""
     robot_comes(world)
@@ -212,6 +256,88 @@ def test_a_busy_robot_without_such_a_stream_is_told_of(world: World) -> None:
     for user in range(STREAM_VIEWERS - 1):
         Watcher(2000 + user).watch(world, full.settings)
     assert str(busy(world, link.VideoSettings()).error) == "two streams are all I can"
+
+
+def test_who_is_shown_another_form_gets_his_own_when_there_is_a_place(world: World) -> None:
+    """A recording before who came earlier; the robot is asked for no more than it makes."""
+    robot_comes(world, streams=3)
+    small, large, rear = showing(world, 32, 24), showing(world, 64, 48), showing(world, 32, 24, OTHER)
+    early, tape, late = Watcher(1), Watcher(2), Watcher(3)
+    assert early.watch(world, link.VideoSettings(width=40)) is small
+    tape.stream = world.videos.watch(world.robot, CAMERA, link.VideoSettings(), tape, first=True)
+    assert late.watch(world, link.VideoSettings(width=60)) is tape.stream is large
+    (only,) = rear.viewers
+    rear.detach(only)
+    world.clock.advance(LINGER_SECONDS)
+    (asked_for,) = asked(world)
+    assert asked_for.settings == link.VideoSettings()
+    assert {early.stream, late.stream} == {small, large}
+    assert tape.stream.settings == asked_for.settings
+    assert tape.stream.viewers == {tape}
+    tape.leave()
+    world.clock.advance(LINGER_SECONDS)
+    assert early.stream.settings.width == 40
+    assert late.stream is large
+    assert len(world.videos.of(world.robot)) == 3
+    assert not any(each.error for each in (early, tape, late))
+
+
+def test_a_stream_that_nobody_asked_for_gives_way(world: World) -> None:
+    """Who is left in it gets his own in its place; the others are shown that, until it is their turn."""
+    robot_comes(world, streams=1)
+    shared = showing(world, 32, 24)
+    (owner,) = shared.viewers
+    early, tape = Watcher(1), Watcher(2)
+    early.watch(world, link.VideoSettings(width=40))
+    tape.stream = world.videos.watch(world.robot, CAMERA, link.VideoSettings(), tape, first=True)
+    world.control.take(link.OpenVideo)
+    shared.detach(owner)
+    world.clock.advance(0)
+    assert shared.state is State.CLOSED
+    (whole,) = world.videos.of(world.robot)
+    assert (whole.settings, whole.viewers) == (link.VideoSettings(), {early, tape})
+    told = [type(each) for each in world.control.said if not isinstance(each, link.KeyFrame)]
+    assert told == [link.CloseVideo, link.OpenVideo]
+    tape.leave()
+    world.clock.advance(0)
+    (own,) = world.videos.of(world.robot)
+    assert (own.settings.width, own.viewers, early.stream) == (40, {early}, own)
+
+
+def test_a_place_that_the_robot_has_not_is_asked_for_once(world: World) -> None:
+    """It knows best how many streams it makes; who is sent back is shown what he was."""
+    robot_comes(world)
+    shared = showing(world, 32, 24)
+    watcher = busy(world, link.VideoSettings(width=40))
+    assert watcher.stream is shared
+    assert asked(world) == []
+    gone = showing(world, 32, 24, OTHER)
+    gone.shut(Unavailable("the lens is covered"))
+    refused = world.videos.redeem(asked(world)[-1].ticket)
+    assert refused is not None and refused is watcher.stream
+    refused.joined(MemoryLink())
+    refused.message(link.NotPlaying(reason="one stream is all I can", busy=True))
+    assert watcher.stream is shared
+    world.clock.advance(5)
+    assert asked(world) == []
+    assert watcher.error is None
+
+
+def test_what_may_be_another_topic_takes_no_ones_place(world: World) -> None:
+    """Not everybody may view it who may view the camera."""
+    robot_comes(world, streams=1)
+    shared = showing(world, 32, 24)
+    (owner,) = shared.viewers
+    first, second = Watcher(1), Watcher(2)
+    first.watch(world, link.VideoSettings(transport="compressed"))
+    second.watch(world, link.VideoSettings(transport="raw"))
+    shared.detach(owner)
+    world.clock.advance(0)
+    assert shared.viewers == {first, second}
+    second.leave()
+    world.clock.advance(0)
+    assert first.stream is not None
+    assert first.stream.settings.transport == "compressed"
 
 
 def test_all_streams_of_a_robot_end(world: World) -> None:

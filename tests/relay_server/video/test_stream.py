@@ -6,17 +6,18 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, Unavailable
-from relay_server.video import NO_CAMERA, NothingCame, State
-from relay_server.video.pictures import SPAN_SECONDS, STALE_SECONDS, Lateness
+from relay_server.video import NO_CAMERA, NothingCame, NotMade, State
+from relay_server.video.keys import KEY_SECONDS
+from relay_server.video.patience import FIRST_PICTURE_SECONDS
+from relay_server.video.pictures import STALE_SECONDS
 from relay_server.video.states import LINKED, NEXT, Event
 from relay_server.video.stream import (
-    FIRST_PICTURE_SECONDS,
     JOIN_SECONDS,
-    KEY_SECONDS,
     LINGER_SECONDS,
     MOST_REOPEN_SECONDS,
     REOPEN_SECONDS,
     STREAM_VIEWERS,
+    TELL_SECONDS,
     Hooks,
     Stream,
 )
@@ -51,7 +52,7 @@ def watched(world: World, settings: link.VideoSettings | None = None) -> tuple[S
 def brought_to(world: World, state: State) -> Stream:
     """A stream in this state, by what really happens."""
     if state is State.NEW:
-        hooks = Hooks(lambda stream: "ticket", lambda stream: None, lambda stream: None)
+        hooks = Hooks(lambda stream: "ticket", *3 * (lambda stream: None,))
         return Stream(world.clock, world.robot, CAMERA, link.VideoSettings(), "rover#video0", hooks)
     watcher = Watcher()
     stream = watcher.watch(world)
@@ -104,18 +105,6 @@ def test_what_the_network_held_up_is_good_for_less_long(world: World) -> None:
         shows(world, stream, number, late=late)
     left = [picture.good_until - world.clock.seconds() for picture in watcher.pictures]
     assert left == pytest.approx([STALE_SECONDS, STALE_SECONDS - 0.3, STALE_SECONDS - 2.0])
-
-
-def test_what_is_late_is_learnt_anew_when_a_clock_was_set() -> None:
-    """After ten to twenty seconds; what comes sooner than ever is known at once."""
-    lateness = Lateness()
-    assert lateness.of(100.0, 1.0) == 0
-    assert lateness.of(101.0, 2.5) == pytest.approx(0.5)
-    assert lateness.of(103.0, 3.0) == 0
-    late = [lateness.of(3.0 + second - 5.0 + 100.0, 3.0 + second) for second in range(1, 30)]
-    assert late[0] == pytest.approx(5.0)
-    assert late[-1] == pytest.approx(0.0)
-    assert sum(each > 1 for each in late) <= 2 * SPAN_SECONDS
 
 
 def test_who_comes_later_is_told_what_the_others_know(world: World) -> None:
@@ -360,10 +349,28 @@ def test_a_robot_that_can_not_show_it_says_why(world: World) -> None:
     """The viewers hear it, and the stream is over."""
     stream, watcher, end = watched(world)
     stream.message(link.NotPlaying(reason="no module named av"))
-    assert isinstance(watcher.error, Unavailable)
+    assert type(watcher.error) is Unavailable
     assert str(watcher.error) == "no module named av"
     assert stream.state is State.CLOSED
     assert end.closed
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_of_h264_it_is_told_whether_another_codec_may_do(world: World, busy: bool) -> None:
+    """Not when the robot only makes too many streams."""
+    stream, watcher, _ = watched(world, H264)
+    stream.message(link.NotPlaying(reason="no module named av", busy=busy))
+    assert type(watcher.error) is (Unavailable if busy else NotMade)
+    assert str(watcher.error) == "no module named av"
+
+
+def test_h264_that_is_none_is_the_encoders_fault(world: World) -> None:
+    """JPEG may be better."""
+    stream, watcher, _ = watched(world, H264)
+    stream.message(PLAYING)
+    with pytest.raises(MalformedMessage):
+        shows(world, stream, 1, b"<html>")
+    assert type(watcher.error) is NotMade
 
 
 def test_what_the_robot_plays_is_told_when_it_changes(world: World) -> None:
@@ -371,11 +378,39 @@ def test_what_the_robot_plays_is_told_when_it_changes(world: World) -> None:
     stream, watcher, end = watched(world)
     less = link.Playing(width=16, height=12, quality=40, reduced=0.5)
     stream.message(PLAYING)
+    stream.message(PLAYING)
     stream.message(less)
-    assert watcher.played == [PLAYING, less]
     assert stream.told == less
+    world.clock.advance(1)
+    assert watcher.played == [PLAYING, less]
     stream.lost(end)
     assert stream.told is None
+    world.clock.advance(REOPEN_SECONDS)
+    robot_joins(world)
+    stream.message(less)
+    assert watcher.played == [PLAYING, less, less]
+
+
+def test_a_robot_that_says_without_end_what_it_plays_is_told_of_ten_times_a_second(world: World) -> None:
+    """The first at once, then the newest; who comes meanwhile hears that, and nobody anything once it is over."""
+    stream, watcher, _ = watched(world)
+    playing = [link.Playing(width=16 + number, height=12, quality=40) for number in range(1000)]
+    for each in playing:
+        stream.message(each)
+    assert watcher.played == playing[:1]
+    late = Watcher()
+    late.watch(world)
+    world.clock.advance(TELL_SECONDS)
+    assert watcher.played == [playing[0], playing[-1]]
+    assert set(late.played) == {playing[-1]}
+    for number in range(100):
+        stream.message(playing[number])
+        world.clock.advance(TELL_SECONDS / 10)
+    assert len(watcher.played) == pytest.approx(2 + 10, abs=1)
+    stream.message(PLAYING)
+    stream.shut(Unavailable("over"))
+    world.clock.advance(1)
+    assert PLAYING not in watcher.played
 
 
 # --- H.264 ------------------------------------------------------------------------------------------------

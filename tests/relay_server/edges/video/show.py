@@ -101,7 +101,8 @@ class Show:
         websocket = WebSocketResource(ClientFactory(clock, time.monotonic_ns, self.desk, cap))
         pictures = WebSocketResource(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds))
         video = Video(clock, rounds, self.desk, api.principal, pictures)
-        root = Root(Robots(websocket, video, "1.2.3"), api.app.resource(), Missing())
+        robots = Robots(websocket, video, "1.2.3")
+        root = Root(robots, api.app.resource(), Missing(), Missing(), Missing())
         site = RelaySite(root, clock, cap, tls is not None)
         self._listening = (
             clock.listenTCP(0, site, interface="127.0.0.1")
@@ -153,6 +154,10 @@ class Show:
         cameras = [link.Camera(name=CAMERA, width=32, height=24), link.Camera(name=SECRET)]
         self.registry.cameras(self.robot, link.Cameras(cameras=cameras))
         return control
+
+    def makes(self, streams: int) -> None:
+        """The robot tells how many streams it makes at a time."""
+        self.registry.cameras(self.robot, link.Cameras(cameras=list(self.robot.cameras), streams=streams))
 
     async def joined(self, control: MemoryLink) -> Stream:
         """The stream the robot was asked for, once it has joined it."""

@@ -13,7 +13,7 @@ from twisted.internet.defer import DeferredList, ensureDeferred
 from relay_protocol import limits, link
 from relay_server.edges import site
 from relay_server.edges.video import multipart
-from relay_server.video import stream as streams
+from relay_server.video import patience
 from tests.relay_server.edges.video.show import CAMERA, STREAM, Show, jpeg, until
 
 
@@ -167,7 +167,7 @@ async def test_where_nothing_comes_the_answer_says_why(
     show: Show, monkeypatch: pytest.MonkeyPatch, online: bool
 ) -> None:
     """503 when the robot is not there, 504 when it is; the connection serves the next request."""
-    monkeypatch.setattr(streams, "FIRST_PICTURE_SECONDS", 0.2)
+    monkeypatch.setattr(patience, "FIRST_PICTURE_SECONDS", 0.2)
     if online:
         show.robot_comes()
     looker = show.looks(STREAM)
@@ -182,7 +182,7 @@ async def test_a_camera_that_never_appears_is_told_like_one_that_may_not_be_view
     show: Show, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """404 in the same words; the robot had time to tell of it."""
-    monkeypatch.setattr(streams, "FIRST_PICTURE_SECONDS", 0.2)
+    monkeypatch.setattr(patience, "FIRST_PICTURE_SECONDS", 0.2)
     show.robot_comes()
     looker = show.looks(STREAM.replace(CAMERA, "/nowhere"))
     assert await looker.problem() == (404, "there is no such camera, or you have no right to view it")

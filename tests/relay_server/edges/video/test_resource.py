@@ -169,6 +169,38 @@ async def test_a_snapshot_is_the_first_picture_that_comes(show: Show, query: str
     assert (await looker.answer())[0] == 200
 
 
+@pytest_twisted.ensureDeferred
+async def test_that_another_form_is_shown_than_was_asked_for_is_told(show: Show) -> None:
+    """By the parameters in which it differs; nothing is told to who gets what he asked for."""
+    control = show.robot_comes()
+    show.makes(1)
+    first = show.looks(STREAM + "&width=32")
+    stream = await show.joined(control)
+    show.films(stream, jpeg())
+    assert "x-instead" not in (await first.head())[1]
+    second = show.looks(STREAM + "&width=64&quality=50")
+    assert (await second.head())[1]["x-instead"] == "width=32&quality=80"
+    snapshot = show.looks(SNAPSHOT)
+    assert (await snapshot.answer())[1]["x-instead"] == "width=32"
+    first.leave()
+    second.leave()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_snapshot_of_a_slow_stream_is_the_newest_picture_whose_time_it_tells(show: Show) -> None:
+    """Nobody waits twenty seconds for one that somebody else has just seen."""
+    control = show.robot_comes()
+    viewer = show.looks(STREAM + "&fps=0.05")
+    stream = await show.joined(control)
+    # It took five seconds more on its way than the one before.
+    for stamp in (1000.5, 995.5):
+        show.shows(stream, jpeg(), stamp)
+    status, headers, got = await show.looks(SNAPSHOT + "&fps=0.05").answer()
+    assert (status, got) == (200, jpeg())
+    assert float(headers["x-timestamp"]) == 995.5
+    viewer.leave()
+
+
 @pytest.mark.parametrize(("path", "kind"), [(STREAM, "multipart/x-mixed-replace"), (SNAPSHOT, "image/jpeg")])
 @pytest_twisted.ensureDeferred
 async def test_head_tells_what_there_would_be_without_waking_the_robot(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,11 +14,11 @@ from websockets.sync.client import ClientConnection, connect
 
 from relay_db import queries
 from relay_protocol import link
-from relay_server import closing
+from relay_server import closing, wsframe
 from relay_server.auth import Opening
 from relay_server.edges.video import socket as module
 from relay_server.video import Stream, hub
-from tests.relay_server.edges.video.show import CAMERA, SECRET, Show, jpeg, until
+from tests.relay_server.edges.video.show import CAMERA, SECRET, STREAM, Show, jpeg, until
 from tests.relay_server.video.watching import DELTA, KEY
 
 
@@ -40,6 +41,14 @@ class Eye:
         told: dict[str, Any] = json.loads(await self._next())
         assert told.pop("op") == "playing"
         return told
+
+    async def told(self) -> dict[str, Any]:
+        """The next message that says what is sent, after what pictures there may be."""
+        while True:
+            message = await self._next()
+            if isinstance(message, str) and '"playing"' in message:
+                told: dict[str, Any] = json.loads(message)
+                return told
 
     async def _next(self) -> str | bytes:
         return await deferToThread(self._end.recv, 10)
@@ -135,6 +144,22 @@ async def test_a_picture_is_a_header_and_then_the_bytes(show: Show) -> None:
     await eye.leave()
     await until(lambda: not show.access._permits)
     assert not stream.viewers
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_is_shown_another_form_is_told_so_until_he_gets_his_own(show: Show) -> None:
+    """With what is played: the parameters in which it differs from what he asked for."""
+    control = show.robot_comes()
+    show.makes(1)
+    first = show.looks(f"{STREAM}&width=32")
+    stream = await show.joined(control)
+    show.shows(stream, jpeg())
+    eye = await opens(show, "&width=64&fps=5")
+    assert (await eye.playing())["instead"] == {"width": 32, "fps": 0.0}
+    first.leave()
+    await show.joined(control)
+    assert (await eye.told())["instead"] is None
+    await eye.leave()
 
 
 @pytest_twisted.ensureDeferred
@@ -296,6 +321,40 @@ async def test_who_takes_what_was_not_sent_is_cut_when_it_is_too_much(show: Show
         await eye.took(0)
     assert (await eye.closed())[0] == closing.TOO_MANY_ERRORS
     assert not stream.viewers
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_sent_is_put_into_words_once_for_all_viewers(
+    show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many watch, and however often a robot says it."""
+    made: list[bytes] = []
+
+    def text(words: bytes) -> bytes:
+        made.append(words)
+        return wsframe.text(words)
+
+    monkeypatch.setattr(module, "wsframe", SimpleNamespace(text=text))
+    control = show.robot_comes()
+    eyes = [await opens(show) for _ in range(5)]
+    stream = await show.joined(control)
+    for width in range(100, 1100):
+        stream.message(link.Playing(width=width, height=13, quality=40))
+    for eye in eyes:
+        assert [(await eye.playing())["width"] for _ in range(2)] == [32, 1099]
+        await eye.leave()
+    assert len(made) <= 2
+
+
+@pytest_twisted.ensureDeferred
+async def test_h264_that_the_robot_can_not_make_is_told_with_a_code_of_its_own(show: Show) -> None:
+    """4415: another codec may do; 4503 when the robot makes too many streams as it is."""
+    eye, stream = await watched(show, "&codec=h264")
+    stream.message(link.NotPlaying(reason="no module named av"))
+    assert await eye.closed() == (closing.NOT_MADE, "no module named av")
+    eye, stream = await watched(show, "&codec=h264")
+    stream.message(link.NotPlaying(reason="I have eyes for four", busy=True))
+    assert await eye.closed() == (closing.UNAVAILABLE, "I have eyes for four")
 
 
 @pytest_twisted.ensureDeferred

@@ -111,16 +111,15 @@ def test_a_viewer_who_vanished_is_noticed_while_nothing_is_written() -> None:
 
 
 def test_what_is_made_of_a_picture_is_made_once_for_all() -> None:
-    """Anew for another picture, or when something else is said of it."""
-    made: list[tuple[int, float]] = []
+    """Anew for another picture."""
+    made: list[int] = []
 
-    def make(each: Picture, reduced: float) -> bytes:
-        made.append((each.number, reduced))
+    def make(each: Picture) -> bytes:
+        made.append(each.number)
         return each.body
 
     shared = Made(make)
     one, two = picture(1, 0.0), picture(2, 0.0)
     assert shared.of(one) is shared.of(one)
-    shared.of(one, 0.5)
-    shared.of(two, 0.5)
-    assert made == [(1, 0.0), (1, 0.5), (2, 0.5)]
+    shared.of(two)
+    assert made == [1, 2]

@@ -1,0 +1,235 @@
+"""Who may register, see, renew, change and remove what, on a real database."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import pytest_twisted
+
+from relay_db import queries
+from relay_db.queries import NoRoom, Taken
+from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError
+from relay_server.directory import desk as module
+from relay_server.directory.desk import MatchNeeded, TooManyChanges
+from relay_server.directory.entries import TooLarge
+from relay_server.directory.limits import CHANGES_AT_ONCE
+from relay_server.resources import NotAsBefore
+from tests.relay_server.directory.room import HERE, Room
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_registered_comes_back_as_it_was_sent(room: Room) -> None:
+    """With an id, from whom it is, and until when."""
+    fields = {"kind": "application", "robot": "rover", "description": "x", "data": {"a": [1]}, "ttl": 30}
+    told = await room.register(**fields)
+    etag, id = told.pop("etag"), told["id"]
+    assert told == {
+        **fields,
+        "name": "map",
+        "address": "http://a/",
+        "id": id,
+        "user": "ann",
+        "registered": 1000.0,
+        "expires": 1030.0,
+        "fresh": True,
+    }
+    one = await room.desk.one(room.people["ann"], id)
+    assert one.etag == etag
+    del told["fresh"]
+    assert await room.all(kind="application") == [told]
+    assert room.memory() == [("registered", "relay:rover", "default", "ann", "map")]
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_sees_what(room: Room) -> None:
+    """Of robots who has a right on them, also by his token; what is about none, all of the realm, and nobody else."""
+    about_rover = (await room.register(name="about-rover", robot="rover"))["id"]
+    await room.register(name="for-all")
+    await room.register("bob", name="about-hidden", robot="hidden")
+    await room.register("cleo", name="elsewhere", robot="rover")
+    assert await room.names("ann") == ["for-all", "about-rover"]
+    assert await room.names("bob") == ["for-all", "about-hidden", "about-rover"]
+    assert await room.names("root") == ["for-all", "about-hidden", "about-rover"]
+    assert await room.names("cleo") == ["elsewhere"]
+    assert await room.names("ann", realm="default") == ["for-all", "about-rover"]
+    assert await room.names("ann", realm="lab") == await room.all("root", realm="lab") == []
+    assert await room.names("bob", robot="*d*") == ["about-hidden"]
+    assert await room.names("bob", robot="r*", name="a*") == ["about-rover"]
+    assert await room.names(room.by_token("bob", "viewer@hidden")) == ["for-all", "about-hidden"]
+    for who in ("cleo", room.by_token("ann", "operator@hidden")):
+        with pytest.raises(NotFound):
+            await room.desk.one(room.who(who), about_rover)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_right_that_goes_hides_what_it_showed(room: Room) -> None:
+    """At once, and what was registered by it is renewed no more."""
+    id = (await room.register(robot="rover"))["id"]
+    rover, ann = room.robots["rover", "default"], room.people["ann"].user_id
+    with room.store.database.begin() as s:
+        queries.grant_right(s, rover, "viewer", user_id=ann)
+    await room.access.refresh()
+    assert await room.names("ann") == ["map"]
+    with pytest.raises(Refused, match="provide on map needs the level operator"):
+        await room.put("ann", id)
+    with room.store.database.begin() as s:
+        queries.revoke_right(s, rover, user_id=ann)
+    await room.access.refresh()
+    assert await room.names("ann") == []
+    with pytest.raises(NotFound):
+        await room.put("ann", id)
+
+
+WRONG: list[tuple[str, dict[str, Any], type[SwitchboardError]]] = [
+    ("bob", {"robot": "rover"}, Refused),
+    ("ann", {"robot": "hidden"}, NotFound),
+    ("ann", {"robot": "nowhere"}, NotFound),
+    ("ann", {"kind": "robot"}, Invalid),
+    ("ann", {"address": "http://ann:secret@host/"}, Invalid),
+    ("ann", {"data": [1]}, Invalid),
+    ("ann", {"data": {"a": "x" * 2048}}, TooLarge),
+    ("ann viewer@rover", {"robot": "rover"}, Refused),
+    ("ann operator@rover", {}, Refused),
+    ("root admin", {}, Refused),
+    ("root admin", {"robot": "rover"}, NotFound),
+]
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_may_not_be_registered_is_refused(room: Room) -> None:
+    """By rights and scopes; of another's robot nobody learns that it is there."""
+    for who, fields, error in WRONG:
+        name, _, scope = who.partition(" ")
+        with pytest.raises(error) as caught:
+            await room.register(room.by_token(name, scope) if scope else name, **fields)
+        assert type(caught.value) is error, (who, fields)
+        if error is NotFound:
+            assert str(caught.value) == "there is no such robot, or you have no right on it"
+    assert await room.names("root") == [] and room.noted == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_token_for_a_robot_registers_what_is_about_it(room: Room) -> None:
+    """As does a right to provide just that; to deny it counts as well."""
+    await room.register(room.by_token("ann", "operator@rover"), robot="rover")
+    with room.store.database.begin() as s:
+        rover, bob = room.robots["rover", "default"], room.people["bob"].user_id
+        queries.grant_right(s, rover, "operator", user_id=bob, deny=["provide:/door"])
+    await room.access.refresh()
+    await room.register("bob", name="/bell", robot="rover")
+    with pytest.raises(Refused, match="denied to you"):
+        await room.register("bob", name="/door", robot="rover")
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_begins_anew_gets_his_entry_back(room: Room) -> None:
+    """It says what was sent last; somebody else's it does not become."""
+    first = await room.register()
+    room.time.now += 10
+    again = await room.register(description="again")
+    assert (again["id"], again["fresh"], again["expires"]) == (first["id"], False, 1070.0)
+    with pytest.raises(Taken, match="ann has registered"):
+        await room.register("root")
+    await room.register("bob", robot="hidden")
+    assert [each[0] for each in room.memory()] == ["registered", "registered"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_lease_is_renewed_by_its_user_or_an_administrator(room: Room) -> None:
+    """Without a body, or with the same; what is over is there no more."""
+    id = (await room.register(ttl=30))["id"]
+    room.time.now += 20
+    assert (await room.put("ann", id))["expires"] == 1050.0
+    assert (await room.put("ann", id, name="map", ttl=30))["expires"] == 1050.0
+    room.time.now += 20
+    assert (await room.put("root", id))["expires"] == 1070.0
+    with pytest.raises(Refused, match="only ann, who registered it, or an administrator"):
+        await room.put("bob", id)
+    with pytest.raises(NotFound):
+        await room.put("cleo", id)
+    with pytest.raises(Refused, match="token without a scope"):
+        await room.put(room.by_token("ann", "operator"), id)
+    room.time.now += 30
+    for who in ("ann", "root"):
+        with pytest.raises(NotFound):
+            await room.put(who, id)
+    assert await room.names() == []
+    assert [each[0] for each in room.memory()] == ["registered"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_entry_is_changed_only_as_it_was_read(room: Room) -> None:
+    """Which has to be said; names stay."""
+    read = await room.register()
+    with pytest.raises(MatchNeeded):
+        await room.put("ann", read["id"], description="b")
+    with pytest.raises(NotAsBefore):
+        await room.put("ann", read["id"], '"other"', description="b")
+    changed = await room.put("ann", read["id"], read["etag"], description="b", ttl=5)
+    assert (changed["description"], changed["expires"]) == ("b", 1005.0)
+    for match in (read["etag"], f"W/{changed['etag']}"):
+        with pytest.raises(NotAsBefore):
+            await room.put("ann", read["id"], match)
+    assert (await room.put("ann", read["id"], "*", description="c"))["description"] == "c"
+    for fields in ({"name": "other"}, {"kind": "application"}, {"robot": "rover"}):
+        with pytest.raises(Invalid, match="stay as they are"):
+            await room.put("ann", read["id"], "*", **fields)
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_entry_is_removed_by_its_user_or_an_administrator(room: Room) -> None:
+    """The audit log has what one does with what is another's."""
+    mine, his, own = [(await room.register(name=each, robot="rover"))["id"] for each in ("a", "b", "c")]
+    with pytest.raises(Refused, match="only ann"):
+        await room.remove("bob", mine)
+    with pytest.raises(NotFound):
+        await room.remove("cleo", mine)
+    with pytest.raises(NotAsBefore):
+        await room.remove("ann", mine, '"x"')
+    await room.remove("ann", mine)
+    with pytest.raises(NotFound):
+        await room.remove("ann", mine)
+    await room.put("root", own, "*", name="c", robot="rover", description="by root")
+    await room.remove("root", his)
+    assert await room.names() == ["c"]
+    removed = [
+        ("removed", "relay:rover", "default", who, name) for who, name in (("ann", "a"), ("root", "b"))
+    ]
+    assert room.memory()[3:] == removed
+    with room.store.database.reading() as s:
+        audited = queries.list_audit(s)
+    assert {(each.actor, each.action, each.target, each.origin) for each in audited} == {
+        ("user:root", "directory.remove", his, HERE),
+        ("user:root", "directory.change", own, HERE),
+    }
+    assert all(each.data["registrant"] == "ann" and each.data["robot"] == "rover" for each in audited)
+
+
+@pytest_twisted.ensureDeferred
+async def test_there_is_room_for_so_many(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each user, and of each realm."""
+    monkeypatch.setattr(module, "OF_USER", 2)
+    monkeypatch.setattr(module, "OF_REALM", 3)
+    for name in ("a", "b"):
+        await room.register(name=name)
+    with pytest.raises(NoRoom, match="a user has 2"):
+        await room.register(name="c")
+    await room.register("root", name="c")
+    with pytest.raises(NoRoom, match="holds 3"):
+        await room.register("root", name="d")
+    await room.register("cleo")
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_changes_too_much_has_to_wait(room: Room) -> None:
+    """What fails counts as well, and for nobody else."""
+    for _ in range(CHANGES_AT_ONCE):
+        with pytest.raises(NotFound):
+            await room.register(robot="nowhere")
+    for work in (room.register(), room.put("ann", "x"), room.remove("ann", "x")):
+        with pytest.raises(TooManyChanges):
+            await work
+    await room.register("root")
+    room.world.clock.advance(1)
+    await room.register(name="other")

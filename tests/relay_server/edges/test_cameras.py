@@ -1,0 +1,100 @@
+"""Cameras over HTTP on transports in memory: which, in which form, and to whom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from relay_protocol.errors import NotFound
+from relay_server.access import Principal
+from relay_server.edges import cameras as module
+from relay_server.resources import HEADER, Asker, CameraDesk, Moments
+from relay_server.resources.forms import FORMS
+from tests.relay_server.edges.http_client import World
+
+HERE = "/api/v1/robots/rover/cameras"
+ANN = {"Authorization": "Bearer ann"}
+FACTS = {
+    "type": "sensor_msgs/msg/Image",
+    "encoding": None,
+    "width": 640,
+    "height": 480,
+    "fps": 15.0,
+    "seen": 5.5,
+}
+CAMERAS = [{"name": name, **FACTS, "streams": []} for name in ("/back", "/front/left")]
+
+
+async def look(principal: Principal, robot: str) -> list[dict[str, Any]]:
+    """All of them."""
+    if robot != "rover":
+        raise NotFound("there is no such robot, or you have no right on it")
+    return CAMERAS
+
+
+class Desk:
+    """Makes what takes long."""
+
+    async def made(self, asker: Asker, work: Callable[[], Any]) -> Any:
+        """Here and now."""
+        return work()
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """A site with the cameras of one robot."""
+    made = World(tmp_path)
+    desk: Any = Desk()
+    made.below["cameras"] = partial(module.below, CameraDesk(look), Moments(lambda: 1), desk)
+    return made
+
+
+@pytest.mark.parametrize("media", [each.media for each in FORMS])
+@pytest.mark.parametrize("address", [HERE, f"{HERE}/front/left"])
+def test_cameras_are_told_in_every_form(world: World, address: str, media: str) -> None:
+    """With a moment, and with a tag of that form by which they are known again."""
+    answer = world.ask("GET", address, Accept=media, **ANN)
+    assert (answer.status, answer.headers["content-type"].partition(";")[0]) == (200, media)
+    assert answer.headers[HEADER][:2] == "1." and answer.headers["vary"] == "Accept"
+    assert b"/front/left" in answer.body
+    known = world.ask("GET", address, Accept=media, If_None_Match=answer.headers["etag"], **ANN)
+    assert (known.status, known.body) == (304, b"")
+
+
+def test_a_page_of_cameras_is_filtered(world: World) -> None:
+    """As those of topics are; what no page can be asked by is refused."""
+    page = world.ask("GET", f"{HERE}?name=/front/*&limit=1", **ANN).json
+    assert page == {"cameras": CAMERAS[1:], "next": ""}
+    assert world.ask("GET", f"{HERE}?limit=1", **ANN).json["next"] == "/back"
+    assert world.ask("GET", f"{HERE}?colour=red", **ANN).status == 400
+
+
+def test_one_camera_has_addresses(world: World) -> None:
+    """Beside its facts."""
+    told = world.ask("GET", f"{HERE}/back", **ANN).json
+    assert told.pop("addresses")["snapshot"] == "/robots/rover/video/snapshot?topic=%2Fback"
+    assert told == CAMERAS[0]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers", "status"),
+    [
+        ("GET", HERE, {}, 401),
+        ("GET", f"{HERE}/back", {}, 401),
+        ("GET", f"{HERE}/other", ANN, 404),
+        ("GET", HERE.replace("rover", "other"), ANN, 404),
+        ("GET", HERE, {**ANN, "Accept": "image/png"}, 406),
+        ("POST", HERE, ANN, 405),
+        ("DELETE", f"{HERE}/back", ANN, 405),
+    ],
+)
+def test_what_is_not_there_is_told(
+    world: World, method: str, path: str, headers: dict[str, str], status: int
+) -> None:
+    """As problem details."""
+    answer = world.ask(method, path, **headers)
+    assert (answer.status, answer.json["status"]) == (status, status)

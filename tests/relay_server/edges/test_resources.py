@@ -1,0 +1,148 @@
+"""Resources over HTTP on transports in memory: the headers of their answers, in every form and as a stream."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from twisted.internet.defer import Deferred
+
+from relay_protocol.errors import Refused, SwitchboardError
+from relay_server.edges import resources as module
+from relay_server.edges.resources import RobotResources
+from relay_server.inside import MaybeDone
+from relay_server.resources import HEADER, Asker, Listing, Moments, Wanted
+from relay_server.resources.background import Background
+from relay_server.resources.forms import FORMS
+from relay_server.resources.states import Param, State
+from tests.relay_server.edges.http_client import HOST, World, parse
+
+HERE = "/api/v1/robots/rover"
+ANN = {"Authorization": "Bearer ann"}
+MEDIA = [each.media for each in FORMS]
+NEWEST = State("/said", "std_msgs/msg/String", 5.0, b'{"data":"hello"}')
+
+
+class Desk:
+    """Knows one topic, which says the same for ever, and one parameter."""
+
+    def __init__(self) -> None:
+        self.over: Deferred[None] = Deferred()
+        self.cut: SwitchboardError | None = None
+        """What comes in between when parameters are read or deleted."""
+
+    async def members(self, asker: Asker, kind: str, listing: Listing) -> dict[str, Any]:
+        """None."""
+        return {kind: [], "next": "", "online": True}
+
+    async def state(self, asker: Asker, name: str, wanted: Wanted) -> tuple[State, bool]:
+        """What is said."""
+        return NEWEST, NEWEST.etag in wanted.unlike
+
+    async def param(self, asker: Asker, name: str) -> Param:
+        """A truth."""
+        if self.cut is not None:
+            raise self.cut
+        return Param(name, b"true")
+
+    async def remove_param(self, asker: Asker, name: str, match: str | None) -> None:
+        """Nothing comes of it."""
+        if self.cut is not None:
+            raise self.cut
+
+    async def background(self, asker: Asker, state: State) -> Background:
+        """Nothing."""
+        return Background({}, False)
+
+    async def made(self, asker: Asker, work: Callable[[], Any]) -> Any:
+        """Here and now."""
+        return work()
+
+    @asynccontextmanager
+    async def follow(
+        self, asker: Asker, name: str, throttle_ms: float, tell: Callable[[bytes], None]
+    ) -> AsyncIterator[Any]:
+        """Said once, at once."""
+        tell(NEWEST.value)
+        yield SimpleNamespace(over=self.over, reason=None, look=lambda: None)
+
+
+@pytest.fixture
+def desk() -> Desk:
+    """Who is asked."""
+    return Desk()
+
+
+@pytest.fixture
+def world(tmp_path: Path, desk: Any) -> World:
+    """A site in front of it."""
+    made, moments, unused = World(tmp_path), Moments(lambda: 1), SimpleNamespace()
+
+    def below(part: str, api: Any, robot: str) -> Any:
+        resources = RobotResources(
+            made.clock,
+            desk,
+            moments,
+            unused,  # type: ignore[arg-type]
+            unused,  # type: ignore[arg-type]
+            part,
+            api,
+            robot,
+        )
+        return resources.app.resource()
+
+    made.below.update({part: partial(below, part) for part in module.PARTS})
+    return made
+
+
+@pytest.mark.parametrize("media", MEDIA)
+@pytest.mark.parametrize("address", ["topics", "topics/said", "params/node:truth"])
+def test_an_answer_has_a_moment_in_every_form(world: World, address: str, media: str) -> None:
+    """Who reads in that form gives it back."""
+    answer = world.ask("GET", f"{HERE}/{address}", Accept=media, **ANN)
+    assert (answer.status, answer.headers["content-type"].partition(";")[0]) == (200, media)
+    assert answer.body
+    assert answer.headers[HEADER][:2] == "1."
+
+
+def test_a_stream_has_a_moment(world: World, desk: Desk) -> None:
+    """Though what is there already is told at once."""
+    transport = world.connect()
+    lines = {"Host": HOST, "Accept": "text/event-stream", **ANN}
+    head = f"GET {HERE}/topics/said HTTP/1.1\r\n" + "".join(
+        f"{key}: {each}\r\n" for key, each in lines.items()
+    )
+    world.send(transport, head.encode() + b"\r\n")
+    desk.over.callback(None)
+    answer = parse(transport.value())
+    assert (answer.status, answer.headers["content-type"]) == (200, "text/event-stream")
+    assert NEWEST.value in answer.body
+    assert answer.headers[HEADER][:2] == "1."
+
+
+@pytest.mark.parametrize("media", MEDIA)
+def test_what_is_known_is_told_with_its_tag(world: World, media: str) -> None:
+    """That of the form asked for (RFC 9110 section 15.4.5)."""
+    address = f"{HERE}/topics/said"
+    tag = world.ask("GET", address, Accept=media, **ANN).headers["etag"]
+    known = world.ask("GET", address, Accept=media, If_None_Match=f'"other", {tag}', **ANN)
+    assert (known.status, known.body, known.headers["etag"]) == (304, b"", tag)
+    assert known.headers["vary"] == "Accept"
+
+
+def test_what_may_have_been_done_is_told_so(world: World, desk: Desk) -> None:
+    """But for what is only read: that is refused."""
+    desk.cut = MaybeDone(Refused("your right was revoked"))
+    address = f"{HERE}/params/node:truth"
+    changed = world.ask("DELETE", address, **ANN)
+    told = changed.json
+    assert (changed.status, told["code"], told["title"]) == (409, "maybe_done", "Perhaps done")
+    assert "revoked" in told["detail"] and "may have been done" in told["detail"]
+    read = world.ask("GET", address, **ANN)
+    assert (read.status, read.json["code"], read.json["detail"]) == (403, "refused", "your right was revoked")
+    assert read.headers[HEADER][:2] == "1."

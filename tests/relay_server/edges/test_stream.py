@@ -1,0 +1,108 @@
+"""The page's stream as server-sent events, on transports in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from relay_server.access import Principal
+from relay_server.edges import telling
+from tests.relay_server.edges.http_client import World, parse
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """A site with an empty portal."""
+    return World(tmp_path)
+
+
+def streaming(world: World) -> Any:
+    """A client that follows the robots."""
+    transport = world.connect()
+    world.send(
+        transport, b"GET /api/v1/robots/stream HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer ann\r\n\r\n"
+    )
+    assert parse(transport.value()).headers["content-type"] == "text/event-stream"
+    return transport
+
+
+def events(transport: Any) -> list[str]:
+    """Names of the events that came since the last time."""
+    lines = transport.value().decode().splitlines()
+    transport.clear()
+    return [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
+
+
+def test_each_source_is_an_event(world: World) -> None:
+    """With a list under its name."""
+
+    async def alerts(principal: Principal) -> list[dict[str, Any]]:
+        assert principal.name == "ann"
+        return [{"id": "a1"}]
+
+    world.events["alerts"] = alerts
+    transport = streaming(world)
+    assert b'event: robots\ndata: {"robots":[{"name":"rover","seen by":"ann"}]}\n\n' in transport.value()
+    assert b'event: alerts\ndata: {"alerts":[{"id":"a1"}]}\n\n' in transport.value()
+
+
+def test_it_goes_on(world: World) -> None:
+    """At every change, and without one."""
+    transport = streaming(world)
+    events(transport)
+    world.clock.advance(telling.COALESCE_SECONDS)
+    world.desk.changed()
+    assert events(transport) == ["robots"]
+    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    assert events(transport) == ["robots"]
+
+
+def test_a_client_that_leaves_its_stream_leaves_nothing_behind(world: World) -> None:
+    """Neither a listener nor a timer, at whatever moment."""
+    for seconds in (0.0, telling.COALESCE_SECONDS):
+        transport = streaming(world)
+        world.clock.advance(seconds)
+        transport.loseConnection()
+        assert world.desk.listeners == []
+        world.clock.advance(0)
+        assert not world.clock.getDelayedCalls()
+
+
+def test_the_stream_ends_with_the_credentials(world: World) -> None:
+    """The client is told, so that it does not just try again."""
+    transport = streaming(world)
+    del world.desk.tokens["ann"]
+    events(transport)
+    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    assert events(transport) == ["ended"]
+    assert world.desk.listeners == []
+
+
+def test_a_database_that_is_away_does_not_end_the_stream(world: World) -> None:
+    """What is open goes on, says that it can't tell, and tells again when it can."""
+    transport = streaming(world)
+    events(transport)
+    world.desk.up = False
+    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    assert b'event: unknown\ndata: {"reason":"the database does not answer"}\n\n' in transport.value()
+    transport.clear()
+    world.desk.up = True
+    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    assert events(transport) == ["robots"]
+
+
+def test_a_client_that_takes_nothing_of_its_stream_is_cut(world: World) -> None:
+    """Nothing piles up for it meanwhile."""
+    transport = streaming(world)
+    events(transport)
+    transport.producer.pauseProducing()
+    for _ in range(3):
+        world.clock.advance(telling.COALESCE_SECONDS)
+        world.desk.changed()
+    assert transport.value() == b""
+    assert transport.connected
+    world.clock.advance(telling.STALL_SECONDS)
+    assert not transport.connected
+    assert world.desk.listeners == []

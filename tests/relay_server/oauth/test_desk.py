@@ -1,0 +1,281 @@
+"""Tokens as they are asked for, on a real database."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+
+from relay_db import queries
+from relay_protocol.errors import Unavailable
+from relay_server import passwords
+from relay_server.access import Access, BadCredentials
+from relay_server.auth import Authenticator, TooManyTries
+from relay_server.journal import Journal
+from relay_server.limiter import FAILURES
+from relay_server.oauth import OAuthDesk, OAuthError, TokenAsk
+from relay_server.oauth.desk import ACCESS_SECONDS, REFRESH_SECONDS
+from relay_server.store import Store
+
+HERE = "192.0.2.1"
+PASSWORD = "correct horse"
+KEY, SECRET = "swp_1", "swb_secret"
+
+
+class World:
+    """A desk, ann with a password, and a program of hers."""
+
+    def __init__(self, store: Store) -> None:
+        self.now = 1000.0
+        self.store = store
+        self.auth = Authenticator(reactor, store, lambda: self.now, lambda: self.now)  # type: ignore[arg-type]
+        self.access = Access(store, lambda: self.now)
+        journal = Journal(store, lambda: self.now)
+        self.told: list[tuple[str, dict[str, Any]]] = []
+        journal.listen(lambda kind, robot, data: self.told.append((kind, data)))
+        self.desk = OAuthDesk(store, self.auth, self.access, journal, lambda: self.now, lambda: self.now)
+
+    async def fill(self, scope: str | None = None) -> None:
+        """Ann and her program."""
+        ann = await self.store.write(queries.add_user, "ann", passwords.hash_password(PASSWORD))
+        known = passwords.verifier(KEY, SECRET)
+        await self.store.write(queries.add_program, ann.id, KEY, known, scope=scope, label="", now=self.now)
+
+    async def by_password(self, scope: str | None = None, password: str = PASSWORD) -> dict[str, Any]:
+        """What ann gets."""
+        ask = TokenAsk("password", username="ann", password=password, scope=scope)
+        return (await self.desk.token(ask, None, HERE)).told()
+
+    async def by_secret(self, scope: str | None = None) -> dict[str, Any]:
+        """What her program gets."""
+        program = await self.desk.program("", "POST", "/", HERE, (KEY, SECRET))
+        return (await self.desk.token(TokenAsk("client_credentials", scope=scope), program, HERE)).told()
+
+    async def refreshed(self, token: str, scope: str | None = None) -> dict[str, Any]:
+        """What follows on a refresh token."""
+        ask = TokenAsk("refresh_token", refresh_token=token, scope=scope)
+        return (await self.desk.token(ask, None, HERE)).told()
+
+    async def error(self, asking: Any) -> str:
+        """Of a request that fails."""
+        with pytest.raises(OAuthError) as caught:
+            await asking
+        return caught.value.error
+
+
+@pytest.fixture
+def there(store: Store) -> Iterator[World]:
+    """The world."""
+    world = World(store)
+    world.auth.start()
+    yield world
+    world.auth.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_password_gives_a_token_and_one_to_go_on_with(there: World) -> None:
+    """The access token acts as the user; it is on record."""
+    await there.fill()
+    told = await there.by_password()
+    assert told["token_type"] == "Bearer" and told["expires_in"] == ACCESS_SECONDS
+    assert "scope" not in told
+    principal = await there.auth.token(told["access_token"])
+    assert (principal.name, principal.scope) == ("ann", None)
+    [entry] = await there.store.read(queries.list_audit, limit=9)
+    assert (entry.action, entry.actor, entry.data["how"]) == ("token.issue", "user:ann", "password")
+    there.now += ACCESS_SECONDS
+    with pytest.raises(BadCredentials):
+        await there.auth.token(told["access_token"])
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_wrong_password_gives_none(there: World) -> None:
+    """It is an event; too many are refused before anything is hashed."""
+    await there.fill()
+    assert await there.error(there.by_password(password="wrong")) == "invalid_grant"
+    assert there.told[-1] == ("login.refused", {"user": "ann", "address": HERE, "reason": "bad_credentials"})
+    for _ in range(FAILURES - 1):
+        await there.error(there.by_password(password="wrong"))
+    with pytest.raises(TooManyTries):
+        await there.by_password()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_scope_is_given_as_it_was_asked_for(there: World) -> None:
+    """And narrows what the token does."""
+    await there.fill()
+    told = await there.by_password("viewer operator@rover")
+    assert told["scope"] == "viewer operator@rover"
+    assert str((await there.auth.token(told["access_token"])).scope) == "viewer operator@rover"
+    assert await there.error(there.by_password("king")) == "invalid_scope"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_refresh_token_is_used_once(there: World) -> None:
+    """Each gives the next; one that comes again ends all of them."""
+    await there.fill()
+    first = await there.by_password("operator")
+    second = await there.refreshed(first["refresh_token"])
+    assert second["scope"] == "operator"
+    await there.auth.token(second["access_token"])
+    assert await there.error(there.refreshed(first["refresh_token"])) == "invalid_grant"
+    assert await there.error(there.refreshed(second["refresh_token"])) == "invalid_grant"
+    for each in (first, second):
+        with pytest.raises(BadCredentials):
+            await there.auth.token(each["access_token"])
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_refreshed_token_may_be_for_less(there: World) -> None:
+    """Never for more; what is refused for that costs nothing."""
+    await there.fill()
+    first = await there.by_password("operator")
+    for scope in ("owner", "admin", "king"):
+        assert await there.error(there.refreshed(first["refresh_token"], scope)) == "invalid_scope"
+    second = await there.refreshed(first["refresh_token"], "viewer@rover")
+    assert second["scope"] == "viewer@rover"
+    assert (await there.refreshed(second["refresh_token"]))["scope"] == "operator"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_refresh_token_ends_by_itself(there: World) -> None:
+    """After so long somebody has to log in."""
+    await there.fill()
+    first = await there.by_password()
+    there.now += REFRESH_SECONDS
+    assert await there.error(there.refreshed(first["refresh_token"])) == "invalid_grant"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_program_gets_what_its_scope_allows(there: World) -> None:
+    """All of it, or less; it has its secret, and gets nothing to refresh."""
+    await there.fill("operator@rover viewer")
+    told = await there.by_secret()
+    assert told["scope"] == "operator@rover viewer" and "refresh_token" not in told
+    assert (await there.by_secret("viewer@arm"))["scope"] == "viewer@arm"
+    assert await there.error(there.by_secret("operator")) == "invalid_scope"
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_can_not_be_granted(there: World) -> None:
+    """Each in the words of the standard."""
+    await there.fill()
+    desk = there.desk
+    for ask, error in (
+        (TokenAsk("password"), "invalid_request"),
+        (TokenAsk("refresh_token"), "invalid_request"),
+        (TokenAsk("authorization_code"), "unsupported_grant_type"),
+    ):
+        assert await there.error(desk.token(ask, None, HERE)) == error
+    with pytest.raises(BadCredentials, match="prove the program"):
+        await desk.token(TokenAsk("client_credentials"), None, HERE)
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_program_that_was_removed_meanwhile_gets_none(there: World) -> None:
+    """Between its proof and its token."""
+    await there.fill()
+    program = await there.desk.program("", "POST", "/", HERE, (KEY, SECRET))
+    assert program is not None
+    await there.store.write(queries.remove_program, program.id)
+    with pytest.raises(BadCredentials):
+        await there.desk.token(TokenAsk("client_credentials"), program, HERE)
+
+
+def basic(key: str, secret: str) -> str:
+    """A header."""
+    return "Basic " + base64.b64encode(f"{key}:{secret}".encode()).decode()
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_guesses_at_a_secret_is_soon_refused(there: World) -> None:
+    """Before it is even looked at; a challenge that was too old is no guess."""
+    await there.fill()
+    prove = there.desk.program
+    assert await prove("", "POST", "/", HERE) is None
+    assert (await prove(basic(KEY, SECRET), "POST", "/", HERE)) is not None
+    for header in ("Basic", "Basic !", basic(KEY, "wrong"), basic("swp_2", SECRET)):
+        with pytest.raises(BadCredentials):
+            await prove(header, "POST", "/", HERE)
+    for _ in range(FAILURES - 1):
+        with pytest.raises(BadCredentials):
+            await prove(basic(KEY, "wrong"), "POST", "/", HERE)
+    with pytest.raises(TooManyTries):
+        await prove(basic(KEY, SECRET), "POST", "/", HERE)
+    assert (await prove(basic(KEY, SECRET), "POST", "/", "198.51.100.7")) is not None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_database_that_does_not_answer_is_no_guess(
+    there: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody is locked out for its sake."""
+    await there.fill()
+
+    async def gone(*_: object) -> None:
+        raise Unavailable("gone")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(there.store, "read", gone)
+        for _ in range(FAILURES + 1):
+            with pytest.raises(Unavailable):
+                await there.desk.program(basic(KEY, SECRET), "POST", "/", HERE)
+    assert await there.desk.program(basic(KEY, SECRET), "POST", "/", HERE) is not None
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_left_of_a_token(there: World) -> None:
+    """Whose it is, what for, and how many seconds."""
+    await there.fill("viewer")
+    told = await there.by_secret()
+    there.now += 100
+    assert await there.desk.introspect(told["access_token"], "default") == {
+        "active": True,
+        "token_type": "Bearer",
+        "username": "ann",
+        "sub": "ann@default",
+        "realm": "default",
+        "iat": 1000,
+        "scope": "viewer",
+        "client_id": KEY,
+        "exp": 4600,
+        "expires_in": 3500,
+    }
+    refresh = (await there.by_password())["refresh_token"]
+    assert (await there.desk.introspect(refresh, "default"))["token_type"] == "refresh_token"
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_none_is_not_active_and_no_more_is_said(there: World) -> None:
+    """An unknown one, an expired one, and that of another realm are the same."""
+    await there.fill()
+    told = await there.by_secret()
+    inactive = {"active": False}
+    assert await there.desk.introspect("swb_unknown", "default") == inactive
+    assert await there.desk.introspect(told["access_token"], "lab2") == inactive
+    there.now += ACCESS_SECONDS
+    assert await there.desk.introspect(told["access_token"], "default") == inactive
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_revoked_token_is_over(there: World) -> None:
+    """What was opened with it is told at once; revoking nothing is no error."""
+    await there.fill()
+    robot = await there.store.write(queries.add_robot, "rover")
+    ann = await there.store.read(queries.find_user, "ann")
+    assert ann is not None
+    await there.store.write(queries.grant_right, robot.id, "viewer", user_id=ann.id)
+    told = await there.by_password()
+    permit = await there.access.permit(await there.auth.token(told["access_token"]), robot)
+    assert permit is not None
+    ended: list[str] = []
+    permit.on_revoke = lambda error: ended.append(error.code)
+    await there.desk.revoke("swb_unknown", "default")
+    await there.desk.revoke(told["refresh_token"], "lab2")
+    assert ended == []
+    await there.desk.revoke(told["refresh_token"], "default")
+    assert ended == ["bad_credentials"]

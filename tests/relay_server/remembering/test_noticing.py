@@ -1,0 +1,206 @@
+"""What leaves an event by itself, in whose name, and how much of it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from twisted.internet.task import Clock
+
+from relay_db.queries import AlertRecord, NewMemory
+from relay_protocol import link
+from relay_server.journal import Journal
+from relay_server.memory.limits import NOTED_AT_ONCE
+from relay_server.memory.noticing import Noticing
+from relay_server.memory.writer import Writer
+from relay_server.registry import Registry
+from tests.relay_server.memory import FIBONACCI, TRIGGER, TWIST, Person, Time, World
+
+GO = {"linear": {"x": 0.5}}
+
+
+class Notes(Writer):
+    """A writer that keeps what it is given."""
+
+    def __init__(self) -> None:
+        store: Any = None
+        super().__init__(Clock(), store, lambda: 0.0, lambda events: None)
+        self.events: list[NewMemory] = []
+
+    def note(self, event: NewMemory) -> None:
+        """Keep it."""
+        self.events.append(event)
+
+
+@pytest.fixture
+def notes() -> Notes:
+    """Nothing noted yet."""
+    return Notes()
+
+
+@pytest.fixture
+def noticing(notes: Notes, time: Time) -> Noticing:
+    """What takes notes; it knows rover."""
+    registry = Registry(time)
+    registry.presence(1, "rover", "lab")
+    return Noticing(notes, registry, time, time)
+
+
+def test_an_event_of_a_robot_is_in_its_name_and_says_who_did_it(notes: Notes, noticing: Noticing) -> None:
+    """In the robot's realm; addresses are for owners, and not everybody who reads is one."""
+    noticing.happened(
+        "control.taken",
+        "user:ann",
+        1,
+        {"robot": "rover", "user": "ann", "address": "192.0.2.1", "why": "x" * 500},
+    )
+    (event,) = notes.events
+    assert event[:6] == ("lab", 1000.0, "relay:rover", "control.taken", 1, "ann")
+    assert json.loads(event.data) == {"why": "x" * 254 + "…"}
+
+
+def test_a_refused_login_is_told_in_full(notes: Notes, noticing: Noticing) -> None:
+    """Only administrators read it."""
+    data = {"user": "ann", "address": "192.0.2.1", "reason": "bad_credentials"}
+    noticing.happened("login.refused", "relay", None, data)
+    (event,) = notes.events
+    assert (event.realm, event.source, event.user, json.loads(event.data)) == ("default", "relay", None, data)
+
+
+def test_what_is_not_for_the_memory_leaves_nothing(notes: Notes, noticing: Noticing) -> None:
+    """Nor does what is about a robot that is gone."""
+    noticing.happened("video.joined", "user:ann", 1, {})
+    noticing.happened("robot.online", "relay", 2, {})
+    assert notes.events == []
+
+
+def test_what_comes_too_often_is_counted(notes: Notes, noticing: Noticing, time: Time) -> None:
+    """Of one user on one robot; others are not concerned."""
+    for _ in range(NOTED_AT_ONCE + 50):
+        noticing.happened("call.begun", "user:ann", 1, {"service": "/x"})
+    assert (len(notes.events), notes.dropped) == (NOTED_AT_ONCE, 50)
+    noticing.happened("call.begun", "user:bob", 1, {"service": "/x"})
+    time.now += 1
+    noticing.happened("call.begun", "user:ann", 1, {"service": "/x"})
+    assert len(notes.events) == NOTED_AT_ONCE + 2
+
+
+def test_data_that_is_too_large_is_left_out(notes: Notes, noticing: Noticing) -> None:
+    """The event is not."""
+    noticing.happened("goal.begun", "user:ann", 1, {f"field{n}": "\N{GRINNING FACE}" * 255 for n in range(3)})
+    assert set(json.loads(notes.events[0].data)) == {"left_out"}
+
+
+@pytest.mark.parametrize(("kind", "told"), [("battery", True), ("stale", False), ("diagnostics", False)])
+def test_words_of_an_alert_are_told_where_they_take_no_further_right(
+    notes: Notes, noticing: Noticing, kind: str, told: bool
+) -> None:
+    """That there is one is told in any case."""
+    alert = AlertRecord("a1", 1, "rover", kind, "part", "error", "words", 1.0, 2.0, 1, 1, None, None, None)
+    noticing.alert("begun", alert)
+    (event,) = notes.events
+    words = {"about": "part", "text": "words"} if told else {}
+    assert (event.kind, event.source) == ("alert.begun", "relay:rover")
+    assert json.loads(event.data) == {"alert": "a1", "alert_kind": kind, "level": "error", **words}
+
+
+def test_a_witness_of_the_journal_hears_who_says_so(time: Time, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of what is not kept there."""
+    store: Any = None
+    journal = Journal(store, time)
+    monkeypatch.setattr(journal, "_write", lambda *_: None)
+    heard: list[Any] = []
+    journal.witness(lambda *what: heard.append(what))
+    journal.event("x", "user:ann", cause="a", robot_id=1, n=1)
+    journal.tell("y", 1, "user:bob", n=2)
+    journal.tell("z", 2)
+    assert heard == [("x", "user:ann", 1, {"n": 1}), ("y", "user:bob", 1, {"n": 2}), ("z", "relay", 2, {})]
+
+
+# --- what clients do ---------------------------------------------------------------------------------------
+
+
+def noticed(person: Person) -> list[tuple[str, dict[str, Any]]]:
+    """What is noted of a client from now on."""
+    notes: list[tuple[str, dict[str, Any]]] = []
+    person.session.notice = lambda kind, **data: notes.append((kind, data))
+    return notes
+
+
+def drive(person: Person, msg: Any = GO) -> None:
+    """A fresh command."""
+    person.session._pinging.ping()
+    person.answers_pings()
+    person.says("publish", topic="/cmd_vel", msg=msg)
+
+
+def test_the_first_command_that_moves_is_noted_once_for_each_time_of_control(world: World) -> None:
+    """Zeros are not, nor what follows."""
+    world.robot_comes(encodings=["json"])
+    ann = world.person()
+    world.robot_joins()
+    world.registry.described(world.robot, link.Describe(motion=link.MotionPolicy(types=[TWIST])))
+    ann.says("advertise", topic="/cmd_vel", type=TWIST)
+    notes, begun = noticed(ann), ("motion.begun", {"topic": "/cmd_vel"})
+    drive(ann, {"linear": {"x": 0.0}})
+    assert notes == []
+    for _ in range(20):
+        drive(ann)
+        world.wait(0.1, ann)
+    assert notes == [begun]
+    ann.says("call_service", id="r", service="/relay/release_control")
+    world.wait(1.0, ann)
+    drive(ann)
+    world.wait(0.5, ann)
+    drive(ann)
+    assert notes == [begun, begun]
+
+
+def test_a_call_of_the_robot_is_noted_when_it_begins_and_ends(world: World) -> None:
+    """With whether it was answered; the relay's own services are not the robot's."""
+    world.robot_comes()
+    ann = world.person()
+    world.robot_joins()
+    notes = noticed(ann)
+    ann.says("call_service", id="1", service="/relay/ping")
+    ann.says("call_service", id="2", service="/reset", type=TRIGGER)
+    assert notes == [("call.begun", {"service": "/reset"})]
+    world.wait(60.0, ann)
+    ann.says("call_service", id="3", service="/reset", type=TRIGGER)
+    ann.session.end()
+    ended = ("call.ended", {"service": "/reset", "ok": False})
+    assert notes == [notes[0], ended, notes[0], ended]
+
+
+def test_a_goal_is_noted_when_it_begins_and_ends(world: World) -> None:
+    """Also by its client's end; one that is refused never began."""
+    world.robot_comes()
+    ann = world.person()
+    world.robot_joins()
+    notes = noticed(ann)
+    for id in ("g", "g", "h"):
+        ann.says("send_action_goal", id=id, action="count", action_type=FIBONACCI, args={"order": 3})
+    ann.says("cancel_action_goal", id="g", action="count")
+    world.wait(60.0, ann)
+    kinds = [(kind, data["goal"]) for kind, data in notes]
+    assert sorted(kinds) == [
+        ("goal.begun", "g"),
+        ("goal.begun", "h"),
+        ("goal.ended", "g"),
+        ("goal.ended", "h"),
+    ]
+    ann.says("send_action_goal", id="i", action="count", action_type=FIBONACCI, args={"order": 3})
+    ann.session.end()
+    assert notes[-2:] == [
+        ("goal.begun", {"action": "/count", "goal": "i"}),
+        ("goal.ended", {"action": "/count", "goal": "i", "status": 5}),
+    ]
+
+
+def test_what_is_put_together_elsewhere_is_kept_as_it_is(notes: Notes, noticing: Noticing) -> None:
+    """As much as of anything else."""
+    event = NewMemory("lab", 5.0, "relay:rover", "registered", 1, "ann", "{}")
+    for _ in range(NOTED_AT_ONCE + 1):
+        noticing.note(event)
+    assert notes.events == [event] * NOTED_AT_ONCE and notes.dropped == 1

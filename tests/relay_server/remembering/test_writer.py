@@ -1,0 +1,208 @@
+"""Events are written many at once, and nobody is told that one is safe before it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock
+from twisted.logger import capturedLogs
+
+from relay_db.queries import MemoryRecord, NewMemory
+from relay_protocol.errors import Unavailable
+from relay_server.memory import writer as module
+from relay_server.memory.limits import DROPS_SECONDS, GATHER_SECONDS
+from relay_server.memory.writer import Full, Writer
+
+
+class Paper:
+    """A store that writes when the test says so."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[list[NewMemory], Deferred[list[MemoryRecord]]]] = []
+        self.number = 0
+
+    def write(self, query: Any, events: list[NewMemory]) -> Deferred[list[MemoryRecord]]:
+        """One transaction."""
+        done: Deferred[list[MemoryRecord]] = Deferred()
+        self.asked.append((events, done))
+        return done
+
+    def commit(self) -> list[NewMemory]:
+        """It is safe; what it holds."""
+        events, done = self.asked.pop(0)
+        self.number += len(events)
+        first = self.number - len(events) + 1
+        done.callback([MemoryRecord(first + at, *each, used=0) for at, each in enumerate(events)])
+        return events
+
+    def fail(self, error: Exception) -> None:
+        """It is not."""
+        self.asked.pop(0)[1].errback(error)
+
+
+class Scene:
+    """A writer with its clock and its paper."""
+
+    def __init__(self) -> None:
+        self.clock, self.paper = Clock(), Paper()
+        self.told: list[int] = []
+        store: Any = self.paper
+        self.writer = Writer(self.clock, store, lambda: 7.0, self._written)
+
+    def _written(self, events: list[MemoryRecord]) -> None:
+        self.told += [each.number for each in events]
+
+    def write(self, count: int = 1) -> Deferred[list[MemoryRecord]]:
+        """Somebody brings so many at once."""
+        return Deferred.fromCoroutine(self.writer.write([new()] * count))
+
+    def gather(self) -> None:
+        """What waits is gathered."""
+        self.clock.advance(GATHER_SECONDS)
+
+
+def new(realm: str = "default", kind: str = "x") -> NewMemory:
+    """An event."""
+    return NewMemory(realm, 1.0, "app", kind, None, None, "{}")
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Nothing written yet."""
+    return Scene()
+
+
+@contextmanager
+def fails(work: Deferred[Any], kind: type[Exception]) -> Iterator[None]:
+    """What somebody waits for fails by what is done here."""
+    caught: list[Any] = []
+    work.addErrback(caught.append)
+    yield
+    assert [each.type for each in caught] == [kind]
+
+
+def test_what_comes_within_a_moment_is_one_transaction(scene: Scene) -> None:
+    """And nobody hears that his is safe before it is."""
+    first, second = scene.write(), scene.write(2)
+    scene.writer.note(new(kind="own"))
+    assert scene.paper.asked == []
+    scene.gather()
+    assert not first.called and scene.told == []
+    assert [each.kind for each in scene.paper.commit()] == ["x", "x", "x", "own"]
+    assert [each.number for each in first.result] == [1]
+    assert [each.number for each in second.result] == [2, 3]
+    assert (scene.told, scene.writer.waiting, scene.writer.written) == ([1, 2, 3, 4], 0, 4)
+
+
+def test_what_fills_a_transaction_does_not_wait(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is under way at a time; what came meanwhile follows, never torn apart."""
+    monkeypatch.setattr(module, "BATCH", 10)
+    works = [scene.write(4) for _ in range(6)]
+    assert [len(events) for events, _ in scene.paper.asked] == [8]
+    scene.gather()
+    assert len(scene.paper.asked) == 1
+    assert len(scene.paper.commit()) == 8
+    assert len(scene.paper.commit()) == 8
+    assert not works[4].called and scene.paper.asked == []
+    scene.gather()
+    scene.paper.commit()
+    assert [each.number for each in works[5].result] == [21, 22, 23, 24]
+
+
+def test_when_the_queue_is_full_who_brings_more_has_to_come_again(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The relay's own are dropped; how many is told with what is written next."""
+    monkeypatch.setattr(module, "QUEUE", 10)
+    monkeypatch.setattr(module, "OWN_QUEUE", 3)
+    for _ in range(5):
+        scene.writer.note(new())
+    scene.write(7)
+    with fails(scene.write(1), Full):
+        pass
+    scene.writer.note(new("lab"))
+    assert (scene.writer.waiting, scene.writer.dropped) == (10, 3)
+    scene.gather()
+    drops = scene.paper.commit()[10:]
+    assert [(each.realm, each.source, each.kind, each.data) for each in drops] == [
+        ("default", "relay.dropped", "events.dropped", '{"count":2}'),
+        ("lab", "relay.dropped", "events.dropped", '{"count":1}'),
+    ]
+    scene.write(10)
+    scene.gather()
+    assert len(scene.paper.commit()) == 10
+
+
+def test_that_something_was_dropped_is_not_told_all_the_time(scene: Scene) -> None:
+    """In each realm once in a while, with all that were dropped meanwhile."""
+    told = []
+    for _ in range(4):
+        scene.writer.drop("default")
+        scene.write()
+        scene.gather()
+        told += [each.data for each in scene.paper.commit()[1:]]
+    scene.writer.drop("lab")
+    scene.write()
+    scene.gather()
+    told += [each.realm for each in scene.paper.commit()[1:]]
+    scene.clock.advance(DROPS_SECONDS)
+    scene.write()
+    scene.gather()
+    told += [each.data for each in scene.paper.commit()[1:]]
+    assert told == ['{"count":1}', "lab", '{"count":3}']
+    assert scene.writer.dropped == 5
+
+
+def test_a_database_that_fails_is_told_to_who_waits(scene: Scene) -> None:
+    """The relay's own are counted as dropped, and what comes later is written."""
+    waiting = scene.write()
+    scene.writer.note(new())
+    scene.gather()
+    with fails(waiting, Unavailable):
+        scene.paper.fail(Unavailable("the disk is full"))
+    assert (scene.writer.waiting, scene.writer.own_waiting, scene.writer.dropped) == (0, 0, 1)
+    following = scene.write()
+    scene.gather()
+    assert [each.kind for each in scene.paper.commit()] == ["x", "events.dropped"]
+    assert len(following.result) == 1
+
+
+def test_what_nobody_has_foreseen_is_not_the_end_of_writing(scene: Scene) -> None:
+    """It is in the log, and told without its words."""
+    waiting = scene.write()
+    scene.gather()
+    with capturedLogs() as logs, fails(waiting, Unavailable):
+        scene.paper.fail(KeyError("insides"))
+    assert logs[0]["log_failure"].type is KeyError
+    assert scene.write() is not None
+    scene.gather()
+    scene.paper.commit()
+    assert scene.told == [1]
+
+
+def test_who_leaves_does_not_keep_his_event_from_being_written(scene: Scene) -> None:
+    """Nor the others from hearing of theirs."""
+    gone, stays = scene.write(), scene.write()
+    gone.addErrback(lambda failure: None)
+    gone.cancel()
+    scene.gather()
+    assert len(scene.paper.commit()) == 2
+    assert [each.number for each in stays.result] == [2]
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_goes_down_waits_for_what_is_under_way(scene: Scene) -> None:
+    """And not at all when there is nothing."""
+    await scene.writer.flush()
+    scene.write()
+    flushing = Deferred.fromCoroutine(scene.writer.flush())
+    assert not flushing.called
+    scene.gather()
+    assert not flushing.called
+    scene.paper.commit()
+    assert flushing.called

@@ -1,0 +1,82 @@
+"""Which form a request wants, and which it has."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_server.resources.forms import (
+    EVENTS,
+    FORMS,
+    JSON,
+    JSON_LD,
+    RDF_XML,
+    TURTLE,
+    Form,
+    NotAcceptable,
+    UnknownForm,
+    of_any_form,
+    sent,
+    tags_of,
+    wanted,
+)
+from relay_server.resources.states import tag_of
+
+
+@pytest.mark.parametrize(
+    ("accept", "form"),
+    [
+        (None, JSON),
+        ("", JSON),
+        ("*/*", JSON),
+        ("application/json; charset=utf-8", JSON),
+        ("application/*", JSON),
+        ("text/*", TURTLE),
+        ("text/turtle", TURTLE),
+        ("text/turtle, */*", TURTLE),
+        ("text/turtle;q=0.5, application/rdf+xml;q=0.7, */*;q=0.1", RDF_XML),
+        ('application/ld+json;profile="http://www.w3.org/ns/json-ld#expanded"', JSON_LD),
+        ("application/json;q=0, */*;q=0.5", RDF_XML),
+        ("TEXT/TURTLE", TURTLE),
+        ("text/event-stream", EVENTS),
+        ("text/event-stream;q=0.9, application/json", JSON),
+    ],
+)
+def test_the_form_that_is_wanted_most_is_given(accept: str | None, form: Form) -> None:
+    """By the qualities of 'Accept'; JSON where nothing else is asked for."""
+    assert wanted(accept, (*FORMS, EVENTS)) is form
+
+
+@pytest.mark.parametrize("accept", ["text/html", "application/json;q=0", "text/event-stream"])
+def test_who_takes_no_form_is_told_those_there_are(accept: str) -> None:
+    """In words, and as a list."""
+    with pytest.raises(NotAcceptable, match="text/turtle") as refused:
+        wanted(accept)
+    assert refused.value.available == [each.media for each in FORMS]
+
+
+def test_a_body_says_its_form() -> None:
+    """With whatever parameters; what is none that is read is refused."""
+    assert sent("Text/Turtle; charset=utf-8") is TURTLE
+    for unknown in (None, "", "text/plain", "text/event-stream"):
+        with pytest.raises(UnknownForm, match=r"application/rdf\+xml"):
+            sent(unknown)
+
+
+def test_each_form_has_tags_of_its_own() -> None:
+    """By which the state is known in that form alone."""
+    base = tag_of(b"1")
+    tags = {each: each.tag(base) for each in FORMS}
+    assert len(set(tags.values())) == len(FORMS) and tags[JSON] == base
+    for form in FORMS:
+        assert form.bases(frozenset(tags.values())) == {base}
+        assert form.bases(frozenset({tags[each] for each in FORMS if each is not form})) == frozenset()
+
+
+def test_a_state_may_be_changed_by_whoever_read_it_in_any_form() -> None:
+    """'If-Match' is about the state; a weak tag matches nothing."""
+    base = tag_of(b"1")
+    for form in FORMS:
+        assert of_any_form(form.tag(base)) == base
+        assert of_any_form(f"W/{form.tag(base)}") == '""'
+    assert of_any_form("*") == "*" and of_any_form(None) is None
+    assert tags_of(f'W/{base}, "b"') == {base, '"b"'}

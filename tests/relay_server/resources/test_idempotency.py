@@ -1,0 +1,203 @@
+"""Requests with a key are done once, and answered as often as they are sent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock
+
+from relay_protocol.errors import Invalid, Refused, Unavailable
+from relay_server.control import NotDone
+from relay_server.inside import MaybeDone
+from relay_server.resources import Idempotency, KeyReused, Owner, Reply, Target, key_in
+from relay_server.resources import idempotency as module
+from tests.relay_server.steering import outcome, result
+
+ANN = Owner(1, "default", None)
+DONE = Reply(200, b'"done"')
+
+
+class Requests:
+    """Requests of people, and what is done for them."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.memory = Idempotency(self.clock)
+        self.work: list[Deferred[Reply]] = []
+        self.withdrawn = False
+
+    def send(self, key: str = "k", body: bytes = b"{}", owner: Owner = ANN, **target: str) -> list[Any]:
+        """One request; the list holds its answer, or its error, as soon as there is one."""
+        return outcome(self.request(key, body, owner, **target))
+
+    def request(
+        self,
+        key: str = "k",
+        body: bytes = b"{}",
+        owner: Owner = ANN,
+        robot: str = "rover",
+        address: str = "/a",
+    ) -> Deferred[Reply]:
+        """The same, to be given up."""
+        target = Target(owner, robot, address, key)
+        return Deferred.fromCoroutine(self.memory.once(target, body, self._do, self._may))
+
+    async def _do(self) -> Reply:
+        self.work.append(Deferred())
+        return await self.work[-1]
+
+    async def _may(self) -> None:
+        if self.withdrawn:
+            raise Refused("no more")
+
+
+@pytest.fixture
+def requests() -> Requests:
+    """None yet."""
+    return Requests()
+
+
+def test_the_first_answer_is_given_again(requests: Requests) -> None:
+    """Also to who asks before it is there."""
+    first, second = requests.send(), requests.send()
+    assert (first, second) == ([], [])
+    (work,) = requests.work
+    work.callback(DONE)
+    assert first == second == requests.send() == [DONE]
+    assert len(requests.work) == 1
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"key": "l"},
+        {"owner": Owner(2, "default", None)},
+        {"owner": Owner(1, "default", "viewer")},
+        {"robot": "other"},
+        {"address": "/b"},
+    ],
+)
+def test_a_key_means_nothing_elsewhere(requests: Requests, other: dict[str, Any]) -> None:
+    """To another user or scope, at another robot or address."""
+    requests.send()
+    requests.send(**other)
+    assert len(requests.work) == 2
+
+
+def test_another_body_is_another_request(requests: Requests) -> None:
+    """Which needs a key of its own, also while the first is under way."""
+    requests.send()
+    (error,) = requests.send(body=b"[]")
+    assert isinstance(error, KeyReused)
+
+
+def test_what_is_begun_is_done_though_its_sender_leaves(requests: Requests) -> None:
+    """He gets the answer when he comes again."""
+    left = requests.request()
+    left.addErrback(lambda failure: None)
+    left.cancel()
+    requests.work[0].callback(DONE)
+    assert requests.send() == [DONE]
+
+
+@pytest.mark.parametrize(
+    ("error", "kept"),
+    [
+        (NotDone("no"), True),
+        (MaybeDone(Refused("your right was revoked")), True),
+        (RuntimeError("broken"), True),
+        (Unavailable("no"), False),
+    ],
+)
+def test_errors_are_given_again_unless_nothing_was_done(
+    requests: Requests, error: Exception, kept: bool
+) -> None:
+    """Then it is tried anew."""
+    first, second = requests.send(), requests.send()
+    requests.work[0].errback(error)
+    assert first == second == [error]
+    third = requests.send()
+    assert third == ([error] if kept else [])
+    assert len(requests.work) == (1 if kept else 2)
+
+
+def test_an_answer_is_given_to_who_may_ask_still(requests: Requests) -> None:
+    """The right to may be gone by then."""
+    requests.send()
+    requests.work[0].callback(DONE)
+    requests.withdrawn = True
+    (error,) = requests.send()
+    assert isinstance(error, Refused)
+
+
+def test_an_answer_is_kept_for_ten_minutes(requests: Requests) -> None:
+    """From the time when it was there; then nothing is left of it."""
+    requests.send()
+    requests.clock.advance(module.KEPT_SECONDS)
+    requests.work[0].callback(DONE)
+    requests.clock.advance(module.KEPT_SECONDS - 1)
+    assert requests.send() == [DONE]
+    requests.clock.advance(1)
+    assert not requests.memory._of
+    assert requests.send() == []
+
+
+def test_so_many_answers_are_kept(requests: Requests, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one user, by number and by size: the oldest go, the newest stays, and so does what is under way."""
+    monkeypatch.setattr(module, "KEYS", 3)
+    monkeypatch.setattr(module, "ANSWERS_BYTES", 100)
+    for key, size in (("a", 10), ("b", 10), ("c", 10), ("d", 10)):
+        requests.send(key)
+        requests.work[-1].callback(Reply(200, b"x" * size))
+    assert (len(requests.send("b")), len(requests.send("a"))) == (1, 0)
+    requests.send("e")
+    requests.work[-1].callback(Reply(200, b"x" * 1000))
+    assert len(requests.send("e")) == 1
+    assert [len(requests.send(key)) for key in "d"] == [0]
+    requests.work[4].callback(DONE)
+    assert requests.send("a") == [DONE]
+
+
+def test_so_many_are_under_way(requests: Requests, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one user; of others as many."""
+    monkeypatch.setattr(module, "KEYS", 2)
+    requests.send("a"), requests.send("b")
+    (error,) = requests.send("c")
+    assert isinstance(error, Unavailable)
+    assert requests.send("c", owner=Owner(2, "default", None)) == []
+    requests.work[0].callback(DONE)
+    assert requests.send("c") == []
+
+
+@pytest.mark.parametrize(
+    ("values", "key"),
+    [
+        ([], None),
+        (['"8e03978e"'], "8e03978e"),
+        ([" 8e03978e "], "8e03978e"),
+        ([r'"a \"b\" \\ c"'], r'a "b" \ c'),
+        (["k" * 255], "k" * 255),
+    ],
+)
+def test_keys_are_read_with_and_without_quotes(values: list[str], key: str | None) -> None:
+    """As the draft wants them, and as programs send them."""
+    assert key_in(values) == key
+
+
+@pytest.mark.parametrize("values", [[""], ['""'], ['"open'], ["a b"], ["ä"], ["k" * 256], ["a", "b"]])
+def test_a_key_that_makes_no_sense_is_refused(values: list[str]) -> None:
+    """In words."""
+    with pytest.raises(Invalid, match="idempotency-key"):
+        key_in(values)
+
+
+def test_an_answer_at_once_is_an_answer(requests: Requests) -> None:
+    """What waits for nothing is done within the request."""
+
+    async def work() -> Reply:
+        return DONE
+
+    target = Target(ANN, "rover", "/a", "k")
+    assert result(requests.memory.once(target, b"", work, requests._may)) == DONE

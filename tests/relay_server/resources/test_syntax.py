@@ -1,0 +1,285 @@
+"""Texts of RDF that strangers send: what they may mean, and what they may not do."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rdflib import Graph
+
+from relay_protocol import jsontext
+from relay_protocol.errors import SwitchboardError
+from relay_server.resources.forms import JSON_LD, RDF_XML, TURTLE, Form
+from relay_server.resources.syntax import NAMESPACES, read
+from relay_server.resources.values import message_in, value_in
+
+PATH = "/api/v1/robots/rover/topics/cmd_vel"
+BASE = f"http://robots.example{PATH}"
+WORDS = "http://robots.example/api/v1/vocabulary/"
+BODY = 64 * 1024
+"""What a request may carry."""
+
+PREFIXES = f"""
+@prefix sosa: <http://www.w3.org/ns/sosa/> .
+@prefix rdf: <http://www.w3.org/1999/02/22-rdf-syntax-ns#> .
+@prefix xsd: <http://www.w3.org/2001/XMLSchema#> .
+@prefix t: <{WORDS}geometry_msgs/Twist#> .
+@prefix v: <{WORDS}geometry_msgs/Vector3#> .
+@prefix f: <{WORDS}fields#> .
+@prefix s: <{WORDS}switchboard#> .
+"""
+XML = f"""<?xml version="1.0"?>
+<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" xmlns:sosa="http://www.w3.org/ns/sosa/"
+  xmlns:t="{WORDS}geometry_msgs/Twist#" xmlns:v="{WORDS}geometry_msgs/Vector3#">
+  <rdf:Description rdf:about="">%s</rdf:Description>
+</rdf:RDF>"""
+GO_XML = XML % (
+    '<sosa:hasResult rdf:parseType="Resource"><t:linear rdf:parseType="Resource">'
+    '<v:x rdf:datatype="http://www.w3.org/2001/XMLSchema#double">0.2</v:x></t:linear></sosa:hasResult>'
+)
+GO = {"linear": {"x": 0.2}}
+CONTEXT = {
+    "sosa": "http://www.w3.org/ns/sosa/",
+    "t": f"{WORDS}geometry_msgs/Twist#",
+    "hasResult": "sosa:hasResult",
+}
+
+
+def turtle(text: str) -> Graph:
+    """A graph in Turtle."""
+    return read((PREFIXES + text).encode(), TURTLE, BASE)
+
+
+def linked(**value: Any) -> Graph:
+    """A graph in JSON-LD."""
+    return read(jsontext.encode({"@id": BASE, **value}), JSON_LD, BASE)
+
+
+def refused(body: bytes | str, form: Form) -> str:
+    """Why a body is refused."""
+    with pytest.raises(SwitchboardError) as error:
+        message_in(read(body.encode() if isinstance(body, str) else body, form, BASE), PATH)
+    return str(error.value)
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+    """Nothing may be connected to or opened; the address of a file that is there."""
+
+    def never(*arguments: Any, **more: Any) -> Any:
+        raise AssertionError(f"something was fetched: {arguments}")
+
+    secret = tmp_path / "secret"
+    secret.write_text('{"@context": {}}')
+    monkeypatch.setattr(socket.socket, "connect", never)
+    monkeypatch.setattr("urllib.request.urlopen", never)
+    return secret.as_uri()
+
+
+def test_people_write_it_as_they_like() -> None:
+    """With or without datatypes' names, nodes in place or by address, on any host the relay has."""
+    assert message_in(read(GO_XML.encode(), RDF_XML, BASE), PATH).value == GO
+    short = turtle("<> sosa:hasResult [ t:linear [ v:x 0.2 ] ] .")
+    assert message_in(short, PATH) == ("geometry_msgs/msg/Twist", GO)
+    far = turtle(
+        f'<https://proxy{PATH}> sosa:hasResult <#a> . <#a> t:linear <#b> . <#b> v:x "0.2"^^xsd:float .'
+    )
+    assert message_in(far, PATH).value == GO
+    there = linked(
+        **{"@context": CONTEXT, "hasResult": {"t:linear": {f"{WORDS}geometry_msgs/Vector3#x": 0.2}}}
+    )
+    assert message_in(there, PATH).value == GO
+    assert value_in(turtle("<> s:value 5 ."), PATH) == 5
+
+
+@pytest.mark.parametrize(
+    ("literal", "value"),
+    [
+        ('"2023-11-14T22:13:20.000000001Z"^^xsd:dateTime', {"sec": 1_700_000_000, "nanosec": 1}),
+        ('"1969-12-31T23:59:59.5+00:00"^^xsd:dateTime', {"sec": -1, "nanosec": 500_000_000}),
+        ('"2023-11-14T23:13:20+01:00"^^xsd:dateTime', {"sec": 1_700_000_000, "nanosec": 0}),
+        ('"NaN"^^xsd:double', None),
+        ("1e3", 1000.0),
+        ('" 1 "^^xsd:boolean', True),
+        ('"AQ\\n=="^^xsd:base64Binary', "AQ=="),
+        ('"1 NaN"^^s:floatList', [1.0, None]),
+        ('"word"@en', "word"),
+        ("(1 (2) ())", [1, [2], []]),
+    ],
+)
+def test_values_are_what_xml_schema_says(literal: str, value: Any) -> None:
+    """Also those that this relay writes in another way."""
+    assert value_in(turtle(f"<> s:value {literal} ."), PATH) == value
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("", "0 times"),
+        ("<> sosa:hasResult [ ], [ ] .", "2 times"),
+        ("<http://robots.example/other> sosa:hasResult [ ] .", "0 times"),
+        ("<> sosa:hasResult 5 .", "must be a message"),
+        ("<> sosa:hasResult [ t:linear <http://elsewhere/> ] .", "linear must be a value or a node"),
+        ("<> sosa:hasResult [ t:linear 1, 2 ] .", "'linear' more than once"),
+        ("<> sosa:hasResult [ t:linear 1 ; v:x 2 ] .", "at once"),
+        ("<> sosa:hasResult [ a <x> ; sosa:linear 1 ] .", "is no field of a message"),
+        ("<> sosa:hasResult [ t:x \"INF\"^^xsd:double ] .", "x is infinite"),
+        ("<> sosa:hasResult [ t:x \"1e999\"^^xsd:double ] .", "out of range"),
+        ("<> sosa:hasResult [ t:x \"twelve\"^^xsd:int ] .", "'twelve' is no integer"),
+        ("<> sosa:hasResult [ t:x \"maybe\"^^xsd:boolean ] .", "'maybe' is no boolean"),
+        ("<> sosa:hasResult [ t:x \"1999\"^^xsd:gYear ] .", "gYear> are not known"),
+        ("<> sosa:hasResult [ t:x \"2023-11-14T22:13:20\"^^xsd:dateTime ] .", "with its zone"),
+        ("<> sosa:hasResult [ t:x \"{\"^^rdf:JSON ] .", "not JSON"),
+        ("<> sosa:hasResult [ t:x \"?\"^^s:base64Text ] .", "is no UTF-8 in base64"),
+        ("<> sosa:hasResult _:a . _:a t:x _:a .", "in several places, or within itself"),
+        ("<> sosa:hasResult [ t:x _:l ] . _:l rdf:first 1 ; rdf:rest _:l .", "within itself"),
+        ("<> sosa:hasResult [ t:x _:l ] . _:l rdf:first 1 .", "is no whole list"),
+        ("<> sosa:hasResult [", "no text/turtle that can be read"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused_in_words(body: str, words: str) -> None:
+    """Nothing of it is guessed, or passed over."""
+    assert words in refused(PREFIXES + body, TURTLE)
+
+
+ENTITIES = """<?xml version="1.0"?><!DOCTYPE r [%s]>""" + XML.partition("?>")[2]
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [
+        '<!ENTITY a "0.2">',
+        "".join(f'<!ENTITY e{n} "{f"&e{n - 1};" * 10}">' for n in range(1, 12)) + '<!ENTITY e0 "lol">',
+        '<!ENTITY a SYSTEM "{file}">',
+        '<!ENTITY % a SYSTEM "http://robots.example/evil.dtd"> %a;',
+    ],
+)
+def test_entities_are_not_read(alone: str, declared: str) -> None:
+    """Neither bombs nor files, and no others."""
+    body = ENTITIES.replace("%s", declared.replace("{file}", alone), 1)
+    assert "DOCTYPE" in refused(body, RDF_XML)
+
+
+@pytest.mark.parametrize(
+    "context",
+    [
+        "http://robots.example/context.jsonld",
+        "{file}",
+        ["{file}"],
+        {"@import": "{file}"},
+        {"a": {"@id": "http://a/", "@context": "{file}"}},
+        {"a": {"@id": "http://a/", "@context": {}}},
+        {"a": "b:x", "b": "a:y"},
+        {"a": "b:", "b": "c:", "c": "http://c/"},
+        {"a": 5},
+        {"a": "http://a/" + "x" * 2000},
+        {f"a{n}": "http://a/" for n in range(1000)},
+        5,
+    ],
+)
+def test_contexts_stand_in_the_body(alone: str, context: Any) -> None:
+    """None is fetched, and none grows."""
+    text = jsontext.encode({"@context": context, "@id": BASE}).replace(b"{file}", alone.encode())
+    assert "'@context'" in refused(text, JSON_LD)
+
+
+def test_contexts_stand_at_its_top(alone: str) -> None:
+    """Not within nodes, nor within their values."""
+    for inner in ({"@context": alone}, [{"x": {"@context": alone}}], {"@import": alone}):
+        assert "'@context'" in refused(jsontext.encode({"@id": BASE, "t:x": inner}), JSON_LD)
+
+
+def test_addresses_are_not_fetched(alone: str) -> None:
+    """What a body names is a name."""
+    named = (
+        f"<> sosa:hasResult [ t:x <{alone}> ] . <{alone}> <http://www.w3.org/2002/07/owl#imports> <{alone}> ."
+    )
+    refused(PREFIXES + named, TURTLE)
+    refused(f"@prefix : <{alone}#> . @base <{alone}> . <> :a :b .", TURTLE)
+    refused(XML.replace("<rdf:Description", f'<rdf:Description xml:base="{alone}"') % "<t:x/>", RDF_XML)
+
+
+def test_values_are_not_xml() -> None:
+    """No field is, and reading it takes longer the more there is of it."""
+    body = XML % f"<sosa:hasResult rdf:parseType='Literal'>{'<b/>' * 10_000}</sosa:hasResult>"
+    assert "parseType" in refused(body, RDF_XML)
+
+
+def test_namespaces_are_few() -> None:
+    """Also where each is declared within another."""
+    names = [f' xmlns:n{each}="u:"' for each in range(1000)]
+    for body in (f"<a{''.join(names)}/>", f"<a>{''.join(f'<a{each}/>' for each in names)}</a>"):
+        assert "namespaces" in refused(body, RDF_XML)
+
+
+@pytest.mark.parametrize("declares", ["@prefix n{0}:<u:{0}>.", "PREFIX n{0}: <u:{0}>", "prefix n{0}:<u:{0}>"])
+def test_prefixes_are_few(declares: str) -> None:
+    """However they are written; fields that are called so are none."""
+    assert "namespaces" in refused("".join(declares.format(each) for each in range(NAMESPACES + 1)), TURTLE)
+    few = "".join(declares.format(each) for each in range(NAMESPACES))
+    fields = "<> <u:f> <u:prefix/prefix#prefix>, n0:prefix. " * 300
+    assert len(read((few + fields).encode(), TURTLE, BASE)) == 2
+
+
+def nested(form: Form, depth: int) -> str:
+    """A message within a message, and so on."""
+    if form is TURTLE:
+        return PREFIXES + "<> sosa:hasResult " + "[ f:x " * depth + "1" + " ]" * depth + " ."
+    if form is JSON_LD:
+        within = f'{{"{WORDS}fields#x":' * depth + "1" + "}" * depth
+        return f'{{"@id": "{BASE}", "http://www.w3.org/ns/sosa/hasResult": {within}}}'
+    open_, close = '<t:x rdf:parseType="Resource">', "</t:x>"
+    return XML % f"<sosa:hasResult rdf:parseType='Resource'>{open_ * depth + close * depth}</sosa:hasResult>"
+
+
+@pytest.mark.parametrize("form", [TURTLE, JSON_LD, RDF_XML])
+@pytest.mark.parametrize("depth", [100, 1000])
+def test_deep_nesting_is_refused(form: Form, depth: int) -> None:
+    """In words, however deep."""
+    assert "deep" in refused(nested(form, depth), form)
+
+
+def test_a_shared_node_does_not_stand_for_many() -> None:
+    """Thirty lines would be a message of a billion fields."""
+    lines = "".join(f"_:n{each} f:a _:n{each + 1} ; f:b _:n{each + 1} ." for each in range(30))
+    assert "several places" in refused(f"{PREFIXES}<> sosa:hasResult _:n0 . {lines} _:n30 f:a 1 .", TURTLE)
+
+
+@pytest.mark.parametrize(
+    ("form", "body"),
+    [
+        (TURTLE, f"{PREFIXES}<> s:value {'9' * 60_000} ."),
+        (TURTLE, f'{PREFIXES}<> s:value "1e999999999"^^xsd:decimal .'),
+        (TURTLE, f'{PREFIXES}<> s:value "{"9" * 60_000}"^^xsd:gYear .'),
+        (
+            TURTLE,
+            f"{PREFIXES}<> s:value \"<!DOCTYPE a [<!ENTITY b SYSTEM 'file:///'>]>&b;\"^^rdf:XMLLiteral .",
+        ),
+        (TURTLE, f"@prefix a: <http://{'a' * 30_000}> . {'a:a a:a a:a . ' * 2000}"),
+        (TURTLE, "\n" * BODY),
+        (TURTLE, "[" * BODY),
+        (TURTLE, '"' * BODY),
+        (RDF_XML, "<a" + "".join(f' xmlns:n{each}="u:"' for each in range(3000)) + "/>"),
+        (RDF_XML, f'<a xmlns="http://{"a" * 30_000}">{"<a/>" * 5000}</a>'),
+        (RDF_XML, '<?xml version="1.0" encoding="utf-16"?><a/>'),
+        (RDF_XML, "<a>" * 20_000),
+        (JSON_LD, '{"a":' * 10_000),
+        (JSON_LD, "[]"),
+        (
+            JSON_LD,
+            '{"@id": {"@id": []}, "@type": [[5]], "@reverse": 5, "@graph": {"@graph": [1, {"@value": {}}]}}',
+        ),
+    ],
+)
+def test_what_is_huge_or_odd_is_refused_in_words(form: Form, body: str) -> None:
+    """A body is small, and does not become large by being read."""
+    assert len(body) <= BODY + 1024
+    assert 0 < len(refused(body, form)) < 500
+
+
+def test_a_body_is_utf8() -> None:
+    """Whatever it says of itself."""
+    for form in (TURTLE, JSON_LD, RDF_XML):
+        assert "not UTF-8" in refused(GO_XML.encode("utf-16"), form)
