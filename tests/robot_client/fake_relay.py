@@ -18,7 +18,7 @@ from relay_protocol.errors import PeerError
 from relay_protocol.link.moving import Order
 
 T = TypeVar("T", bound=link.Message | frames.SampleFrame | frames.VideoFrame)
-PATIENCE = 20.0
+PATIENCE = 60.0
 
 
 class Peer:

@@ -17,7 +17,7 @@ from typing import Any
 from switchboard_domains import free_domain
 from twisted.internet import reactor, task
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 CONFORMANCE = Path(__file__).parents[1] / "conformance"
 
 

@@ -30,6 +30,8 @@ BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 node = None
 ends: dict[str, object] = {}
+relenting: set[str] = set()
+"""Stubborn actions that cancel their goals after all."""
 
 
 def tell(**what: object) -> None:
@@ -38,6 +40,7 @@ def tell(**what: object) -> None:
 
 
 def invert(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    tell(inverted=request.data)
     response.success = not request.data
     response.message = "inverted"
     return response
@@ -124,8 +127,14 @@ def act(action: str, kind: str) -> None:
 
     def judge(goal: object) -> GoalResponse:
         if kind.startswith("late"):
+            tell(thinks=action)
             time.sleep(1.0)  # a server that thinks before it takes a goal
         return GoalResponse.REJECT if kind == "reject" else GoalResponse.ACCEPT
+
+    def wished(goal: object) -> CancelResponse:
+        refuses = kind.startswith("stubborn") and action not in relenting
+        tell(wished=action, refused=refuses)
+        return CancelResponse.REJECT if refuses else CancelResponse.ACCEPT
 
     ends[action] = ActionServer(
         node,
@@ -133,9 +142,14 @@ def act(action: str, kind: str) -> None:
         action,
         count,
         goal_callback=judge,
-        cancel_callback=lambda goal: CancelResponse.ACCEPT,
+        cancel_callback=wished,
         callback_group=ReentrantCallbackGroup(),
     )
+
+
+def relent(action: str) -> None:
+    """Cancel goals from now on."""
+    relenting.add(action)
 
 
 def unact(action: str) -> None:

@@ -87,6 +87,19 @@ def test_a_daemon_that_has_just_begun_hears_before_it_says_that_is_all() -> None
     assert scene.comes() == ["arm broken", "that is all"]
 
 
+def test_a_loss_of_control_is_told_until_it_is_heard_and_no_more(scene: Scene) -> None:
+    """It has happened; what is wrong with a part of what controls the robot lasts, as with any other."""
+    scene.goes()
+    scene.tell("", "lost", kind="control")
+    scene.tell("goals", "they go on", kind="control")
+    assert scene.comes() == ["lost", "goals they go on", "that is all"]
+    scene.goes()
+    assert "lost" in scene.comes()
+    scene.proves()
+    scene.goes()
+    assert scene.comes() == ["goals they go on", "that is all"]
+
+
 def test_a_daemon_that_is_away_when_it_has_heard_says_so_when_it_is_back() -> None:
     """Not into a link that is none."""
     scene = Scene()

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol import link
-from robot_client.authority import GRIPS, LET_GO, SETTLED, Authority, Suppression, Verdict
+from robot_client import authority as module
+from robot_client.authority import LET_GO, SETTLED, Authority, Suppression, Verdict
 
 MS = 1_000_000
 ANN, BEN, EVE = 1, 2, 3
@@ -23,8 +24,8 @@ class Scene:
     def wait(self, ms: int) -> None:
         self.now += ms * MS
 
-    def hold(self, holder: int) -> bool:
-        return self.authority.hold(holder, "somebody", "operator", self.now)
+    def hold(self, holder: int, user: str = "") -> bool:
+        return self.authority.hold(holder, user or f"user {holder}", "operator", self.now)
 
     def stop(self) -> None:
         self.authority.stop(STOP, self.now)
@@ -35,11 +36,11 @@ class Scene:
     def suppress(self, *sources: int, ms: int = 100, topic: str = WHEELS) -> bool:
         return self.authority.suppress(topic, Suppression(frozenset(sources), self.now + ms * MS, "x"))
 
-    def go(self, source: int, topic: str = WHEELS) -> Verdict:
-        return self.authority.judge(source, topic, True, self.now)
+    def go(self, source: int, topic: str = WHEELS, late: int = 0) -> Verdict:
+        return self.authority.judge(source, topic, True, self.now, self.now - late * MS)
 
     def zero(self, source: int, topic: str = WHEELS) -> Verdict:
-        return self.authority.judge(source, topic, False, self.now)
+        return self.authority.judge(source, topic, False, self.now, self.now)
 
     def stream(self, source: int, ms: int, every: int = 50) -> list[Verdict]:
         said = []
@@ -67,7 +68,7 @@ def test_only_the_holder_moves(scene: Scene) -> None:
 def test_nobody_is_no_source(scene: Scene) -> None:
     """Source 0 moves nothing, also while nobody holds control."""
     assert scene.go(0) is Verdict.NOT_HOLDER
-    assert scene.authority.judge_request(0) is Verdict.NOT_HOLDER
+    assert scene.authority.judge_request(0, scene.now, scene.now) is Verdict.NOT_HOLDER
 
 
 def test_who_takes_a_free_robot_by_commanding_moves_at_once(scene: Scene) -> None:
@@ -120,7 +121,7 @@ def test_stop_beats_the_holder_and_whoever_suppresses(scene: Scene) -> None:
     assert scene.go(BEN) is Verdict.STOPPED
     assert scene.go(ANN, ARM) is Verdict.STOPPED
     assert scene.zero(ANN) is Verdict.STOPPED
-    assert scene.authority.judge_request(ANN) is Verdict.STOPPED
+    assert scene.authority.judge_request(ANN, scene.now, scene.now) is Verdict.STOPPED
     assert scene.authority.stopped == STOP
 
 
@@ -179,6 +180,110 @@ def test_who_comes_after_the_resume_moves_at_once(scene: Scene) -> None:
     assert scene.go(BEN) is Verdict.ALLOWED
 
 
+# --- what was sent before ----------------------------------------------------------------------------------
+
+
+def requests(scene: Scene, late: int, source: int = ANN) -> Verdict:
+    """What becomes of a goal that can have been sent so many milliseconds ago."""
+    return scene.authority.judge_request(source, scene.now, scene.now - late * MS)
+
+
+def test_what_was_sent_before_a_stop_is_not_obeyed_after_the_resume(scene: Scene) -> None:
+    """A goal that was held up meanwhile; nor one of the time in which the robot was stopped. What comes after is."""
+    scene.hold(ANN)
+    scene.wait(100)
+    scene.stop()
+    scene.wait(200)
+    scene.resume()
+    scene.wait(100)
+    assert requests(scene, 400) is Verdict.OVERTAKEN
+    assert requests(scene, 101) is Verdict.OVERTAKEN
+    assert scene.authority.refused == 2
+    assert requests(scene, 100) is Verdict.ALLOWED
+
+
+def test_a_link_that_stalls_makes_no_silence(scene: Scene) -> None:
+    """However long nothing came of who must let go: what counts is when it can have been sent."""
+    scene.hold(ANN)
+    scene.stream(ANN, 200)
+    scene.stop()
+    scene.wait(200)
+    scene.resume()
+    scene.wait(700)
+    assert scene.go(ANN, late=1000) is Verdict.NOT_LET_GO
+    assert scene.go(ANN, late=500) is Verdict.NOT_LET_GO
+    assert set(scene.stream(ANN, 300)) == {Verdict.NOT_LET_GO}
+    scene.wait(700)
+    assert scene.go(ANN, late=201) is Verdict.NOT_LET_GO
+    scene.wait(700)
+    assert scene.go(ANN, late=200) is Verdict.ALLOWED
+
+
+def test_who_took_the_stick_before_the_resume_must_let_go_of_it(scene: Scene) -> None:
+    """Though he had said zero before that, and the link told of it only after the resume."""
+    scene.hold(ANN)
+    scene.stop()
+    scene.zero(ANN)
+    scene.wait(1000)
+    scene.resume()
+    scene.wait(100)
+    assert scene.go(ANN, late=500) is Verdict.NOT_LET_GO
+    assert set(scene.stream(ANN, 1000)) == {Verdict.NOT_LET_GO}
+
+
+def test_who_lets_go_and_drives_right_after_the_resume_is_obeyed_soon(scene: Scene) -> None:
+    """Pings leave it in doubt for a moment whether he waited for it: that bars nobody."""
+    scene.hold(ANN)
+    scene.stop()
+    scene.zero(ANN)
+    scene.wait(1000)
+    scene.resume()
+    said = []
+    for _ in range(5):
+        scene.wait(50)
+        said.append(scene.go(ANN, late=150))
+    assert said == 2 * [Verdict.OVERTAKEN] + 3 * [Verdict.ALLOWED]
+
+
+def test_zero_is_obeyed_whenever_it_was_sent(scene: Scene) -> None:
+    """It moves nothing."""
+    scene.hold(ANN)
+    scene.stop()
+    scene.resume()
+    assert scene.authority.judge(ANN, WHEELS, False, scene.now, scene.now - 400 * MS) is Verdict.ALLOWED
+
+
+def test_what_takes_a_free_robot_was_sent_before_control_came(scene: Scene) -> None:
+    """The command, call or goal that made the relay ask for control is obeyed when it is there."""
+    scene.wait(300)
+    scene.hold(ANN)
+    assert scene.go(ANN, late=200) is Verdict.ALLOWED
+    assert requests(scene, 200) is Verdict.ALLOWED
+
+
+def test_what_was_sent_before_control_was_lost_is_not_obeyed_when_it_is_back(scene: Scene) -> None:
+    """It is of another time; who lost no control is not held up by that."""
+    scene.hold(ANN)
+    scene.wait(400)
+    scene.hold(BEN)
+    scene.wait(100)
+    assert requests(scene, 400, BEN) is Verdict.ALLOWED
+    scene.hold(ANN)
+    scene.wait(100)
+    assert requests(scene, 201) is Verdict.OVERTAKEN
+    assert scene.go(ANN, late=201) is Verdict.OVERTAKEN
+    assert requests(scene, 200) is Verdict.ALLOWED
+
+
+def test_what_was_sent_before_the_link_was_lost_is_not_obeyed_by_the_new_one(scene: Scene) -> None:
+    """Also of who is new to the robot, and waited in the relay."""
+    lose(scene, 100)
+    scene.wait(100)
+    assert requests(scene, 201) is Verdict.OVERTAKEN
+    assert scene.go(ANN, late=201) is Verdict.OVERTAKEN
+    assert requests(scene, 200) is Verdict.ALLOWED
+
+
 def test_same_holder_changes_only_the_level(scene: Scene) -> None:
     """Control given to who has it takes nothing from him."""
     scene.hold(ANN)
@@ -208,6 +313,31 @@ def test_suppression_by_nobody_lets_nobody_move_the_topic(scene: Scene) -> None:
     scene.hold(ANN)
     scene.suppress()
     assert scene.go(ANN) is Verdict.SUPPRESSED
+
+
+def test_nothing_that_moves_by_itself_begins_while_others_suppress(scene: Scene) -> None:
+    """Goals and calls drive by publishers of the robot's own: of any topic, until the last suppression is over."""
+    scene.hold(ANN)
+    scene.suppress(BEN, ms=100)
+    scene.suppress(EVE, ms=200, topic=ARM)
+    assert requests(scene, 0) is Verdict.OVERRULED
+    assert requests(scene, 0, BEN) is Verdict.NOT_HOLDER
+    scene.wait(100)
+    assert requests(scene, 0) is Verdict.OVERRULED
+    scene.wait(100)
+    assert requests(scene, 0) is Verdict.ALLOWED
+    assert scene.authority.refused == 3
+
+
+def test_a_holder_who_suppresses_gives_goals(scene: Scene) -> None:
+    """He stands above himself; not beside others who suppress another topic, and never above a stop."""
+    scene.hold(ANN)
+    scene.suppress(ANN, BEN)
+    assert requests(scene, 0) is Verdict.ALLOWED
+    scene.suppress(BEN, topic=ARM)
+    assert requests(scene, 0) is Verdict.OVERRULED
+    scene.stop()
+    assert requests(scene, 0) is Verdict.STOPPED
 
 
 def test_who_suppresses_is_not_held_up_by_a_change_of_control(scene: Scene) -> None:
@@ -269,6 +399,59 @@ def test_who_is_new_after_a_lost_link_begins_at_once(scene: Scene) -> None:
     assert scene.go(BEN) is Verdict.NOT_LET_GO
 
 
+@pytest.mark.parametrize("away", [10, 300, 60_000])
+@pytest.mark.parametrize("graceful", [False, True])
+@pytest.mark.parametrize("early", [False, True])
+def test_who_comes_back_by_another_connection_must_let_go_first(
+    scene: Scene, away: int, graceful: bool, early: bool
+) -> None:
+    """A relay that was started anew knows him by another number, and gives him control for his first command."""
+    scene.hold(ANN, "ann")
+    scene.stream(ANN, 200)
+    if graceful:
+        scene.authority.hold(0, "", "", scene.now)
+    scene.authority.forget(scene.now)
+    scene.wait(away)
+    scene.authority.meet(scene.now)
+    if early:
+        scene.go(EVE)
+    scene.hold(EVE, "ann")
+    assert set(scene.stream(EVE, 7000)) == {Verdict.NOT_LET_GO}
+    scene.wait(500)
+    assert scene.go(EVE) is Verdict.ALLOWED
+
+
+@pytest.mark.parametrize("by", ["zero", "silence"])
+def test_who_has_let_go_since_he_came_back_need_not_by_his_next_connection(scene: Scene, by: str) -> None:
+    """Of each topic by itself."""
+    scene.hold(ANN, "ann")
+    scene.go(ANN)
+    scene.go(ANN, ARM)
+    scene.authority.forget(scene.now)
+    scene.authority.meet(scene.now)
+    scene.hold(EVE, "ann")
+    if by == "zero":
+        scene.zero(EVE)
+    else:
+        assert scene.go(EVE) is Verdict.NOT_LET_GO
+        scene.wait(500)
+        assert scene.go(EVE) is Verdict.ALLOWED
+    scene.hold(BEN, "ann")
+    assert scene.go(BEN) is Verdict.ALLOWED
+    assert scene.go(BEN, ARM) is Verdict.NOT_LET_GO
+
+
+def test_who_comes_back_later_begins_at_once(scene: Scene) -> None:
+    """After so long nobody takes it for the going on of anything."""
+    scene.hold(ANN, "ann")
+    scene.go(ANN)
+    scene.authority.forget(scene.now)
+    scene.authority.meet(scene.now)
+    scene.wait(SETTLED // MS)
+    scene.hold(EVE, "ann")
+    assert scene.go(EVE) is Verdict.ALLOWED
+
+
 def test_zero_is_letting_go_after_a_lost_link(scene: Scene) -> None:
     """Of its topic, also before control is given; and who begins long after it begins."""
     scene.hold(ANN)
@@ -326,23 +509,39 @@ def test_first_link_asks_nobody_to_let_go(scene: Scene) -> None:
     assert scene.go(ANN) is Verdict.ALLOWED
 
 
-def test_however_many_sources_come_little_is_remembered(scene: Scene) -> None:
-    """The memory of who commanded is bounded."""
-    scene.hold(ANN)
-    for source in range(2, 2 * GRIPS):
-        scene.go(source)
-    scene.authority.forget(scene.now)
-    scene.authority.meet(scene.now)
-    for source in range(2 * GRIPS, 4 * GRIPS):
-        scene.go(source)
-    scene.authority.forget(scene.now)
-    kept = (scene.authority._grips, scene.authority._former, scene.authority._again)
-    assert max(map(len, kept)) <= GRIPS
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Most that is remembered, so that tests come to its end soon."""
+    monkeypatch.setattr(module, "GRIPS", 20)
+    return 20
 
 
-def test_however_many_sources_come_who_still_commands_is_remembered(scene: Scene) -> None:
-    """Thousands of others before him, at the same time, or before the link was lost twice, give him no opening."""
-    others = range(100, 100 + GRIPS + 1)
+def test_however_many_come_little_is_remembered(scene: Scene, few: int) -> None:
+    """Of those who command, hold control or let go, and of topics: of each kind so many, and no more."""
+    largest: dict[str, int] = {}
+
+    def look() -> None:
+        for name, kept in vars(scene.authority).items():
+            if isinstance(kept, (dict, set)) and name.startswith("_"):
+                largest[name] = max(largest.get(name, 0), len(kept))
+
+    for _ in range(2):
+        for number in range(1, 2 * few):
+            scene.hold(number)
+            scene.zero(number)
+            scene.go(number)
+        for number in range(2 * few):
+            scene.zero(2 * few - 1, f"/{number}")
+        look()
+        scene.authority.forget(scene.now)
+        scene.authority.meet(scene.now)
+        look()
+    assert set(largest.values()) == {few}, largest
+
+
+def test_however_many_sources_come_who_still_commands_is_remembered(scene: Scene, few: int) -> None:
+    """More than that before him, at the same time, or before the link was lost twice, give him no opening."""
+    others = range(100, 100 + few + 1)
     for source in others:
         scene.go(source)
     scene.go(ANN)
@@ -382,6 +581,37 @@ def test_nobody_but_the_holder_is_ever_obeyed(steps: list[tuple[str, int, int]])
             assert scene.authority.stopped is None
 
 
+@given(
+    st.lists(
+        st.tuples(st.sampled_from("hsrfmzggg"), st.integers(0, 3), st.integers(0, 600), st.integers(0, 3000)),
+        max_size=60,
+    )
+)
+def test_nothing_sent_before_a_stop_a_resume_or_a_lost_link_is_ever_obeyed(
+    steps: list[tuple[str, int, int, int]],
+) -> None:
+    """Whatever happens in whatever order, and however long each was on its way."""
+    scene = Scene()
+    turned = 0
+    for what, source, ms, late in steps:
+        scene.wait(ms)
+        if what == "h":
+            scene.hold(source)
+        elif what == "z":
+            scene.zero(source)
+        elif what == "g":
+            for verdict in (scene.go(source, late=late), requests(scene, late, source)):
+                assert verdict is not Verdict.ALLOWED or scene.now - late * MS >= turned
+        elif what == "f":
+            turned = turned if scene.authority._lost else scene.now
+            scene.authority.forget(scene.now)
+        elif what == "m":
+            scene.authority.meet(scene.now)
+        elif what == "s" or scene.authority.stopped is not None:
+            turned = scene.now
+            (scene.stop if what == "s" else scene.resume)()
+
+
 @given(st.lists(st.tuples(st.sampled_from("hsrg"), st.integers(0, 3)), max_size=60))
 def test_a_stream_through_a_stop_never_moves_again_by_itself(steps: list[tuple[str, int]]) -> None:
     """Who never lets go is not obeyed after a resume, whatever else happens, as long as he is heard often enough."""
@@ -401,6 +631,31 @@ def test_a_stream_through_a_stop_never_moves_again_by_itself(steps: list[tuple[s
             scene.resume()
         else:
             scene.go(source if source != ANN else BEN)
+
+
+@given(st.lists(st.tuples(st.sampled_from("sr...."), st.integers(1, 20)), max_size=20))
+def test_a_stream_through_a_stop_never_moves_again_however_its_link_stalls(
+    steps: list[tuple[str, int]],
+) -> None:
+    """All that is held up comes in the end, and shows that nobody has let go."""
+    scene = Scene()
+    scene.hold(ANN)
+    scene.go(ANN)
+    scene.stop()
+    scene.resume()
+    held_up: list[int] = []
+    for what, stalled in steps:
+        for _ in range(stalled):
+            scene.wait(100)
+            held_up.append(scene.now)
+        if what == "s":
+            scene.stop()
+        elif what == "r":
+            scene.resume()
+        else:
+            for sent in held_up:
+                assert scene.authority.judge(ANN, WHEELS, True, scene.now, sent) is not Verdict.ALLOWED
+            held_up.clear()
 
 
 @given(

@@ -14,6 +14,7 @@ from robot_client.motion import KEPT, MOTION_QOS
 from robot_client.platforms.base import CANCELED, GraphView, Outcome
 from robot_client.platforms.memory import TWIST, twist
 from robot_client.tracks import MAX_TOPICS
+from tests.robot_client.breaking import broken
 from tests.robot_client.scene import DRIVER, STRING, Scene
 
 
@@ -193,6 +194,32 @@ def test_end_of_the_channel_stops_and_releases_all(scene: Scene) -> None:
     assert len(scene.wire.said) == told
 
 
+def test_what_can_not_be_released_keeps_nothing_else(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the end of a channel whose subscription, publication and offer all fail to go, goals and calls end."""
+    given_up: list[Deferred[bytes]] = []
+    scene.platform.services["/slow"] = lambda request: Deferred(given_up.append)
+    scene.platform.actions.add("/navigate_to_pose")
+    for request in (
+        link.Subscribe(number=1, topic="/chat"),
+        link.Advertise(number=4, topic="/chat", type=STRING),
+        link.Advertise(number=5, topic="/cmd_vel", type=TWIST),
+        link.AdvertiseService(service="/mine", type="std_srvs/srv/Trigger"),
+        link.CallService(id="x", service="/slow", type="t", timeout=5, cdr=""),
+        link.SendActionGoal(
+            id="g", action="/navigate_to_pose", type="t", source=DRIVER, stamp=scene.now(), cdr=""
+        ),
+    ):
+        scene.channel.handle(request)
+    scene.drive(twist(1.0))
+    platform = scene.platform
+    for each in (platform.sources[0], platform.sinks[0], platform.offered["/mine"]):
+        monkeypatch.setattr(each, "close", broken)
+    scene.channel.close()
+    assert [goal.cancelled for goal in platform.goals] == [True]
+    assert platform.published[-1] == ("/cmd_vel", twist())
+    assert len(given_up) == 1
+
+
 def test_call_is_answered(scene: Scene) -> None:
     """A service's answer comes back with the id of its call."""
     scene.platform.services["/echo"] = lambda request: request
@@ -223,10 +250,6 @@ def test_call_that_can_not_be_made_is_answered_in_words(
 
 def test_middleware_that_throws_costs_one_answer(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """An unforeseen fault of the platform is answered without its internals, and the channel lives."""
-
-    def broken(*args: object) -> None:
-        raise RuntimeError("secret internals")
-
     monkeypatch.setattr(scene.platform, "subscribe", broken)
     answer = scene.ask(link.Subscribe(number=1, topic="/chat"))
     assert isinstance(answer, link.Failed)
@@ -304,10 +327,6 @@ def test_goals_are_cancelled_in_order_whatever_one_does(
     scene.platform.actions = {"/a", "/navigate_to_pose"}
     for action in ("/a", "/navigate_to_pose"):
         scene.ask(link.SendActionGoal(id=action, action=action, type="t", source=DRIVER, cdr=""))
-
-    def broken() -> None:
-        raise RuntimeError("gone")
-
     first, second = scene.platform.goals
     monkeypatch.setattr(first, "cancel", broken)
     scene.channel.cancel_goals(only_moving=False)

@@ -9,6 +9,7 @@ import pytest
 
 from relay_protocol.errors import Invalid
 from robot_client.config import Settings, load
+from robot_client.rules import rules_of
 from robot_client.safety import Times
 
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -25,6 +26,7 @@ def test_without_anything_the_defaults_hold() -> None:
         "geometry_msgs/msg/TwistStamped",
         "sensor_msgs/msg/Joy",
         "trajectory_msgs/msg/JointTrajectory",
+        "trajectory_msgs/msg/MultiDOFJointTrajectory",
         "control_msgs/msg/JointJog",
     ]
 
@@ -57,9 +59,14 @@ def test_lists_in_variables_have_commas() -> None:
         ('[cameras]\n"a b" = "/film.mp4"\n', "a b"),
         ('[cameras]\nusb = "video0"\n', "v4l2:/dev/video0"),
         ("[video]\nstreams = 0\n", "streams"),
+        ("[video]\nstreams = 17\n", "streams"),
+        ("[video]\ntarget_ms = 49\n", "target_ms"),
+        ("[video]\ntarget_ms = 5001\n", "target_ms"),
         ("[limits]\nlinear = 0\n", "linear"),
         ("[limits]\nviewer = { linear = 1 }\n", "viewer"),
         ("[limits.owner]\nlinar = 1\n", "linar"),
+        ('[limits]\nunlimited = ["a b"]\n', "unlimited: 'a b'"),
+        ('[limits.operator]\nunlimited = ["/joy"]\n', "unlimited"),
         ("[safety]\nstop_within_ms = 9000\nramp_ms = 2001\n", r"<= 2000.*safety\.ramp_ms"),
         ("[safety]\nramp_ms = 251\n", "at most half of stop_within_ms, which is 500"),
         ('[safety]\nramp_ms = 101\ntopic = [{name="a", stop_within_ms=200}]\n', "which is 200"),
@@ -81,11 +88,11 @@ def test_cameras_are_named_like_topics(tmp_path: Path) -> None:
     """With a leading / or without; what they are is kept as it is written."""
     file = tmp_path / "robot.toml"
     file.write_text(
-        '[cameras]\nusb = "v4l2:/dev/video0"\n"/gate/left" = "rtsp://gate/1"\n[video]\nstreams = 3\n'
+        '[cameras]\nusb = "v4l2:/dev/video0"\n"/gate/left" = "rtsp://gate/1"\n[video]\nstreams = 3\ntarget_ms = 150\n'
     )
     settings = load(file, {})
     assert settings.cameras == {"/usb": "v4l2:/dev/video0", "/gate/left": "rtsp://gate/1"}
-    assert settings.video.streams == 3
+    assert (settings.video.streams, settings.video.target_ms) == (3, 150)
 
 
 def test_address_of_a_camera_is_not_told(tmp_path: Path) -> None:
@@ -177,6 +184,16 @@ def test_limits_of_a_level_have_variables_too(tmp_path: Path) -> None:
     file.write_text("[limits]\noperator = 3\n")
     with pytest.raises(Invalid, match="operator"):
         load(file, {"SWITCHBOARD_ROBOT_LIMITS_OPERATOR_LINEAR": "0.25"})
+
+
+def test_topics_without_limits_are_named_like_topics_that_move(tmp_path: Path) -> None:
+    """By name, with or without a slash, or by a pattern; in a variable with commas."""
+    file = tmp_path / "robot.toml"
+    file.write_text('[limits]\nlinear = 1\nunlimited = ["joy", "*/arm"]\n')
+    assert rules_of(load(file, {})).unlimited == ["/joy", "*/arm"]
+    variable = {"SWITCHBOARD_ROBOT_LIMITS_UNLIMITED": "/a, /b"}
+    assert rules_of(load(file, variable)).unlimited == ["/a", "/b"]
+    assert rules_of(load(None, {})).unlimited == []
 
 
 def test_tables_have_no_variables() -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
+
 from relay_protocol import link
 from robot_client.platforms.memory import TWIST, twist
+from tests.robot_client.breaking import broken
 from tests.robot_client.daemon_scene import DRIVER, Line, Scene
 
 
@@ -43,6 +46,16 @@ def test_answers_are_the_proof() -> None:
     assert scene.connection.answered == asked
     control.lose()
     assert scene.connection.answered is None
+
+
+def test_a_link_is_dialled_again_whatever_its_loss_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that never dialled again would have to be restarted by hand."""
+    scene = Scene()
+    control = scene.register()
+    monkeypatch.setattr(scene.daemon, "on_unregistered", broken)
+    control.lose()
+    scene.run(1)
+    assert len(scene.lines) == 2
 
 
 def test_a_robot_whose_word_does_not_arrive_stops() -> None:

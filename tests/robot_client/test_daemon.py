@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 import pytest
 
 from relay_protocol import frames, link
 from robot_client.alerts import HEARING_NS
+from robot_client.lasting import MemoryLatch
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, twist
+from tests.robot_client.breaking import broken
 from tests.robot_client.daemon_scene import DRIVER, Scene
 
 
@@ -178,6 +181,38 @@ def test_every_loss_stops_the_robot_at_once(scene: Scene, how: str) -> None:
     assert scene.platform.sinks == []
 
 
+@pytest.mark.parametrize(
+    "where",
+    ["helm.unregistered", "motion.stop_all", "_alerts.tell", "_cameras.unregistered", "c1.close", "c1.say"],
+)
+def test_a_lost_link_ends_all_whatever_breaks(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """One part that fails keeps no goal under way, no wheel turning, no channel open, and the robot dials again."""
+    scene.platform.actions = {"/spin"}
+    control = scene.register()
+    lines = [scene.driving(control), scene.channel(control, "c2")]
+    lines[1].say(link.Advertise(number=5, topic="/joy/cmd_vel", type=TWIST))
+    scene.command(lines[1], twist(1.0))
+    for line in lines:
+        line.say(link.SendActionGoal(id="g", action="/spin", type="t", source=DRIVER, cdr=""))
+    scene.clock.advance(0.06)
+    place, name = where.split(".")
+    if place == "c1":
+        end = scene.daemon._ends["c1"]
+        part: object = end if name == "say" else end.channel
+    else:
+        part = getattr(scene.daemon, place)
+    monkeypatch.setattr(part, name, broken)
+    control.lose()
+    assert [goal.cancelled for goal in scene.platform.goals] == [where != "c1.close", True]
+    last = dict(scene.platform.published)
+    assert last == {"/cmd_vel": twist(), "/joy/cmd_vel": twist()}
+    assert not any(line.transport.connected for line in lines)
+    scene.run(1)
+    assert len(scene.lines) == 4
+
+
 def test_nothing_behind_a_goodbye_is_done(scene: Scene) -> None:
     """A command that follows the relay's goodbye in the same bytes is not executed."""
     line = scene.driving(scene.register())
@@ -205,6 +240,37 @@ def test_reconnecting_resumes_nothing(scene: Scene) -> None:
     scene.command(line, twist())
     scene.command(line, twist(1.0))
     assert scene.platform.published[-1] == ("/cmd_vel", twist(1.0))
+
+
+@pytest.mark.parametrize("first", ["control", "channel"])
+def test_who_drove_as_the_link_was_lost_is_told_to_the_next_relay(scene: Scene, first: str) -> None:
+    """Once: one that was killed knows nothing of it. Whichever link is found lost first, for they go together."""
+    scene.run(HEARING_NS / 1e9)
+    control = scene.register()
+    line = scene.driving(control)
+    scene.clock.advance(0.06)
+    for each in (control, line) if first == "control" else (line, control):
+        each.lose()
+    told = []
+    for _ in range(2):
+        scene.run(1)
+        told += [each for each in scene.register().heard() if each["op"] == "alert"]
+        scene.run(0.1)
+        scene.daemon._tell_health()
+        scene.lines[-1].lose()
+    assert [(each["kind"], each["level"]) for each in told] == [("control", "error")]
+    assert told[0]["text"] == "ann lost control while the robot moved: its link to the relay was lost"
+
+
+def test_a_link_that_is_lost_while_the_robot_stands_is_nobodys_loss(scene: Scene) -> None:
+    """Though somebody has control."""
+    control = scene.register()
+    line = scene.driving(control)
+    scene.command(line, twist())
+    scene.run(0.5)
+    control.lose()
+    scene.run(1)
+    assert [each for each in scene.register().heard() if each["op"] == "alert"] == []
 
 
 def test_alert_waits_for_the_relay(scene: Scene) -> None:
@@ -255,10 +321,6 @@ def test_stuck_middleware_is_told_once(scene: Scene, monkeypatch: pytest.MonkeyP
 
 def test_battery_that_can_not_be_read_ends_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A platform that throws over its battery costs the charge, not the registration and not the health to come."""
-
-    def broken() -> float | None:
-        raise RuntimeError("malformed sample")
-
     with monkeypatch.context() as broken_for_now:
         broken_for_now.setattr(scene.platform, "battery", broken)
         heard = scene.register().heard()
@@ -273,16 +335,33 @@ def test_graph_that_can_not_be_read_at_first_is_told_later(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot whose graph throws is registered all the same, and tells it when it can be read."""
-
-    def broken() -> GraphView:
-        raise RuntimeError("no graph")
-
     with monkeypatch.context() as broken_for_now:
         broken_for_now.setattr(scene.platform, "graph", broken)
         control = scene.register()
         assert "health" in control.ops()
     scene.run(1)
     assert any("/talker" in each["nodes"] for each in control.heard() if each["op"] == "graph")
+
+
+@pytest.mark.parametrize("where", ["platform.trouble", "helm._hardware.prepare", "_pursuits._sweep.actions"])
+def test_what_is_done_every_second_goes_on_after_a_failure(
+    monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """Stops are finished by it: a robot that ceased to look would have to be restarted, and nobody would know."""
+    latch = MemoryLatch()
+    latch.noted = ["/spin"]
+    scene = Scene(latch)
+    *place, name = where.split(".")
+    part = attrgetter(".".join(place))(scene if place == ["platform"] else scene.daemon)
+    times: list[float] = []
+
+    def fails() -> None:
+        times.append(scene.clock.seconds())
+        broken()
+
+    monkeypatch.setattr(part, name, fails)
+    scene.run(5.05)
+    assert len(times) >= 5
 
 
 def test_daemon_that_leaves_says_every_zero_first(scene: Scene) -> None:

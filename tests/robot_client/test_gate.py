@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
+from twisted.internet.defer import Deferred
 
 from relay_protocol import link
 from relay_protocol.errors import Refused
 from relay_protocol.link import MotionPolicy
+from robot_client.authority import Suppression
 from robot_client.config import Safety, Settings
 from robot_client.gate import Gate
 from robot_client.offset import Offset
@@ -127,6 +131,133 @@ def test_the_relays_clock_of_the_very_link_counts(scene: Scene) -> None:
     other.add(scene.now(), scene.now() + ahead, scene.now())
     scene.gate.goal("/navigate_to_pose", DRIVER, scene.now() + ahead, other)
     assert goal(scene, "/navigate_to_pose", scene.now() + ahead) is not None
+
+
+def suppress(scene: Scene, *sources: int) -> None:
+    """Some sources have the wheels for themselves, for 200 ms from now."""
+    until = scene.now() + 200 * MILLI
+    scene.authority.suppress("/cmd_vel", Suppression(frozenset(sources), until, "eve"))
+
+
+def test_no_goal_or_call_that_moves_the_robot_begins_while_others_suppress(scene: Scene) -> None:
+    """It would drive past it, and is refused in words; what moves nothing is done, and afterwards all is."""
+    suppress(scene, DRIVER + 1)
+    end, answer = goal(scene, "/navigate_to_pose", None), call(scene, "/arm/move", None)
+    assert end is not None
+    assert not answer.result
+    for words in (end.reason, answer.reason):
+        assert "moves the robot: others suppress a topic that moves it" in words
+    assert goal(scene, "/dock", None) is None
+    assert call(scene, "/lamp", None).result
+    scene.run(0.2)
+    assert goal(scene, "/navigate_to_pose", None) is None
+    assert call(scene, "/arm/move", None).result
+
+
+def test_a_goal_under_way_outlasts_a_suppression(scene: Scene) -> None:
+    """It is not cancelled: the program that suppresses may stop the robot."""
+    assert goal(scene, "/navigate_to_pose", None) is None
+    suppress(scene, DRIVER + 1)
+    scene.run(0.3)
+    assert [each.cancelled for each in scene.platform.goals] == [False]
+
+
+# --- what a stop or a change of control has overtaken ------------------------------------------------------
+
+
+def stop(scene: Scene) -> None:
+    """Stop the robot, 100 ms after and before something else."""
+    scene.run(0.1)
+    scene.authority.stop(link.Stopped(by="eve", since=1.0), scene.now())
+    scene.run(0.1)
+
+
+def stop_and_resume(scene: Scene) -> None:
+    """Stop the robot, let it go again, and wait 100 ms."""
+    stop(scene)
+    scene.authority.resume(scene.now())
+    scene.run(0.1)
+
+
+def hand_over(scene: Scene) -> None:
+    """Somebody else has control now."""
+    scene.authority.hold(DRIVER + 1, "bob", "operator", scene.now())
+
+
+def hand_over_and_back(scene: Scene) -> None:
+    """Somebody else had control."""
+    scene.run(0.1)
+    hand_over(scene)
+    scene.run(0.1)
+    scene.authority.hold(DRIVER, "ann", "operator", scene.now())
+
+
+@pytest.mark.parametrize("age", [250, 150])
+def test_what_was_held_up_through_a_stop_is_refused_after_the_resume(scene: Scene, age: int) -> None:
+    """A goal or a call that was sent before the one or the other comes in time, and in vain; the next is obeyed."""
+    stop_and_resume(scene)
+    stamp = scene.now() - age * MILLI
+    end, answer = goal(scene, "/navigate_to_pose", stamp), call(scene, "/arm/move", stamp)
+    assert end is not None
+    assert not answer.result
+    for words in (end.reason, answer.reason):
+        assert "it may have been sent before the robot was stopped or resumed" in words
+    assert scene.authority.refused == 2
+    assert goal(scene, "/navigate_to_pose", scene.now()) is None
+    assert call(scene, "/arm/move", scene.now()).result
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        (stop, "stopped until somebody resumes it"),
+        (stop_and_resume, "sent before the robot was stopped or resumed"),
+        (hand_over, "only who holds control"),
+        (hand_over_and_back, "or control was lost"),
+        (lambda scene: suppress(scene, DRIVER + 1), "others suppress a topic"),
+        (lambda scene: scene.run(0.6), "it may be 60"),
+    ],
+    ids=["stop", "resume", "control", "control again", "suppression", "age"],
+)
+def test_a_call_is_judged_once_more_when_its_service_is_found(
+    scene: Scene, event: Callable[[Scene], None], words: str, stamped: bool
+) -> None:
+    """Looking for it may take a second; what has happened meanwhile counts, and the service is not called."""
+    asked: list[bytes] = []
+
+    def move(request: bytes) -> bytes:
+        asked.append(request)
+        return request
+
+    scene.platform.services["/arm/move"] = move
+    looking: list[Deferred[None]] = []
+    scene.platform.looking = looking
+    stamp = scene.now() if stamped else None
+    scene.ask(link.CallService(id="c", service="/arm/move", type="t", source=DRIVER, stamp=stamp, cdr=CDR))
+    event(scene)
+    looking.pop().callback(None)
+    (answer,) = scene.wire.said
+    assert not answer.result
+    assert "a call of /arm/move moves the robot" in answer.reason
+    assert words in answer.reason
+    assert asked == []
+
+
+def test_a_call_whose_service_takes_its_time_is_made(scene: Scene) -> None:
+    """When nothing has happened meanwhile; and one that moves nothing, whatever has."""
+    looking: list[Deferred[None]] = []
+    scene.platform.looking = looking
+    for id, service in (("c", "/arm/move"), ("d", "/lamp")):
+        message = link.CallService(
+            id=id, service=service, type="t", source=DRIVER, stamp=scene.now(), cdr=CDR
+        )
+        scene.ask(message)
+    scene.run(0.4)
+    looking[0].callback(None)
+    stop(scene)
+    looking[1].callback(None)
+    assert [(each.id, each.result) for each in scene.wire.said] == [("c", True), ("d", True)]
 
 
 # --- the switch in the hardware ----------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 from relay_protocol import frames, link
 from robot_client.motion import MOTION_QOS
 from robot_client.platforms.base import GraphView
-from robot_client.platforms.memory import twist
+from robot_client.platforms.memory import TWIST, twist
 from tests.robot_client.daemon_scene import DRIVER, Line, Scene
 
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -50,6 +50,15 @@ def goals() -> Goals:
     return Goals()
 
 
+@pytest.mark.parametrize("topic", ["/goal_update", "/robot1/goals_update"])
+def test_what_bends_a_goal_under_way_is_for_who_holds_control(topic: str) -> None:
+    """Nav2 takes it for the goal from then on."""
+    goals = Goals(topic)
+    assert goals.told[0]["motion"] is True
+    assert goals.say(DRIVER + 1) == 0
+    assert goals.say() == 1
+
+
 def test_goals_are_for_who_holds_control(goals: Goals) -> None:
     """The topic is told as motion, and takes the commands of the holder alone."""
     assert goals.told[0]["motion"] is True
@@ -69,6 +78,17 @@ def test_no_goal_passes_while_the_robot_is_stopped(goals: Goals) -> None:
     goals.control.say(link.Resume(id=3, by="eve"))
     goals.scene.run(1.0)
     assert goals.heard() == []
+    assert goals.say() == 1
+
+
+def test_no_goal_passes_while_others_suppress_a_topic(goals: Goals) -> None:
+    """It would drive past the suppression; one that waited for the link to prove itself is judged again."""
+    goals.scene.platform.view = GraphView(topics={"/cmd_vel": link.Topic(types=[TWIST])})
+    goals.scene.run(1.0)
+    goals.control.say(link.Suppress(id=2, resource="/cmd_vel", sources=[DRIVER + 1], ms=200, by="eve"))
+    assert goals.say() == 0
+    assert goals.scene.daemon.authority.refused == 1
+    goals.scene.run(0.3)
     assert goals.say() == 1
 
 
@@ -245,6 +265,18 @@ def test_a_goal_that_waits_does_not_outlast_a_stop(paced: Paced) -> None:
     assert paced.heard() == []
     assert authority.refused == 1
     assert paced.say() == 1
+
+
+def test_a_goal_that_was_held_up_does_not_outlast_a_stop(goals: Goals) -> None:
+    """The channel's link was slower than the one by which the robot was stopped, and resumed."""
+    goals.scene.run(0.1)
+    goals.control.say(link.Stop(id=2, by="eve"))
+    goals.scene.run(0.2)
+    goals.control.say(link.Resume(id=3, by="eve"))
+    goals.scene.run(0.1)
+    assert goals.say(age=0.4) == 0
+    assert goals.scene.daemon.authority.refused == 1
+    assert goals.say() == 1
 
 
 def test_a_goal_that_waits_does_not_outlast_its_publication(paced: Paced) -> None:

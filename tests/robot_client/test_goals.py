@@ -9,6 +9,7 @@ from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
 from relay_protocol import link
+from robot_client.goals import ASK_EVERY
 from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, Outcome
 from robot_client.platforms.memory import MemoryGoal
 from robot_client.wire import MAX_OPEN
@@ -106,6 +107,23 @@ def test_cancel_reaches_the_goal(scene: Scene) -> None:
     scene.channel.handle(link.CancelActionGoal(id="c"))
     assert (first.cancelled, second.cancelled) == (False, True)
     assert scene.wire.said == []
+
+
+def test_the_relay_can_have_a_goal_cancelled_once_a_second(scene: Scene) -> None:
+    """However often it asks; who wants it to end for the robot's sake is not held up by that."""
+    goal = begin(scene, "a")
+    for _ in range(100):
+        scene.channel.handle(link.CancelActionGoal(id="a"))
+    assert goal.cancels == 1
+    scene.channel.cancel_goals(only_moving=False)
+    assert goal.cancels == 2
+    scene.clock.advance(ASK_EVERY)
+    scene.channel.handle(link.CancelActionGoal(id="a"))
+    assert goal.cancels == 3
+    goal.result.callback(Outcome(CANCELED, BODY))
+    second = begin(scene, "a")
+    scene.channel.handle(link.CancelActionGoal(id="a"))
+    assert second.cancels == 1
 
 
 def test_full_link_keeps_the_newest_feedback(scene: Scene) -> None:

@@ -16,6 +16,7 @@ from robot_client.velocity import TWIST, TWIST_STAMPED, Velocity, form
 
 MS = 1_000_000
 CMD = TypedTopic("/cmd_vel", TWIST)
+JOY = TypedTopic("/joy", "sensor_msgs/msg/Joy")
 SOME = st.floats(-1e9, 1e9, allow_nan=False)
 
 
@@ -103,12 +104,38 @@ def test_each_topic_counts_for_itself_and_is_forgotten() -> None:
 
 
 def test_who_has_no_limits_is_not_looked_at() -> None:
-    """An owner without limits, a type without speeds, a robot without limits: the bytes pass unread."""
+    """An owner without limits, a robot without limits: the bytes pass unread, of whatever type."""
+    rules, free = governor(linear=0.1), Governor({}, "cdr")
+    for on in (CMD, JOY):
+        assert rules.tame(on, b"anything", "owner", 0) == b"anything"
+        assert free.tame(on, b"anything", "", 0) == b"anything"
+        assert rules.covers(on, "owner")
+        assert not rules.closed(on)
+        assert not free.closed(on)
+
+
+def test_what_has_no_speeds_to_read_is_not_followed_where_there_are_limits() -> None:
+    """Of a limited level, and of one that is not known; where all levels are limited, of nobody."""
     rules = governor(linear=0.1)
-    joy = TypedTopic("/joy", "sensor_msgs/msg/Joy")
-    assert rules.tame(CMD, b"anything", "owner", 0) == b"anything"
-    assert rules.tame(joy, b"anything", "operator", 0) == b"anything"
-    assert Governor({}, "cdr").tame(CMD, b"anything", "", 0) == b"anything"
+    for level in ("operator", ""):
+        assert not rules.covers(JOY, level)
+        assert rules.covers(CMD, level)
+        assert rules.tame(JOY, b"anything", level, 0) is None
+    assert not rules.closed(JOY)
+    all_limited = Governor({"operator": Limits(linear=0.1), "owner": Limits(angular=1.0)}, "cdr")
+    assert all_limited.closed(JOY)
+    assert not all_limited.closed(CMD)
+
+
+def test_what_is_listed_passes_without_speeds() -> None:
+    """By names and patterns, whoever commands; what has speeds is held to them all the same."""
+    told = {"operator": Limits(linear=0.1), "owner": Limits(linear=0.1)}
+    rules = Governor(told, "cdr", ["*/joy", "/cmd_vel"])
+    assert rules.covers(JOY, "operator")
+    assert not rules.closed(JOY)
+    assert rules.tame(JOY, b"anything", "operator", 0) == b"anything"
+    assert rules.closed(TypedTopic("/joystick", JOY.type))
+    assert speeds(rules.tame(CMD, command(5.0), "operator", 0)).linear[0] == pytest.approx(0.1)
 
 
 def test_of_an_unknown_level_the_strictest_limits_hold() -> None:

@@ -11,16 +11,22 @@ from typing import Any
 import pytest
 import pytest_twisted
 from twisted.internet import reactor
+from twisted.internet.defer import Deferred
 from twisted.internet.error import ProcessTerminated
 from twisted.internet.task import Clock
 from twisted.python.failure import Failure
 
+from relay_protocol import link
 from relay_protocol.errors import Unavailable
 from robot_client import hardware
 from robot_client.hardware import DYING, PATIENCE, Hardware, Switches, run
+from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import MemoryPlatform
+from tests.robot_client.breaking import broken
 
 PYTHON = sys.executable
+DONE, REFUSED = b"\0\1\0\0\1", b"\0\1\0\0" + bytes(9)
+"""Answers of a service that stops the hardware, as CDR: a success as far as it is read, a failure without a word."""
 
 
 @pytest_twisted.ensureDeferred
@@ -156,3 +162,109 @@ def test_without_switches_nothing_is_waited_for() -> None:
     switch.stop().addCallback(ends.append)
     switch.resume().addCallback(ends.append)
     assert ends == [[], []]
+
+
+class Robot:
+    """A robot with a service that cuts its motors off, once that is found.
+
+    :param answer: of the service, CDR
+    :ivar called: what it was asked
+    """
+
+    def __init__(self, answer: bytes) -> None:
+        self.called: list[bytes] = []
+        self.platform = MemoryPlatform()
+        self.platform.services["/estop"] = self._call
+        self._answer = answer
+
+    def _call(self, request: bytes) -> bytes:
+        self.called.append(request)
+        return self._answer
+
+    def serves(self) -> None:
+        """The service is found."""
+        self.platform.view = GraphView(services={"/estop": link.Service(types=["std_srvs/srv/Trigger"])})
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[Deferred[None]]:
+    """Programs that were run so far; each ends when a test says so."""
+    running: list[Deferred[None]] = []
+
+    def runs(reactor: object, command: object) -> Deferred[None]:
+        running.append(Deferred())
+        return running[-1]
+
+    monkeypatch.setattr(hardware, "run", runs)
+    return running
+
+
+def test_only_what_failed_is_thrown_again(ran: list[Deferred[None]]) -> None:
+    """A program that could not be run, and not the service that answered; who listens hears of both, and their ends."""
+    told: list[list[str]] = []
+    robot = Robot(DONE)
+    robot.serves()
+    switch = Hardware(Switches("/estop", ["off"]), robot.platform, Clock())
+    switch.on_owed = told.append
+    switch.stop()
+    ran[0].errback(Unavailable("no power"))
+    switch.look()
+    switch.look()
+    ran[1].callback(None)
+    switch.look()
+    assert (len(robot.called), len(ran)) == (1, 2)
+    assert told == [["no power"], []]
+
+
+def test_program_does_not_wait_for_a_service_that_is_not_there_yet(ran: list[Deferred[None]]) -> None:
+    """A daemon that starts stopped runs it at once, and calls the service when that is found."""
+    told: list[list[str]] = []
+    robot = Robot(DONE)
+    switch = Hardware(Switches("/estop", ["off"]), robot.platform, Clock())
+    switch.on_owed = told.append
+    switch.begin()
+    switch.look()
+    assert len(ran) == 1
+    ran[0].errback(Unavailable("no power"))
+    switch.look()
+    ran[1].callback(None)
+    assert told == [["no power"], []]
+    for _ in range(5):
+        switch.look()
+    robot.serves()
+    switch.prepare()
+    for _ in range(5):
+        switch.look()
+    assert (len(robot.called), len(ran), told[2:]) == (1, 2, [[]])
+
+
+def test_who_listens_and_fails_holds_up_nothing() -> None:
+    """A stop ends, what failed is thrown again, and a resume is done."""
+    robot = Robot(REFUSED)
+    robot.serves()
+    switch = Hardware(Switches("/estop"), robot.platform, Clock())
+    switch.on_owed = broken
+    ends: list[list[str]] = []
+    switch.stop().addCallback(ends.append)
+    switch.stop().addCallback(ends.append)
+    switch.look()
+    switch.look()
+    switch.resume().addCallback(ends.append)
+    assert ends == [["a switch in the hardware failed; the robot's log says why"]] * 2 + [[]]
+    assert len(robot.called) == 4
+
+
+def test_resume_that_fails_unforeseen_ends(
+    monkeypatch: pytest.MonkeyPatch, ran: list[Deferred[None]]
+) -> None:
+    """That it failed is told, and the next stop and the next resume are done."""
+    switch = Hardware(Switches("", ["off"], ["on"]), MemoryPlatform(), Clock())
+    ends: list[list[str]] = []
+    with monkeypatch.context() as broken_for_now:
+        broken_for_now.setattr(hardware, "DeferredList", broken)
+        switch.resume().addCallback(ends.append)
+    assert ends == [["a switch in the hardware failed; the robot's log says why"]]
+    for each in (switch.stop(), switch.resume()):
+        each.addCallback(ends.append)
+        ran.pop().callback(None)
+    assert ends[1:] == [[], []]

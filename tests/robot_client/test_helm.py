@@ -10,18 +10,27 @@ from twisted.internet.defer import Deferred
 from relay_protocol import frames, link
 from relay_protocol.errors import Unavailable
 from robot_client.config import Limits, Safety, Settings, Speeds
-from robot_client.hardware import PATIENCE, Switches
+from robot_client.hardware import LOOKS, PATIENCE, RARELY, Hardware, Switches
+from robot_client.helm import KEEP_EVERY, UNFORESEEN
+from robot_client.keeping import Keeping
 from robot_client.lasting import MemoryLatch
+from robot_client.motion import MotionDesk
 from robot_client.platforms.base import CANCELED, GraphView, Outcome
 from robot_client.platforms.memory import TWIST, twist
-from robot_client.sweep import CANCEL, HEARD_WITHIN, MAX_ACTIONS, MAX_NAMES
+from robot_client.statuses import AFTER, STATUS
+from robot_client.sweep import CANCEL, HEARD_WITHIN, MAX_ACTIONS, MAX_NAMES, Sweep
 from robot_client.telling import TELL_EVERY
+from robot_client.zeros import Zeros
+from tests.robot_client.breaking import broken
 from tests.robot_client.daemon_scene import DRIVER, Line, Scene
 
 GO, ZERO = twist(1.0), twist()
 OTHER = 8
+JOY = "sensor_msgs/msg/Joy"
 NAVIGATE = "/navigate_to_pose"
 ALL_GOALS = b"\0\1\0\0" + bytes(24)
+NOTHING_LEFT = b"\0\1\0\0" + bytes(8)
+"""An action's answer where it has no goals."""
 
 
 def said(line: Line, op: str) -> list[Any]:
@@ -66,6 +75,19 @@ def test_at_first_nobody_moves_the_robot(scene: Scene, control: Line) -> None:
     assert scene.daemon._health().refused_commands == 1
 
 
+def test_commands_that_make_no_sense_are_told_in_the_health(scene: Scene, control: Line) -> None:
+    """Counted beside those that are dropped for other reasons, goals among them."""
+    line = scene.driving(control)
+    line.say(link.Advertise(number=6, topic="/goal_pose", type="geometry_msgs/msg/PoseStamped"))
+    control.heard()
+    for number in (5, 6):
+        line.protocol.dataReceived(frames.encode_command(number, scene.now(), DRIVER, twist(float("nan"))))
+    scene.daemon._tell_health()
+    (health,) = said(control, "health")
+    assert health["invalid_commands"] == 2
+    assert health.get("refused_commands", 0) == 0
+
+
 def test_control_for_another_stops_what_moved_before_it_is_done(scene: Scene, control: Line) -> None:
     """Zero goes out first, goals that move the robot are cancelled, and the former one is not obeyed any more."""
     scene.platform.actions = {NAVIGATE, "/dock_is_free"}
@@ -108,6 +130,63 @@ def test_goal_that_does_not_end_holds_up_a_change_of_control_for_a_second(
     assert said(control, "done") == [{"op": "done", "id": 11}]
 
 
+def lasting(line: Line) -> dict[str, bool]:
+    """What was told about goals that outlast control, and whether it was that none does."""
+    return {
+        each["about"]: each.get("over", False) for each in said(line, "alert") if each["kind"] == "control"
+    }
+
+
+def test_goal_that_outlasts_its_drivers_control_is_told_and_cancelled_again_until_it_ends(
+    acting: Acting,
+) -> None:
+    """An action may refuse to cancel it; the next one's goals there go on."""
+    acting.scene.platform.actions = {NAVIGATE}
+    line = acting.scene.driving(acting.control)
+    line.say(link.SendActionGoal(id="g", action=NAVIGATE, type="a/action/B", source=DRIVER, cdr=""))
+    (former,) = acting.scene.platform.goals
+    acting.control.heard()
+    acting.control.say(link.Control(id=9, holder=OTHER))
+    acting.pass_seconds(1)
+    heard = [each for each in acting.control.heard() if isinstance(each, dict)]
+    (alert,) = [each for each in heard if each["op"] == "alert"]
+    assert (alert["level"], NAVIGATE in alert["text"]) == ("error", True)
+    assert [each["id"] for each in heard if each["op"] == "done"] == [9]
+    line.say(link.SendActionGoal(id="n", action=NAVIGATE, type="a/action/B", source=OTHER, cdr=""))
+    for _ in range(5):
+        acting.answer()  # no error, and nothing that is being cancelled
+        acting.pass_seconds(1, line)
+    assert 5 <= len(acting.asked) <= 6
+    assert set(acting.asked) == {b"\0\1\0\0" + former.id + bytes(8)}
+    assert lasting(acting.control) == {}
+    former.result.callback(Outcome(CANCELED, None))
+    acting.pass_seconds(3, line)
+    assert lasting(acting.control) == {"goals": True}
+    assert len(acting.asked) <= 6
+    assert not acting.scene.platform.goals[1].cancelled
+
+
+def test_goal_that_outlasts_the_control_link_is_told_when_it_is_back(acting: Acting) -> None:
+    """Control is lost by that as well, and nobody may drive on."""
+    acting.scene.platform.actions = {NAVIGATE}
+    line = acting.scene.driving(acting.control)
+    line.say(link.SendActionGoal(id="g", action=NAVIGATE, type="a/action/B", source=DRIVER, cdr=""))
+    acting.control.lose()
+    acting.scene.run(3)
+    control = acting.scene.register()
+    assert lasting(control) == {"goals": False}
+
+
+def test_goal_of_a_driver_who_keeps_control_is_nobodys_concern(acting: Acting) -> None:
+    """It goes on, and what he has cancelled himself may take its time."""
+    acting.scene.platform.actions = {NAVIGATE}
+    line = acting.scene.driving(acting.control)
+    line.say(link.SendActionGoal(id="g", action=NAVIGATE, type="a/action/B", source=DRIVER, cdr=""))
+    line.say(link.CancelActionGoal(id="g"))
+    acting.pass_seconds(10, line)
+    assert (acting.asked, lasting(acting.control)) == ([], {})
+
+
 def test_control_for_the_holder_disturbs_nothing(scene: Scene, control: Line) -> None:
     """Who has it goes on moving; only his level changes."""
     scene.driving(control)
@@ -121,10 +200,6 @@ def test_robot_that_can_not_be_stopped_is_not_given_to_another(
 ) -> None:
     """The answer says why, and nobody holds control then."""
     scene.driving(control)
-
-    def broken(body: bytes) -> None:
-        raise RuntimeError("no middleware")
-
     monkeypatch.setattr(scene.platform.sinks[0], "publish", broken)
     done = order(control, link.Control(id=9, holder=OTHER))
     assert done["ok"] is False
@@ -200,7 +275,7 @@ def test_resume_moves_nothing_by_itself(scene: Scene, control: Line) -> None:
         scene.clock.advance(0.05)
         scene.command(line, GO)
     assert scene.platform.published.count(("/cmd_vel", GO)) == 1
-    scene.clock.advance(0.5)
+    scene.clock.advance(0.51)
     scene.command(line, GO)
     assert scene.platform.published[-1] == ("/cmd_vel", GO)
 
@@ -255,6 +330,73 @@ class CountingLatch(MemoryLatch):
         super().keep(stopped)
 
 
+class Broken(MemoryLatch):
+    """Fails as nobody foresaw."""
+
+    def keep(self, stopped: link.Stopped) -> None:
+        raise RuntimeError("secret internals")
+
+
+def test_stop_whose_record_fails_unforeseen_is_answered_and_can_be_resumed() -> None:
+    """It is in effect; what went wrong is said in words, and its details stay in the log."""
+    scene = Scene(Broken())
+    control = scene.register()
+    scene.driving(control)
+    done = order(control, stop())
+    assert (done["ok"], "can't be kept" in done["reason"], "secret" in done["reason"]) == (False, True, False)
+    assert scene.platform.published[-1] == ("/cmd_vel", ZERO)
+    assert scene.daemon.authority.stopped is not None
+    assert order(control, resume()) == {"op": "done", "id": 3}
+    assert scene.daemon.authority.stopped is None
+
+
+@pytest.mark.parametrize(
+    ("owner", "part"),
+    [(MotionDesk, "halt"), (Hardware, "stop"), (Sweep, "stop"), (Zeros, "say"), (Keeping, "keep")],
+)
+def test_part_of_a_stop_that_fails_unforeseen_keeps_no_other_from_being_done(
+    monkeypatch: pytest.MonkeyPatch, owner: type, part: str
+) -> None:
+    """The answer says that one has failed; the robot is stopped, and can be resumed."""
+    switched = Switched()
+    with monkeypatch.context() as broken_for_now:
+        broken_for_now.setattr(owner, part, broken)
+        switched.control.say(stop())
+        for _ in switched.answers:
+            switched.answer(True)
+    (done,) = switched.done()
+    assert (done["ok"], done["reason"]) == (False, UNFORESEEN)
+    assert switched.scene.daemon.authority.stopped is not None
+    assert (len(switched.asked) == 1) is (owner is not Hardware)
+    assert (switched.scene.latch.stopped is not None) is (owner is not Keeping)
+    switched.control.say(resume())
+    switched.answer(True)
+    assert switched.done() == [{"op": "done", "id": 3}]
+
+
+@pytest.mark.parametrize(("owner", "part"), [(Hardware, "resume"), (MemoryLatch, "clear"), (Sweep, "end")])
+def test_resume_that_fails_unforeseen_is_taken_back(
+    monkeypatch: pytest.MonkeyPatch, owner: type, part: str
+) -> None:
+    """The robot stays stopped, switch and record as well, the answer says so, and the next one resumes it."""
+    switched = Switched()
+    switched.control.say(stop())
+    switched.answer(True)
+    switched.control.heard()
+    with monkeypatch.context() as broken_for_now:
+        broken_for_now.setattr(owner, part, broken)
+        switched.control.say(resume())
+        while switched.answers:
+            switched.answer(True)
+    (done,) = switched.done()
+    assert (done["ok"], "log says why" in done["reason"], "secret" in done["reason"]) == (False, True, False)
+    assert switched.asked[-1] == b"\0\1\0\0\1"
+    assert switched.scene.latch.stopped is not None
+    switched.control.say(resume(4))
+    switched.answer(True)
+    assert switched.done() == [{"op": "done", "id": 4}]
+
+
 @pytest.mark.parametrize("fails", [0, 2])
 def test_stop_is_kept_once_and_again_only_when_that_failed(fails: int) -> None:
     """A robot that is told to stop again and again does not write each time."""
@@ -266,6 +408,35 @@ def test_stop_is_kept_once_and_again_only_when_that_failed(fails: int) -> None:
     order(control, resume())
     order(control, stop())
     assert latch.kept == fails + 2
+
+
+def test_stop_that_could_not_be_kept_is_kept_later() -> None:
+    """While the robot is stopped it is tried now and then; a person hears when it could not be, and when it is."""
+    latch = CountingLatch(2)
+    scene = Scene(latch)
+    control = scene.register()
+    assert order(control, stop())["ok"] is False
+    texts: list[tuple[str, bool]] = []
+    for _ in range(3 * KEEP_EVERY):
+        control.say(link.Ping(t=1))
+        scene.clock.advance(1)
+        texts += [(each["text"], each.get("over", False)) for each in said(control, "alert")]
+    assert latch.kept == 3
+    assert latch.stopped is not None
+    assert [over for _, over in texts] == [True]
+
+
+def test_resume_ends_what_could_not_be_kept() -> None:
+    """Nobody is told any more that a stop is not on the disk, and none comes there."""
+    latch = CountingLatch(99)
+    scene = Scene(latch)
+    control = scene.register()
+    order(control, stop())
+    control.say(resume())
+    assert [each["over"] for each in said(control, "alert")] == [True]
+    kept = latch.kept
+    scene.run(3 * KEEP_EVERY)
+    assert latch.kept == kept
 
 
 def test_hardware_is_stopped_before_the_disk_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,6 +481,23 @@ class Switched:
 
     def done(self) -> list[dict[str, Any]]:
         return said(self.control, "done")
+
+    def pass_seconds(self, seconds: int, good: bool | None = None) -> list[tuple[str, bool]]:
+        """Let time pass; with what was told a person, and whether it was that something is over.
+
+        :param good: what the service says at once; ``None``: nothing
+        """
+        told: list[tuple[str, bool]] = []
+        for _ in range(seconds):
+            self.control.say(link.Ping(t=1))
+            self.scene.clock.advance(1)
+            while self.answers and good is not None:
+                if self.answers[0].called:
+                    self.answers.pop(0)
+                else:
+                    self.answer(good)
+            told += [(each["text"], each.get("over", False)) for each in said(self.control, "alert")]
+        return told
 
 
 def test_stop_waits_for_the_hardware_with_its_answer_only() -> None:
@@ -373,9 +561,9 @@ def test_hardware_that_a_failed_resume_let_go_is_stopped_again(monkeypatch: pyte
     switched.control.say(stop(4), resume(5))
     assert [(each["id"], each["ok"]) for each in switched.done()] == [(5, False)]
     switched.answer(True)
-    (second, first) = switched.done()
-    assert second == {"op": "done", "id": 4}
+    (first, second) = switched.done()
     assert (first["id"], first["ok"], first["reason"]) == (3, False, "the disk is read-only")
+    assert second == {"op": "done", "id": 4}
     assert switched.scene.latch.stopped is not None
     assert switched.scene.daemon.authority.stopped is not None
 
@@ -435,6 +623,74 @@ def test_stop_during_a_resume_wins() -> None:
     assert switched.asked[-1] == b"\0\1\0\0\1"
 
 
+def test_hardware_that_fails_is_thrown_again_until_it_does_not() -> None:
+    """Each second for half a minute, then now and then; a person hears once that it failed, and when it is well."""
+    switched = Switched()
+    switched.control.say(stop())
+    switched.answer(False, "fuse blown")
+    ((text, over),) = [(each["text"], each.get("over")) for each in said(switched.control, "alert")]
+    assert ("fuse blown" in text, over) == (True, None)
+    switched.pass_seconds(LOOKS, good=False)
+    assert len(switched.asked) == 1 + LOOKS
+    switched.pass_seconds(10 * RARELY, good=False)
+    assert len(switched.asked) == 1 + LOOKS + 10
+    told = switched.pass_seconds(RARELY, good=True)
+    assert told == [("the switch in the hardware is thrown", True)]
+    asked = len(switched.asked)
+    assert switched.pass_seconds(100) == []
+    assert len(switched.asked) == asked
+    assert set(switched.asked) == {b"\0\1\0\0\1"}
+
+
+def test_hardware_that_was_found_is_called_though_it_is_not_seen_now() -> None:
+    """What calls it is kept from the start on, and a graph that is told late loses nobody the switch."""
+    switched = Switched()
+    switched.pass_seconds(2)
+    assert switched.scene.platform.prepared == [("/estop", "std_srvs/srv/SetBool")]
+    switched.scene.platform.view = GraphView()
+    switched.control.say(stop())
+    assert switched.asked == [b"\0\1\0\0\1"]
+
+
+def test_resume_waits_for_hardware_that_is_thrown_again() -> None:
+    """Else the one could undo the other; a stop meanwhile is never let go."""
+    switched = Switched()
+    switched.control.say(stop())
+    switched.answer(False)
+    switched.pass_seconds(1)
+    switched.control.say(resume())
+    assert switched.asked == 2 * [b"\0\1\0\0\1"]
+    switched.answer(True)
+    assert switched.asked[2:] == [b"\0\1\0\0\0"]
+    switched.answer(True)
+    assert switched.done()[-1] == {"op": "done", "id": 3}
+    switched.control.say(stop(4))
+    switched.answer(False)
+    switched.pass_seconds(1)
+    switched.asked.clear()
+    switched.control.say(resume(5))
+    switched.control.say(stop(6))
+    for _ in range(3):
+        while switched.answers:
+            switched.answer(True)
+    assert [(each["id"], each.get("ok", True)) for each in switched.done()] == [(5, False), (6, True)]
+    assert set(switched.asked) == {b"\0\1\0\0\1"}
+    assert switched.scene.daemon.authority.stopped is not None
+
+
+def test_resume_ends_the_alert_about_the_hardware() -> None:
+    """A switch that is called at stops alone need not work for that."""
+    switched = Switched("std_srvs/srv/Trigger")
+    switched.control.say(stop())
+    switched.answer(False)
+    switched.control.heard()
+    switched.control.say(resume())
+    assert [each["over"] for each in said(switched.control, "alert")] == [True]
+    asked = len(switched.asked)
+    switched.pass_seconds(5)
+    assert len(switched.asked) == asked
+
+
 def test_resume_waits_for_no_stop_under_way() -> None:
     """While the hardware is being stopped a resume is refused in words."""
     switched = Switched()
@@ -480,6 +736,30 @@ def test_hardware_that_can_not_be_stopped_after_a_start_is_an_alert(there: bool)
     assert ("fuse blown" if there else "no service /estop") in alert["text"]
 
 
+def test_stop_while_a_daemon_throws_its_switch_again_is_a_whole_stop() -> None:
+    """The goals of others are cancelled, and it is confirmed only then."""
+    switched = Switched(stopped=BEFORE)
+    platform = switched.scene.platform
+    cancelled: list[Deferred[bytes]] = []
+
+    def cancel(request: bytes) -> Deferred[bytes]:
+        cancelled.append(Deferred())
+        return cancelled[-1]
+
+    switched.pass_seconds(2)
+    assert len(switched.answers) == 1  # under way since the start
+    platform.services[NAVIGATE + CANCEL] = cancel
+    actions = {NAVIGATE: link.Service(types=["a/action/B"])}
+    platform.view = GraphView(services=platform.view.services, actions=actions)
+    switched.control.say(stop())
+    assert len(cancelled) == 1
+    while switched.answers:
+        switched.answer(True)
+    assert switched.done() == []
+    cancelled[0].callback(NOTHING_LEFT)
+    assert switched.done() == [{"op": "done", "id": 2}]
+
+
 def test_resume_ends_what_a_start_had_yet_to_stop() -> None:
     """A service that appears afterwards is left alone."""
     switched = Switched("std_srvs/srv/Trigger", BEFORE)
@@ -497,8 +777,8 @@ def test_resume_ends_what_a_start_had_yet_to_stop() -> None:
 class Acting:
     """A daemon whose graph has two actions, of which one moves the robot; :attr:`asked` are the calls to cancel."""
 
-    def __init__(self, latch: MemoryLatch | None = None) -> None:
-        self.scene = Scene(latch)
+    def __init__(self, latch: MemoryLatch | None = None, switches: Switches | None = None) -> None:
+        self.scene = Scene(latch, switches)
         self.asked: list[bytes] = []
         self.answers: list[Deferred[bytes]] = []
         """Those to come."""
@@ -531,10 +811,17 @@ class Acting:
             if not each.called:
                 each.callback(b"\0\1\0\0" + bytes([code]) + bytes(7))
 
-    def pass_seconds(self, seconds: int) -> None:
+    def pass_seconds(self, seconds: int, *channels: Line) -> None:
         for _ in range(seconds):
-            self.control.say(link.Ping(t=1))
+            for line in (self.control, *channels):
+                line.say(link.Ping(t=1))
             self.scene.clock.advance(1)
+
+    def pass_zeros(self, times: int) -> None:
+        """Let the time pass in which zero is said so often."""
+        for _ in range(times):
+            self.scene.clock.advance(0.05)
+        self.control.say(link.Ping(t=1))
 
     def heard(self, op: str) -> list[dict[str, Any]]:
         return said(self.control, op)
@@ -628,14 +915,167 @@ def test_each_stop_asks_anew(acting: Acting) -> None:
     assert acting.heard("done") == [{"op": "done", "id": 2}, {"op": "done", "id": 3}]
 
 
+def test_stop_that_comes_while_another_is_confirmed_is_a_whole_one() -> None:
+    """The switch hangs, and a node of the robot has given its next goal: all are cancelled, and zero is said again."""
+    acting = Acting(switches=Switches("/estop"))
+    switch = link.Service(types=["std_srvs/srv/Trigger"])
+    actions, topics = acting.scene.platform.view.actions, {"/nav_vel": heard_by(TWIST)}
+    acting.scene.platform.view = GraphView(actions=actions, topics=topics, services={"/estop": switch})
+    acting.scene.platform.services["/estop"] = lambda request: Deferred()
+    acting.control.say(stop())
+    acting.answer()
+    acting.pass_zeros(40)
+    assert (len(acting.asked), acting.scene.platform.published) == (1, 20 * [("/nav_vel", ZERO)])
+    acting.control.say(stop(4))
+    assert acting.asked == 2 * [ALL_GOALS]
+    acting.pass_zeros(40)
+    assert acting.scene.platform.published == 40 * [("/nav_vel", ZERO)]
+    assert acting.heard("done") == []
+    acting.pass_seconds(3)
+    first, second = acting.heard("done")
+    assert [first["id"], second["id"]] == [2, 4]
+    assert ("/estop did not answer" in second["reason"], NAVIGATE in second["reason"]) == (True, True)
+
+
+def test_action_that_is_being_asked_is_asked_again_for_the_next_stop(acting: Acting) -> None:
+    """When it has answered, and not before: however often somebody stops the robot, each action has one to answer."""
+    for id in (2, 3, 4):
+        acting.control.say(stop(id))
+    assert acting.asked == [ALL_GOALS]
+    acting.answer()
+    assert acting.heard("done") == [{"op": "done", "id": 2}]
+    assert acting.asked == 2 * [ALL_GOALS]
+    acting.answer()
+    assert acting.heard("done") == [{"op": "done", "id": 3}, {"op": "done", "id": 4}]
+    acting.pass_seconds(5)
+    assert len(acting.asked) == 2
+    assert acting.heard("alert") == []
+
+
+def test_stop_after_one_that_nobody_answers_has_its_own_time(acting: Acting) -> None:
+    """What it asks anew makes it good; the other was answered for, after two seconds, as it was."""
+    acting.control.say(stop())
+    acting.scene.clock.advance(0.5)
+    acting.control.say(stop(4))
+    acting.scene.clock.advance(0.5)
+    assert acting.asked == 2 * [ALL_GOALS]
+    acting.scene.clock.advance(0.9)
+    assert acting.heard("done") == []
+    acting.scene.clock.advance(0.1)
+    (done,) = acting.heard("done")
+    assert (done["id"], done["ok"], NAVIGATE in done["reason"]) == (2, False, True)
+    acting.pass_zeros(5)
+    acting.scene.daemon.helm.look()
+    acting.answer()
+    assert acting.heard("done") == [{"op": "done", "id": 4}]
+
+
 def test_late_refusal_is_an_alert(acting: Acting) -> None:
     """Nobody waits for the answer any more."""
     acting.control.say(stop())
     acting.pass_seconds(3)
     acting.control.heard()
     acting.answer(1)
+    acting.pass_seconds(1)
     (alert,) = acting.heard("alert")
     assert f"{NAVIGATE} refuses" in alert["text"]
+
+
+def test_action_that_refuses_is_asked_every_second_until_it_does_not(acting: Acting) -> None:
+    """A person hears once that it refuses, and when its goals are cancelled."""
+    acting.control.say(stop())
+    acting.answer(1)
+    (told,) = acting.heard("alert")
+    assert (told["level"], told["kind"]) == ("error", "stop")
+    for _ in range(5):
+        acting.pass_seconds(1)
+        acting.answer(1)
+    assert len(acting.asked) == 6
+    assert acting.heard("alert") == []
+    acting.pass_seconds(1)
+    acting.answer()
+    acting.pass_seconds(5)
+    assert len(acting.asked) == 7
+    assert [each["over"] for each in acting.heard("alert")] == [True]
+
+
+EXECUTING = b"\0\1\0\0\1" + bytes(3 + 24) + b"\2"
+ENDED = EXECUTING[:-1] + b"\4"
+CANCELING = EXECUTING[:-1] + b"\3"
+TWO = b"\0\1\0\0\2" + CANCELING[5:] + bytes(3 + 24) + b"\2"
+"""Of one goal that is being cancelled, and one that goes on."""
+ACCEPTED = b"\0\1\0\0" + bytes(4) + b"\1" + bytes(3 + 24)
+"""An action's answer that it cancels one goal."""
+
+
+def test_action_that_refuses_without_a_word_is_known_by_what_it_publishes(acting: Acting) -> None:
+    """It says that it cancels none, as one does that has none: the stop is confirmed, and then a person is told."""
+    acting.control.say(stop())
+    acting.answer()
+    assert acting.heard("done") == [{"op": "done", "id": 2}]
+    for _ in range(3):
+        acting.scene.clock.advance(AFTER)
+        acting.scene.platform.emit(NAVIGATE + STATUS, EXECUTING)
+        acting.pass_seconds(1)
+        acting.answer()
+    assert len(acting.asked) == 4
+    (alert,) = acting.heard("alert")
+    assert (alert["kind"], f"{NAVIGATE} refuses" in alert["text"]) == ("stop", True)
+    acting.scene.clock.advance(AFTER)
+    acting.scene.platform.emit(NAVIGATE + STATUS, ENDED)
+    acting.pass_seconds(5)
+    assert [each["over"] for each in acting.heard("alert")] == [True]
+    assert (len(acting.asked), acting.scene.platform.sources) == (4, [])
+
+
+def test_action_that_cancels_one_goal_of_two_is_told_and_asked_again(acting: Acting) -> None:
+    """One of rclpy leaves out of its answer what it refuses, so what it publishes counts, also of one that cancels."""
+    acting.control.say(stop())
+    for _ in range(4):
+        acting.answers.pop().callback(ACCEPTED)
+        acting.scene.clock.advance(AFTER)
+        acting.scene.platform.emit(NAVIGATE + STATUS, TWO)
+        if not acting.answers:
+            acting.pass_seconds(1)
+    heard = [each for each in acting.control.heard() if isinstance(each, dict)]
+    assert [each for each in heard if each["op"] == "done"] == [{"op": "done", "id": 2}]
+    (alert,) = [each for each in heard if each["op"] == "alert"]
+    assert (alert["kind"], f"{NAVIGATE} refuses" in alert["text"]) == ("stop", True)
+    acting.answers.pop().callback(ACCEPTED)
+    acting.scene.clock.advance(AFTER)
+    acting.scene.platform.emit(NAVIGATE + STATUS, ENDED)
+    acting.pass_seconds(5)
+    assert [each["over"] for each in acting.heard("alert")] == [True]
+    assert (len(acting.asked), acting.scene.platform.sources) == (5, [])
+
+
+def test_goal_that_is_accepted_just_after_all_were_cancelled_is_cancelled_at_once(acting: Acting) -> None:
+    """It was on its way inside the robot when the stop came."""
+    acting.control.say(stop())
+    acting.answers.pop().callback(ACCEPTED)
+    acting.scene.clock.advance(AFTER)
+    acting.scene.platform.emit(NAVIGATE + STATUS, CANCELING)
+    acting.scene.clock.advance(0.05)
+    assert len(acting.asked) == 1
+    acting.scene.platform.emit(NAVIGATE + STATUS, TWO)
+    assert acting.asked == 2 * [ALL_GOALS]
+    acting.answers.pop().callback(ACCEPTED)
+    acting.scene.clock.advance(AFTER)
+    acting.scene.platform.emit(NAVIGATE + STATUS, CANCELING)
+    acting.pass_seconds(5)
+    assert (len(acting.asked), acting.scene.platform.sources) == (2, [])
+    assert acting.heard("alert") == []
+
+
+def test_resume_ends_the_listening(acting: Acting) -> None:
+    """Goals that are given then are to go on."""
+    acting.control.say(stop())
+    acting.answer()
+    acting.control.say(resume())
+    acting.scene.clock.advance(AFTER)
+    assert acting.scene.platform.sources == []
+    acting.pass_seconds(3)
+    assert len(acting.asked) == 1
 
 
 def test_goal_of_a_client_that_has_not_ended_is_told(acting: Acting) -> None:
@@ -675,10 +1115,6 @@ def test_graph_that_can_not_be_read_makes_no_good_stop(
     acting: Acting, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Which actions to ask is not known then; they are asked when it can be read."""
-
-    def broken() -> GraphView:
-        raise RuntimeError("no graph")
-
     with monkeypatch.context() as broken_for_now:
         broken_for_now.setattr(acting.scene.platform, "graph", broken)
         done = order(acting.control, stop())
@@ -687,7 +1123,31 @@ def test_graph_that_can_not_be_read_makes_no_good_stop(
     assert acting.asked == [ALL_GOALS]
 
 
-def test_many_silent_actions_are_asked_in_turn(acting: Acting) -> None:
+def test_stop_that_can_not_read_the_graph_asks_what_was_seen_before(
+    acting: Acting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is known to refuse is no better by that, and what is there may have goals again."""
+    acting.control.say(stop())
+    acting.answer(1)
+    acting.pass_seconds(1)
+    acting.answer(1)
+    acting.control.heard()
+    with monkeypatch.context() as broken_for_now:
+        broken_for_now.setattr(acting.scene.platform, "graph", broken)
+        asked = len(acting.asked)
+        acting.control.say(stop(4))
+        assert len(acting.asked) == asked + 1
+        acting.answer(1)
+        heard = [each for each in acting.control.heard() if isinstance(each, dict)]
+    (done,) = [each for each in heard if each["op"] == "done"]
+    assert ("could not be found out" in done["reason"], f"{NAVIGATE} refuses" in done["reason"]) == (
+        True,
+        True,
+    )
+    assert not any(each.get("over") for each in heard if each["op"] == "alert")
+
+
+def test_many_silent_actions_are_asked_in_turn(acting: Acting, monkeypatch: pytest.MonkeyPatch) -> None:
     """So many at a time, and each in the end."""
     names = [f"/r{number:03}/spin" for number in range(MAX_ACTIONS + 10)]
     acting.show(*names)
@@ -697,7 +1157,7 @@ def test_many_silent_actions_are_asked_in_turn(acting: Acting) -> None:
         asked[service.removesuffix(CANCEL)] += 1
         return Deferred()
 
-    acting.scene.platform.call = call  # type: ignore[method-assign]
+    monkeypatch.setattr(acting.scene.platform, "call", call)
     acting.control.say(stop())
     assert sum(asked.values()) == MAX_ACTIONS
     acting.pass_seconds(2)
@@ -889,6 +1349,23 @@ def test_held_topic_repeats_its_last_value(scene: Scene) -> None:
     assert listening.emit(b"e") == [b"e"]
 
 
+def test_inhibition_ends_with_the_link_it_was_ordered_by(scene: Scene) -> None:
+    """Nobody is left who could end it: a relay that comes back hears of none, and gets samples."""
+    listening = Listening(scene)
+    listening.inhibit(60_000)
+    listening.control.lose()
+    scene.run(1)
+    control = scene.register()
+    (told,) = said(control, "safety")
+    assert "inhibited" not in told
+    line = scene.channel(control)
+    line.say(link.Subscribe(number=1, topic="/chat"))
+    line.heard()
+    scene.platform.emit("/chat", b"a")
+    scene.clock.advance(0)
+    assert [each.body for each in line.heard() if isinstance(each, frames.SampleFrame)] == [b"a"]
+
+
 # --- what is told ------------------------------------------------------------------------------------------
 
 
@@ -910,6 +1387,23 @@ def test_safety_tells_who_moves_the_robot(scene: Scene, control: Line) -> None:
     told = said(control, "safety")[-1]
     assert "moving" not in told
     assert told["stopped"]["by"] == "eve"
+
+
+def test_robot_moves_as_long_as_a_goal_that_moves_it_goes_on(scene: Scene, control: Line) -> None:
+    """Also where whoever gave it has lost control; other goals count for nothing."""
+    scene.platform.actions = {NAVIGATE, "/count"}
+    line = scene.driving(control)
+    scene.command(line, ZERO)
+    for id, action in (("g", NAVIGATE), ("h", "/count")):
+        line.say(link.SendActionGoal(id=id, action=action, type="a/action/B", source=DRIVER, cdr=""))
+    scene.clock.advance(TELL_EVERY)
+    assert said(control, "safety")[-1]["moving"] is True
+    control.say(link.Control(id=9))
+    scene.run(1)
+    assert said(control, "safety")[-1]["moving"] is True
+    scene.platform.goals[0].result.callback(Outcome(CANCELED, None))
+    scene.clock.advance(TELL_EVERY)
+    assert "moving" not in said(control, "safety")[-1]
 
 
 def test_safety_is_told_at_most_twenty_times_a_second_and_the_last_state_always(
@@ -943,10 +1437,6 @@ def test_order_that_fails_unforeseen_is_answered(
     scene: Scene, control: Line, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A middleware that throws costs the order, not the link, and its words stay in the log."""
-
-    def broken(name: str, what: str) -> str:
-        raise RuntimeError("secret internals")
-
     monkeypatch.setattr(scene.platform, "full_name", broken)
     done = order(control, link.Inhibit(id=4, resource="/chat", ms=100))
     assert done["ok"] is False
@@ -969,6 +1459,36 @@ def test_limits_are_told_and_hold() -> None:
         scene.command(line, GO)
     assert scene.platform.published == [("/cmd_vel", twist(0.5)), ("/cmd_vel", twist(0.8))]
     assert scene.daemon._health().limited_commands == 2
+
+
+def test_who_is_limited_hears_why_a_joystick_moves_nothing() -> None:
+    """A person is told once, by an alert that lasts until control changes; where nobody may, advertising is refused."""
+    scene = Scene(settings=Settings(limits=Limits(operator=Speeds(linear=0.5))))
+    control = scene.register()
+    line = scene.channel(control)
+    line.say(link.Advertise(number=5, topic="/joy", type=JOY))
+    control.say(link.Control(id=8, holder=DRIVER, user="ann", level="operator"))
+    control.heard()
+    for _ in range(3):
+        scene.command(line, GO)
+    (alert,) = said(control, "alert")
+    assert (alert["kind"], alert["about"], alert.get("over", False)) == ("control", "limits", False)
+    assert (
+        "commands on /joy (sensor_msgs/msg/Joy) are refused: the speed of the level 'operator'"
+        in alert["text"]
+    )
+    assert scene.platform.published == []
+    assert scene.daemon._health().refused_commands == 3
+    control.say(link.Control(id=9, holder=DRIVER, user="ann", level="owner"))
+    assert [each["over"] for each in said(control, "alert")] == [True]
+    scene.command(line, GO)
+    assert scene.platform.published == [("/joy", GO)]
+    closed = Scene(settings=Settings(limits=Limits(linear=0.5)))
+    line = closed.channel(closed.register())
+    line.say(link.Advertise(number=5, topic="/joy", type=JOY))
+    (failed,) = said(line, "failed")
+    assert "how fast sensor_msgs/msg/Joy on /joy moves the robot can't be told" in failed["reason"]
+    assert closed.platform.sinks == []
 
 
 def test_control_is_given_when_the_ramp_of_the_former_holder_is_over() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 from twisted.internet.task import Clock
 
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.link import Limits, MotionPolicy, Stopped
 from robot_client.authority import Authority, Suppression
 from robot_client.motion import KEPT, MAX_SHAPE, MotionDesk
@@ -25,6 +25,7 @@ ZERO = twist()
 DRIVER = 7
 """The source that holds control."""
 STAMPED = "geometry_msgs/msg/TwistStamped"
+JOY = "sensor_msgs/msg/Joy"
 
 
 class Feed:
@@ -136,8 +137,50 @@ def test_stale_zero_is_no_letting_go(scene: Scene) -> None:
     assert not scene.command(ZERO, age=3.0)
     assert not scene.command(GO)
     assert scene.sent == [GO]
+    scene.clock.advance(0.01)
     assert scene.command(ZERO)
     assert scene.command(GO)
+
+
+def test_what_a_stalled_link_held_back_through_a_stop_is_not_obeyed_after_the_resume() -> None:
+    """Nor what follows it, before its driver lets go, also where commands may be old."""
+    scene = Scene(deadline_ms=2000)
+    scene.run(0.1)
+    scene.command(GO)
+    scene.authority.stop(Stopped(by="eve", since=1.0), scene.now())
+    scene.run(0.2)
+    scene.authority.resume(scene.now())
+    scene.run(0.7)
+    for age in (1.0, 0.8, 0.6, 0.4, 0.2, 0.0):
+        assert not scene.command(GO, age=age)
+    assert scene.sent.count(GO) == 1
+    assert scene.command(ZERO)
+    assert scene.command(GO)
+
+
+def test_stall_of_the_link_is_no_letting_go() -> None:
+    """What comes too old when it ends shows that nobody did."""
+    scene = Scene()
+    scene.command(GO)
+    scene.authority.stop(Stopped(by="eve", since=1.0), scene.now())
+    scene.run(0.1)
+    scene.authority.resume(scene.now())
+    scene.command(GO)
+    scene.run(1.0)
+    assert not scene.command(GO, age=0.9)
+    assert scene.desk.stale_commands == 0
+    assert not scene.command(GO, age=0.1)
+    assert scene.sent.count(GO) == 1
+
+
+def test_stamp_of_the_future_is_no_letting_go(scene: Scene) -> None:
+    """Nobody was silent until then."""
+    scene.authority.stop(Stopped(by="eve", since=1.0), scene.now())
+    scene.authority.resume(scene.now())
+    assert not scene.command(GO)
+    assert not scene.command(GO, age=-3.0)
+    scene.run(0.1)
+    assert not scene.command(GO)
 
 
 def test_zero_needs_no_stop(scene: Scene) -> None:
@@ -474,6 +517,41 @@ def test_what_can_not_be_limited_is_not_followed() -> None:
     assert scene.desk.invalid_commands == 1
 
 
+def test_who_is_limited_moves_nothing_by_what_has_no_speeds_to_read() -> None:
+    """He is refused, and somebody is told; his zero passes, and so does who has no limits."""
+    scene = Scene(Rules(limits={"operator": Limits(linear=0.5)}))
+    told: list[tuple[str, str]] = []
+    scene.desk.on_unread = lambda on, level: told.append((on.topic, level))
+    scene.open("pad", "/joy", JOY)
+    assert scene.command(GO, "pad") is False
+    assert scene.command(ZERO, "pad")
+    assert (told, scene.authority.refused, scene.desk.invalid_commands) == ([("/joy", "operator")], 1, 0)
+    scene.authority.hold(DRIVER, "ann", "owner", scene.now())
+    assert scene.command(GO, "pad")
+    scene.authority.suppress("/joy", Suppression(frozenset({8}), scene.now() + 10**9, "eve"))
+    assert scene.command(GO, "pad", by=8) is False
+    assert told[1:] == [("/joy", "")]
+    assert scene.sent == [ZERO, GO]
+
+
+def test_what_is_listed_moves_the_robot_without_speeds() -> None:
+    """Whoever set the limits says that it may."""
+    scene = Scene(Rules(limits={"operator": Limits(linear=0.5)}, unlimited=["/joy"]))
+    scene.open("pad", "/joy", JOY)
+    assert scene.command(GO, "pad")
+    assert scene.sent == [GO]
+
+
+def test_what_nobody_may_command_can_not_be_advertised() -> None:
+    """Everybody is limited; it is said why, and what helps."""
+    scene = Scene(Rules(limits={"operator": Limits(linear=0.5), "owner": Limits(linear=0.8)}))
+    with pytest.raises(
+        Refused, match=r"sensor_msgs/msg/Joy on /joy .* 'unlimited' of the robot's \[limits\]"
+    ):
+        scene.open("pad", "/joy", JOY)
+    assert TypedTopic("/joy", JOY) not in scene.feed.topics
+
+
 def test_zero_has_the_shape_of_the_command(scene: Scene) -> None:
     """The guard hears of the shape before the command, and again only when it changes."""
     scene.platform.rests[TWIST] = b"two axes"
@@ -540,6 +618,22 @@ def test_a_longer_deadline_leaves_more_time_for_the_proof() -> None:
     assert scene.command(GO)
     scene.run(0.11)
     assert scene.sent[-1] == ZERO
+
+
+def test_a_topic_of_shorter_times_waits_no_longer_for_the_proof() -> None:
+    """The greater of its own times counts, not of the robot's."""
+    scene = Scene(Rules(topics={"/arm": Times(200, 100)}))
+    scene.open("arm", "/arm")
+    proof = scene.now()
+    scene.desk.proof = lambda: proof
+    passed = []
+    for _ in range(25):
+        passed.append((scene.command(GO, "arm"), scene.command(GO)))
+        scene.run(0.01)
+    assert passed == [(True, True)] * 18 + [(False, True)] * 7
+    stopped = [topic for topic, body in scene.platform.published if body == ZERO]
+    assert set(stopped) == {"/arm"}
+    assert scene.desk.stale_commands == 7
 
 
 def test_whether_somebody_may_command_is_told(scene: Scene) -> None:

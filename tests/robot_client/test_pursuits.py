@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import pytest
+from action_msgs.msg import GoalStatus
 from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
@@ -24,17 +25,24 @@ from robot_client.pursuits import (
     LOOKS,
     MAX_ACTIONS,
     MAX_ADRIFT,
+    MAX_ASKING,
     UNPROVEN,
     Pursuits,
 )
+from robot_client.statuses import AFTER, STATUS
 from robot_client.sweep import PATIENCE, Sweep
 from robot_client.topics import TypedTopic
 from tests.robot_client.daemon_scene import DRIVER, Line
 from tests.robot_client.daemon_scene import Scene as DaemonScene
+from tests.robot_client.goal_statuses import published
 
 SPIN = "/robot1/spin"
-ACCEPTED = b"\0\1\0\0\0"
-REJECTED = b"\0\1\0\0\1"
+ACCEPTED = b"\0\1\0\0" + bytes(4) + b"\1" + bytes(3 + 24)
+REFUSED = b"\0\1\0\0\1" + bytes(7)
+REFUSED_SILENTLY = b"\0\1\0\0" + bytes(8)
+"""As a server of rclpy says it: no error, and nothing that is being cancelled."""
+UNKNOWN = b"\0\1\0\0\2" + bytes(7)
+ENDED = b"\0\1\0\0\3" + bytes(7)
 
 
 class Feed(NoGuard):
@@ -96,6 +104,10 @@ class Scene:
 
         self.platform.services[action + CANCEL] = cancel
         actions = {**self.platform.view.actions, action: link.Service(types=["t"])}
+        self.platform.view = GraphView(actions=actions)
+
+    def vanish(self, action: str) -> None:
+        actions = {name: each for name, each in self.platform.view.actions.items() if name != action}
         self.platform.view = GraphView(actions=actions)
 
     def look(self, times: int = 1) -> None:
@@ -200,6 +212,9 @@ def test_nothing_begins_before_what_is_left_is_cancelled() -> None:
     scene.begin("/other/spin")
     scene.appear(SPIN)
     scene.look()
+    with pytest.raises(Unavailable, match="try again in a moment"):
+        scene.begin()  # what it publishes of its goals may yet say that one goes on
+    scene.look(2)
     scene.begin()
     scene.look(LOOKS)
     assert scene.asked == [SPIN]
@@ -207,15 +222,106 @@ def test_nothing_begins_before_what_is_left_is_cancelled() -> None:
 
 
 def test_an_action_that_does_not_answer_is_asked_again() -> None:
-    """Until it does; one that refuses has answered."""
+    """Until it does."""
     scene = Scene([SPIN])
     scene.appear(SPIN, None)
     scene.look(2)
     assert scene.clock.seconds() >= 2 * PATIENCE
     assert scene.asked == [SPIN, SPIN]
-    scene.appear(SPIN, REJECTED)
+    scene.appear(SPIN)
     scene.look(2)
     assert len(scene.asked) == 3
+
+
+def test_an_action_that_refuses_to_end_what_is_left_is_asked_until_it_does() -> None:
+    """However long: it is noted and nothing new begins there, while actions that never appear are given up."""
+    scene = Scene([SPIN, "/late/spin"])
+    scene.appear(SPIN, REFUSED)
+    scene.look(3 * LOOKS)
+    assert len(scene.asked) == 3 * LOOKS
+    assert scene.latch.noted == [SPIN]
+    assert scene.pursuits.overdue == [SPIN]
+    with pytest.raises(Unavailable, match="try again in a moment"):
+        scene.begin()
+    scene.begin("/late/spin")
+    scene.appear(SPIN)
+    scene.look(3)
+    assert len(scene.asked) == 3 * LOOKS + 1
+    assert scene.latch.noted == ["/late/spin"]
+    assert scene.pursuits.overdue == []
+    scene.begin()
+
+
+def test_what_is_left_goes_on_where_only_another_goal_of_its_action_is_cancelled() -> None:
+    """The action says how many it cancels, and refuses the rest without a word: nothing begins beside that."""
+    scene = Scene([SPIN])
+    scene.appear(SPIN)
+    scene.pursuits.look()
+    scene.clock.advance(AFTER)
+    scene.platform.emit(SPIN + STATUS, b"\0\1\0\0\1" + bytes(3 + 24) + b"\2")
+    with pytest.raises(Unavailable, match="try again in a moment"):
+        scene.begin()
+    assert scene.pursuits.overdue == [SPIN]
+    scene.look(3)
+    assert scene.asked == [SPIN, SPIN]
+    scene.begin()
+
+
+def publish(scene: Scene, *goals: int) -> None:
+    """An action that was just asked publishes that these goals go on."""
+    scene.clock.advance(AFTER)
+    told = published((bytes([goal]) * 16, GoalStatus.STATUS_EXECUTING) for goal in goals)
+    scene.platform.emit(SPIN + STATUS, told)
+    scene.clock.advance(1.0 - AFTER)
+
+
+def test_goals_that_others_give_are_not_those_that_were_left() -> None:
+    """A node may send its goal again as soon as one ends: it is cancelled once more at most, and holds up nobody."""
+    scene = Scene([SPIN])
+    scene.appear(SPIN)
+    for goal in range(1, 6):
+        scene.pursuits.look()
+        publish(scene, goal)
+    assert scene.asked == [SPIN, SPIN]
+    assert scene.latch.noted == []
+    assert scene.pursuits.overdue == []
+    scene.begin()
+
+
+def test_a_goal_that_was_left_is_cancelled_until_it_ends_among_those_of_others() -> None:
+    """What has ended does not count again, nor what came later."""
+    scene = Scene([SPIN])
+    scene.appear(SPIN)
+    for goals in ((1, 2), (3, 2, 4), (2,), (5, 2, 4)):
+        scene.pursuits.look()
+        publish(scene, *goals)
+        assert scene.pursuits.overdue == [SPIN]
+    scene.pursuits.look()
+    publish(scene, 1, 5)
+    assert scene.pursuits.overdue == []
+    scene.look(3)
+    assert len(scene.asked) == 5
+
+
+def test_an_action_that_refused_and_is_gone_is_given_up() -> None:
+    """After ten minutes in which it never came back; what is there is asked for ever."""
+    scene = Scene([SPIN, "/left/spin"])
+    for action in (SPIN, "/left/spin"):
+        scene.appear(action, REFUSED)
+    scene.look(2)
+    scene.vanish(SPIN)
+    scene.look(round(ADRIFT) - 1)
+    scene.appear(SPIN, REFUSED)
+    scene.look()
+    scene.vanish(SPIN)
+    scene.look(round(ADRIFT))
+    assert scene.pursuits.overdue == ["/left/spin", SPIN]
+    with pytest.raises(Unavailable):
+        scene.begin()
+    scene.look()
+    assert scene.pursuits.overdue == ["/left/spin"]
+    assert scene.latch.noted == ["/left/spin"]
+    scene.begin()
 
 
 def test_what_never_appears_is_given_up() -> None:
@@ -233,7 +339,7 @@ def test_a_note_that_is_damaged_stands_for_every_action_that_moves() -> None:
     scene = Scene(None)
     scene.appear(SPIN)
     scene.appear("/dock_is_free")
-    scene.look()
+    scene.look(3)
     assert scene.asked == [SPIN]
     scene.begin()
 
@@ -325,15 +431,81 @@ def test_a_goal_adrift_holds_up_no_new_one(scene: Scene) -> None:
 
 
 def test_an_action_that_does_not_answer_for_a_goal_adrift_is_asked_again(scene: Scene) -> None:
-    """Every second, until it does; one that refuses has answered."""
+    """Every second, until it does."""
     lose(scene.begin())
     scene.appear(SPIN, None)
     scene.look(5)
     assert len(scene.asked) == 5
-    scene.appear(SPIN, REJECTED)
+    scene.appear(SPIN)
     scene.look(3)
     assert len(scene.asked) == 6
     assert scene.latch.noted == []
+
+
+@pytest.mark.parametrize("refusal", [REFUSED, REFUSED_SILENTLY], ids=["refused", "silent"])
+@pytest.mark.parametrize("end", [ACCEPTED, UNKNOWN, ENDED], ids=["accepted", "unknown", "ended"])
+def test_a_goal_adrift_goes_on_until_its_action_does_not_refuse(
+    scene: Scene, refusal: bytes, end: bytes
+) -> None:
+    """Guard and note have it until then: it is cancelled, or unknown, or has ended."""
+    lose(scene.begin())
+    scene.appear(SPIN, refusal)
+    scene.look(5)
+    assert len(scene.asked) == 5
+    assert scene.latch.noted == [SPIN]
+    assert scene.feed.commands[-1][1] is True
+    assert scene.pursuits.overdue == [SPIN]
+    scene.appear(SPIN, end)
+    scene.look(3)
+    assert len(scene.asked) == 6
+    assert scene.latch.noted == []
+    assert scene.pursuits.overdue == []
+
+
+def test_a_goal_that_is_to_end_is_asked_to_until_it_has(scene: Scene) -> None:
+    """It alone, every second, also when its action says that it cancels it; one that ends within a second is not."""
+    going, other = scene.begin(), scene.begin()
+    for action, answer in ((SPIN, REFUSED_SILENTLY), ("/quick/spin", ACCEPTED)):
+        scene.appear(action, answer)
+    quick = scene.begin("/quick/spin")
+    for goal in (going, quick):
+        scene.pursuits.end(goal)
+    scene.look()
+    assert (scene.asked, scene.pursuits.overdue) == ([], ["/quick/spin", SPIN])
+    end(quick)
+    assert scene.pursuits.overdue == [SPIN]
+    scene.look(3)
+    scene.appear(SPIN)
+    scene.look(2)
+    assert scene.wished == 5 * [going.id]
+    end(going)
+    scene.look(3)
+    assert len(scene.wished) == 5
+    assert scene.pursuits.overdue == []
+    assert scene.pursuits.pursued == [SPIN]
+    end(other)
+
+
+def test_goals_that_are_to_end_are_asked_in_turn(scene: Scene) -> None:
+    """So many at a time, though they never answer, and each in the end."""
+    goals = [scene.begin() for _ in range(2 * MAX_ASKING)]
+    for goal in goals:
+        scene.pursuits.end(goal)
+    scene.appear(SPIN, None)
+    scene.look(2)
+    assert len(scene.wished) == MAX_ASKING
+    scene.look(2)
+    assert set(scene.wished) == {goal.id for goal in goals}
+
+
+def test_it_is_told_when_actions_begin_and_cease_to_pursue_goals(scene: Scene) -> None:
+    """Once each, however many goals."""
+    told: list[list[str]] = []
+    scene.pursuits.on_changed = lambda: told.append(scene.pursuits.pursued)
+    goals = [scene.begin(), scene.begin()]
+    for goal in goals:
+        end(goal)
+    assert told == [[SPIN], []]
 
 
 def test_goals_adrift_are_forgotten_in_time_and_number(scene: Scene) -> None:
@@ -404,9 +576,8 @@ def test_a_goal_that_has_just_begun_has_its_two_seconds(scene: Scene) -> None:
     assert not goal.cancelled
     scene.clock.pump([BEAT] * 2)
     assert goal.cancelled
-    goal.cancelled = False
     scene.clock.pump([BEAT] * 20)
-    assert not goal.cancelled
+    assert goal.cancels == 1
 
 
 def leave(scene: DaemonScene) -> MemoryGoal:

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from switchboard_socket import Socket
 
+from robot_client.apps.driver import Command
+from robot_client.apps.line import Line, Refused
 from robot_client.apps.runaway import (
     BLIND,
     FLAT,
-    Command,
     Link,
     Manners,
     Phase,
     Program,
-    Refused,
     Runaway,
     Scan,
     main,
@@ -152,37 +152,22 @@ def test_leaning_on_a_wall_the_robot_follows_it() -> None:
 # --- over the relay ----------------------------------------------------------------------------------------
 
 
-class Socket:
-    """A websocket in memory."""
-
-    def __init__(self) -> None:
-        self.sent: list[dict[str, Any]] = []
-        self.coming: list[dict[str, Any]] = []
-
-    def send(self, text: str) -> None:
-        self.sent.append(json.loads(text))
-
-    def recv(self, timeout: float) -> str:
-        if not self.coming:
-            raise TimeoutError
-        return json.dumps(self.coming.pop(0))
+class Scanner(Socket):
+    """A websocket in memory, by which scans come."""
 
     def scan(self, scan: Scan) -> None:
         ranges = [each if each is not None and math.isfinite(each) else None for each in scan.ranges]
         message = {"ranges": ranges, "angle_min": scan.begin, "angle_increment": scan.step}
         self.coming.append({"op": "publish", "topic": "/scan", "msg": message})
 
-    def answer(self, success: bool = True, result: bool = True) -> None:
-        asked = [each for each in self.sent if each["op"] == "call_service"][-1]
-        values: Any = {"success": success, "message": ""} if result else "you may not"
-        self.coming.append({"op": "service_response", "id": asked["id"], "result": result, "values": values})
-
 
 class Scene:
     def __init__(self) -> None:
         self.now = 100.0
-        self.socket = Socket()
-        self.program = Program(Link(self.socket, "/scan", "/cmd_vel"), Runaway(Manners()), lambda: self.now)
+        self.socket = Scanner()
+        self.program = Program(
+            Link(Line(self.socket), "/scan", "/cmd_vel"), Runaway(Manners()), lambda: self.now
+        )
         self.socket.sent.clear()
 
     def step(self, scan: Scan | None = None, seconds: float = 0.11) -> list[dict[str, Any]]:

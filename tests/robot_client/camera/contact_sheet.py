@@ -1,6 +1,8 @@
 """Draws one PNG with a still of every encoding as a viewer gets it, to be looked at.
 
-    python -m tests.robot_client.camera.contact_sheet build/encodings.png
+    python -m tests.robot_client.camera.contact_sheet build/stills.png
+
+``make stills`` does just that.
 
 Bars: white, yellow, cyan, green, magenta, red, blue, grey, over a ramp. Depth: red to blue over black.
 """

@@ -17,7 +17,7 @@ from robot_client.camera import capture
 from robot_client.camera.capture import Capture
 from robot_client.camera.formats import Pixels
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 LOGIN = "ann:s3cret"
 
 

@@ -174,6 +174,15 @@ def test_configured_camera_is_opened_by_its_source() -> None:
     assert (line.source, line.topic, line.heartbeat, line.settings.width) == ("rtsp://gate/1", "", 7.0, 320)
 
 
+@pytest.mark.parametrize("transport", ["", "compressed", "raw"])
+def test_configured_camera_has_no_other_form(transport: str) -> None:
+    """A topic with the name that its compressed pictures would have is another camera."""
+    scene = Scene(webcam="v4l2:/dev/video0")
+    scene.desk.look(topics(webcam=IMAGE, webcam_compressed=COMPRESSED))
+    line = scene.order("/webcam", transport=transport)
+    assert (line.source, line.topic, line.compressed) == ("v4l2:/dev/video0", "", False)
+
+
 def test_unknown_camera_is_left_for_the_process_to_refuse(scene: Scene) -> None:
     """The stream's own link is where the relay is told."""
     line = scene.order("/none")

@@ -31,10 +31,10 @@ class Road:
         """Frames without answer."""
         self._decoder = FrameDecoder(2**25)
 
-    def put(self, number: int, size: int) -> bytes:
+    def put(self, number: int, size: int, alone: bool = True) -> bytes:
         body = bytes([number]) * size
         shot = Shot(STAMP, self.now, lambda: Look("rgb8", 640, 480), unread)
-        self.leaving.put(number, shot, body, self.now)
+        self.leaving.put(number, shot, body, self.now, alone)
         return body
 
     def answer(self, after: float) -> bool:
@@ -121,6 +121,34 @@ def test_one_that_waits_behind_it_is_given_up_too() -> None:
     road.answer(0.65)
     assert road.wire == []
     road.put(4, PART)
+    assert [frame.number for frame in road.wire] == [4]
+
+
+@pytest.mark.parametrize(("alone", "leave"), [(False, []), (True, [3, 4])])
+def test_one_behind_it_that_needs_it_is_given_up_too(alone: bool, leave: list[int]) -> None:
+    """Also if it would be in time itself; one that stands alone leaves, and what needs but that."""
+    road = Road("h264")
+    road.put(2, 5 * PART)
+    assert not road.answer(0.8)
+    road.put(3, PART, alone)
+    road.put(4, 10, alone=False)
+    assert road.answer(0.05)
+    while road.wire and road.wire[0].number == 2:
+        road.answer(0.001)
+    assert [frame.number for frame in road.wire] == leave
+
+
+def test_one_behind_it_that_the_relay_says_it_has_does_no_harm() -> None:
+    """Though it has not left yet, it is given up with the one it needs."""
+    road = Road("h264")
+    road.put(2, 5 * PART)
+    assert not road.answer(0.8)
+    road.put(3, PART, alone=False)
+    road.leaving.answered(Took(number=3), road.now, 0.0)
+    answers = [road.answer(0.85) for _ in range(len(road.wire))]
+    assert any(answers)
+    assert road.wire == []
+    road.put(4, 10)
     assert [frame.number for frame in road.wire] == [4]
 
 

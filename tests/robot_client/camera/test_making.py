@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 
 import cv2
@@ -36,6 +37,49 @@ def test_jpeg_of_the_camera_goes_as_it_is(settings: VideoSettings) -> None:
     file = jpeg()
     made = Maker(settings).make(file_shot(file), ASKED)
     assert made == (file, 64, 48, "jpeg")
+
+
+def exif(orientation: int, order: str = "<") -> bytes:
+    """An APP1 segment that tells the camera's maker and how the picture should be turned (Exif 2.32)."""
+    tiff = {"<": b"II", ">": b"MM"}[order] + struct.pack(order + "HIH", 42, 8, 2)
+    tiff += struct.pack(order + "HHI4s", 0x010F, 2, 4, b"abc")
+    tiff += struct.pack(order + "HHIHH", 0x0112, 3, 1, orientation, 0) + bytes(4)
+    return b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_how_a_jpeg_wants_to_be_turned_does_not_go_out(orientation: int, order: str) -> None:
+    """Browsers would obey it, and the picture turn when the uplink gets thin; the pixels are the camera's own."""
+    plain = jpeg()
+    file = plain[:20] + exif(orientation, order) + plain[20:]
+    made = Maker(VideoSettings()).make(file_shot(file), ASKED)
+    assert made.body == (file if orientation == 1 else plain)
+    assert look_at("jpeg", made.body) == (64, 48, True)
+    thin = Maker(VideoSettings()).make(file_shot(file), ASKED._replace(reduced=True))
+    assert (thin.width, thin.height) == (made.width, made.height)
+    for body in (made.body, thin.body):
+        shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
+        assert shown is not None and shown.shape[:2] == (48, 64)
+
+
+@pytest.mark.parametrize(
+    "segment",
+    [
+        b"",
+        b"Exif\0\0",
+        b"Exif\0\0II*\0\xff\xff\xff\xff",
+        b"Exif\0\0II*\0\x08\0\0\0\xff\xff",
+        b"Exif\0\0XX*\0\x08\0\0\0\1\0",
+        b"http://ns.adobe.com/xap/1.0/\0<x/>",
+    ],
+    ids=["nothing", "empty", "beyond the end", "too many entries", "no byte order", "XMP"],
+)
+def test_other_segments_go_as_they_are(segment: bytes) -> None:
+    """Also broken Exif, which tells nobody anything."""
+    plain = jpeg()
+    file = plain[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + plain[2:]
+    assert Maker(VideoSettings()).make(file_shot(file), ASKED).body == file
 
 
 @pytest.mark.parametrize(
@@ -88,6 +132,9 @@ def test_picture_too_large_for_a_frame_is_refused() -> None:
     noise = np.random.default_rng(4).integers(0, 255, (1400, 1400, 3), np.uint8)
     with pytest.raises(Invalid, match="as JPEG"):
         Maker(VideoSettings(codec="png")).make(pixels_shot(5, 1.0, noise), ASKED)
+    noise = np.random.default_rng(5).integers(0, 255, (2400, 2400, 3), np.uint8)
+    with pytest.raises(Invalid, match="of less quality"):
+        Maker(VideoSettings(quality=100)).make(pixels_shot(5, 1.0, noise), ASKED._replace(quality=100))
     padded = jpeg() + bytes(PICTURE_FRAME)
     assert len(Maker(VideoSettings()).make(file_shot(padded), ASKED).body) < PICTURE_FRAME
 

@@ -17,6 +17,7 @@ from robot_client.camera.leaving import PART
 from robot_client.camera.lines import Open
 from robot_client.camera.shot import Look, Made, Shot, Wish
 from robot_client.camera.stream import FAULTS, TELL_EVERY, Busy, Stream
+from robot_client.camera.trip import DOUBT, RoundTrip
 from robot_client.link import VideoLink
 from robot_client.transport import LinkProtocol
 
@@ -32,7 +33,9 @@ class View:
 
     def __init__(self) -> None:
         self.fps = 15.0
+        self.latched = False
         self.closed = 0
+        self.before: Shot | None = None
         self.wishes: list[Wish] = []
         self.making: list[tuple[Shot, Deferred[Made]]] = []
 
@@ -41,6 +44,9 @@ class View:
         done: Deferred[Made] = Deferred()
         self.making.append((shot, done))
         return done
+
+    def latest(self) -> Shot | None:
+        return self.before
 
     def close(self) -> None:
         self.closed += 1
@@ -51,6 +57,7 @@ class Scene:
         self.clock = Clock()
         self.clock.advance(100)
         self.view = View()
+        self.way = RoundTrip()
         self.gone: list[str] = []
         self._refusal = refusal
         line = Open(
@@ -64,7 +71,7 @@ class Scene:
         self.protocol = LinkProtocol(
             VideoLink("t", self.now, 2.0),
             lambda protocol: Stream(
-                line, protocol, self.watch, self.clock, lambda _, why: self.gone.append(why)
+                line, protocol, self.watch, self.clock, lambda _, why: self.gone.append(why), self.way
             ),
             self.clock,
         )
@@ -204,6 +211,75 @@ def test_after_a_picture_that_was_given_up_one_stands_alone() -> None:
     assert scene.view.wishes[-1].scale < 1
 
 
+@pytest.mark.parametrize("codec", ["h264", "jpeg"])
+def test_one_that_was_being_made_when_it_was_given_up_does_not_go_on_from_it(codec: str) -> None:
+    """Of H.264; it is made again, so as to stand alone, if no newer one is there."""
+    scene = Scene(codec=codec).joined()
+    scene.shot(1)
+    scene.make(40_000)
+    for part in scene.heard()[1:]:
+        scene.clock.advance(0.001)
+        scene.say(link.Took(number=1, upto=part.offset + PART if part.offset + PART < 40_000 else None))
+    scene.shot(2)
+    scene.make(200_000)
+    scene.shot(3)
+    assert [shot.stamp for shot, _ in scene.view.making] == [1, 2, 3]
+    while parts := scene.heard():
+        for part in parts:
+            scene.clock.advance(1.0)
+            scene.say(link.Took(number=2, upto=part.offset + PART))
+    scene.make(1000)
+    if codec == "jpeg":
+        assert scene.pictures() == [3]
+        return
+    assert scene.pictures() == []
+    assert [
+        (shot.stamp, wish.key) for (shot, _), wish in zip(scene.view.making, scene.view.wishes, strict=True)
+    ] == [(1, True), (2, False), (3, False), (3, True)]
+    scene.make(1000)
+    (picture,) = [each for each in scene.heard() if isinstance(each, frames.VideoFrame)]
+    assert (picture.number, picture.stamp) == (3, 3)
+    scene.clock.advance(0.01)
+    scene.say(link.Took(number=3))
+    scene.shot(4)
+    scene.clock.advance(1.0)
+    scene.make(1000)
+    assert scene.pictures() == [4]
+    assert not scene.view.wishes[-1].key
+
+
+@pytest.mark.parametrize(("latched", "made"), [(True, [1, 1]), (False, [1])])
+def test_kept_picture_that_was_given_up_is_made_again(latched: bool, made: list[int]) -> None:
+    """Smaller, because no other one may follow; of other cameras the next one does."""
+    scene = Scene().joined()
+    scene.view.latched = latched
+    scene.shot(1)
+    scene.view.before = scene.view.making[-1][0]
+    scene.make(200_000)
+    for part in scene.heard()[1:]:
+        scene.clock.advance(1.0)
+        scene.say(link.Took(number=1, upto=part.offset + PART))
+    assert [shot.stamp for shot, _ in scene.view.making] == made
+    assert (scene.view.wishes[-1].scale < 1) == latched
+
+
+@pytest.mark.parametrize(("latched", "made"), [(True, [(1, True), (1, True)]), (False, [(1, True)])])
+def test_kept_picture_is_made_again_for_who_needs_one_that_stands_alone(
+    latched: bool, made: list[tuple[int, bool]]
+) -> None:
+    """In H.264, at once, because no other one may follow."""
+    scene = Scene(codec="h264").joined()
+    scene.view.latched = latched
+    scene.shot(1)
+    scene.view.before = scene.view.making[-1][0]
+    scene.make()
+    scene.clock.advance(0.01)
+    scene.say(link.Took(number=1))
+    scene.say(link.KeyFrame())
+    wished = zip(scene.view.making, scene.view.wishes, strict=True)
+    assert [(shot.stamp, wish.key) for (shot, _), wish in wished] == made
+
+
 def test_measured_delay_is_told_once_a_second_at_most() -> None:
     """What was decided is told at once, what is measured now and then."""
     scene = Scene().joined()
@@ -215,6 +291,29 @@ def test_measured_delay_is_told_once_a_second_at_most() -> None:
         scene.say(link.Took(number=number))
         told += sum(isinstance(each, dict) and each["op"] == "playing" for each in scene.heard())
     assert 2 <= told <= 2 + (scene.clock.seconds() - 100) / TELL_EVERY
+
+
+def test_whether_a_picture_is_kept_is_told_with_it_and_when_it_changes() -> None:
+    """Also if no other picture comes: who subscribes to a topic learns only then how it is published."""
+    scene = Scene().joined()
+    scene.heard()
+    scene.clock.advance(TELL_EVERY)
+    assert scene.heard() == []  # nothing is told before there is a picture
+    scene.view.latched = True
+    scene.shot(1)
+    scene.make()
+    assert scene.heard()[0]["latched"]
+    scene.clock.advance(TELL_EVERY)
+    scene.say(link.Took(number=1))
+    assert scene.heard() == []
+    scene.view.latched = False
+    scene.clock.advance(TELL_EVERY)
+    (playing,) = scene.heard()
+    assert (playing["op"], playing["width"], playing.get("latched", False)) == ("playing", 64, False)
+    scene.stream.close("over")
+    scene.view.latched = True
+    scene.clock.advance(TELL_EVERY)
+    assert [each["op"] for each in scene.heard()] == ["bye"]
 
 
 def test_rate_is_kept_and_the_last_picture_still_goes() -> None:
@@ -307,3 +406,64 @@ def test_joined_to_another_stream_is_not_believed() -> None:
     scene.say(link.Joined(channel="other", at=1))
     assert not scene.transport.connected
     assert scene.view.closed == 0
+
+
+def doubted(scene: Scene) -> Scene:
+    """What is measured has been longer than the round trip for so long that it is asked for."""
+    now = scene.clock.seconds()
+    scene.way.measured(0.005, now)
+    scene.way.measured(0.4, now)
+    scene.clock.advance(DOUBT)
+    return scene
+
+
+def test_round_trip_is_asked_for_by_the_first_byte_of_a_picture() -> None:
+    """The rest leaves when it has its answer, and the relay gets the picture it was."""
+    scene = doubted(Scene().joined())
+    scene.shot(1)
+    scene.make(1000)
+    (first,) = scene.heard()[1:]
+    assert (first.offset, len(first.body), first.total) == (0, 1, 1000)
+    scene.clock.advance(0.35)
+    scene.say(link.Took(number=1, upto=1))
+    (rest,) = scene.heard()
+    joiner = frames.PictureJoiner(2**22)
+    assert joiner.join(first) is None
+    assert joiner.join(rest) == frames.VideoFrame(1, 1, bytes(1000))
+    assert scene.way.seconds == pytest.approx(0.35)
+
+
+def test_picture_that_had_to_wait_for_another_stream_goes_when_that_is_over() -> None:
+    """Also if the camera gives no other one."""
+    scene = doubted(Scene().joined())
+    scene.way.leaves("another stream", scene.clock.seconds())
+    scene.shot(1)
+    scene.clock.advance(0.5)
+    assert scene.view.making == []
+    scene.way.idle("another stream", scene.clock.seconds())
+    scene.clock.advance(0.1)
+    assert len(scene.view.making) == 1
+
+
+def test_lost_link_holds_up_no_other_stream() -> None:
+    """What was under way on it is answered no more."""
+    scene = doubted(Scene().joined())
+    scene.shot(1)
+    scene.make(1000)
+    assert not scene.way.may_leave(scene.clock.seconds())
+    scene.transport.loseConnection()
+    assert scene.way.may_leave(scene.clock.seconds())
+
+
+def test_stream_begins_with_the_picture_that_was_there() -> None:
+    """With its stamp; its age says nothing of the uplink."""
+    scene = Scene()
+    scene.view.before = Shot(7, scene.clock.seconds() - 15, lambda: Look("rgb8", 64, 48), unread)
+    scene.joined()
+    scene.make()
+    assert scene.pictures() == [7]
+    scene.clock.advance(0.02)
+    scene.say(link.Took(number=1))
+    assert scene.stream.pace.delay == pytest.approx(0.02)
+    assert scene.stream.pace.reduced == 0
+    assert scene.stream.pace.may_send(scene.clock.seconds())

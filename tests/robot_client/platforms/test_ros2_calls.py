@@ -6,11 +6,13 @@ from typing import Any
 
 import pytest
 import pytest_twisted
+from rclpy.client import Client
 from rclpy.serialization import deserialize_message, serialize_message
 from std_srvs.srv import SetBool, Trigger
 from twisted.internet import reactor, task
 
-from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
+from robot_client.platforms import ros2_calls
 from robot_client.platforms.ros2 import Ros2Platform
 from tests.robot_client.platforms.ends import seen
 from tests.robot_client.ros import Peer
@@ -55,6 +57,36 @@ async def test_calls_that_can_not_be_answered_end_in_words(ros: Ros2Platform, pe
 
 
 @pytest_twisted.ensureDeferred
+async def test_call_is_judged_when_its_service_is_found(
+    ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What has happened while it was looked for counts, and nothing is sent of what is refused then."""
+    peer.do("serve", "/hidden", "invert")
+    await seen(ros, lambda graph: "/hidden" in graph.services)
+    before = len(peer.told("inverted", True))
+    found: list[bool] = []
+    stopped: list[bool] = []
+
+    def check() -> None:
+        if stopped:
+            raise Refused("the robot is stopped")
+
+    def call(data: bool) -> Any:
+        request = bytes(serialize_message(SetBool.Request(data=data)))
+        return ros.call("/hidden", "std_srvs/srv/SetBool", request, 10, check)
+
+    monkeypatch.setattr(Client, "service_is_ready", lambda client: bool(found))
+    refused = call(True)
+    stopped.append(True)
+    found.append(True)
+    assert "the robot is stopped" in str(await failure(refused))
+    monkeypatch.undo()
+    stopped.clear()
+    assert await call(False)
+    assert len(peer.told("inverted", True)) == before
+
+
+@pytest_twisted.ensureDeferred
 async def test_service_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: Peer) -> None:
     """A call under way to a service that is taken away ends long before its timeout."""
     peer.do("serve", "/doomed", "slow")
@@ -63,3 +95,22 @@ async def test_service_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: 
     await task.deferLater(reactor, 0.3)
     peer.do("unserve", "/doomed")
     assert isinstance(await failure(call), SwitchboardError)
+
+
+@pytest_twisted.ensureDeferred
+async def test_service_that_is_prepared_need_not_be_found_again(
+    ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it was not called; that it is waited for makes none."""
+    monkeypatch.setattr(ros2_calls, "IDLE", -1.0)
+    peer.do("serve", "/switch", "invert")
+    await seen(ros, lambda graph: "/switch" in graph.services)
+    ros.prepare_call("/switch", "std_srvs/srv/SetBool")
+    request = bytes(serialize_message(SetBool.Request(data=True)))
+    await ros.call("/switch", "std_srvs/srv/SetBool", request, 10)
+    ros.graph()
+    monkeypatch.setattr(ros2_calls, "APPEAR", -1.0)
+    assert await ros.call("/switch", "std_srvs/srv/SetBool", request, 10)
+    peer.do("unserve", "/switch")
+    await seen(ros, lambda graph: "/switch" not in graph.services)
+    assert isinstance(await failure(ros.call("/switch", "std_srvs/srv/SetBool", request, 10)), NotFound)

@@ -16,7 +16,7 @@ from robot_client.camera import formats
 from robot_client.platforms.ros2_camera import RosCameras
 from robot_client.platforms.ros2_transport import without_shared_memory
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 BEST_EFFORT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -97,6 +97,60 @@ def test_camera_that_comes_later_is_found_whatever_it_offers(scene: Scene) -> No
     until = time.monotonic() + PATIENCE
     while formats.image(scene.shown(second, grey(2))).pixels[0, 0] != 2:
         assert time.monotonic() < until
+
+
+def test_picture_that_was_published_once_is_shown(scene: Scene) -> None:
+    """To who subscribes when it was published long ago, and the next one to who is there."""
+    publisher = scene.node.create_publisher(Image, "/map", LATCHED)
+    publisher.publish(grey(3))
+    for _ in range(2):
+        subscribed = scene.cameras.subscribe("/map", False, "", scene.got.put)
+        assert formats.image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 3
+        assert subscribed.latched
+    publisher.publish(grey(4))
+    assert formats.image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 4
+
+
+def test_picture_of_a_camera_that_comes_later_is_shown_once(scene: Scene) -> None:
+    """Subscribed anew for its publisher's sake it would come again."""
+    subscribed = scene.cameras.subscribe("/map", False, "", scene.got.put)
+    publisher = scene.node.create_publisher(Image, "/map", LATCHED)
+    publisher.publish(grey(3))
+    until = time.monotonic() + PATIENCE
+    while not subscribed.latched:
+        assert time.monotonic() < until
+        time.sleep(0.02)  # publishers are looked at once a second
+    assert formats.image(scene.got.get(timeout=PATIENCE)).pixels[0, 0] == 3
+    with pytest.raises(queue.Empty):
+        scene.got.get(timeout=0.5)  # to prove its absence
+    publisher.publish(grey(3))
+    assert scene.got.get(timeout=PATIENCE)
+
+
+def test_publishers_that_keep_nothing_are_heard_beside_one_that_does(scene: Scene) -> None:
+    """Who asks for kept pictures gets none of theirs."""
+    latched = scene.node.create_publisher(Image, "/grey", LATCHED)
+    volatile = scene.node.create_publisher(Image, "/grey", BEST_EFFORT)
+    subscribed = scene.cameras.subscribe("/grey", False, "", scene.got.put)
+    seen: set[int] = set()
+    until = time.monotonic() + PATIENCE
+    while seen != {1, 2}:
+        assert time.monotonic() < until
+        for level, publisher in ((1, latched), (2, volatile)):
+            seen.add(int(formats.image(scene.shown(publisher, grey(level))).pixels[0, 0]))
+    assert not subscribed.latched
+
+
+@pytest.mark.parametrize("asked", ["default", "sensor_data"])
+def test_profile_asked_for_by_name_keeps_nothing(scene: Scene, asked: str) -> None:
+    """As ROS has it by that name."""
+    scene.node.create_publisher(Image, "/map", LATCHED)
+    scene.cameras.subscribe("/map", False, asked, scene.got.put)
+    until = time.monotonic() + PATIENCE
+    while not scene.node.get_subscriptions_info_by_topic("/map"):
+        assert time.monotonic() < until
+        time.sleep(0.02)  # the middleware takes it up by and by
+    assert scene.offered("/map").durability == DurabilityPolicy.VOLATILE
 
 
 def test_compressed_pictures_come_as_they_are(scene: Scene) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 import pytest_twisted
 from example_interfaces.action import Fibonacci
 from rclpy.serialization import deserialize_message, serialize_message
-from twisted.internet import reactor, task
+from twisted.internet import reactor
 
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.link import MotionPolicy
@@ -92,13 +94,31 @@ async def test_goal_can_be_cancelled_before_it_is_taken(ros: Ros2Platform, peer:
     await serve(ros, peer, "/late", "late")
     first = Wanted(ros, "/late", 3)
     await first.end()
+    thought = len(peer.told("thinks", "/late"))
     wanted = Wanted(ros, "/late", 3)
-    await task.deferLater(reactor, 0.1)
+    await until(lambda: len(peer.told("thinks", "/late")) > thought)
     wanted.goal.cancel()
     assert wanted.outcomes == []
     # This server had pursued it before it looked at the cancellation; what counts is that there is one end.
     assert (await wanted.end()).status in (SUCCEEDED, CANCELED)
     assert len(wanted.outcomes) == 1
+
+
+@pytest_twisted.ensureDeferred
+async def test_goal_cancelled_before_it_was_sent_is_not_sent(ros: Ros2Platform, peer: Peer) -> None:
+    """However busy the executor was, no movement begins after the stop that cancelled it."""
+    await serve(ros, peer, "/count", "count")
+    await Wanted(ros, "/count", 5).end()
+    free = threading.Event()
+    ros._goals.spinner.do(free.wait, 10)
+    wanted = Wanted(ros, "/count", 7)
+    wanted.goal.cancel()
+    free.set()
+    status, _, reason, certain = await wanted.end()
+    assert (status, certain) == (NEVER_BEGAN, True)
+    assert "cancelled before it began" in reason
+    await Wanted(ros, "/count", 6).end()
+    assert 7 not in [each["order"] for each in peer.told("began", "/count")]
 
 
 @pytest_twisted.ensureDeferred
@@ -162,6 +182,24 @@ async def test_server_that_vanishes_is_not_waited_for(ros: Ros2Platform, peer: P
     status, body, reason, certain = await wanted.end()
     assert (status, body, certain) == (ABORTED, None, False)
     assert "/doomed vanished" in reason
+
+
+@pytest_twisted.ensureDeferred
+async def test_wishes_to_cancel_that_nobody_answers_are_not_kept(
+    ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They go with their goal when it is given up."""
+    await serve(ros, peer, "/forever", "forever")
+    wanted = Wanted(ros, "/forever", 3)
+    await until(lambda: wanted.goal._handle)
+    waiting = wanted.goal._client.ros._pending_cancel_requests
+    with peer.frozen():
+        for _ in range(3):
+            wanted.goal.cancel()
+        await until(lambda: len(waiting) == 3)
+        monkeypatch.setattr(ros._goals, "servers", lambda action: frozenset())
+        assert "vanished" in (await wanted.end()).reason
+        await until(lambda: not waiting)
 
 
 @pytest_twisted.ensureDeferred

@@ -12,9 +12,9 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor
 
+from relay_protocol.clocks import now_ns
 from relay_protocol.link import MotionPolicy
 from robot_client.authority import Authority
-from robot_client.clocks import now_ns
 from robot_client.guard_feed import NoGuard
 from robot_client.motion import MOTION_QOS, MotionDesk
 from robot_client.offset import Offset

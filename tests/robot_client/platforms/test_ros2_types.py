@@ -8,19 +8,26 @@ from pathlib import Path
 
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import Transform, Twist, TwistStamped, Vector3
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import BatteryState, Image, Joy
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import (
+    JointTrajectory,
+    JointTrajectoryPoint,
+    MultiDOFJointTrajectory,
+    MultiDOFJointTrajectoryPoint,
+)
 
 from relay_protocol.errors import Invalid, NotFound
 from robot_client.platforms.base import Motion
-from robot_client.platforms.ros2_motion import JOY, TRAJECTORY
+from robot_client.platforms.ros2_motion import JOY
 from robot_client.platforms.ros2_types import Types, introspected
 from tests.robot_client.platforms.ends import STAMPED, TWIST
 
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
 KINDS = {
     "message": "std_msgs/msg/String",
     "service": "std_srvs/srv/Trigger",
@@ -143,6 +150,25 @@ def test_a_trajectory_moves_wherever_it_leads() -> None:
     assert deserialize_message(zero, JointTrajectory).joint_names == ["a"]
     way.points[0].positions = [float("inf")]
     assert types.judge(TRAJECTORY, bytes(serialize_message(way))) is Motion.INVALID
+
+
+def test_a_trajectory_of_bodies_moves_wherever_it_leads() -> None:
+    """As that of joints does, though no number in it is any but zero; none of them may be endless."""
+    types = Types()
+    way = MultiDOFJointTrajectory(joint_names=["base"], points=[MultiDOFJointTrajectoryPoint()])
+    way.header.frame_id = "map"
+    body = bytes(serialize_message(way))
+    assert types.judge(MULTI_DOF, body) is Motion.MOVING
+    zero = types.zero(MULTI_DOF, Time(sec=9), types.resting(MULTI_DOF, body))
+    assert types.judge(MULTI_DOF, zero) is Motion.STILL
+    said = deserialize_message(zero, MultiDOFJointTrajectory)
+    assert (said.joint_names, list(said.points)) == (["base"], [])
+    assert (said.header.frame_id, said.header.stamp.sec) == ("map", 9)
+    way.points[0].velocities = [Twist(linear=Vector3(x=float("nan")))]
+    assert types.judge(MULTI_DOF, bytes(serialize_message(way))) is Motion.INVALID
+    way.points[0].velocities = []
+    way.points[0].transforms = [Transform(translation=Vector3(y=float("inf")))]
+    assert types.judge(MULTI_DOF, bytes(serialize_message(way))) is Motion.INVALID
 
 
 def test_zeros_of_a_velocity_are_all_alike() -> None:

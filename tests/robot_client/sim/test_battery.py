@@ -4,7 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_client.sim.battery import CAPACITY_AH, EMPTY_VOLTS, FULL_VOLTS, IDLE_AMPERES, Battery
+from robot_client.sim.battery import (
+    CAPACITY_AH,
+    CHARGER_AMPERES,
+    EMPTY_VOLTS,
+    FULL_VOLTS,
+    IDLE_AMPERES,
+    Battery,
+)
 
 
 def test_standing_drains_the_idle_current() -> None:
@@ -34,3 +41,16 @@ def test_charge_only_falls_and_stays_within_bounds(steps: list[tuple[float, floa
         battery.step(seconds, speed, turn)
         assert 0 <= battery.charge <= before
         assert EMPTY_VOLTS - 1 < battery.voltage <= FULL_VOLTS
+
+
+def test_a_charger_fills_it_and_then_feeds_the_robot() -> None:
+    """A tenth comes back in minutes; a full one draws nothing, gives nothing, and drains again without."""
+    battery = Battery(0.1)
+    battery.step(300, 0.0, 0.0, charging=True)
+    assert battery.charging and battery.current == pytest.approx(IDLE_AMPERES - CHARGER_AMPERES)
+    assert battery.charge == pytest.approx(0.1 + (CHARGER_AMPERES - IDLE_AMPERES) / 12 / CAPACITY_AH)
+    battery.step(7200, 0.0, 0.0, charging=True)
+    battery.step(1, 0.0, 0.0, charging=True)
+    assert (battery.charge, battery.current) == (1.0, 0.0)
+    battery.step(60, 0.0, 0.0)
+    assert battery.charge < 1.0 and not battery.charging

@@ -51,3 +51,9 @@ def test_camera_tells_whether_it_streams(
     """Off is stale, not broken; on without viewers is fine."""
     finding = health.camera(enabled, viewers, 10, 3.0)
     assert (finding.severity, finding.message) == (severity, message)
+
+
+def test_a_battery_that_charges_is_never_low() -> None:
+    """However little is in it."""
+    assert health.battery(0.01, 19.9, -8.8, charging=True)[1:3] == (Severity.OK, "charging")
+    assert health.battery(1.0, 25.2, 0.0, charging=True)[1:3] == (Severity.OK, "full")

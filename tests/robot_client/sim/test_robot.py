@@ -9,6 +9,7 @@ import pytest
 
 from robot_client.sim.recorder import Recorder
 from robot_client.sim.robot import SCAN_FARTHEST, SCAN_RAYS, Robot
+from robot_client.sim.world import Pose
 from robot_client.sim.worlds import WORLDS
 
 STEP = 0.02
@@ -111,3 +112,22 @@ def test_noise_repeats_with_its_seed_only() -> None:
     assert np.array_equal(one, same)
     assert not np.array_equal(one, other)
     assert one[np.isfinite(one)].max() <= SCAN_FARTHEST
+
+
+def test_it_is_charged_while_it_stands_at_the_charger() -> None:
+    """Not while it drives there, nor where none is; a reset gives back the charge of the beginning."""
+    place = Pose(-2.7, -4.0, -math.pi / 2)
+    robot = Robot(WORLDS["default"](), Recorder(None), 1, clock=lambda: 0.0, charge=0.15)
+    robot.step(STEP)
+    assert robot.battery.charge < 0.15 and not robot.battery.charging
+    robot.body.reset(place)
+    robot.command(0.0, 1.0)
+    robot.step(STEP)
+    assert not robot.battery.charging
+    robot.body.reset(place)
+    robot.step(STEP)
+    before = robot.battery.charge
+    robot.step(60.0)
+    assert robot.battery.charging and robot.battery.charge > before
+    robot.reset()
+    assert (robot.battery.charge, robot.battery.charging) == (0.15, False)

@@ -30,7 +30,7 @@ from std_srvs.srv import Trigger
 from switchboard_domains import free_domain
 from switchboard_processes import mortal
 
-PATIENCE = 30.0
+PATIENCE = 60.0
 """Seconds; only a failure takes that long."""
 DOMAIN = free_domain()
 SETTINGS = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from robot_client.sim.drive import RADIUS
-from robot_client.sim.world import Circle, Colour, Look, Pose, Segment, Texture, World, box
+from robot_client.sim.world import Charger, Circle, Colour, Look, Pose, Segment, Texture, World, box
 from robot_client.sim.worlds import WORLDS
 
 GREY = Look(Colour(128, 128, 128), Texture.BRICK)
@@ -99,3 +99,15 @@ def test_default_world_shows_many_colours() -> None:
     """All looks of the hall can be told apart by colour."""
     looks = {look.colour for look in WORLDS["default"]().looks}
     assert len(looks) >= 8
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "charged"),
+    [(0.0, -2.5, True), (0.4, -2.7, True), (0.0, -2.3, False), (0.7, -2.9, False), (0.0, -3.3, False)],
+)
+def test_a_charger_reaches_who_stands_before_it(x: float, y: float, charged: bool) -> None:
+    """Not who is too far, nor who is behind its wall."""
+    walls = box(0, 0, 8.0, 6.0, 0.0, GREY)
+    world = World(walls, [], Pose(0, 0, 0), (Charger(wall=1, along=4.0, marker=1),))
+    assert world.charges(x, y) is charged
+    assert not room().charges(x, y)

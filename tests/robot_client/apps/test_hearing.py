@@ -1,0 +1,138 @@
+"""Words in speech, and what is none: made by eSpeak NG, heard faster than it was spoken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from switchboard_speech import RATE, Samples, spaced, speech
+
+from robot_client.apps.hearing import (
+    BEFORE,
+    BEGINS,
+    ENDS,
+    LONGEST,
+    SHORTEST,
+    Cutter,
+    Recogniser,
+    has_voice,
+    may_be_word,
+)
+from robot_client.apps.sounds import BLOCK, SIZE
+from robot_client.apps.words import Word
+
+
+def blocks(samples: Samples) -> list[bytes]:
+    """As they come."""
+    data = samples.tobytes()
+    return [data[at : at + SIZE] for at in range(0, len(data) - SIZE + 1, SIZE)]
+
+
+@pytest.fixture(scope="module")
+def ear() -> Recogniser:
+    """Its model takes half a second to read."""
+    return Recogniser()
+
+
+def heard(ear: Recogniser, samples: Samples) -> list[tuple[Word, float]]:
+    """The words, and the second at which each was found to have ended."""
+    return [
+        (word, (number + 1) * BLOCK - before)
+        for number, data in enumerate(blocks(samples))
+        for word, before in ear.hear(data)
+    ]
+
+
+def test_all_words_are_heard_and_when_they_ended(ear: Recogniser) -> None:
+    """One after the other, to a seventh of a second."""
+    parts = [speech(word.value) for word in Word]
+    found = heard(ear, spaced(*parts))
+    assert [word for word, _ in found] == list(Word)
+    ends = np.cumsum([0.7 + len(part) / RATE for part in parts])
+    assert [at for _, at in found] == pytest.approx(ends, abs=0.15)
+
+
+@pytest.mark.parametrize("word", [Word.STOP, Word.AHEAD])
+def test_a_word_is_heard_softly_and_loudly(ear: Recogniser, word: Word) -> None:
+    """Over a factor of three."""
+    samples = speech(word.value).astype(float)
+    for gain in (0.3, 1.0):
+        assert [each for each, _ in heard(ear, spaced((samples * gain).astype(np.int16)))] == [word]
+
+
+def test_other_words_and_sentences_are_not_taken_for_those(ear: Recogniser) -> None:
+    """Neither such as it was told of nor others."""
+    said = [
+        "hello",
+        "window",
+        "purple elephant",
+        "monkey",
+        "what time is it tomorrow",
+        "seventeen",
+        "good morning",
+    ]
+    assert heard(ear, spaced(*map(speech, said))) == []
+
+
+def noises() -> list[Samples]:
+    """Hiss, claps, a hum and a whistle."""
+    random = np.random.default_rng(7)
+    moments = np.arange(RATE) / RATE
+    hiss = random.normal(0, 3000, RATE)
+    claps = random.normal(0, 9000, RATE) * np.exp(-(moments % 0.4) * 40)
+    hum = 6000 * np.sin(2 * np.pi * 110 * moments)
+    whistle = 6000 * np.sin(2 * np.pi * (700 + 300 * moments) * moments)
+    return [each.clip(-32000, 32000).astype(np.int16) for each in (hiss, claps, hum, whistle)]
+
+
+def test_noise_is_no_word(ear: Recogniser) -> None:
+    """Of no kind, and not for long."""
+    assert heard(ear, spaced(*noises())) == []
+    assert heard(ear, np.concatenate(noises() * 2)) == []
+
+
+def test_a_word_is_heard_behind_noise(ear: Recogniser) -> None:
+    """Hiss and claps have not spoilt what comes after them."""
+    found = heard(ear, spaced(*noises()[:2], speech("stop"), gap=1.0))
+    assert [word for word, _ in found] == [Word.STOP]
+
+
+def test_silence_has_no_voice_and_speech_has() -> None:
+    """Hiss, however loud, has none."""
+    assert not has_voice(bytes(SIZE))
+    assert not any(map(has_voice, blocks(noises()[0])))
+    assert sum(map(has_voice, blocks(speech("ahead")))) > 5
+
+
+def test_what_is_spoken_is_cut_out_with_some_silence_around() -> None:
+    """What is between is not cut: it is shorter."""
+    cutter = Cutter(lambda data: data == b"!")
+    plan = "." * 20 + "!" * 5 + "." * (ENDS - 1) + "!" * 5 + "." * 20
+    cuts = [cut for each in plan if (cut := cutter.take(each.encode()))]
+    (cut,) = cuts
+    spoken = b"".join(cut).decode()
+    assert spoken == "." * BEFORE + "!" * 5 + "." * (ENDS - 1) + "!" * 5 + "." * ENDS
+
+
+def test_a_single_block_is_no_speech() -> None:
+    """It takes some in a row."""
+    cutter = Cutter(lambda data: data == b"!")
+    plan = ("." * 5 + "!" * (BEGINS - 1)) * 5 + "." * 20
+    assert [cutter.take(each.encode()) for each in plan] == [None] * len(plan)
+
+
+def test_of_a_speech_without_end_no_more_is_kept_than_tells_its_length() -> None:
+    """It is too long to be a word."""
+    cutter = Cutter(lambda data: data == b"!")
+    cuts = [cut for each in "!" * 5000 + "." * ENDS if (cut := cutter.take(each.encode()))]
+    assert len(cuts[0]) < BEFORE + LONGEST + ENDS + BEGINS
+    assert not may_be_word(cuts[0])
+
+
+def test_what_is_too_short_or_too_long_is_no_word() -> None:
+    """Though it has a voice."""
+    voice = next(each for each in blocks(speech("ahead")) if has_voice(each))
+    around = BEFORE + ENDS
+    assert may_be_word([voice] * (around + SHORTEST))
+    assert not may_be_word([voice] * (around + SHORTEST - 1))
+    assert may_be_word([voice] * (around + LONGEST))
+    assert not may_be_word([voice] * (around + LONGEST + 1))

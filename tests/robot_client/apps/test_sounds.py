@@ -1,0 +1,143 @@
+"""Where speech comes from, and when it was spoken."""
+
+from __future__ import annotations
+
+import builtins
+import io
+import wave
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from robot_client.apps import sounds
+from robot_client.apps.sounds import AFTER, BLOCK, KEPT, RATE, SIZE, Moments, Tape
+
+
+def written(path: Path, seconds: float, channels: int = 1, rate: int = RATE) -> Path:
+    """A WAV file."""
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(channels)
+        file.setsampwidth(2)
+        file.setframerate(rate)
+        file.writeframes(b"\x01\x00" * int(seconds * rate * channels))
+    return path
+
+
+def test_a_file_is_as_long_as_it_was_spoken(tmp_path: Path) -> None:
+    """With silence behind, and a wait before each block."""
+    waits: list[float] = []
+    blocks = list(sounds.from_file(written(tmp_path / "a.wav", 0.3), waits.append))
+    assert len(blocks) == round((0.3 + AFTER) / BLOCK)
+    assert {len(each) for each in blocks} == {SIZE}
+    assert sum(each == b"\x01\x00" * (SIZE // 2) for each in blocks) == 10
+    assert len(waits) == len(blocks)
+    assert max(waits) > BLOCK / 2
+
+
+@pytest.mark.parametrize("form", [{"channels": 2}, {"rate": 44100}])
+def test_a_file_of_another_form_is_refused_in_words(tmp_path: Path, form: dict[str, int]) -> None:
+    """What it has, and what is needed."""
+    with pytest.raises(click.ClickException, match="16000 Hz"):
+        list(sounds.from_file(written(tmp_path / "a.wav", 0.1, **form)))
+
+
+class _Pipe(io.RawIOBase):
+    """Gives 700 bytes at a time, at most."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def read(self, size: int = -1) -> bytes:
+        given, self._data = self._data[: min(size, 700)], self._data[min(size, 700) :]
+        return given
+
+
+def test_samples_from_a_stream_come_in_whole_blocks() -> None:
+    """However they come; what is less at the end is nothing."""
+    data = bytes(range(256)) * (2 * SIZE // 256 + 1)
+    blocks = list(sounds.from_stream(_Pipe(data[: 2 * SIZE + 5])))
+    assert blocks == [data[:SIZE], data[SIZE : 2 * SIZE]]
+
+
+def test_without_sounddevice_a_microphone_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With what to install, and what works without."""
+    real: Callable[..., Any] = builtins.__import__
+
+    def without(name: str, *rest: Any) -> Any:
+        if name == "sounddevice":
+            raise ImportError("no such module")
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(click.ClickException, match=r"pip install sounddevice.*--wav"):
+        sounds.from_microphone(None)
+
+
+def test_blocks_that_come_in_time_ended_when_they_came() -> None:
+    """To the jitter."""
+    moments = Moments()
+    assert [moments.of_next(100.0 + n * BLOCK) for n in range(3)] == pytest.approx(
+        [100.0 + n * BLOCK for n in range(3)]
+    )
+
+
+def test_blocks_that_were_held_up_ended_before_they_came() -> None:
+    """As when the program stood still for a second: all come at once then."""
+    moments = Moments()
+    moments.of_next(100.0)
+    late = [moments.of_next(101.0 + BLOCK) for _ in range(10)]
+    assert late == pytest.approx([100.0 + (n + 1) * BLOCK for n in range(10)])
+
+
+class _Clock:
+    """Each look at it takes as long as a block."""
+
+    now = 5.0
+
+    def __call__(self) -> float:
+        self.now += BLOCK
+        return self.now
+
+
+def test_a_tape_keeps_the_newest() -> None:
+    """Who is too slow hears no old things."""
+    tape = Tape(iter([bytes([n]) for n in range(KEPT + 10)]), _Clock())
+    tape.start()
+    tape.join()
+    heard = list(tape)
+    assert len(heard) == KEPT - 1  # and the end
+    assert heard[-1].data == bytes([KEPT + 9])
+
+
+def test_a_source_that_breaks_ends_the_tape_and_says_why() -> None:
+    """What came before is heard."""
+
+    def source() -> Any:
+        yield b"a"
+        raise OSError("unplugged")
+
+    tape = Tape(source(), _Clock())
+    tape.start()
+    (block,) = tape
+    assert block == (b"a", pytest.approx(5.0 + 2 * BLOCK))
+    assert "unplugged" in tape.broken
+
+
+def test_sound_that_lay_ready_at_the_start_is_dropped() -> None:
+    """A full pipe is of nobody knows when; a burst after the first wait was held up, and is kept."""
+    now = 5.0
+
+    def source() -> Iterator[bytes]:
+        nonlocal now
+        for number in range(20):
+            now += BLOCK if number in (10, 15) else 0.001
+            yield bytes([number])
+
+    tape = Tape(source(), lambda: now)
+    tape.start()
+    heard = list(tape)
+    assert [each.data[0] for each in heard] == list(range(10, 20))
+    assert heard[0].at == pytest.approx(5.0 + 10 * 0.001 + BLOCK)

@@ -1,0 +1,220 @@
+"""Positions from NMEA sentences, and where those come from."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import threading
+from functools import reduce
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from switchboard_waiting import wait_for
+
+from relay_protocol.errors import Invalid, Unavailable
+from robot_client.services.gps import APPROXIMATED, LONGEST, NO_FIX, SBAS_FIX, Lines, Nmea
+from robot_client.services.gps_source import Reader, Recording, opener
+from robot_client.services.health import Level
+
+
+def sentence(body: str) -> bytes:
+    """With its sum."""
+    return f"${body}*{reduce(lambda total, each: total ^ each, body.encode(), 0):02X}".encode()
+
+
+GGA = sentence("GPGGA,123519.00,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,")
+
+
+def test_a_fix_is_read() -> None:
+    """Degrees, height over the ellipsoid, and what a dilution of 0.9 stands for."""
+    fix = Nmea().read(GGA)
+    assert fix is not None
+    assert (fix.latitude, fix.longitude) == pytest.approx((48.1173, 11.516667), abs=1e-6)
+    assert fix.altitude == pytest.approx(545.4 + 46.9)
+    assert (fix.status, fix.service) == (0, 1)
+    assert fix.variances == pytest.approx((12.96, 12.96, 51.84))
+
+
+def test_south_and_west_are_negative_and_a_better_fix_is_surer() -> None:
+    """A differential fix of several systems, after one was heard by its own name."""
+    nmea = Nmea()
+    nmea.read(sentence("GAGSV,1,1,00"))
+    fix = nmea.read(sentence("GNGGA,000000,3351.500,S,15112.500,W,2,12,1.0,10.0,M,,M,,"))
+    assert fix is not None
+    assert (fix.latitude, fix.longitude) == pytest.approx((-33.858333, -151.208333), abs=1e-6)
+    assert fix.status == SBAS_FIX
+    assert fix.variances is not None and fix.variances[0] == pytest.approx(1.0)
+    assert math.isnan(fix.altitude)  # over the sea, but not over the ellipsoid
+
+
+@pytest.mark.parametrize("quality", ["0", "6", "7", "8", ""])
+def test_without_a_fix_there_are_no_coordinates(quality: str) -> None:
+    """Also when a receiver repeats its last position, estimates one or simulates."""
+    fix = Nmea().read(sentence(f"GPGGA,123519,4807.038,N,01131.000,E,{quality},00,,,M,,M,,"))
+    assert fix is not None
+    assert fix.status == NO_FIX
+    assert math.isnan(fix.latitude) and math.isnan(fix.longitude) and fix.variances is None
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        GGA[:-1] + b"0",
+        GGA[: GGA.index(b"*")],
+        GGA[:30],
+        b"\xff\x00\x80" * 9,
+        b"hello",
+        sentence("GPGGA,123519,9907.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"),
+        sentence("GPGGA,123519,x,N,y,E,1,08,0.9,545.4,M,46.9,M,,"),
+        sentence("GPGGA,123519,4807.038,N,01131.000,E,1,08,nan,545.4,M,46.9,M,,"),
+        sentence("GPGGA,123519,4807.038,N,01131.000,E,z,08,0.9,545.4,M,46.9,M,,"),
+        sentence("GPGGA,1"),
+    ],
+)
+def test_a_bad_sentence_is_counted_and_the_next_is_read(bad: bytes) -> None:
+    """A wrong sum, noise, half a sentence, fields that make no sense."""
+    nmea = Nmea()
+    nmea.read(bad)
+    assert nmea.read(GGA) is not None
+    assert (nmea.good, nmea.bad) in ((1, 1), (2, 0))
+    assert nmea.last is not None and nmea.last.variances is not None
+
+
+def test_a_wrong_sum_counts_as_bad() -> None:
+    """One of each."""
+    nmea = Nmea()
+    assert nmea.read(GGA[:-1] + b"0") is None
+    assert (nmea.good, nmea.bad) == (0, 1)
+
+
+def test_other_sentences_are_good_but_no_fix() -> None:
+    """Known and unknown kinds."""
+    nmea = Nmea()
+    assert nmea.read(sentence("GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W")) is None
+    assert nmea.read(sentence("GPXYZ,1,2")) is None
+    assert (nmea.good, nmea.bad) == (2, 0)
+
+
+def test_a_sentence_after_a_cut_one_on_the_same_line_is_read() -> None:
+    """As after a byte that was lost with a line's end."""
+    assert Nmea().read(GGA[:20] + GGA) is not None
+
+
+@given(st.binary(max_size=100))
+def test_no_bytes_break_it(noise: bytes) -> None:
+    """Whatever comes, the next sentence is read."""
+    nmea = Nmea()
+    nmea.read(noise)
+    nmea.read(b"$" + noise)
+    assert nmea.read(GGA) is not None
+
+
+@given(st.lists(st.integers(0, 120), max_size=6))
+def test_lines_do_not_depend_on_how_bytes_come(cuts: list[int]) -> None:
+    """In whichever pieces, the same lines."""
+    data = GGA + b"\r\n\r\n" + GGA + b"\nrest"
+    lines = Lines()
+    found: list[bytes] = []
+    at = 0
+    for cut in [*sorted(cuts), len(data)]:
+        found += lines.feed(data[at:cut])
+        at = max(at, cut)
+    assert found == [GGA, GGA]
+
+
+def test_what_is_too_long_for_a_line_is_thrown_away() -> None:
+    """It is counted once, memory stays bounded, and the next line is whole."""
+    lines = Lines()
+    for _ in range(100):
+        assert list(lines.feed(b"x" * LONGEST)) == []
+    assert list(lines.feed(b"end\n" + GGA + b"\n")) == [GGA]
+    assert lines.too_long == 1
+    assert len(lines._rest) <= LONGEST
+
+
+def test_the_recording_of_the_documentation_is_a_round_with_a_tunnel() -> None:
+    """All of its sentences are good; it leaves the sky once, and ends near where it began."""
+    lines, nmea = Lines(), Nmea()
+    data = Path(__file__).parents[3].joinpath("docs/examples/drive.nmea").read_bytes()
+    fixes = [fix for line in lines.feed(data) if (fix := nmea.read(line))]
+    assert (nmea.good, nmea.bad, len(fixes)) == (120, 0, 60)
+    assert sum(fix.status == NO_FIX for fix in fixes) == 3
+    assert abs(fixes[0].latitude - fixes[-1].latitude) < 1e-4
+
+
+def test_the_finding_tells_how_good_it_is() -> None:
+    """Nothing heard, no fix, a fix with its sigma."""
+    nmea = Nmea()
+    assert nmea.finding().message == "no position was heard yet"
+    nmea.read(sentence("GPGGA,123519,,,,,0,00,,,M,,M,,"))
+    assert nmea.finding().message == "the receiver has no fix"
+    nmea.read(GGA)
+    nmea.read(b"$noise")
+    found = nmea.finding(too_long=2)
+    assert (found.level, found.message) == (Level.OK, "a fix of 8 satellites")
+    assert found.values == {"sentences": "2", "bad_sentences": "3", "satellites": "8", "sigma_m": "3.60"}
+    assert APPROXIMATED == 1
+
+
+@pytest.mark.parametrize("bad", ["tcp://host", "tcp://:1", "tcp://host:0", "tcp://host:99999", "tcp://a:b:1"])
+def test_an_address_that_is_none_is_refused(bad: str) -> None:
+    """In words, before anything is opened."""
+    with pytest.raises(Invalid):
+        opener(bad, 9600, 1.0)
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    """In words."""
+    with pytest.raises(Unavailable, match="No such file"):
+        opener(str(tmp_path / "none"), 9600, 1.0)
+
+
+def test_a_recording_has_its_pace(tmp_path: Path) -> None:
+    """It waits before each position, and ends."""
+    file = tmp_path / "drive.nmea"
+    file.write_bytes(GGA + b"\n" + sentence("GPXYZ,1") + b"\n" + GGA + b"\n")
+    waited: list[float] = []
+    recording = Recording(file, 0.5, waited.append)
+    assert b"".join(recording.read() for _ in range(3)) == file.read_bytes()
+    with pytest.raises(EOFError):
+        recording.read()
+    recording.close()
+    assert waited == [0.5, 0.5]
+
+
+def test_a_server_that_hangs_up_is_dialled_again() -> None:
+    """What it sends comes, also from the second connection."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        came: list[bytes] = []
+        reader = Reader("test", opener(f"tcp://127.0.0.1:{server.getsockname()[1]}", 9600, 1.0), came.append)
+        try:
+            for word in (b"one", b"two"):
+                connection, _ = server.accept()
+                connection.sendall(word)
+                wait_for("it comes", lambda word=word: word in b"".join(came))
+                assert reader.finding() is None
+                connection.close()
+        finally:
+            reader.close()
+
+
+def test_a_serial_device_is_read_and_found_again() -> None:
+    """A terminal is set raw, so that nothing is translated; one that is gone is an error in words."""
+    master, slave = os.openpty()
+    came: list[bytes] = []
+    reader = Reader("the receiver", opener(os.ttyname(slave), 4800, 1.0), came.append)
+    try:
+        wait_for(
+            "it is read",
+            lambda: os.write(master, b"$A\x03\r\n") and b"$A\x03\r\n" in b"".join(came),
+        )
+        os.close(slave)
+        os.close(master)
+        trouble = wait_for("the loss", reader.finding)
+        assert trouble.level is Level.ERROR and trouble.message.startswith("the receiver: ")
+    finally:
+        reader.close()
+    assert "gps-source" not in {each.name for each in threading.enumerate()}

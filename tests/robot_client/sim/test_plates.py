@@ -1,0 +1,82 @@
+"""Chargers in the camera's picture: their markers are found where they are."""
+
+import math
+
+import numpy as np
+import pytest
+
+from robot_client.services.lens import of_view
+from robot_client.services.markers import Detector, Seen
+from robot_client.sim.camera import Camera
+from robot_client.sim.plates import MARKER_SIDE
+from robot_client.sim.world import Charger, Circle, Colour, Look, Pose, Segment, Texture, World, box
+from robot_client.sim.worlds import WORLDS
+
+NOON = 1_700_000_000.0
+GREY = Look(Colour(150, 150, 150), Texture.PANEL)
+HALL = WORLDS["default"]()
+LENS = of_view(640, 480, 75)
+CAPTIONS = 430
+"""Row from which there are captions."""
+PLACE = (-2.7, -4.5)
+"""Of the hall's charger."""
+
+
+def seen(world: World, pose: Pose) -> list[Seen]:
+    """Markers in the picture a robot has from there; the plates of its captions, which may look like some, left out."""
+    picture = Camera(world).render(pose, 0.0, NOON)
+    picture[CAPTIONS:] = 128
+    return Detector("4X4_50", MARKER_SIDE).find(picture, LENS)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "aside"),
+    [(-2.4, -0.4, 0.0), (-2.7, -2.5, 0.3), (-2.7, -2.5, -0.3), (-1.9, -3.2, 0.1), (-2.7, -4.05, 0.0)],
+)
+def test_the_marker_of_the_hall_is_found_where_it_is(x: float, y: float, aside: float) -> None:
+    """From the start, from near, from the side and at the charger: its distance and its bearing."""
+    ahead = math.atan2(PLACE[1] - y, PLACE[0] - x)
+    (found,) = seen(HALL, Pose(x, y, ahead - aside))
+    assert found.number == 7
+    assert found.distance == pytest.approx(math.hypot(PLACE[0] - x, PLACE[1] - y), rel=0.05)
+    assert found.bearing == pytest.approx(aside, abs=math.radians(1.5))
+
+
+def room(*pillars: Circle) -> World:
+    """A room with a charger ahead of the start."""
+    walls = box(0.0, 0.0, 6.0, 6.0, 0.0, GREY)
+    # The wall in the east runs from south to north.
+    return World(walls, list(pillars), Pose(0.0, 0.0, 0.0), (Charger(wall=2, along=3.0, marker=3),))
+
+
+def test_it_is_hidden_by_what_stands_before_it() -> None:
+    """And is there without."""
+    assert [each.number for each in seen(room(), Pose(0.0, 0.0, 0.0))] == [3]
+    assert seen(room(Circle(1.5, 0.0, 0.4, GREY)), Pose(0.0, 0.0, 0.0)) == []
+
+
+def test_it_is_not_seen_from_behind() -> None:
+    """A wall has two sides, and a charger looks to one."""
+    walls = [Segment(1.0, -2.0, 1.0, 2.0, GREY)]
+    for side, heading in ((-1.0, 0.0), (1.0, math.pi)):
+        world = World(walls, [], Pose(0, 0, 0), (Charger(wall=0, along=2.0, marker=3),))
+        found = seen(world, Pose(1.0 + 1.5 * side, 0.0, heading))
+        assert [each.number for each in found] == ([3] if side < 0 else [])
+
+
+def test_the_rest_of_the_picture_is_the_same() -> None:
+    """Looking elsewhere nothing is drawn; looking there only the plate is."""
+    bare = World(list(HALL.segments), list(HALL.circles), HALL.start)
+    for heading, changed in ((0.0, False), (-math.pi / 2, True)):
+        pose = Pose(HALL.start.x, HALL.start.y, heading)
+        one, other = (Camera(world).render(pose, 0.0, NOON).astype(int) for world in (HALL, bare))
+        share = float((one != other).any(axis=2).mean())
+        assert (0 < share < 0.03) if changed else share == 0.0
+
+
+@pytest.mark.parametrize("heading", [-math.pi / 2, 0.0, math.pi, -0.3])
+def test_right_before_the_lens_it_still_draws(heading: float) -> None:
+    """No number overflows, whichever way the robot looks."""
+    with np.errstate(all="raise", under="ignore"):
+        frame = Camera(HALL).render(Pose(PLACE[0], PLACE[1] + 0.001, heading), 0.0, NOON)
+    assert frame.shape == (480, 640, 3)
