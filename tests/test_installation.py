@@ -18,7 +18,7 @@ SERVER_ONLY = [
     "prometheus_client",
     "rich",
 ]
-ROBOT_ONLY = ["rclpy", "cv2", "av", "psutil"]
+ROBOT_ONLY = ["rclpy", "cv2", "av"]
 VIDEO_ONLY = ["numpy", "cv2", "av"]
 
 WITHOUT = """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.driving import ages_ms, stamped_turn
+from bench.driving import ages_ms, sent_before, stamped_turn
 
 MS = 1_000_000
 
@@ -18,6 +18,18 @@ def test_the_age_of_a_command_is_read_from_the_record(sent: int) -> None:
         {"event": "standstill", "t": sent + 310 * MS},
     ]
     assert ages_ms(record) == pytest.approx([250.0], abs=0.01)
+
+
+@pytest.mark.parametrize(("sent", "before"), [(-MS, True), (0, False), (5 * MS, False)])
+def test_a_command_from_before_a_moment_is_known(sent: int, before: bool) -> None:
+    """Though it was carried out after it; zeros are no matter."""
+    moment = 123_456_789_012_000
+    record = [
+        {"event": "command", "t": moment + 300 * MS, "v": 0.0, "w": 0.0},
+        {"event": "command", "t": moment + 400 * MS, "v": 0.2, "w": stamped_turn(moment + sent)},
+        {"event": "moving", "t": moment + 401 * MS},
+    ]
+    assert sent_before(moment, record) is before
 
 
 def test_what_is_written_into_a_command_moves_nothing_else() -> None:

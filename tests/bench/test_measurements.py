@@ -22,11 +22,14 @@ LEAST_ROWS = {
     "endtoend": 1,
     "crowd": 10,
     "soak": 7,
-    "video": 15,
+    "video": 16,
     "browser": 6,
     "standstill": 3,
     "control": 6,
     "stopping": 4,
+    "alerts": 5,
+    "apps": 8,
+    "memory": 10,
 }
 
 

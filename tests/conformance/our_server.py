@@ -44,11 +44,11 @@ class OurServer:
         node.wait_to_say("READY")
         daemon = [str(BIN / "switchboard-robot"), "run", "--state", str(state)]
         self._running.append(Process(daemon, folder, "daemon", environment))
-        wait_for("the robot is online", lambda: relay.state_of(ROBOT) != "offline", 30)
+        wait_for("the robot is online", lambda: relay.state_of(ROBOT) != "offline")
         server = Server(relay.url(ROBOT), token)
         with server.connect() as client:
             known = lambda: "/conformance/do" in client.values("/rosapi/services")["services"]  # noqa: E731
-            wait_for("the robot's graph is known", known, 20)
+            wait_for("the robot's graph is known", known)
         return server
 
     def stop(self) -> None:

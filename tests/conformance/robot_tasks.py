@@ -16,6 +16,8 @@ TWIST = "geometry_msgs/msg/Twist"
 TRIGGER = "std_srvs/srv/Trigger"
 FIBONACCI = "example_interfaces/action/Fibonacci"
 CDR = b"\0\1\0\0"
+OVERTAKEN = 0.1
+"""Seconds by which zero may come before a command that was sent earlier."""
 DRIVER = 11
 """The source that drives, unless a case says another."""
 
@@ -168,12 +170,24 @@ class Wheels:
                     return report
 
     def stands(self, moving: Sample) -> float:
-        """Wait until it stands; seconds from the last report of moving, no earlier than ``moving``, to that."""
+        """Wait until it stands; seconds from the last report of moving, no earlier than ``moving``, to that.
+
+        Zero may overtake the latest command, where another part of the robot says it: what comes next tells.
+        """
+        stood: Sample | None = None
         while True:
-            report = self.watching.expect_sample(1, 3)
-            if self.speed(report) == 0:
-                return (report.stamp - moving.stamp) / 1e9
-            moving = report
+            try:
+                report = self.watching.expect_sample(1, 3 if stood is None else OVERTAKEN)
+            except AssertionError:
+                if stood is None:
+                    raise
+                return (stood.stamp - moving.stamp) / 1e9
+            if self.speed(report) != 0:
+                moving, stood = report, None
+            elif stood is None:
+                stood = report
+            elif report.stamp - stood.stamp > OVERTAKEN * 1e9:
+                return (stood.stamp - moving.stamp) / 1e9
 
     def never_moves(self, seconds: float = ABSENCE) -> None:
         """Nothing but standing is reported within this time."""

@@ -54,6 +54,7 @@ class JsonRobot:
             *("test_publish", "test_large_sample", "test_get_type", "test_get_interfaces"),
             *("test_offer_service", "test_offer_action", "test_goal", "test_cancel"),
             *("test_old_goal_that_moves", "test_old_goal_that_moves_nothing"),
+            "test_goal_sent_before_the_resume",
         )
     )
     """Cases about what it does not offer; with ``--listen`` a robot finds that out by itself."""
@@ -89,6 +90,9 @@ class SensorRobot(JsonRobot):
                 "test_stop_outlives_the_link",
                 "test_resume_moves_nothing",
                 "test_zero_is_letting_go",
+                "test_sent_before_the_resume",
+                "test_stall_is_no_silence",
+                "test_sent_before_control_was_lost",
             ),
             *("test_suppress", "test_suppression_ends_in_time"),
         )

@@ -62,7 +62,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """One Chromium for all tests of a module, which wait for what a page shows."""
-    expect.set_options(timeout=30_000)
+    expect.set_options(timeout=60_000)
     with chromium() as browser:
         yield browser
 

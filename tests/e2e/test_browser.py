@@ -11,14 +11,16 @@ import pytest
 from mcap.reader import make_reader
 from playwright.sync_api import Browser, Page, expect
 from switchboard_browser import hold_joystick, hold_resume, lived_in, ready_to_drive, seen, sound_pages
+from switchboard_drive import LET_GO_SECONDS
 from switchboard_relay import Relay
 from switchboard_robot import Robot
+from switchboard_video import get
 from switchboard_waiting import wait_for
 
 from robot_client.safety import REPEATS
 
 PASSWORD = "correct horse"
-WAIT_SECONDS = 30.0
+WAIT_SECONDS = 60.0
 
 OpenPage = Callable[..., Page]
 
@@ -108,18 +110,19 @@ def colours(page: Page, canvas: str) -> int:
 def stands_after_zero(house: House, page: Page, since: int) -> None:
     """What reached the robot since then ends with zeros alone, and it stands.
 
-    The page says zero once; the robot's daemon repeats it for 200 ms, for subscribers that may have missed it.
+    The page says zero once; the robot's daemon repeats it for 200 ms, for subscribers that may have missed it. A page
+    that was late, as on a busy computer, has had the robot stopped by its watchdog already, in the same way.
     """
 
     def commands() -> list[tuple[float, float]]:
         return [(each["v"], each["w"]) for each in house.robot.events("command", since)]
 
-    wait_for("a zero came", lambda: commands()[-1:] == [(0, 0)], 5)
-    wait_for("the robot stands", lambda: not house.robot.moving(), 5)
+    wait_for("a zero came", lambda: commands()[-1:] == [(0, 0)])
+    wait_for("the robot stands", lambda: not house.robot.moving())
     page.wait_for_timeout(700)  # proves absence: no further command, and no zero but the daemon's repeats
     told = commands()
     last = max(index for index, each in enumerate(told) if each != (0, 0))
-    assert 1 <= len(told[last + 1 :]) <= REPEATS
+    assert 1 <= len(told[last + 1 :]) <= 2 * REPEATS
 
 
 def turn_by_key(house: House, page: Page) -> None:
@@ -231,7 +234,7 @@ def test_a_page_that_is_closed_leaves_the_robot_standing(house: House, open_page
     page.keyboard.down("a")
     wait_for("the robot moves", house.robot.moving)
     page.close()
-    wait_for("the robot stands", lambda: not house.robot.moving(), 5)
+    wait_for("the robot stands", lambda: not house.robot.moving())
 
 
 def test_the_stop_button_stops(house: House, open_page: OpenPage) -> None:
@@ -241,7 +244,7 @@ def test_the_stop_button_stops(house: House, open_page: OpenPage) -> None:
     page.keyboard.down("a")
     wait_for("the robot moves", house.robot.moving)
     seen(page, "stop").click()
-    wait_for("the robot stands", lambda: not house.robot.moving(), 5)
+    wait_for("the robot stands", lambda: not house.robot.moving())
     page.keyboard.up("a")
     expect(seen(page, "stopped")).to_contain_text("By pilot")
     hold_resume(page)
@@ -293,6 +296,9 @@ def test_the_page_recovers_from_a_restart_of_the_relay(house: House, open_page: 
         ready(page)
         first = picture(page, "camera-canvas")
         wait_for("the picture changes", lambda first=first: picture(page, "camera-canvas") != first)
+    # Whoever has driven this robot by the relay that was killed lets go of it first.
+    page.keyboard.press("a", delay=200)
+    page.wait_for_timeout(1000 * LET_GO_SECONDS)  # so long he must say nothing
     turn_by_key(house, page)
 
 
@@ -324,6 +330,8 @@ def test_what_is_recorded_from_the_cockpit_is_downloaded_there(
     seen(page, "recording-start").click()
     expect(seen(page, "recording-state")).to_have_text("Recording")
     expect(seen(page, "recording-messages")).to_have_text(re.compile(r"[1-9]\d+"))
+    # Its first picture goes to all who watch it.
+    assert get(house.relay, house.pilot, "snapshot").status == 200
     watcher = open_page("/cockpit/rover", "watcher")
     expect(seen(watcher, "topic-row").first).to_be_visible()
     expect(seen(watcher, "recordings")).to_have_count(0)

@@ -20,6 +20,8 @@ from switchboard_waiting import wait_for
 
 CLEANERS = ("cleaner-1", "cleaner-2", "cleaner-3")
 
+MOMENT = "switchboard-moment"
+
 
 def starts(robot: SmallRobot, args: Any) -> dict[str, Any]:
     """A service that succeeds."""
@@ -62,7 +64,9 @@ class Fleet:
 
     def orders(self, token: str, **order: Any) -> list[dict[str, Any]]:
         """The lines of an answer."""
-        answer = ask(self.relay.http_port, "POST", "/api/v1/fleet", order, token=token)
+        moment = ask(self.relay.http_port, "GET", "/api/v1/fleet/groups", token=token).headers[MOMENT]
+        dated = {MOMENT: moment}
+        answer = ask(self.relay.http_port, "POST", "/api/v1/fleet", order, headers=dated, token=token)
         assert (answer.status, answer.headers["Content-Type"]) == (200, "application/x-ndjson"), answer.body
         return [json.loads(line) for line in answer.body.splitlines()]
 

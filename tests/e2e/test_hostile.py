@@ -36,7 +36,7 @@ def nobody_notices(world: Any, watchers: list[Watcher]) -> Iterator[None]:
 
 def logs(world: Any, words: str, since: int) -> None:
     """These words come into the relay's log."""
-    wait_for(f"the log says '{words}'", lambda: words in world.relay.log[since:], 5)
+    wait_for(f"the log says '{words}'", lambda: words in world.relay.log[since:])
 
 
 def robot_of_our_own(world: Any) -> tuple[str, bytes]:
@@ -284,7 +284,8 @@ def test_a_flood_of_malformed_messages_ends_the_connection(world: Any) -> None:
     since = len(world.relay.log)
     with world.relay.connect("rover", world.viewer) as client:
         with contextlib.suppress(ConnectionClosed):
-            for _ in range(20_000):
+            # No more than are sent before the relay hangs up on who does not answer its close.
+            for _ in range(2_000):
                 client.connection.send("{]")
         closed = close_of(client)
         assert closed.code == 4429

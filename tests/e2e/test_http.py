@@ -239,6 +239,33 @@ def test_the_stream_tells_when_a_robot_goes_and_comes(world: Any) -> None:
         world.robot.wait_online()
 
 
+def test_a_page_follows_by_websocket_until_its_session_ends(world: Any, cookie: dict[str, str]) -> None:
+    """By its cookie and the relay's own origin; other pages are closed, and a robot's ticket opens nothing here."""
+    url = f"ws://127.0.0.1:{world.relay.http_port}/api/v1/robots/stream"
+    headers = {**cookie, **own_origin(world.relay)}
+    with connect(url, additional_headers=cookie, origin=headers["Origin"]) as page:
+        told = json.loads(page.recv(10))
+        assert told["event"] == "robots"
+        (rover,) = (each for each in told["data"]["robots"] if each["name"] == "rover")
+        listed = ask(world.relay.http_port, "GET", "/api/v1/robots/rover", headers=cookie).json
+        assert rover.keys() == listed.keys()
+        assert json.loads(page.recv(10))["event"] == "alerts"
+        assert ask(world.relay.http_port, "DELETE", "/api/v1/session", headers=headers).status == 204
+        with pytest.raises(ConnectionClosed) as closed:
+            while True:
+                page.recv(10)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 4401
+    with connect(url, additional_headers=cookie, origin="http://evil.example") as page:
+        with pytest.raises(ConnectionClosed) as closed:
+            page.recv(10)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 4403
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"{url}?ticket={ticket(world)}").__enter__()
+    assert refused.value.response.status_code == 401
+
+
 def test_a_ticket_opens_one_websocket_to_one_robot(world: Any) -> None:
     """The second use is refused, so is another robot, and nobody gets a ticket without a right."""
     single = ticket(world)

@@ -1,12 +1,9 @@
-"""Stopping, dying and coming back: of relays, of robots, of the demo; two relays on one host; PostgreSQL."""
+"""Stopping, dying and coming back: of relays and of robots; two relays on one host; PostgreSQL."""
 
 from __future__ import annotations
 
-import contextlib
-import re
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -19,14 +16,14 @@ import psutil
 import psycopg
 import pytest
 from switchboard_client import Client
-from switchboard_http import ask
-from switchboard_processes import BIN, Process, running
+from switchboard_drive import LET_GO_SECONDS
+from switchboard_http import ask, log_in
+from switchboard_processes import Process, running
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_threads import Driver
 from switchboard_waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
 
 CLIENTS = Path(__file__).parent / "clients"
 PASSWORD = "correct horse"
@@ -77,12 +74,13 @@ def close_of(client: Client) -> Any:
 def drives(relay: Relay, robot: Robot, token: str) -> None:
     """An operator makes the robot move, and lets go of it."""
     driver = Driver(relay.connect(robot.name, token))
+    driver.begin_with_a_pause(LET_GO_SECONDS)
     driver.start()
     try:
         wait_for("the robot moves", robot.moving)
     finally:
         driver.stop()
-    wait_for("the robot stands", lambda: not robot.moving(), 5)
+    wait_for("the robot stands", lambda: not robot.moving())
 
 
 # --- the relay --------------------------------------------------------------------------------------------
@@ -102,7 +100,7 @@ def test_a_relay_that_is_ended_says_goodbye_and_leaves_the_robot_standing(house:
         farewell = close_of(client)
         assert farewell.code == 1001
         assert "going down" in farewell.reason
-    wait_for("the robot stands", lambda: not house.robot.moving(), 5)
+    wait_for("the robot stands", lambda: not house.robot.moving())
     driver.stop()
     assert "Traceback" not in house.relay.log
     house.restart()
@@ -112,9 +110,7 @@ def test_a_relay_that_is_ended_says_goodbye_and_leaves_the_robot_standing(house:
 
 def test_a_killed_relay_comes_back_with_sessions_tokens_rights_and_robots(house: House) -> None:
     """After kill -9 a new process has all that was acknowledged; the robot is back by itself."""
-    headers = {"Origin": f"http://127.0.0.1:{house.relay.http_port}"}
-    body = {"user": "driver", "password": PASSWORD}
-    login = ask(house.relay.http_port, "POST", "/api/v1/session", body, headers=headers)
+    cookie = log_in(house.relay.http_port, "driver", PASSWORD)
     house.relay.cli("right", "grant", "viewer", "rover", "operator")
     house.relay.kill()
     house.relay.start()
@@ -123,7 +119,7 @@ def test_a_killed_relay_comes_back_with_sessions_tokens_rights_and_robots(house:
     # On an idle machine this is the time until READY.
     assert used.user + used.system < 3
     house.robot.wait_online(10)
-    session = ask(house.relay.http_port, "GET", "/api/v1/session", headers={"Cookie": login.cookie})
+    session = ask(house.relay.http_port, "GET", "/api/v1/session", headers={"Cookie": cookie})
     assert session.json["user"] == "driver"
     with house.relay.connect("rover", house.viewer) as client:
         wait_for("the robot answers a call", lambda: client.call("/reset")["result"])
@@ -232,121 +228,25 @@ def test_two_relays_live_side_by_side_on_one_host(house: House, tmp_path: Path) 
             drives(other, robot, token)
             assert len(house.robot.events("moving")) == moved
             drives(house.relay, house.robot, house.driver)
-            headers = {"Origin": f"http://127.0.0.1:{other.http_port}"}
-            body = {"user": "driver", "password": PASSWORD}
-            one = ask(other.http_port, "POST", "/api/v1/session", body, headers=headers)
-            headers = {"Origin": f"http://127.0.0.1:{house.relay.http_port}"}
-            two = ask(house.relay.http_port, "POST", "/api/v1/session", body, headers=headers)
             # Browsers send both: cookies know no ports.
-            both = {"Cookie": f"{one.cookie}; {two.cookie}"}
+            both = [log_in(relay.http_port, "driver", PASSWORD) for relay in (other, house.relay)]
             for relay in (other, house.relay):
-                assert ask(relay.http_port, "GET", "/api/v1/session", headers=both).status == 200
+                session = ask(relay.http_port, "GET", "/api/v1/session", headers={"Cookie": "; ".join(both)})
+                assert session.status == 200
 
 
-# --- the demo ---------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def demo_in(folder: Path) -> Iterator[Process]:
-    """``switchboard demo`` on a data folder, killed with all its children at the end, if need be."""
-    command = [sys.executable, str(BIN / "switchboard"), "demo", "--data", str(folder / "demo")]
-    demo = Process(command, folder, "demo")
+def test_a_robot_that_is_removed_is_cut_and_forgotten(tmp_path: Path) -> None:
+    """The command line removes it: its link ends, nobody sees it any more, and its key opens nothing."""
+    relay = Relay(tmp_path)
+    robot = Robot(relay, "rover")
     try:
-        yield demo
+        relay.cli("robot", "remove", "rover", "--yes")
+        wait_for("the robot is forgotten", lambda: relay.cli("status")["robots"] == [])
+        wait_for("it is told", lambda: "not accepted" in robot.daemon.log.read_text())
+        assert relay.cli("status")["robots"] == []
     finally:
-        if demo.popen.poll() is None:
-            for each in psutil.Process(demo.popen.pid).children(recursive=True):
-                each.kill()
-            demo.kill()
-
-
-def test_the_demo_works_for_all_three_logins_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    """READY, three passwords that work, rights as printed; Ctrl-C ends every process within five seconds."""
-    with demo_in(tmp_path) as demo:
-        url = demo.wait_to_say("READY http").split()[1]
-        port = int(url.rpartition(":")[2])
-        logins = dict(re.findall(r"^  (admin|driver|viewer) +(\S+)   ", demo.said(), re.MULTILINE))
-        cookies = {user: log_in(port, user, password) for user, password in logins.items()}
-        assert set(cookies) == {"admin", "driver", "viewer"}
-        seen = {user: robots_of(port, cookie) for user, cookie in cookies.items()}
-        assert seen["driver"] == {"robot-one": "operator"}
-        assert seen["viewer"] == {"robot-one": "viewer", "robot-two": "viewer"}
-        assert set(seen["admin"]) == {"robot-one", "robot-two"}
-        with enter(port, cookies["viewer"], "robot-two") as client:
-            client.send(op="set_level", level="error")
-            client.drive(0.2)
-            assert "needs the level operator" in client.until(op="status")["msg"]
-            client.send(op="subscribe", **ODOMETRY)
-            assert client.until(op="publish")["msg"]["twist"]["twist"]["linear"]["x"] == 0
-        with enter(port, cookies["driver"], "robot-one") as client:
-            moves_in_odometry(client)
-            administer(tmp_path / "demo", "user", "list")
-            administer(tmp_path / "demo", "right", "revoke", "driver", "robot-one")
-            with pytest.raises(ConnectionClosed):
-                while True:
-                    client.receive(5)
-        assert robots_of(port, log_in(port, "driver", logins["driver"])) == {}
-        assert "login" in administer(tmp_path / "demo", "audit", "list", "--json")
-        family = [
-            psutil.Process(demo.popen.pid),
-            *psutil.Process(demo.popen.pid).children(recursive=True),
-        ]
-        assert len(family) >= 5
-        begun = time.monotonic()
-        demo.signal(signal.SIGINT)
-        _, alive = psutil.wait_procs(family[1:], timeout=10)
-        assert demo.popen.wait(10) == 0
-        took = time.monotonic() - begun
-        assert alive == []
-        assert took < 5, f"it took {took:.1f} s"
-    left = [
-        each.info["cmdline"]
-        for each in psutil.process_iter(["cmdline"])
-        if str(tmp_path) in " ".join(each.info["cmdline"] or [])
-    ]
-    assert left == []
-    log = (tmp_path / "demo" / "relay.log").read_text()
-    assert "Traceback" not in log + demo.log.read_text()
-    assert not any(password in log for password in logins.values())
-
-
-def administer(data: Path, *arguments: str) -> str:
-    """An admin command on a folder whose relay runs; what it prints."""
-    command = [str(BIN / "switchboard"), "--data", str(data), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
-
-
-def log_in(port: int, user: str, password: str) -> str:
-    """A session's cookie."""
-    headers = {"Origin": f"http://127.0.0.1:{port}"}
-    answer = ask(port, "POST", "/api/v1/session", {"user": user, "password": password}, headers=headers)
-    assert answer.status == 200, answer.body
-    return answer.cookie
-
-
-def robots_of(port: int, cookie: str) -> dict[str, str]:
-    """Names and levels of the robots a session sees; all are online."""
-    robots = ask(port, "GET", "/api/v1/robots", headers={"Cookie": cookie}).json["robots"]
-    assert all(each["state"] != "offline" for each in robots)
-    return {each["name"]: each["level"] for each in robots}
-
-
-def enter(port: int, cookie: str, robot: str) -> Client:
-    """A websocket with a session's cookie."""
-    url, origin = f"ws://127.0.0.1:{port}/robots/{robot}", f"http://127.0.0.1:{port}"
-    return Client(connect(url, additional_headers={"Cookie": cookie}, origin=origin))
-
-
-def moves_in_odometry(client: Client) -> None:
-    """The robot's odometry tells speed while it is driven."""
-    client.send(op="subscribe", **ODOMETRY)
-    client.send(op="advertise", topic="/cmd_vel", type="geometry_msgs/msg/Twist")
-
-    def moving() -> bool:
-        client.drive(0.2, 0.6)
-        return bool(client.until(op="publish", topic="/odom")["msg"]["twist"]["twist"]["linear"]["x"] > 0.05)
-
-    wait_for("the robot moves", moving)
+        robot.stop()
+        relay.stop()
 
 
 # --- PostgreSQL -------------------------------------------------------------------------------------------
@@ -393,17 +293,3 @@ def test_a_relay_on_postgresql_does_the_daily_round(postgres: str, tmp_path: Pat
             assert not (relay.data / "switchboard.db").exists()
     assert "Traceback" not in relay.log
     assert "postgres" not in relay.log
-
-
-def test_a_robot_that_is_removed_is_cut_and_forgotten(tmp_path: Path) -> None:
-    """The command line removes it: its link ends, nobody sees it any more, and its key opens nothing."""
-    relay = Relay(tmp_path)
-    robot = Robot(relay, "rover")
-    try:
-        relay.cli("robot", "remove", "rover", "--yes")
-        wait_for("the robot is forgotten", lambda: relay.cli("status")["robots"] == [], 5)
-        wait_for("it is told", lambda: "not accepted" in robot.daemon.log.read_text(), 30)
-        assert relay.cli("status")["robots"] == []
-    finally:
-        robot.stop()
-        relay.stop()

@@ -197,7 +197,7 @@ def test_who_may_not_record_gets_nothing(world: Any, operator: Recorder) -> None
     id = operator.start("/odom")
     viewer = Recorder(world.relay, "rover", world.viewer)
     assert viewer.ask("POST", "", {"topics": ["/odom"]}).status == 403
-    assert viewer.ask("GET").json == {"recordings": []}
+    assert viewer.ask("GET").json == {"recordings": [], "next": None}
     stranger = Recorder(world.relay, "rover", world.stranger)
     for method, path in (
         ("GET", f"/{id}"),

@@ -62,10 +62,16 @@ def place(tmp_path: Path) -> Iterator[Place]:
         place.stop()
 
 
+def serves(client: Client, service: str) -> bool:
+    """Whether the robot's graph, as a client is told of it, has a service."""
+    return service in client.call("/rosapi/services")["values"]["services"]
+
+
 def test_only_a_stop_throws_the_switch(place: Place) -> None:
     """Neither an operator nor an owner who has control can call it, while the robot is stopped or not."""
     with place.connect("ann") as ann, place.connect("olga") as olga:
         wait_for("the owner has control", lambda: olga.call("/relay/take_control")["values"]["success"])
+        wait_for("its services are known", lambda: serves(olga, "/reset"))
         for stopped in (False, True):
             if stopped:
                 assert ann.call("/relay/stop")["values"]["success"]

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 
 import psutil
 import pytest
+from switchboard_client import Client
 from switchboard_drive import LET_GO_SECONDS, Drive
 from switchboard_threads import Driver, Returning
 from switchboard_waiting import wait_for
@@ -88,16 +89,32 @@ def test_who_drives_on_across_a_lost_robot_link_moves_nothing_before_he_lets_go(
     drive.again()
 
 
-def test_who_drives_on_across_a_restart_of_the_relay_moves_nothing_before_he_lets_go(drive: Drive) -> None:
-    """By a new connection, without a pause: the relay knows nothing of before, but the robot does."""
-    driver = Returning(lambda: drive.relay.connect_by(drive.client_side.port, "rover", drive.token))
+@pytest.mark.parametrize("who_is_first", ["driver", "robot"])
+def test_who_drives_on_across_a_restart_of_the_relay_moves_nothing_before_he_lets_go(
+    drive: Drive, who_is_first: str
+) -> None:
+    """By a new connection, whether the robot is there before him or not: what it says to nobody is no letting go."""
+    killed = 0
+
+    def connect() -> Client:
+        if killed and who_is_first == "robot":
+            drive.robot.wait_online()
+        return drive.relay.connect_by(drive.client_side.port, "rover", drive.token)
+
+    driver = Returning(connect)
     drive.start_driving(driver)
     killed = time.monotonic_ns()
     drive.relay.kill()
     drive.stands_within_limit(killed)
     stood = time.monotonic_ns()
+    if who_is_first == "driver":
+        drive.robot_side.black_hole()
     drive.relay.start()
     wait_for("the driver is back", lambda: driver.connections > 1)
+    enough = driver.sent + 3
+    wait_for("he commands", lambda: driver.sent >= enough)
+    if who_is_first == "driver":
+        drive.robot_side.heal()
     moves_only_after_letting_go(drive, driver, stood)
     drive.again()
 
@@ -113,7 +130,7 @@ def test_no_command_from_before_a_partition_is_executed_after_it(drive: Drive) -
     drive.robot_side.heal()
     with drive.relay.connect("rover", drive.token) as client:
         # The answer comes behind everything that was held back.
-        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
+        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"])
     late = [each for each in drive.robot.events("command", healed) if each["v"] or each["w"]]
     assert late == []
     assert not drive.robot.moving()
@@ -137,7 +154,7 @@ def test_the_robot_stands_when_the_relay_freezes_and_nothing_old_is_executed_whe
         drive.relay.thaw()
     drive.robot.wait_online()
     with drive.relay.connect("rover", drive.token) as client:
-        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
+        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"])
     late = [each for each in drive.robot.events("command", woken) if each["v"] or each["w"]]
     assert late == []
     drive.again()
@@ -179,7 +196,7 @@ def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
         drive.robot.daemon.signal(signal.SIGCONT)
     drive.robot.wait_online()
     with drive.relay.connect("rover", drive.token) as client:
-        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"], 20)
+        wait_for("the robot answers", lambda: client.call("/relay/ping", {"robot": True})["result"])
     late = [each for each in drive.robot.events("command", woken) if each["v"] or each["w"]]
     assert late == []
     drive.again()

@@ -14,7 +14,7 @@ from switchboard_client import Client
 from switchboard_processes import Process, ros_environment, running
 from switchboard_relay import Relay
 from switchboard_robot import Robot
-from switchboard_waiting import wait_for
+from switchboard_waiting import PATIENCE, wait_for
 
 from tests.robot_client.ros import Peer
 
@@ -31,7 +31,7 @@ def peer(world: Any) -> Iterator[Peer]:
     peer.close()
 
 
-def adds(client: Client, service: str, seconds: float = 20.0) -> dict[str, Any]:
+def adds(client: Client, service: str, seconds: float = PATIENCE) -> dict[str, Any]:
     """Answer the next call with the sum; returns the call."""
     call = client.until(seconds, op="call_service", service=service)
     values = {"sum": call["args"]["a"] + call["args"]["b"]}

@@ -24,7 +24,7 @@ from switchboard_processes import BIN
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_threads import Driver
-from switchboard_waiting import wait_for
+from switchboard_waiting import PATIENCE, wait_for
 from websockets.sync.client import connect
 
 DAY = datetime.timedelta(days=1)
@@ -95,14 +95,14 @@ class House:
         """A websocket over TLS."""
         url = f"wss://127.0.0.1:{self.relay.http_port}/robots/rover"
         headers = {"Authorization": f"Bearer {self.token}"}
-        return Client(connect(url, ssl=self.context, additional_headers=headers))
+        return Client(connect(url, ssl=self.context, additional_headers=headers, open_timeout=PATIENCE))
 
     def reload(self, words: str) -> None:
         """SIGHUP, until the log has these words once more."""
         assert self.relay.process is not None
         before = self.relay.log.count(words)
         self.relay.process.signal(signal.SIGHUP)
-        wait_for(f"the log says '{words}'", lambda: self.relay.log.count(words) > before, 10)
+        wait_for(f"the log says '{words}'", lambda: self.relay.log.count(words) > before)
 
     def serial(self, port: int) -> int:
         """Serial number of the certificate a new connection is shown."""
@@ -189,7 +189,7 @@ def test_a_robot_is_driven_over_tls(house: House) -> None:
         wait_for("the robot moves", house.robot.moving)
     finally:
         driver.stop()
-    wait_for("the robot stands", lambda: not house.robot.moving(), 5)
+    wait_for("the robot stands", lambda: not house.robot.moving())
 
 
 def test_a_robot_refuses_a_ca_it_was_not_given(house: House, tmp_path: Path) -> None:

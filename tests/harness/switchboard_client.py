@@ -8,6 +8,7 @@ import random
 import time
 from typing import Any
 
+from switchboard_waiting import PATIENCE
 from websockets.sync.client import ClientConnection
 
 
@@ -32,11 +33,11 @@ class Client:
         """One operation."""
         self.connection.send(json.dumps(message))
 
-    def receive(self, seconds: float = 10.0) -> dict[str, Any]:
+    def receive(self, seconds: float = PATIENCE) -> dict[str, Any]:
         """The next message."""
         return dict(json.loads(self.connection.recv(timeout=seconds)))
 
-    def until(self, seconds: float = 15.0, **like: Any) -> dict[str, Any]:
+    def until(self, seconds: float = PATIENCE, **like: Any) -> dict[str, Any]:
         """The next message with these fields; what came before it is passed over."""
         end = time.monotonic() + seconds
         while True:
@@ -44,7 +45,7 @@ class Client:
             if all(message.get(key) == value for key, value in like.items()):
                 return message
 
-    def call(self, service: str, args: Any = None, seconds: float = 15.0) -> dict[str, Any]:
+    def call(self, service: str, args: Any = None, seconds: float = PATIENCE) -> dict[str, Any]:
         """Call a service and wait for the answer."""
         call_id = f"call-{random.random()}"
         self.send(op="call_service", id=call_id, service=service, args={} if args is None else args)

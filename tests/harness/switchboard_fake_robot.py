@@ -8,8 +8,13 @@ import socket
 import time
 from typing import Any
 
+from switchboard_waiting import PATIENCE
+
 from relay_protocol import PROTOCOL_VERSION, identity, limits, link
 from relay_protocol.frames import FrameDecoder, JsonFrame
+
+SOON = 8.0
+"""Seconds to be hung up on: fewer than the relay gives to who says nothing, which would end anybody."""
 
 ORDERS = frozenset({"control", "stop", "resume", "suppress", "inhibit"})
 
@@ -21,7 +26,7 @@ class FakeRobot:
     """
 
     def __init__(self, port: int) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", port), timeout=10)
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
         self._decoder = FrameDecoder(limits.COMMAND_FRAME)
         self._heard: list[dict[str, Any]] = []
 
@@ -40,7 +45,7 @@ class FakeRobot:
         with contextlib.suppress(ConnectionError):
             self.socket.sendall(data)
 
-    def receive(self, seconds: float = 10.0) -> dict[str, Any] | None:
+    def receive(self, seconds: float = PATIENCE) -> dict[str, Any] | None:
         """The next message, ``None`` at the end of the connection."""
         self.socket.settimeout(seconds)
         while not self._heard:
@@ -58,7 +63,7 @@ class FakeRobot:
             self._heard += [each for each in heard if each["op"] not in ORDERS]
         return self._heard.pop(0)
 
-    def until(self, op: str, seconds: float = 10.0) -> dict[str, Any]:
+    def until(self, op: str, seconds: float = PATIENCE) -> dict[str, Any]:
         """The next message with this ``op``."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -68,7 +73,7 @@ class FakeRobot:
                 return message
         raise AssertionError(f"no '{op}' within {seconds:g} s")
 
-    def ended(self, seconds: float = 10.0) -> bool:
+    def ended(self, seconds: float = SOON) -> bool:
         """Whether the relay hangs up within this time."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:

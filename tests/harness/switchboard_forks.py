@@ -27,6 +27,7 @@ COMMAND_SECONDS = 60.0
 PROGRAMS = {
     "switchboard": "relay_server.cli",
     "switchboard-robot": "robot_client.cli",
+    "switchboard-robot-service": "robot_client.services.main",
     "switchboard-sim": "robot_client.sim.main",
 }
 """Our commands, and the module each has its ``main`` in."""

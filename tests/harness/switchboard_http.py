@@ -56,3 +56,11 @@ def ask(
         return Answer(connection.getresponse())
     finally:
         connection.close()
+
+
+def log_in(port: int, user: str, password: str) -> str:
+    """The cookie of a new session."""
+    headers = {"Origin": f"http://127.0.0.1:{port}"}
+    answer = ask(port, "POST", "/api/v1/session", {"user": user, "password": password}, headers=headers)
+    assert answer.status == 200, answer.body
+    return answer.cookie

@@ -16,7 +16,7 @@ from switchboard_processes import Process, ros_environment
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_threads import Listener
-from switchboard_waiting import readable, wait_for
+from switchboard_waiting import PATIENCE, readable, wait_for
 from websockets.frames import Frame, Opcode
 
 PUBLISHER = Path(__file__).parents[1] / "e2e" / "clients" / "load.py"
@@ -92,7 +92,7 @@ class Stalled:
     """A client that subscribes and then takes nothing any more."""
 
     def __init__(self, relay: Relay, robot: str, token: str, topics: list[str]) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", relay.http_port), timeout=10)
+        self._socket = socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         self._socket.sendall(
             f"GET /robots/{robot} HTTP/1.1\r\nHost: relay\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -119,7 +119,7 @@ class Stalled:
     def ended(self) -> bool:
         """Whether, reading on at last, it finds the end of its connection."""
         try:
-            while readable(self._socket, 10):
+            while readable(self._socket, PATIENCE):
                 if not self._socket.recv(1 << 20):
                     return True
         except OSError:

@@ -90,7 +90,7 @@ class Process:
         self.popen.kill()
         self.popen.wait(10)
 
-    def stop(self, seconds: float = 10.0) -> int:
+    def stop(self, seconds: float = 30.0) -> int:
         """SIGTERM (also to a frozen one), reap, and return the exit code."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGTERM)

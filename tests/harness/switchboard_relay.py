@@ -12,6 +12,7 @@ from typing import Any
 from switchboard_client import Client
 from switchboard_forks import run_command
 from switchboard_processes import BIN, Process
+from switchboard_waiting import PATIENCE
 from websockets.sync.client import connect
 
 from relay_server.cli.relaysocket import ask_status
@@ -81,12 +82,14 @@ class Relay:
         headers = {"Authorization": f"Bearer {token}"}
         # Who has stopped reading doesn't see the answer to its close behind what it has not read.
         options.setdefault("close_timeout", 1)
+        options.setdefault("open_timeout", PATIENCE)
         return Client(connect(self.url(robot), additional_headers=headers, **options))
 
     def connect_by(self, port: int, robot: str, token: str) -> Client:
         """The same by way of a proxy."""
         headers = {"Authorization": f"Bearer {token}"}
-        return Client(connect(f"ws://127.0.0.1:{port}/robots/{robot}", additional_headers=headers))
+        url = f"ws://127.0.0.1:{port}/robots/{robot}"
+        return Client(connect(url, additional_headers=headers, open_timeout=PATIENCE))
 
     def freeze(self) -> None:
         """SIGSTOP."""

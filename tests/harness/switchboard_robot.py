@@ -10,7 +10,7 @@ from switchboard_domains import free_domain
 from switchboard_forks import run_command
 from switchboard_processes import BIN, Process, ros_environment
 from switchboard_relay import Relay
-from switchboard_waiting import wait_for
+from switchboard_waiting import PATIENCE, wait_for
 
 
 class Robot:
@@ -72,7 +72,7 @@ class Robot:
         """Start the daemon again after it was killed."""
         self.daemon = self._daemon()
 
-    def wait_online(self, seconds: float = 30.0) -> None:
+    def wait_online(self, seconds: float = PATIENCE) -> None:
         """Until the relay sees it."""
         wait_for(f"{self.name} is online", lambda: self.relay.state_of(self.name) != "offline", seconds)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from switchboard_fake_robot import FakeRobot
 from switchboard_relay import Relay
-from switchboard_waiting import wait_for
+from switchboard_waiting import PATIENCE, wait_for
 
 from relay_protocol import PROTOCOL_VERSION, link
 from relay_protocol.frames import JsonFrame, SampleFrame
@@ -27,7 +27,7 @@ Service = Callable[["SmallRobot", Any], dict[str, Any] | None]
 class End(FakeRobot):
     """One end of a link that leaves all messages to the robot, its orders too."""
 
-    def receive(self, seconds: float = 10.0) -> dict[str, Any] | None:
+    def receive(self, seconds: float = PATIENCE) -> dict[str, Any] | None:
         """The next message, ``None`` at the end of the connection."""
         self.socket.settimeout(seconds)
         while not self._heard:

@@ -24,6 +24,7 @@ class Driver(threading.Thread):
         self._v, self._w = v, w
         self._end = threading.Event()
         self._silent = threading.Event()
+        self._pause = 0.0
         self.sent = 0
         self.broken: str | None = None
 
@@ -36,12 +37,22 @@ class Driver(threading.Thread):
 
     def _drive(self, client: Client) -> None:
         client.send(op="advertise", topic="/cmd_vel", type="geometry_msgs/msg/Twist")
+        if self._pause:
+            client.drive(self._v, self._w)
+            self._end.wait(self._pause)
         while not self._end.is_set():
             if not self._silent.is_set():
                 client.drive(self._v, self._w)
                 self.sent += 1
             with contextlib.suppress(TimeoutError):
                 client.receive(0.1)
+
+    def begin_with_a_pause(self, seconds: float) -> None:
+        """Say nothing for so long after the first command.
+
+        To a robot whose relay was started anew, whoever drove it before must let go, and not by having been away.
+        """
+        self._pause = seconds
 
     def let_go(self, seconds: float) -> None:
         """Say nothing for so long, and then drive on."""

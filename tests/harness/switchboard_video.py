@@ -18,13 +18,11 @@ import cv2
 import numpy as np
 from switchboard_http import Answer, ask
 from switchboard_relay import Relay
-from switchboard_waiting import wait_for
+from switchboard_waiting import PATIENCE, wait_for
 from websockets.sync.client import connect
 
 CAMERA = "/camera/image_raw"
 """Of the simulated robot."""
-
-WAIT_SECONDS = 20.0
 
 
 def path(what: str, robot: str = "rover", **parameters: Any) -> str:
@@ -73,7 +71,7 @@ class Mjpeg:
     def __init__(self, relay: Relay, token: str, robot: str = "rover", **parameters: Any) -> None:
         self.seen = 0
         """Parts so far."""
-        self._connection = http.client.HTTPConnection("127.0.0.1", relay.http_port, timeout=WAIT_SECONDS)
+        self._connection = http.client.HTTPConnection("127.0.0.1", relay.http_port, timeout=PATIENCE)
         headers = {"Authorization": f"Bearer {token}"}
         self._connection.request("GET", path("stream", robot, **parameters), headers=headers)
         self.answer = self._connection.getresponse()
@@ -154,6 +152,7 @@ class Eye:
         connecting = connect(
             f"ws://127.0.0.1:{relay.http_port}{path('ws', robot, **parameters)}",
             additional_headers={"Authorization": f"Bearer {token}"},
+            open_timeout=PATIENCE,
             close_timeout=1,
         )
         self.connection = self._stack.enter_context(connecting)
@@ -164,7 +163,7 @@ class Eye:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def untaken(self, seconds: float = WAIT_SECONDS) -> Shown:
+    def untaken(self, seconds: float = PATIENCE) -> Shown:
         """The next picture, which is not answered."""
         while True:
             message = json.loads(self.connection.recv(timeout=seconds))
@@ -181,7 +180,7 @@ class Eye:
         """Have the next one."""
         self.connection.send(json.dumps({"op": "took", "number": shown.head["number"]}))
 
-    def picture(self, seconds: float = WAIT_SECONDS) -> Shown:
+    def picture(self, seconds: float = PATIENCE) -> Shown:
         """The next picture, and the word that it is here."""
         shown = self.untaken(seconds)
         self.took(shown)

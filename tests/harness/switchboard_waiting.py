@@ -8,8 +8,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+PATIENCE = 60.0
+"""Seconds for what comes at once: a machine that runs tests may stand still for a while."""
 
-def wait_for(what: str, condition: Callable[[], Any], seconds: float = 20.0) -> Any:
+
+def wait_for(what: str, condition: Callable[[], Any], seconds: float = PATIENCE) -> Any:
     """Poll until ``condition`` gives something true, and return it; fail by name when it does not."""
     until = time.monotonic() + seconds
     while True:

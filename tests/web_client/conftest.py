@@ -16,7 +16,7 @@ from switchboard_processes import Process
 
 HERE = Path(__file__).parent
 PASSWORD = "correct horse"
-WAIT_SECONDS = 20.0
+WAIT_SECONDS = 60.0
 
 expect.set_options(timeout=WAIT_SECONDS * 1000)
 

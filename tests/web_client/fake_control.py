@@ -28,6 +28,10 @@ class Control:
         self.since = self.asked = 0.0
         self.grace = 30.0
         self.stopped: Json | None = None
+        self.suppressed: list[Json] = []
+        self.inhibited: list[Json] = []
+        self.implicit = False
+        self.away = False
         self.denial = ""
 
     def told(self, client: Any) -> Json:
@@ -35,15 +39,18 @@ class Control:
         request = self._person(self.request, client, self.asked)
         if request is not None:
             request |= {"why": self.why, "until": self.asked + self.grace}
+        holder = self._person(self.holder, client, self.since)
+        if holder is not None:
+            holder |= {"implicit": self.implicit}
         return {
             "robot": self.robot,
             "state": "requested" if self.request else "held" if self.holder else "free",
-            "holder": self._person(self.holder, client, self.since),
+            "holder": holder,
             "request": request,
             "stopped": self.stopped,
             "moving": False,
-            "suppressed": [],
-            "inhibited": [],
+            "suppressed": self.suppressed,
+            "inhibited": self.inhibited,
             "limits": LIMITS,
             "you": {
                 "client": client.number,
@@ -59,9 +66,10 @@ class Control:
 
     def order(self, client: Any, order: str, why: str) -> Json:
         """One of the services below ``/relay/``."""
-        done, message = getattr(self, order)(client, why)
+        success, message = getattr(self, order)(client, why)
         self.changed()
-        return {"success": done, "message": message}
+        done = {"done": not self.away} if order == "stop" else {}
+        return {"success": success, "message": message, **done}
 
     def take_control(self, client: Any, why: str) -> tuple[bool, str]:
         """Free: taken. Held: asked for, or by an owner who waited long enough taken over."""
@@ -71,7 +79,7 @@ class Control:
             return False, self.denial
         ripe = self.request is client and time.time() >= self.asked + self.grace
         mine = self.holder is not None and self.holder.user == client.user
-        if self.holder is None or mine or (client.level == "owner" and ripe):
+        if self.holder is None or mine or ((client.level == "owner" or self.implicit) and ripe):
             self.holder, self.request, self.since = client, None, time.time()
             return True, "you have control"
         if self.request is None:
@@ -102,8 +110,15 @@ class Control:
 
     def stop(self, client: Any, why: str) -> tuple[bool, str]:
         """For everybody."""
-        self.stopped = {"by": client.user, "why": why, "since": time.time(), "told": True}
+        self.stopped = {"by": client.user, "why": why, "since": time.time(), "told": not self.away}
         return True, ""
+
+    def be(self, away: bool) -> None:
+        """The robot goes, or comes: then it hears what it missed."""
+        self.away = away
+        if self.stopped is not None and not away:
+            self.stopped = {**self.stopped, "told": True}
+        self.changed()
 
     def resume(self, client: Any, why: str) -> tuple[bool, str]:
         """For who has control, and owners."""
@@ -164,6 +179,16 @@ class Alerts:
     def of(self, robots: list[str]) -> list[Json]:
         """Those of some robots, the latest first."""
         return sorted((a for a in self.all.values() if a["robot"] in robots), key=lambda a: -a["last"])
+
+    def page(self, robots: list[str], query: Json) -> Json:
+        """As the relay gives them: so many at most, after those that were told before."""
+        lasts = {"true": ["open"], "false": ["over"]}.get(query.get("open", ""), ["open", "over"])
+        fits = [each for each in self.of(robots) if each["state"] in lasts]
+        robot = query.get("robot")
+        fits = [each for each in fits if robot in (None, each["robot"])]
+        began = int(query.get("before", 0))
+        end = began + int(query.get("limit", 100))
+        return {"alerts": fits[began:end], "next": str(end) if end < len(fits) else None}
 
     def streamed(self, robots: list[str]) -> list[Json]:
         """Those that the stream tells: of what is long over it says nothing."""

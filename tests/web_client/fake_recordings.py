@@ -8,6 +8,9 @@ from typing import Any
 Json = dict[str, Any]
 
 FILE = b"\x89MCAP0\r\n" + bytes(range(256)) * 8
+PAGE = 100
+"""Listed at a time, unless others are asked for."""
+
 SAMPLES = 40
 """Messages a second, of each topic and camera."""
 
@@ -32,18 +35,23 @@ class Recordings:
         self.megabytes = self.left = 10_000.0
         self.refusal = ""
         self.denied = ""
+        self.full = ""
 
     def do(self, order: Json) -> None:
-        """One order of a test: left, megabytes (room), refuse (new ones), denied (all), recording (puts one there)."""
+        """One order of a test.
+
+        These are known: left, megabytes (room), full, refuse (new ones), denied (all), recording (puts one there).
+        """
         self.left = order.get("left", self.left)
         self.megabytes = order.get("megabytes", self.megabytes)
         self.refusal = order.get("refuse", self.refusal)
         self.denied = order.get("denied", self.denied)
+        self.full = order.get("full", self.full)
         if "recording" in order:
             self._add(order["robot"], **order["recording"])
 
     def answer(
-        self, method: str, robot: str, path: str, user: str, level: str, body: Json
+        self, method: str, robot: str, path: str, user: str, level: str, body: Json, query: dict[str, str]
     ) -> tuple[int, Any]:
         """One request; status and what is answered, bytes for a file.
 
@@ -55,7 +63,7 @@ class Recordings:
         if path == "":
             if method == "POST":
                 return 201, self._start(robot, user, may, body)
-            return 200, {"recordings": [self._look(each) for each in here] if may else []}
+            return 200, self._page(here if may else [], query)
         id, _, what = path.strip("/").partition("/")
         found = next((each for each in here if each["id"] == id), None)
         if found is None or not may:
@@ -69,8 +77,14 @@ class Recordings:
             self._end(found, f"stopped by {user}")
         return 200, self._look(found)
 
+    def _page(self, listed: list[Json], query: dict[str, str]) -> Json:
+        begin = int(query.get("before", 0))
+        end = begin + int(query.get("limit", PAGE))
+        page = [self._look(each) for each in listed[begin:end]]
+        return {"recordings": page, "next": str(end) if end < len(listed) else None}
+
     def _possible(self, may: bool) -> Json:
-        room = {"megabytes": self.megabytes, "left": self.left}
+        room = {"megabytes": self.megabytes, "left": self.left, "full": self.full}
         if may:
             return {"topics": self.topics, "cameras": self.cameras, "denied": "", **room}
         words = self.denied or "record on /odom needs the level operator; you are viewer on this robot"

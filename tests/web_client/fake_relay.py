@@ -76,7 +76,9 @@ CAMERAS = {
     "/camera/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
     "/camera_rear/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", "jpeg"),
 }
+MOMENT = {"Switchboard_Moment": "1f.0123456789abcdef"}
 ORDERS = ("take_control", "release_control", "grant_control", "refuse_control", "stop", "resume")
+STREAM = "/api/v1/robots/stream"
 CAMERA_SIZE = (640, 480)
 CAMERA_RATE = 12.0
 LINK = {"rtt_ms": 3.4, "p95_ms": 6.1, "jitter_ms": 0.4, "lost": 0, "quality": "good"}
@@ -204,14 +206,23 @@ class Relay:
         self.dead = False
         self.blind = False
         self.broken = False
+        self.unknown = ""
+        self.stuck: list[str] = []
+        self.unstuck = asyncio.Event()
+        self.failing = False
         self.topics = dict(TOPICS)
         self.reduced = 0.0
+        self.instead: Json | None = None
         self.ahead = 0.0
+        self.kept: float | None = None
+        self.source_fps = CAMERA_RATE
         self.last_seen = time.time() - 7200
         self.numbers = itertools.count(1)
         self.controls = {
             name: Control(name, functools.partial(self.control_changed, name)) for name in ROBOTS
         }
+        for name, robot in ROBOTS.items():
+            self.controls[name].away = robot["state"] == "offline"
         self.alerts = Alerts()
         self.recordings = Recordings(
             [name for name in TOPICS if not name.startswith("/relay/")], list(CAMERAS)
@@ -259,10 +270,15 @@ class Relay:
         """One order of a test: close, level, silent (no data), mute (no status), frozen (no answers), say, offline,
         dead (the robot answers no ping), gone (a topic that is there no more).
 
-        Of the event stream: blind (it tells nothing), broken (there is none).
-        Of control: take_away, stopped (by whom), resumed, grace (seconds), deny (why).
+        Of HTTP: stuck (what is not answered until it is let go: "session", "orders"), failing (nobody can say who is
+        logged in).
+        Of the stream of pages: blind (it tells nothing), broken (there is none), unknown (why it can't tell).
+        Of control: take_away, stopped (by whom; told: whether the robot has heard of it), resumed, grace (seconds),
+        deny (why), implicit (whether a command took it), suppressed and inhibited (as told).
         Of alerts: alert, see ``Alerts.put``.
-        Of video: close_video, reduced (a thin link), ahead (seconds by which the robot's clock is wrong).
+        Of video: close_video, reduced (a thin link), instead (in what another form differs that is shown), ahead
+        (seconds by which the robot's clock is wrong), kept (how many seconds old the one picture is that who begins to
+        watch gets; null: he gets new ones), source_fps.
         Of recordings: see ``Recordings.do``.
         """
         self.recordings.do(order)
@@ -272,22 +288,36 @@ class Relay:
         self.dead = order.get("dead", self.dead)
         self.blind = order.get("blind", self.blind)
         self.broken = order.get("broken", self.broken)
+        self.unknown = order.get("unknown", self.unknown)
+        self.stuck = order.get("stuck", self.stuck)
+        self.unstuck.set()
+        self.unstuck = asyncio.Event()
+        self.failing = order.get("failing", self.failing)
         self.topics.pop(order.get("gone", ""), None)
         self.reduced = order.get("reduced", self.reduced)
+        self.instead = order.get("instead", self.instead)
         self.ahead = order.get("ahead", self.ahead)
+        self.kept = order.get("kept", self.kept)
+        self.source_fps = order.get("source_fps", self.source_fps)
         if "level" in order:
             self.rights[order["user"]][order["robot"]] = order["level"]
             self.controls[order["robot"]].rights_changed()
         if "state" in order:
             self.robots[order["robot"]]["state"] = order["state"]
+            self.controls[order["robot"]].be(away=order["state"] == "offline")
         if "alert" in order:
             self.alerts.put(**order["alert"])
         if "robot" in order:
             control = self.controls[order["robot"]]
             control.grace = order.get("grace", control.grace)
             control.denial = order.get("deny", control.denial)
+            control.implicit = order.get("implicit", control.implicit)
+            control.suppressed = order.get("suppressed", control.suppressed)
+            control.inhibited = order.get("inhibited", control.inhibited)
+            control.changed()
             if "stopped" in order:
-                control.stopped = {"by": order["stopped"], "why": "", "since": time.time(), "told": True}
+                told = order.get("told", True)
+                control.stopped = {"by": order["stopped"], "why": "", "since": time.time(), "told": told}
                 control.changed()
             if order.get("resumed"):
                 control.stopped = None
@@ -302,7 +332,7 @@ class Relay:
             if "close" in order:
                 channel.close(order["close"], order.get("reason", ""))
         for viewing in self.viewings:
-            if "reduced" in order:
+            if {"reduced", "instead"} & set(order):
                 viewing.tell()
             if "close_video" in order:
                 viewing.close(order["close_video"], order.get("reason", ""))
@@ -486,8 +516,13 @@ class Viewing(Socket):
             "height": int(self.height * scale),
             "quality": self.quality,
         }
-        more = {"fps": self.rate, "reduced": self.relay.reduced, "delay_ms": 20.0}
-        self.send({"op": "playing", **facts, **more, "encoding": "jpeg", "source_fps": CAMERA_RATE})
+        more = {
+            "fps": self.rate,
+            "reduced": self.relay.reduced,
+            "delay_ms": 20.0,
+            "instead": self.relay.instead,
+        }
+        self.send({"op": "playing", **facts, **more, "encoding": "jpeg", "source_fps": self.relay.source_fps})
 
     def take(self, message: Json) -> None:
         self.note(message)
@@ -495,6 +530,8 @@ class Viewing(Socket):
 
     def stream(self, now: float) -> None:
         if self.relay.silent or self.taken != self.number or now < self.due:
+            return
+        if self.relay.kept is not None and self.number > 0:
             return
         self.due = now + 1 / self.rate
         self.number += 1
@@ -509,7 +546,7 @@ class Viewing(Socket):
             key = True
         facts = {
             "number": self.number,
-            "stamp": time.time() + self.relay.ahead,
+            "stamp": time.time() + self.relay.ahead - (self.relay.kept or 0.0),
             "codec": self.codec,
             "key": key,
         }
@@ -533,12 +570,14 @@ class Connection:
     def __init__(self, relay: Relay, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.relay, self.reader, self.writer = relay, reader, writer
         self.cookies: dict[str, str] = {}
+        self.query: dict[str, str] = {}
 
     async def run(self) -> None:
         with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
             head = await self.reader.readuntil(b"\r\n\r\n")
             lines = head.decode("latin-1").split("\r\n")
             method, target, _ = lines[0].split(" ")
+            self.query = dict(parse_qsl(target.partition("?")[2]))
             self.headers = {
                 k.lower(): v.strip() for k, _, v in (line.partition(":") for line in lines[1:] if line)
             }
@@ -581,6 +620,8 @@ class Connection:
             self.relay.do(json.loads(body))
             self.reply(204)
         elif path == "/api/v1/session":
+            if method == "GET":
+                await self.let_go("session")
             self.session(method, body)
         elif path.startswith("/api/v1/robots/") and "/recordings" in path:
             self.recordings(method, path, body)
@@ -591,6 +632,10 @@ class Connection:
         else:
             self.page(path)
 
+    async def let_go(self, what: str) -> None:
+        while what in self.relay.stuck:
+            await self.relay.unstuck.wait()
+
     def session(self, method: str, body: bytes) -> None:
         if method != "GET" and self.headers.get("x-requested-with") != "switchboard":
             self.problem(403, "The header X-Requested-With is missing.")
@@ -599,6 +644,8 @@ class Connection:
         elif method == "DELETE":
             self.relay.sessions.pop(self.cookies.get("session", ""), None)
             self.reply(204)
+        elif self.relay.failing:
+            self.problem(503, "The database does not answer.")
         elif self.user is None:
             self.problem(401, "You are not logged in.")
         else:
@@ -624,15 +671,14 @@ class Connection:
         if user is None:
             self.problem(401, "You are not logged in.")
         elif method == "POST":
+            await self.let_go("orders")
             self.orders(user, path.removeprefix("/api/v1/").split("/"), json.loads(body))
         elif path == "/api/v1/fleet/groups":
-            self.reply(200, {"groups": [{"name": "hall", "robots": ["rover-1"]}]})
+            self.reply(200, {"groups": [{"name": "hall", "robots": ["rover-1"]}]}, **MOMENT)
+        elif name.endswith("/control"):
+            self.reply(200, {"robot": name.partition("/")[0]}, **MOMENT)
         elif path == "/api/v1/alerts":
-            self.reply(200, {"alerts": self.relay.alerts.of(list(self.relay.rights[user]))})
-        elif name == "stream" and self.relay.broken:
-            self.problem(503, "There is no stream.")
-        elif name == "stream":
-            await self.events(user)
+            self.reply(200, self.relay.alerts.page(list(self.relay.rights[user]), self.query))
         elif name == "":
             self.reply(200, self.relay.robot_list(user))
         elif name in self.relay.rights[user]:
@@ -642,7 +688,10 @@ class Connection:
 
     def orders(self, user: str, parts: list[str], ask: Json) -> None:
         self.relay.log.append({"user": user, "op": "POST " + "/".join(parts), **ask})
-        if parts[0] == "alerts":
+        dated = self.headers.get("switchboard-moment") == MOMENT["Switchboard_Moment"]
+        if not dated and (ask.get("do") in ("resume", "call", "set") or parts[-1] == "resume"):
+            self.problem(428, "Say when this was sent.")
+        elif parts[0] == "alerts":
             self.reply(200, self.relay.alerts.acknowledge(parts[1], user))
         elif parts[0] == "fleet":
             found = meant(ask["robots"], list(self.relay.rights[user]))
@@ -683,7 +732,7 @@ class Connection:
             self.relay.log.append({"user": user, "robot": robot, "op": f"{method} recordings{below}", **ask})
         level = self.relay.rights[user][robot]
         try:
-            status, answer = self.relay.recordings.answer(method, robot, below, user, level, ask)
+            status, answer = self.relay.recordings.answer(method, robot, below, user, level, ask, self.query)
         except Refused as error:
             self.problem(error.status, str(error))
             return
@@ -699,16 +748,6 @@ class Connection:
         cameras = [{"name": n, "type": t, "encoding": e, **size} for n, (t, e) in CAMERAS.items()]
         self.reply(200, {"cameras": cameras})
 
-    async def events(self, user: str) -> None:
-        self.writer.write(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n")
-        while not self.writer.is_closing() and not self.relay.broken:
-            alerts = {"alerts": self.relay.alerts.streamed(list(self.relay.rights[user]))}
-            for event, data in (("robots", self.relay.robot_list(user)), ("alerts", alerts)):
-                if not self.relay.blind:
-                    self.writer.write(f"event: {event}\ndata: {json.dumps(data)}\n\n".encode())
-            await self.writer.drain()
-            await asyncio.sleep(0.5)
-
     def page(self, path: str) -> None:
         file = (self.relay.portal / path.lstrip("/")).resolve()
         if not file.is_file() or self.relay.portal.resolve() not in file.parents:
@@ -716,10 +755,16 @@ class Connection:
         self.reply(200, file.read_bytes(), mimetypes.guess_type(file.name)[0] or "application/octet-stream")
 
     async def websocket(self, head: bytes, target: str) -> None:
+        if target == STREAM and self.relay.broken:
+            self.problem(503, "There is no stream.")
+            return
         protocol = ServerProtocol()
         protocol.receive_data(head)
         protocol.send_response(protocol.accept(protocol.events_received()[0]))  # type: ignore[arg-type]
         self.flush(protocol)
+        if target == STREAM:
+            await self.tell(protocol)
+            return
         path, _, query = target.partition("?")
         robot, video, _ = path.removeprefix("/robots/").partition("/video/ws")
         robot, asked = unquote(robot), dict(parse_qsl(query))
@@ -740,6 +785,32 @@ class Connection:
         finally:
             self.relay.sockets.discard(socket)
             self.relay.controls[robot].left(socket)
+
+    async def tell(self, protocol: ServerProtocol) -> None:
+        """A page's stream."""
+        user = self.user
+        self.relay.log.append({"op": "follow", "by": user})
+        reading = asyncio.ensure_future(self.read(protocol))
+        while not reading.done() and not self.relay.broken:
+            if user is None or self.user != user:
+                protocol.send_close(4401, "your session has ended; log in again")
+            elif not self.relay.blind:
+                for event, data in self.events(user):
+                    protocol.send_text(json.dumps({"event": event, "data": data}).encode())
+            self.flush(protocol)
+            await asyncio.wait([reading], timeout=0.5)
+        reading.cancel()
+
+    def events(self, user: str) -> list[tuple[str, Json]]:
+        if self.relay.unknown:
+            return [("unknown", {"reason": self.relay.unknown})]
+        alerts = {"alerts": self.relay.alerts.streamed(list(self.relay.rights[user]))}
+        return [("robots", self.relay.robot_list(user)), ("alerts", alerts)]
+
+    async def read(self, protocol: ServerProtocol) -> None:
+        while protocol.state is State.OPEN and (data := await self.reader.read(65536)):
+            protocol.receive_data(data)
+            protocol.events_received()
 
     def flush(self, protocol: ServerProtocol) -> None:
         for data in protocol.data_to_send():

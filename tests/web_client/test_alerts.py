@@ -92,6 +92,30 @@ class TestAlerts:
         expect(seen(page, "alert")).to_contain_text("another")
         expect(seen(page, "alert")).to_have_count(1)
 
+    def test_a_long_list_goes_on_with_what_is_older(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A part more with each press, down to the oldest; another list begins anew, and what comes stands in front."""
+        for i in range(450):
+            alert(relay, f"number {i}", id=f"{i}", last=1000.0 + i, state="over", over=1000.0 + i, old=True)
+        alert(relay, "it stands", id="open", last=1.0)
+        page = open_page("/alerts", user="driver")
+        expect(seen(page, "alert")).to_have_count(1)
+        older = seen(page, "alerts-older")
+        expect(older).to_have_count(0)
+        seen(page, "alerts-over").click()
+        expect(seen(page, "alert")).to_have_count(200)
+        older.click()
+        expect(seen(page, "alert")).to_have_count(400)
+        alert(relay, "a new one", id="new", state="over", over=time.time())
+        expect(seen(page, "alert")).to_have_count(401)
+        older.click()
+        expect(seen(page, "alert")).to_have_count(451)
+        expect(seen(page, "alert").first).to_contain_text("a new one")
+        expect(seen(page, "alert").last).to_contain_text("number 0")
+        expect(older).to_have_count(0)
+        seen(page, "alerts-all").click()
+        expect(seen(page, "alert").last).to_contain_text("number 251")
+        expect(older).to_be_visible()
+
     def test_what_is_gone_without_a_word_is_looked_up(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """An alert that leaves the stream while it is open was ended unheard, or is the user's no more."""
         alert(relay, "low", id="1")

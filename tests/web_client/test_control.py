@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -108,6 +109,66 @@ class TestControl:
         stands(driver, "held")
         expect(seen(driver, "drive-words")).to_have_text("admin has control now.")
 
+    def test_anybody_takes_over_from_a_program_that_answers_nobody(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """It took the robot by a command: an operator has the button too, once the grace time is over."""
+        relay.do(robot=ROBOT, grace=1.0, implicit=True)
+        program, driver = open_page(COCKPIT, user="admin"), open_page(COCKPIT, user="driver")
+        take_control(program)
+        seen(driver, "control-ask").click()
+        seen(driver, "control-ask-send").click()
+        expect(seen(program, "request-left")).to_have_text("Who asked may take over now.")
+        expect(seen(driver, "control-words")).to_have_text("admin has not answered. You may take over.")
+        seen(driver, "control-over").click()
+        stands(driver, "yours")
+
+    def test_an_answer_says_whom_it_is_for(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """By the number of the connection that was shown: somebody else may have asked since."""
+        ann, bob = open_page(COCKPIT, user="admin"), open_page(COCKPIT, user="driver")
+        take_control(bob)
+        for answer, order in (("control-refuse", "refuse_control"), ("control-grant", "grant_control")):
+            seen(ann, "control-ask").click()
+            seen(ann, "control-ask-send").click()
+            stands(ann, "waiting")
+            seen(bob, answer).click()
+            stands(ann, "held" if answer == "control-refuse" else "yours")
+            name = f"/relay/{order}"
+            (asked,) = relay.until(
+                lambda name=name: relay.log(op="call_service", service=name), "no answer came"
+            )
+            assert asked["args"]["client"] > 0
+
+    @pytest.mark.parametrize("width", [390, 1280])
+    def test_who_else_has_a_hand_on_the_robot_is_told(
+        self, open_page: OpenPage, relay: FakeRelay, tmp_path: Path, width: int
+    ) -> None:
+        """Who commands the topic that one drives by, and who keeps a panel's topic from saying how things are now."""
+        page = open_page(COCKPIT, user="driver", width=width)
+        ready_to_drive(page)
+        stick = page.get_by_test_id("joystick").bounding_box()
+        by = {"by": "runaway", "ms": 100}
+        relay.do(
+            robot=ROBOT,
+            suppressed=[{"resource": "/cmd_vel", "sources": [99], **by}],
+            inhibited=[{"resource": "/scan", "hold": True, **by}, {"resource": "/odom", "hold": False, **by}],
+        )
+        expect(seen(page, "suppressed")).to_have_text("runaway commands this topic.")
+        scan, odometry = (
+            page.get_by_role("region", name="Laser scan"),
+            page.get_by_role("region", name="Odometry"),
+        )
+        expect(scan.get_by_test_id("silenced")).to_have_text("held by runaway")
+        expect(odometry.get_by_test_id("silenced")).to_have_text("inhibited by runaway")
+        expect(scan).not_to_contain_text("nearest")
+        assert page.get_by_test_id("joystick").bounding_box() == stick
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.screenshot(path=tmp_path / "hands.png", full_page=True)
+        relay.do(robot=ROBOT, suppressed=[], inhibited=[])
+        expect(seen(page, "suppressed")).to_be_empty()
+        expect(page.get_by_test_id("silenced")).to_have_count(0)
+        expect(scan).to_contain_text("nearest")
+
     def test_control_of_another_window_is_brought_here(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """One user with two windows needs nobody's leave."""
         first, second = open_page(COCKPIT, user="driver"), open_page(COCKPIT, user="driver")
@@ -167,17 +228,50 @@ class TestStop:
         expect(seen(page, "resume")).to_have_count(0)
 
     def test_without_a_websocket(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """While the link is down STOP goes by HTTP alone, and says that it was done."""
+        """While the link is down STOP goes by HTTP alone, and that it was done is told before that the link is late."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         relay.do(frozen=True)
-        expect(seen(page, "link-late")).to_be_visible()
+        expect(seen(page, "drive-words")).to_contain_text("The link is late.")
         seen(page, "stop").click()
-        expect(seen(page, "drive-words")).to_contain_text("late")
-        relay.until(lambda: relay.log(op=f"POST robots/{ROBOT}/stop"), "no stop came by HTTP")
+        late = page.locator("body:has([data-testid=link-late])")
+        expect(late.get_by_test_id("drive-words")).to_have_text("The robot is stopped.", timeout=4000)
+        assert relay.log(op=f"POST robots/{ROBOT}/stop")
         relay.do(frozen=False)
         page.reload()
         expect(seen(page, "stopped")).to_be_visible()
+
+    def test_that_nobody_answers(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The page says at once that it is under way, then that it is not confirmed, until the robot stands."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        relay.do(frozen=True, stuck=["orders"])
+        expect(seen(page, "link-late")).to_be_visible()
+        page.clock.install()
+        seen(page, "stop").click()
+        expect(seen(page, "drive-words")).to_have_text("Stopping…")
+        expect(seen(page, "stop")).to_have_text("Stopping…")
+        page.clock.fast_forward(23_000)
+        expect(seen(page, "drive-words")).to_contain_text("The stop is not confirmed.")
+        expect(seen(page, "toast")).to_contain_text("The stop is not confirmed.")
+        expect(seen(page, "stop")).to_have_text("STOP")
+        page.clock.fast_forward(60_000)
+        expect(seen(page, "toast")).to_be_visible()
+        relay.do(frozen=False, stuck=[])
+        expect(seen(page, "drive-words")).to_have_text("The robot is stopped.")
+        expect(seen(page, "toast")).to_have_count(0)
+
+    def test_is_told_as_the_relay_answers(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Not as the page takes the robot to be: one that has just come back is stopped, and not away."""
+        page = open_page(COCKPIT, user="driver")
+        ready_to_drive(page)
+        relay.do(robot=ROBOT, state="offline")
+        expect(page.get_by_text("The robot is offline.").first).to_be_visible()
+        relay.do(mute=True, stuck=["orders"])
+        relay.do(robot=ROBOT, state="online")
+        seen(page, "stop").click()
+        expect(seen(page, "drive-words")).to_have_text("The robot is stopped.")
+        relay.do(stuck=[])
 
     def test_of_a_robot_that_is_away(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """The page says that it will be stopped, not that it is, whichever answer comes first."""
@@ -222,6 +316,28 @@ class TestStop:
         page.wait_for_timeout(2000)  # proves absence
         expect(seen(page, "stopped")).to_be_visible()
         assert "/relay/resume" not in orders(relay)
+
+    def test_a_stop_that_comes_while_the_finger_holds_is_not_resumed(
+        self, open_page: OpenPage, relay: FakeRelay
+    ) -> None:
+        """Somebody else has stopped the robot anew: whoever has seen that presses once more."""
+        page = open_page(COCKPIT, user="admin")
+        expect(seen(page, "link-state")).to_have_attribute("data-state", "open")
+        for attempt in range(5):
+            relay.do(robot=ROBOT, stopped=f"vic {attempt}")
+            expect(seen(page, "stopped")).to_contain_text(f"By vic {attempt}")
+            before = orders(relay).count("/relay/resume")
+            seen(page, "resume").focus()
+            page.keyboard.down("Space")
+            relay.do(robot=ROBOT, stopped=f"eve {attempt}")
+            page.wait_for_timeout(2000)  # proves absence
+            page.keyboard.up("Space")
+            # Where the second stop took longer than the finger, there was nothing to see.
+            if orders(relay).count("/relay/resume") == before:
+                break
+        else:
+            pytest.fail("each time the robot was resumed")
+        expect(seen(page, "stopped")).to_contain_text(f"By eve {attempt}")
 
     def test_of_one_robot_and_of_all_from_the_list(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """Each card has its STOP, and the top bar one for all; one that is away is stopped when it is back."""
@@ -476,6 +592,16 @@ class TestGamepad:
         page.evaluate("window.pad = null")
         ends_with_one_zero(page, relay)
         expect(seen(page, "drive-words")).to_have_text("Stopped: the gamepad is gone.")
+
+    def test_is_looked_at_while_no_frames_are_drawn(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """Commands go by a timer, and must not go on saying what a pad said last."""
+        page = self.open(open_page)
+        self.hold(page, relay)
+        page.evaluate("window.requestAnimationFrame = () => 0")
+        before = len(relay.commands())
+        driving(relay, before + 3)
+        page.evaluate("pad.buttons[5].pressed = false")
+        ends_with_one_zero(page, relay)
 
     def test_has_to_be_let_go_after_a_stop(self, open_page: OpenPage, relay: FakeRelay) -> None:
         """A page that lost the focus is not driven on by the button that is still held."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import itertools
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -111,6 +112,15 @@ class TestFleet:
         relay.do(robot="rover-1", state="offline")
         expect(state).to_have_attribute("data-state", "offline")
 
+    def test_a_robot_that_has_not_heard_of_its_stop(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """It is said to be stopped only when it has said so."""
+        page = open_page("/", user="admin")
+        state = page.locator("[data-robot=arm-3]").get_by_test_id("robot-stopped")
+        relay.do(robot="arm-3", stopped="ann", told=False)
+        expect(state).to_have_text("Being stopped")
+        relay.do(robot="arm-3", state="online")
+        expect(state).to_have_text("Stopped")
+
     def test_search_and_filter(self, open_page: OpenPage) -> None:
         """Words narrow the list; a search without result says so and offers the way back."""
         page = open_page("/", user="admin")
@@ -166,6 +176,78 @@ class TestStopAll:
         stuck.abort()
         expect(page.get_by_text("The page could not be loaded")).to_be_visible()
         expect(page.get_by_role("button", name="Stop all robots")).to_be_visible()
+
+    def test_while_nobody_can_say_who_is_logged_in(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A relay whose database hangs may still stop robots; the page that was asked for is shown when it can."""
+        relay.do(failing=True)
+        page = open_page("/alerts", user="admin")
+        expect(page.get_by_text("The database does not answer. STOP is sent all the same.")).to_be_visible()
+        self.pressed(page, relay)
+        relay.do(failing=False)
+        page.get_by_role("button", name="Try again").click()
+        expect(page.get_by_role("heading", name="Alerts")).to_be_visible()
+
+    def test_while_the_relay_says_nothing(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """A page that can't begin is not blank for long."""
+        relay.do(stuck=["session"])
+        page = open_page("/fleet", user="admin")
+        expect(page.get_by_text("The relay takes long to answer.")).to_be_visible(timeout=5000)
+        self.pressed(page, relay)
+        relay.do(stuck=[])
+        expect(seen(page, "robot-card")).to_have_count(3)
+
+    def test_of_who_turns_out_to_be_nobody(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """He reads that nothing was stopped, where he can log in."""
+        relay.do(failing=True)
+        page = open_page("/fleet")
+        page.get_by_role("button", name="Stop all robots").click()
+        expect(seen(page, "login-notice")).to_contain_text("Nothing was stopped")
+        relay.do(failing=False)
+        seen(page, "login-user").fill("driver")
+        seen(page, "login-password").fill(PASSWORD)
+        seen(page, "login-submit").click()
+        expect(seen(page, "robot-card")).to_have_count(2)
+
+    def test_that_nobody_answers(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The button says at once that it is under way, and the page that it is not confirmed, until all stand."""
+        page = open_page("/fleet", user="admin")
+        button = page.get_by_role("button", name="Stop all robots")
+        expect(seen(page, "robot-card")).to_have_count(3)
+        relay.do(stuck=["orders"])
+        page.clock.install()
+        button.click()
+        expect(button).to_have_text("Stopping…")
+        page.clock.fast_forward(23_000)
+        expect(seen(page, "toast")).to_contain_text("Not all robots are known to be stopped.")
+        expect(button).to_have_text("STOP all")
+        page.clock.fast_forward(60_000)
+        for robot in ("rover-1", "rover-2"):
+            relay.do(robot=robot, stopped="ann")
+            expect(page.locator(f"[data-robot={robot}]").get_by_test_id("robot-stopped")).to_have_text(
+                "Stopped"
+            )
+            expect(seen(page, "toast")).to_be_visible()
+        relay.do(robot="arm-3", stopped="ann", told=False)
+        state = page.locator("[data-robot=arm-3]").get_by_test_id("robot-stopped")
+        expect(state).to_have_text("Being stopped")
+        expect(seen(page, "toast")).to_be_visible()
+        relay.do(robot="arm-3", stopped="ann")
+        expect(state).to_have_text("Stopped")
+        expect(seen(page, "toast")).to_have_count(0)
+
+    def test_of_one_robot_that_nobody_answers(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """The same by the button of its card; what is not confirmed can be dismissed."""
+        page = open_page("/fleet", user="admin")
+        button = page.locator("[data-robot=rover-1]").get_by_test_id("stop")
+        relay.do(stuck=["orders"])
+        page.clock.install()
+        button.click()
+        expect(button).to_have_text("Stopping…")
+        page.clock.fast_forward(23_000)
+        expect(seen(page, "toast")).to_contain_text("rover-1: the stop is not confirmed.")
+        page.clock.fast_forward(60_000)
+        seen(page, "toast").get_by_label("Dismiss").click()
+        expect(seen(page, "toast")).to_have_count(0)
 
     def test_not_where_nobody_is_logged_in(self, open_page: OpenPage) -> None:
         """There is nobody whose robots could be meant, nor where somebody has none."""
@@ -384,21 +466,29 @@ class TestDriving:
         assert relay.commands()[-1] == ZERO
         page.mouse.up()
 
-    def test_a_robot_that_does_not_answer_is_marked(self, open_page: OpenPage, relay: FakeRelay) -> None:
-        """While the relay answers and the robot does not, neither the way to it nor the driving looks well."""
+    def test_a_robot_that_does_not_answer_is_not_driven(self, open_page: OpenPage, relay: FakeRelay) -> None:
+        """While the relay answers and the robot does not, driving ends; when it heals, only a new grip moves it."""
         page = open_page(COCKPIT, user="driver")
         ready_to_drive(page)
         expect(seen(page, "leg-client-robot")).to_contain_text("ms")
         hold_joystick(page)
-        expect(seen(page, "driving")).to_be_visible()
+        driving(relay)
         relay.do(dead=True)
         expect(seen(page, "robot-late")).to_be_visible(timeout=5000)
         expect(seen(page, "driving")).to_have_count(0)
         expect(seen(page, "latency-badge")).to_have_text("robot late")
+        expect(seen(page, "drive-words")).to_contain_text("The robot is late.")
+        assert_one_zero_then_silence(page, relay)
         relay.do(dead=False)
         # Asked again once the relay has given up on the ping that is out.
-        expect(seen(page, "driving")).to_be_visible()
         expect(seen(page, "latency-badge")).to_have_text(re.compile(r"\d+ ms"))
+        expect(seen(page, "drive-words")).to_contain_text("Take hold again")
+        page.mouse.move(640, 300, steps=5)
+        assert_one_zero_then_silence(page, relay)
+        page.mouse.up()
+        before = len(relay.commands())
+        hold_joystick(page)
+        driving(relay, before + 1)
         page.mouse.up()
 
     def test_nothing_old_is_sent_after_a_reconnect(self, open_page: OpenPage, relay: FakeRelay) -> None:
@@ -513,6 +603,26 @@ class TestWidths:
             page.locator("[data-topic='/scan']").click()
             expect(seen(page, "topic-echo")).to_contain_text("angle_min")
         assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+    def test_the_cockpits_bar_tells_what_counts(
+        self, open_page: OpenPage, relay: FakeRelay, width: int
+    ) -> None:
+        """The links, who has control, what alerts there are and STOP stand side by side, each to be seen whole."""
+        driver = open_page(COCKPIT, user="driver")
+        ready_to_drive(driver)
+        relay.do(alert={"robot": "rover-1", "text": "the battery is low"})
+        page = open_page(COCKPIT, width=width, user="admin")
+        expect(seen(page, "holder")).to_have_text("driver has control")
+        expect(seen(page, "alerts-count")).to_have_text("1")
+        expect(seen(page, "latency-badge")).to_contain_text(re.compile(r"\d+ ms"))
+        boxes = [
+            seen(page, each).bounding_box() for each in ("latency-badge", "holder", "alerts-link", "stop")
+        ]
+        assert all(box["x"] >= 0 and box["x"] + box["width"] <= width and box["y"] < 100 for box in boxes)
+        for one, other in itertools.combinations(boxes, 2):
+            beside = one["x"] + one["width"] <= other["x"] or other["x"] + other["width"] <= one["x"]
+            assert beside or abs(one["y"] - other["y"]) >= min(one["height"], other["height"])
+        assert seen(page, "holder").evaluate("it => it.scrollWidth <= it.clientWidth"), "it is cut"
 
     def test_stop_is_always_on_top(self, open_page: OpenPage, width: int) -> None:
         """STOP stays visible and the top bar uncovered however far the cockpit is scrolled."""

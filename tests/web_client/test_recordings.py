@@ -135,6 +135,25 @@ def test_a_finished_recording_is_downloaded(open_page: OpenPage, relay: FakeRela
     assert path.read_bytes() == MAGIC + bytes(range(256)) * 8
 
 
+def test_a_long_list_is_shown_in_lots(open_page: OpenPage, relay: FakeRelay) -> None:
+    """The latest first; older ones when they are asked for, and they stay."""
+    for number in range(230):
+        put(relay, messages=number)
+    page = cockpit(open_page)
+    expect(seen(page, "")).to_have_count(100)
+    expect(seen(page, "count")).to_have_text("100+")
+    expect(seen(seen(page, "").first, "messages")).to_have_text("229")
+    seen(page, "older").click()
+    expect(seen(page, "")).to_have_count(200)
+    seen(page, "older").click()
+    expect(seen(page, "")).to_have_count(230)
+    expect(seen(page, "older")).to_have_count(0)
+    expect(seen(page, "count")).to_have_text("230")
+    with page.expect_response(re.compile("/recordings[?]limit=300$")):
+        pass
+    expect(seen(page, "")).to_have_count(230)
+
+
 def test_deleting_is_asked_about(open_page: OpenPage, relay: FakeRelay) -> None:
     """One press deletes nothing."""
     put(relay)
@@ -181,9 +200,10 @@ def test_who_may_record_nothing_sees_nothing_of_it(open_page: OpenPage, relay: F
         ),
         ({"left": 0.3}, "take all 10 GB they may have"),
         ({"left": 0, "megabytes": 0}, "keeps no recordings"),
+        ({"full": "the disk is nearly full: delete some"}, "The disk is nearly full: delete some."),
         ({"robot": "rover-1", "state": "offline"}, "The robot is offline."),
     ],
-    ids=["right", "room", "none", "offline"],
+    ids=["right", "room", "none", "disk", "offline"],
 )
 def test_why_nothing_can_be_recorded_is_said(
     open_page: OpenPage, relay: FakeRelay, order: dict[str, Any], words: str
@@ -193,7 +213,7 @@ def test_why_nothing_can_be_recorded_is_said(
     page = cockpit(open_page)
     expect(seen(page, "why")).to_contain_text(words)
     expect(seen(page, "new")).to_be_disabled()
-    relay.do(denied="", left=10_000, megabytes=10_000, robot="rover-1", state="online")
+    relay.do(denied="", full="", left=10_000, megabytes=10_000, robot="rover-1", state="online")
     expect(seen(page, "new")).to_be_enabled(timeout=40_000)
     expect(seen(page, "why")).to_have_count(0)
 

@@ -136,6 +136,91 @@ def test_pictures_that_stop_are_marked(open_page: OpenPage, relay: FakeRelay) ->
     expect(part(page, "stale")).to_have_count(0)
 
 
+def kept(open_page: OpenPage, relay: FakeRelay, seconds: float, **options: Any) -> Page:
+    """An open cockpit that has got one picture, so old, and gets no more."""
+    relay.do(kept=seconds, **options)
+    page = open_page(COCKPIT, user="driver")
+    relay.until(lambda: relay.log(op="took"), "the picture was not taken")
+    return page
+
+
+def test_an_old_picture_is_no_live_one(open_page: OpenPage, relay: FakeRelay) -> None:
+    """The picture that a dead camera has left is dimmed, with its own age, until there is a new one."""
+    page = kept(open_page, relay, 50)
+    expect(part(page, "stale")).to_have_text(re.compile(r"No picture since (5\d|6\d) s"))
+    canvas = part(page, "canvas")
+    assert canvas.evaluate("canvas => getComputedStyle(canvas).filter") != "none"
+    expect(canvas).to_have_attribute("aria-label", re.compile("^Old picture"))
+    relay.do(kept=None)
+    expect(part(page, "stale")).to_have_count(0)
+    expect(part(page, "fps")).to_have_text(RUNS)
+
+
+UNDIMMED = """() => {
+    window.undimmed = 0
+    const look = () => {
+        const canvas = document.querySelector('[data-testid=camera-canvas]')
+        const shown = canvas && canvas.style.visibility !== 'hidden'
+        if (shown && !document.querySelector('[data-testid=camera-stale]')) window.undimmed += 1
+        requestAnimationFrame(look)
+    }
+    look()
+}"""
+
+
+def test_an_old_picture_that_comes_again_is_no_newer(open_page: OpenPage, relay: FakeRelay) -> None:
+    """A connection that is made anew and brings the same old picture shows it as old from its first frame on."""
+    page = kept(open_page, relay, 50)
+    expect(part(page, "stale")).to_be_visible()
+    page.evaluate(UNDIMMED)
+    relay.do(close_video=1001, clear_log=True)
+    relay.until(lambda: relay.log(op="took"), "the picture was not taken again")
+    page.evaluate("() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+    assert page.evaluate("window.undimmed") == 0
+
+
+def test_an_old_picture_of_a_slow_camera_grows_older(open_page: OpenPage, relay: FakeRelay) -> None:
+    """Until the next one is missed it is shown as it is, with an age that grows."""
+    page = kept(open_page, relay, 20, source_fps=0.05)
+    expect(part(page, "delay")).to_have_text(re.compile(r"^[23]\d s old$"))
+    first = part(page, "delay").inner_text()
+    expect(part(page, "delay")).not_to_have_text(first)
+    assert int(part(page, "delay").inner_text().split()[0]) > int(first.split()[0])
+    expect(part(page, "stale")).to_have_count(0)
+
+
+def test_the_picture_of_an_hour_ago_is_dated(open_page: OpenPage, relay: FakeRelay) -> None:
+    """A picture that its publisher keeps is dimmed, with its time, and nothing is said of a camera that is silent."""
+    page = kept(open_page, relay, 3600)
+    expect(part(page, "stale")).to_have_text(re.compile(r"^Picture of .*\d:\d\d.*, by the robot’s clock$"))
+
+
+def test_the_time_of_an_old_picture_fits_on_a_phone(open_page: OpenPage, relay: FakeRelay) -> None:
+    """With two cameras beside each other what is said of a picture stays in its pane."""
+    relay.do(kept=3600)
+    page = open_page(COCKPIT, user="driver", width=390, height=844)
+    part(page, "add").click()
+    expect(part(page, "stale")).to_have_count(2)
+    for each in part(page, "pane").all():
+        box, words = each.bounding_box(), part(each, "stale").bounding_box()
+        assert box is not None
+        assert words is not None
+        assert box["x"] <= words["x"]
+        assert words["x"] + words["width"] <= box["x"] + box["width"]
+
+
+def test_a_clock_that_is_behind_makes_no_live_picture_old(open_page: OpenPage, relay: FakeRelay) -> None:
+    """What comes after the first picture is live whatever its stamp says."""
+    relay.do(ahead=-50)
+    page = watching(open_page)
+    expect(part(page, "delay")).to_have_text("age unknown")
+    page.evaluate(UNDIMMED)
+    taken = len(relay.log(op="took"))
+    relay.until(lambda: len(relay.log(op="took")) > taken + 5, "no pictures were taken")
+    expect(part(page, "stale")).to_have_count(0)
+    assert page.evaluate("window.undimmed") > 0
+
+
 def test_a_slow_stream_is_not_a_broken_one(open_page: OpenPage, relay: FakeRelay) -> None:
     """At one picture a second nothing is marked as missing."""
     page = watching(open_page)
@@ -172,6 +257,17 @@ def test_a_thin_link_is_shown(open_page: OpenPage, relay: FakeRelay) -> None:
     relay.do(reduced=0.5)
     expect(part(page, "reduced")).to_have_text("reduced: thin link")
     expect(part(page, "reduced")).to_have_attribute("title", re.compile("480 × 360 at quality 80"))
+
+
+def test_another_form_than_asked_for_is_marked(open_page: OpenPage, relay: FakeRelay) -> None:
+    """Which one, and why, is told; the mark goes with it."""
+    page = watching(open_page)
+    expect(part(page, "instead")).to_have_count(0)
+    relay.do(instead={"width": 320, "fps": 5})
+    expect(part(page, "instead")).to_have_text("others’ form: robot at its limit")
+    expect(part(page, "instead")).to_have_attribute("title", re.compile("width 320, pictures per second 5"))
+    relay.do(instead=None)
+    expect(part(page, "instead")).to_have_count(0)
 
 
 def test_the_snapshot_is_what_is_shown(open_page: OpenPage, tmp_path: Path) -> None:
@@ -266,17 +362,42 @@ def test_h264(open_page: OpenPage, relay: FakeRelay) -> None:
 
 
 def test_h264_that_the_robot_has_not_falls_back(open_page: OpenPage, relay: FakeRelay) -> None:
-    """Refused H.264 is replaced by JPEG, and the controls say why."""
+    """Refused H.264 is replaced by JPEG, and the controls say why; of another camera it is tried anew."""
     page = watching(open_page)
     part(page, "settings").click()
     part(page, "ask-codec").select_option("h264")
     relay.until(lambda: last_watch(relay).get("codec") == "h264", "H.264 was not asked for")
-    relay.do(close_video=4503, reason="the robot has no encoder for H.264")
+    relay.do(close_video=4415, reason="the robot has no encoder for H.264")
     expect(part(page, "codec-note")).to_have_text(
         "The robot has no encoder for H.264. JPEG is shown instead."
     )
     relay.until(lambda: last_watch(relay) == {"topic": FRONT}, "JPEG was not asked for")
     expect(part(page, "stale")).to_have_count(0)
+    part(page, "topic").select_option(REAR)
+    expect(part(page, "codec-note")).to_have_count(0)
+    relay.until(lambda: last_watch(relay) == {"topic": REAR, "codec": "h264"}, "H.264 was not tried anew")
+
+
+@pytest.mark.parametrize(
+    "reason",
+    [
+        "camera /camera/image_raw has given no picture for 10 s",
+        "you begin streams of robot rover-1 faster than it can; try again in 1 s",
+        "robot rover-1 shows 16 streams already, the most it can",
+    ],
+)
+def test_h264_that_is_not_to_be_had_just_now_is_asked_for_again(
+    open_page: OpenPage, relay: FakeRelay, reason: str
+) -> None:
+    """What is not the encoder's fault says nothing against H.264: the next time it is tried again, and shown."""
+    page = watching(open_page)
+    part(page, "settings").click()
+    part(page, "ask-codec").select_option("h264")
+    relay.until(lambda: last_watch(relay).get("codec") == "h264", "H.264 was not asked for")
+    relay.do(close_video=4503, reason=reason, clear_log=True)
+    relay.until(lambda: len(relay.log(op="took")) > 3, "the pictures did not come back")
+    assert {each.get("codec") for each in relay.log(op="watch")} == {"h264"}
+    expect(part(page, "codec-note")).to_have_count(0)
 
 
 def test_why_there_is_no_h264_is_said(open_page: OpenPage) -> None:

@@ -75,7 +75,8 @@ def test_control_first_command(pair: tuple[Client, Client], hand: Hand, topic: s
 def test_control_stop(pair: tuple[Client, Client]) -> None:
     """A stop is told with who and why, until somebody resumes."""
     one, two = pair
-    assert one.values("/relay/stop", {"why": "a case"})["success"] is True
+    answer = one.values("/relay/stop", {"why": "a case"})
+    assert (answer["success"], answer["done"]) == (True, True)
     while not (stopped := two.until("publish", topic="/relay/control")["msg"]["stopped"]):
         pass
     assert stopped["why"] == "a case"

@@ -23,40 +23,63 @@ def long_ago() -> int:
     return time.monotonic_ns() // 2
 
 
-def stale(control: Link) -> int:
-    """What it has not obeyed for its age, by the second message about its health from now on."""
+def counted(control: Link, what: str) -> int:
+    """What it has not obeyed, and counts as this, by the second message about its health from now on."""
     with contextlib.suppress(AssertionError):
         while True:
             control.expect("health", 0.0)
     control.expect("health", 20)
-    return int(control.expect("health", 20).get("stale_commands", 0))
+    return int(control.expect("health", 20).get(what, 0))
 
 
-@case("send_action_goal", "SPEC 2.5, Clocks and deadline, 9")
-def test_old_goal_that_moves(relay: LinkRelay, channel: Link) -> None:
-    """The holder's goal for what counts as motion never begins when its stamp is too old, and is counted."""
+def moving_action(relay: LinkRelay) -> str:
+    """The name of an action that counts as motion; it need not be there."""
     plain = [each.replace("*", "") for each in motion(relay).get("actions", []) if not set("?[") & set(each)]
     if not plain:
         not_offered("no action that counts as motion")
-    control = relay.control
-    assert control.order("resume", by="the suite").get("ok", True)
-    assert control.order("control", holder=DRIVER, user="the suite", level="operator").get("ok", True)
-    before = stale(control)
-    deadline = motion(relay).get("deadline_ms", 500) * 1_000_000
+    return plain[0]
+
+
+def never_begins(channel: Link, action: str, stamp: int) -> None:
+    """The holder's goal of this stamp is refused in words."""
     channel.say(
         "send_action_goal",
         id="old",
-        action=plain[0],
+        action=action,
         type=FIBONACCI,
         source=DRIVER,
-        stamp=time.monotonic_ns() - deadline - 50_000_000,
+        stamp=stamp,
         cdr=base64.b64encode(CDR + bytes(4)).decode(),
         args={},
     )
     end = channel.expect("action_result", id="old")
     assert (end["status"], end["result"]) == (0, False)
     assert end["reason"]
-    assert stale(control) == before + 1
+
+
+@case("send_action_goal", "SPEC 2.5, Clocks and deadline, 9")
+def test_old_goal_that_moves(relay: LinkRelay, channel: Link) -> None:
+    """The holder's goal for what counts as motion never begins when its stamp is too old, and is counted."""
+    action, control = moving_action(relay), relay.control
+    assert control.order("resume", by="the suite").get("ok", True)
+    assert control.order("control", holder=DRIVER, user="the suite", level="operator").get("ok", True)
+    before = counted(control, "stale_commands")
+    deadline = motion(relay).get("deadline_ms", 500) * 1_000_000
+    never_begins(channel, action, time.monotonic_ns() - deadline - 50_000_000)
+    assert counted(control, "stale_commands") == before + 1
+
+
+@case("send_action_goal", "SPEC 2.5, Who moves the robot, 8")
+def test_goal_sent_before_the_resume(relay: LinkRelay, channel: Link) -> None:
+    """The holder's goal for what counts as motion never begins when it was sent before the resume, and is counted."""
+    action, control = moving_action(relay), relay.control
+    assert control.order("control", holder=DRIVER, user="the suite", level="operator").get("ok", True)
+    before = counted(control, "refused_commands")
+    assert control.order("stop", by="the suite").get("ok", True)
+    stamp = time.monotonic_ns()
+    assert control.order("resume", by="the suite").get("ok", True)
+    never_begins(channel, action, stamp)
+    assert counted(control, "refused_commands") == before + 1
 
 
 @case("send_action_goal", "SPEC 2.5, Clocks and deadline, 9")

@@ -169,7 +169,7 @@ def test_resume_moves_nothing(drive: Wheels) -> None:
     drive.streams(0.2, 0.3)
     drive.resume()
     drive.streams(0.2, 1.0)
-    time.sleep(0.6)  # lets go
+    time.sleep(0.8)  # lets go, whatever the way of a ping leaves in doubt
     until = time.monotonic() + 2
     while drive.next_speed(0.05) != 0.2:
         assert time.monotonic() < until, "it does not move after he let go"
@@ -185,6 +185,53 @@ def test_zero_is_letting_go(drive: Wheels) -> None:
     drive.streams(0.2, 0.2)
     drive.resume()
     drive.streams(0.2, 0.2)
+    drive.start()
+
+
+@case("resume", "SPEC 2.5 Who moves the robot, 8")
+def test_sent_before_the_resume(drive: Wheels) -> None:
+    """What can have been sent before the resume is not obeyed after it, though its source has said zero."""
+    moving = drive.start()
+    assert drive.control.order("stop", by="eve").get("ok", True)
+    drive.stands(moving)
+    before = time.monotonic()
+    drive.resume()
+    drive.command(0.0)
+    for _ in range(5):
+        drive.command(0.3, age=time.monotonic() - before)
+    drive.never_goes(0.3)
+    drive.start()
+
+
+@case("resume", "SPEC 2.5 Who moves the robot, 8")
+def test_stall_is_no_silence(drive: Wheels) -> None:
+    """Who must let go has not, when nothing came for a while and then what can have been sent meanwhile."""
+    moving = drive.start()
+    assert drive.control.order("stop", by="eve").get("ok", True)
+    drive.stands(moving)
+    drive.streams(0.2, 0.3)
+    drive.resume()
+    drive.streams(0.2, 0.2)
+    last = time.monotonic()
+    drive.command(0.2)
+    time.sleep(0.55)  # the link stalls
+    for _ in range(5):
+        drive.command(0.3, age=time.monotonic() - last - 0.2)
+    drive.never_goes(0.3)
+    drive.start()
+
+
+@case("control", "SPEC 2.5 Who moves the robot, 8")
+def test_sent_before_control_was_lost(drive: Wheels) -> None:
+    """Who has control again is not obeyed in what he can have sent before he lost it."""
+    drive.start()
+    before = time.monotonic()
+    drive.give(OTHER)
+    drive.give(DRIVER)
+    drive.command(0.0)
+    for _ in range(5):
+        drive.command(0.3, age=time.monotonic() - before)
+    drive.never_goes(0.3)
     drive.start()
 
 

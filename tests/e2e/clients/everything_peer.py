@@ -74,6 +74,10 @@ def send(node: object, name: str) -> None:
     seen = []
     future = client.send_goal_async(goal, feedback_callback=lambda each: seen.append(each.feedback))
     rclpy.spin_until_future_complete(node, future, timeout_sec=20)
+    # rclpy tells of no more feedback once the result has come, and takes one of each at a time.
+    until = time.monotonic() + 20
+    while len(seen) < goal.steps and time.monotonic() < until:
+        rclpy.spin_once(node, timeout_sec=0.1)
     done = future.result().get_result_async()
     rclpy.spin_until_future_complete(node, done, timeout_sec=20)
     result = done.result()

@@ -1,0 +1,353 @@
+"""What README.md, docs/ and the SPEC show of curl works as it stands: their very lines, against a relay and a robot."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from switchboard_examples import Came, Example, Shell, examples
+from switchboard_http import ask
+from switchboard_processes import BIN, Process, ros_environment, running
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_waiting import wait_for
+
+from tests.robot_client.ros import Peer
+
+ROOT = Path(__file__).parents[2]
+README = list(examples(ROOT / "README.md"))
+SHOWN = [
+    *README,
+    *(each for path in sorted((ROOT / "docs").glob("*.md")) for each in examples(path)),
+    *examples(ROOT / "protocol" / "SPEC.md"),
+]
+ASKING = [each for each in SHOWN if each.asks]
+ROBOT = "/api/v1/robots/robot-one"
+DIRECTORY = "/api/v1/directory"
+MCAP = b"\x89MCAP0\r\n"
+JPEG = b"\xff\xd8"
+
+
+@dataclass
+class Scene:
+    """What the examples meet: the demo's robot-one and its user driver, and what some of them need beside."""
+
+    relay: Relay
+    shell: Shell
+
+    @property
+    def folder(self) -> Path:
+        """Where examples run."""
+        return self.shell.folder
+
+    def ask(self, method: str, path: str, body: Any = None) -> Any:
+        """A request of the driver's, by the examples' own token; what it gave."""
+        answer = ask(self.relay.http_port, method, path, body, token=self.shell.environment["TOKEN"])
+        assert answer.status < 300, answer.body
+        return answer.json if answer.body else None
+
+
+def nothing(scene: Scene) -> dict[str, str]:
+    """Nothing has to be done before, or after."""
+    return {}
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What has to come of an example.
+
+    :param status: of HTTP
+    :param check: looks at what came
+    :param before: makes what the example needs; what stands for what in its text
+    :param over: says of one that goes on until it is ended that enough has come
+    :param after: takes back what it did
+    """
+
+    status: int
+    check: Callable[[Scene, Came], bool]
+    before: Callable[[Scene], dict[str, str]] = nothing
+    over: Callable[[Scene, str], bool] | None = None
+    after: Callable[[Scene], object] = nothing
+
+
+def told(came: Came) -> Any:
+    """The JSON that was printed."""
+    return json.loads(came.output)
+
+
+def said_on(topic: str) -> Callable[[Scene], dict[str, str]]:
+    """Wait until something has been said on a topic, which is kept for who asks soon."""
+
+    def before(scene: Scene) -> dict[str, str]:
+        scene.ask("GET", f"{ROBOT}/topics/{topic}?wait=60")
+        return {}
+
+    return before
+
+
+def seen(scene: Scene) -> dict[str, str]:
+    """Wait until the robot shows its camera: on a busy machine what shows it takes its time to begin."""
+    token, picture = (
+        scene.shell.environment["TOKEN"],
+        "/robots/robot-one/video/snapshot?topic=/camera/image_raw",
+    )
+    wait_for("a picture", lambda: ask(scene.relay.http_port, "GET", picture, token=token).status == 200)
+    return {}
+
+
+def recorded(scene: Scene) -> dict[str, str]:
+    """A recording that is complete."""
+    begun = scene.ask("POST", f"{ROBOT}/recordings", {"topics": ["/odom"], "seconds": 600, "megabytes": 1})
+    place = f"{ROBOT}/recordings/{begun['id']}"
+    wait_for("something is recorded", lambda: scene.ask("GET", place)["messages"])
+    scene.ask("POST", f"{place}/stop")
+    wait_for("the recording is complete", lambda: scene.ask("GET", place)["state"] == "complete")
+    return {"<id>": begun["id"]}
+
+
+def unrecorded(scene: Scene) -> None:
+    """No recording goes on, or is kept."""
+    for each in scene.ask("GET", f"{ROBOT}/recordings")["recordings"]:
+        if each["state"] == "recording":
+            scene.ask("POST", f"{ROBOT}/recordings/{each['id']}/stop")
+        scene.ask("DELETE", f"{ROBOT}/recordings/{each['id']}")
+
+
+def downloaded(scene: Scene, came: Came) -> bool:
+    """The file has the name that the next line of the document has, and is one of MCAP."""
+    (file,) = scene.folder.glob("robot-one-*.mcap")
+    return file.read_bytes().startswith(MCAP)
+
+
+def resumed(scene: Scene) -> None:
+    """The robot may move again."""
+    scene.relay.run_cli("resume", "robot-one").check_returncode()
+
+
+def stopped_by_owner(scene: Scene) -> dict[str, str]:
+    """The robot is stopped and driver's own; the moment that the line before tells him stands in this one."""
+    scene.relay.cli("right", "grant", "driver", "robot-one", "owner")
+    scene.relay.run_cli("stop", "robot-one").check_returncode()
+    answer = ask(scene.relay.http_port, "GET", f"{ROBOT}/control", token=scene.shell.environment["TOKEN"])
+    return {"$MOMENT": f"switchboard-moment: {answer.headers['switchboard-moment']}"}
+
+
+def operating(scene: Scene) -> None:
+    """The robot may move again, and the driver is its operator, as ever."""
+    resumed(scene)
+    scene.relay.cli("right", "grant", "driver", "robot-one", "operator")
+
+
+def stopped(scene: Scene, came: Came) -> bool:
+    """The robot is stopped, and the answer says by whom."""
+    (robot,) = (each for each in scene.ask("GET", "/api/v1/robots")["robots"] if each["name"] == "robot-one")
+    return bool(robot["stopped"]) and "driver" in json.dumps(told(came)["stopped"])
+
+
+def registered(scene: Scene) -> dict[str, str]:
+    """The map is in the directory."""
+    scene.ask("POST", DIRECTORY, {"kind": "application", "name": "map", "address": "http://10.0.0.7:8000/"})
+    return {}
+
+
+def unregistered(scene: Scene) -> None:
+    """No application is in the directory."""
+    for each in scene.ask("GET", f"{DIRECTORY}?kind=application")["entries"]:
+        scene.ask("DELETE", f"{DIRECTORY}/{each['id']}")
+
+
+def film(scene: Scene, printed: str) -> bool:
+    """Some pictures are in the file."""
+    file = scene.folder / "film.mjpeg"
+    return file.exists() and file.read_bytes().count(b"Content-Type: image/jpeg") > 2
+
+
+def orders(came: Came) -> list[Any]:
+    """The answer of an order to many, line by line."""
+    return [json.loads(line) for line in came.output.splitlines()]
+
+
+EXPECTED = {
+    r"\$ROBOTS$": Expected(
+        200, lambda _, came: "robot-one" in [each["name"] for each in told(came)["robots"]]
+    ),
+    r"/topics/odom$": Expected(200, lambda _, came: "pose" in told(came)["value"], before=said_on("odom")),
+    r"/services/reset$": Expected(200, lambda _, came: told(came)["values"]["success"] is True),
+    r'/topics/odom\?throttle_ms=500"$': Expected(
+        200,
+        lambda _, came: "event: message\ndata: {" in came.output,
+        over=lambda _, printed: "data: {" in printed,
+    ),
+    r"/actions/fibonacci$": Expected(
+        200, lambda _, came: told(came)["result"] == {"sequence": [0, 1, 1, 2, 3]}
+    ),
+    r"/video/cameras$": Expected(
+        200, lambda _, came: "/camera/image_raw" in [each["name"] for each in told(came)["cameras"]]
+    ),
+    r"/video/snapshot\?.* -o now\.jpg$": Expected(
+        200, lambda scene, _: (scene.folder / "now.jpg").read_bytes().startswith(JPEG), before=seen
+    ),
+    r"/video/stream\?.* -o film\.mjpeg$": Expected(
+        200, lambda scene, _: film(scene, ""), before=seen, over=film
+    ),
+    r"^TICKET=": Expected(201, lambda _, came: re.fullmatch(r"swb_[\w-]+", came.output) is not None),
+    r"--json .* \$REC$": Expected(
+        201,
+        lambda _, came: (
+            (told(came)["topics"], told(came)["cameras"]) == (["/odom", "/scan"], ["/camera/image_raw"])
+        ),
+        after=unrecorded,
+    ),
+    r'"\$AS" \$REC$': Expected(
+        200,
+        lambda _, came: [each["state"] for each in told(came)["recordings"]] == ["complete"],
+        before=recorded,
+        after=unrecorded,
+    ),
+    r"-OJ \$REC/<id>/file$": Expected(200, downloaded, before=recorded, after=unrecorded),
+    r"^MOMENT=": Expected(
+        200, lambda _, came: re.fullmatch(r"(?i)switchboard-moment: \S+", came.output) is not None
+    ),
+    r"/robot-one/resume$": Expected(
+        200, lambda _, came: told(came) == {"stopped": None}, before=stopped_by_owner, after=operating
+    ),
+    r"/robot-one/stop$": Expected(200, stopped, after=resumed),
+    r"--json .* \$DIRECTORY$": Expected(201, lambda _, came: told(came)["name"] == "map", after=unregistered),
+    r"\?kind=application\"$": Expected(
+        200,
+        lambda _, came: [each["name"] for each in told(came)["entries"]] == ["map"],
+        before=registered,
+        after=unregistered,
+    ),
+    r"\?robot=robot-one&kind=topic\"$": Expected(
+        200, lambda _, came: {"/odom", "/scan"} <= {each["name"] for each in told(came)["entries"]}
+    ),
+    r"/api/v1/fleet$": Expected(
+        200,
+        lambda _, came: (
+            (orders(came)[0]["robots"], orders(came)[-1]["done"], orders(came)[-1]["failed"])
+            == (["cleaner-1"], True, 0)
+        ),
+    ),
+    r"/topics/obstacles/places$": Expected(
+        200, lambda _, came: isinstance(told(came)["value"], dict), before=said_on("obstacles/places")
+    ),
+    r"/topics/say$": Expected(204, lambda _, came: came.output == ""),
+    r"/alerts/rules$": Expected(
+        201, lambda _, came: (told(came)["level"], bool(told(came)["secret"])) == ("error", True)
+    ),
+}
+"""By what the command looks like: each of those the documents show is one of these, and each of these is shown."""
+
+
+def expected(example: Example) -> list[str]:
+    """Which of them an example is."""
+    return [each for each in EXPECTED if re.search(each, example.command, re.DOTALL)]
+
+
+def has_curl() -> bool:
+    """Whether there is a curl that the examples are for: ``--json`` came with 7.82."""
+    if shutil.which("curl") is None:
+        return False
+    done = subprocess.run(["curl", "--help", "all"], capture_output=True, text=True, timeout=60, check=False)
+    return "--json" in done.stdout
+
+
+USED = {
+    "topics": {"/odom", "/scan", "/obstacles/places", "/say"},
+    "services": {"/reset"},
+    "actions": {"/fibonacci"},
+    "cameras": {"/camera/image_raw"},
+}
+"""What the robot has that examples use."""
+
+
+def wait_until_known(scene: Scene, part: str) -> None:
+    """Wait until the relay knows what there is of a kind."""
+
+    def known() -> bool:
+        return USED[part] <= {each["name"] for each in scene.ask("GET", f"{ROBOT}/{part}?limit=1000")[part]}
+
+    wait_for(f"the relay knows the robot's {part}", known)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    """A relay with the demo's robot and user, an action, two services of a robot, and a robot that is away."""
+    assert has_curl(), "there is no curl of 7.82 or newer; scripts/setup.sh says how to get one"
+    folder = tmp_path_factory.mktemp("examples")
+    with ExitStack() as stack:
+        relay = Relay(folder)
+        stack.enter_context(running(relay))
+        robot = Robot(relay, "robot-one", camera=True)
+        stack.enter_context(running(robot))
+        relay.user("driver")
+        relay.cli("robot", "add", "cleaner-1")
+        for name in ("robot-one", "cleaner-1"):
+            relay.cli("right", "grant", "driver", name, "operator")
+        environment = ros_environment(robot.domain)
+        for service in (["obstacles"], ["speech", "--out", str(folder / "said.wav")]):
+            command = [str(BIN / "switchboard-robot-service"), *service]
+            stack.enter_context(running(Process(command, folder, service[0], environment)))
+        peer = Peer(environment)
+        stack.callback(peer.close)
+        peer.do("act", "/fibonacci", "ok")
+        place = folder / "shell"
+        place.mkdir()
+        # The documents' own names, in the folder of the checkout.
+        (place / ".venv").symlink_to(BIN.parent)
+        (place / "demo-data").symlink_to(relay.data)
+        shell = Shell(place, os.environ, {"127.0.0.1:9090": f"127.0.0.1:{relay.http_port}"})
+        shell.set([each for each in README if each.sets and not each.asks])
+        scene = Scene(relay, shell)
+        for part in USED:
+            wait_until_known(scene, part)
+        yield scene
+
+
+def test_each_example_is_expected_to_give_something() -> None:
+    """Just one thing; and nothing is expected of examples that are not there."""
+    assert {each.place: len(expected(each)) for each in ASKING} == {each.place: 1 for each in ASKING}
+    assert set(EXPECTED) == {name for each in ASKING for name in expected(each)}
+
+
+@pytest.mark.parametrize("example", ASKING, ids=lambda each: each.place)
+def test_an_example_gives_what_the_document_says(scene: Scene, example: Example) -> None:
+    """It ends well, or goes on until it is ended; HTTP's status and what came are as they should be."""
+    (name,) = expected(example)
+    wanted = EXPECTED[name]
+    try:
+        places = wanted.before(scene)
+        over = wanted.over
+        came = scene.shell.run(
+            example, places, None if over is None else lambda printed: over(scene, printed)
+        )
+        ends = {0} if over is None else {130, -2}
+        assert came.code in ends, came.words
+        assert came.status == wanted.status, came
+        assert wanted.check(scene, came), came
+    finally:
+        wanted.after(scene)
+
+
+def test_lines_of_shell_are_found_as_they_stand(tmp_path: Path) -> None:
+    """Whole, with where they begin; a remark behind one is none of the command, and other blocks are left alone."""
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# T\n\n```sh\nA=1; B=2\ncurl -s \\\n    $A   # a remark\n```\n\n```python\ncurl = 1\n```\n"
+    )
+    found = list(examples(page))
+    assert [(each.place, each.sets, each.asks) for each in found] == [
+        ("page.md:4", True, False),
+        ("page.md:5", False, True),
+    ]
+    assert found[1].command == "curl -s \\\n    $A"

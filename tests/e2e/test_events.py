@@ -1,0 +1,228 @@
+"""The short-term memory, with a real relay, a real ROS 2 robot and httpx."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from switchboard_relay import Relay
+from switchboard_waiting import wait_for
+
+EVENTS = "/api/v1/events"
+
+
+def client_of(relay: Relay, token: str) -> httpx.Client:
+    """Requests to a relay with a token."""
+    headers = {"Authorization": f"Bearer {token}"}
+    return httpx.Client(base_url=f"http://127.0.0.1:{relay.http_port}", headers=headers, timeout=60)
+
+
+@pytest.fixture
+def operator(world: Any) -> Iterator[httpx.Client]:
+    """Requests of who may drive."""
+    with client_of(world.relay, world.operator) as client:
+        yield client
+
+
+@pytest.fixture
+def stranger(world: Any) -> Iterator[httpx.Client]:
+    """Requests of who has no right on the robot."""
+    with client_of(world.relay, world.stranger) as client:
+        yield client
+
+
+def asked(client: httpx.Client, **query: Any) -> list[dict[str, Any]]:
+    """Events, the newest first."""
+    answer = client.get(EVENTS, params=query)
+    assert answer.status_code == 200, answer.text
+    found: list[dict[str, Any]] = answer.json()["events"]
+    return found
+
+
+class Stream:
+    """A stream, read in a thread until so many events have come."""
+
+    def __init__(
+        self, client: httpx.Client, query: dict[str, str], count: int, last: int | None = None
+    ) -> None:
+        self.events: list[dict[str, Any]] = []
+        self.ids: list[int] = []
+        self.open = threading.Event()
+        self._client = client
+        self._query = query
+        self._count = count
+        self._last = {} if last is None else {"Last-Event-ID": str(last)}
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        headers = {"Accept": "text/event-stream", **self._last}
+        with self._client.stream("GET", EVENTS, params=self._query, headers=headers) as answer:
+            for line in answer.iter_lines():
+                self.open.set()
+                if line.startswith("id: "):
+                    self.ids.append(int(line.removeprefix("id: ")))
+                if line.startswith("data: "):
+                    self.events.append(json.loads(line.removeprefix("data: ")))
+                if len(self.events) == self._count:
+                    return
+
+    def told(self) -> list[int]:
+        """The numbers of all that were wanted."""
+        wait_for(f"{self._count} events come", lambda: len(self.events) == self._count)
+        self._thread.join(60)
+        numbers = [each["id"] for each in self.events]
+        assert [each for each in self.ids if each in numbers] == numbers
+        return numbers
+
+
+def test_what_clients_do_leaves_events(world: Any, operator: httpx.Client) -> None:
+    """To come, to take control, to move the robot once, to call, to leave; whoever sees the robot reads of it."""
+    with world.operating() as client:
+        client.call("/relay/take_control", {"why": "a look around"})
+        for _ in range(5):
+            client.drive(0.2)
+        client.call("/relay/release_control")
+        client.call("/nobody/offers/this")
+    kinds = ["client.joined", "control.taken", "motion.begun", "control.released", "call.begun", "call.ended"]
+
+    def all_there() -> Any:
+        found = {each["kind"] for each in asked(operator, robot="rover", user="operator", last=60)}
+        return found >= {*kinds, "client.left"}
+
+    wait_for("they are written", all_there)
+    taken = asked(operator, kind="control.taken", robot="rover", last=60)[0]
+    assert (taken["source"], taken["user"]) == ("relay:rover", "operator")
+    assert taken["data"]["why"] == "a look around" and "address" not in taken["data"]
+    begun = asked(operator, kind="motion.begun", **{"data.topic": "/cmd_vel"})
+    assert sum(each["at"] >= taken["at"] for each in begun) == 1
+    with client_of(world.relay, world.stranger) as stranger:
+        assert asked(stranger, source="relay*") == []
+        assert stranger.get(EVENTS, params={"robot": "rover", "count": "true"}).json() == {"count": 0}
+
+
+def test_was_this_person_greeted_in_the_last_minute(operator: httpx.Client, stranger: httpx.Client) -> None:
+    """One program asks what another has written, and greets nobody twice."""
+    query = {"kind": "greeted", "data.person": "ann", "last": 60, "count": "true"}
+    assert stranger.get(EVENTS, params=query).json() == {"count": 0}
+    event = {"source": "greeting", "kind": "greeted", "data": {"person": "ann", "sure": 0.9}}
+    answer = operator.post(EVENTS, json=event)
+    assert answer.status_code == 201
+    assert {name: answer.json()[name] for name in ("source", "kind", "robot", "user", "data")} == {
+        **event,
+        "robot": None,
+        "user": "operator",
+    }
+    assert stranger.get(EVENTS, params=query).json() == {"count": 1}
+    assert stranger.get(EVENTS, params={**query, "data.person": "bob"}).json() == {"count": 0}
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        ({"kind": "x", "source": "relay"}, 403),
+        ({"kind": "x", "robot": "nowhere"}, 404),
+        ({"kind": ""}, 400),
+        ({"kind": "x", "data": 3}, 400),
+        ({"kind": "x", "id": 3}, 400),
+        ([], 400),
+        ([{"kind": "x"}] * 101, 400),
+        ("x", 400),
+    ],
+)
+def test_what_can_not_be_kept_is_refused_in_words(operator: httpx.Client, body: Any, status: int) -> None:
+    """As problem details."""
+    answer = operator.post(EVENTS, json=body)
+    assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json")
+    assert answer.json()["detail"]
+
+
+def test_what_was_missed_is_told_to_who_comes_back(operator: httpx.Client, stranger: httpx.Client) -> None:
+    """A stream begins with what is new, or behind the last event that its reader names."""
+    operator.post(EVENTS, json={"kind": "step", "source": "resume"})
+    stream = Stream(stranger, {"source": "resume"}, 2)
+    assert stream.open.wait(60)
+    numbers = [
+        operator.post(EVENTS, json={"kind": "step", "source": "resume"}).json()["id"] for _ in range(2)
+    ]
+    assert stream.told() == numbers
+    missed = operator.post(
+        EVENTS, json=[{"kind": "step", "source": "resume", "data": {"n": n}} for n in range(3)]
+    )
+    again = Stream(stranger, {"source": "resume"}, 4, last=numbers[0])
+    assert again.told() == [numbers[1], *(each["id"] for each in missed.json()["events"])]
+
+
+def test_all_that_match_are_exported(operator: httpx.Client) -> None:
+    """As lines of JSON and as a table that holds no formula, in as many parts as it takes."""
+    for part in range(12):
+        several = [{"kind": "=1+1", "source": "export", "data": {"n": part * 100 + n}} for n in range(100)]
+        assert operator.post(EVENTS, json=several).status_code == 201
+    query = {"source": "export"}
+    lines = operator.get(EVENTS, params=query, headers={"Accept": "application/jsonl"})
+    assert lines.headers["content-type"] == "application/jsonl"
+    told = [json.loads(line) for line in lines.text.splitlines()]
+    assert [each["data"]["n"] for each in told] == list(range(1199, -1, -1))
+    table = operator.get(EVENTS, params=query, headers={"Accept": "text/csv"})
+    rows = list(csv.DictReader(io.StringIO(table.text, newline="")))
+    assert [json.loads(row["data"])["n"] for row in rows] == list(range(1199, -1, -1))
+    assert {row["kind"] for row in rows} == {"'=1+1"}
+    pages, after = [], {}
+    while after is not None:
+        page = operator.get(EVENTS, params={**query, "limit": 500, **after}).json()
+        pages.append(len(page["events"]))
+        after = {"after": page["next"]} if page["next"] else None
+    assert pages == [500, 500, 200]
+
+
+def test_what_was_acknowledged_survives_kill_9(tmp_path: Path) -> None:
+    """While many write; the numbers go on, what was told to be refused is refused, and a source keeps to its share."""
+    relay = Relay(tmp_path, "--events-per-source", "500")
+    try:
+        token = relay.user("ann")
+        kept: list[int] = []
+        broken = threading.Event()
+
+        def write(source: str) -> None:
+            with client_of(relay, token) as client:
+                try:
+                    for n in range(10_000):
+                        answer = client.post(
+                            EVENTS, json=[{"kind": "k", "source": source, "data": {"n": n}}] * 10
+                        )
+                        kept.extend(each["id"] for each in answer.json()["events"])
+                except httpx.HTTPError:
+                    broken.set()
+
+        writers = [threading.Thread(target=write, args=(f"s{each}",), daemon=True) for each in range(4)]
+        for each in writers:
+            each.start()
+        wait_for("some are kept", lambda: len(kept) > 300)
+        relay.kill()
+        for each in writers:
+            each.join(60)
+        assert broken.is_set()
+        relay.start()
+        with client_of(relay, token) as client:
+            lines = client.get(
+                EVENTS, params={"source": "s*"}, headers={"Accept": "application/x-ndjson"}
+            ).text
+            found = {json.loads(line)["id"] for line in lines.splitlines()}
+            assert set(kept) <= found
+            fresh = client.post(EVENTS, json={"kind": "k"}).json()
+            assert fresh["id"] > max(found)
+            for _ in range(8):
+                client.post(EVENTS, json=[{"kind": "k", "source": "full"}] * 100)
+            query = {"source": "full", "count": "true"}
+            wait_for(
+                "its share is kept to", lambda: client.get(EVENTS, params=query).json() == {"count": 500}
+            )
+    finally:
+        relay.stop()

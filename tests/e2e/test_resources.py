@@ -1,0 +1,262 @@
+"""A robot's resources over HTTP, with a real relay, a real ROS 2 robot and httpx."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+from switchboard_drive import LET_GO_SECONDS
+from switchboard_waiting import wait_for
+
+from relay_server.resources import HEADER
+
+ROBOT = "/api/v1/robots/rover"
+GO = {"value": {"linear": {"x": 0.2}, "angular": {"z": 0.3}}}
+STILL: dict[str, Any] = {"value": {"linear": {"x": 0.0}}}
+
+
+def client_of(world: Any, token: str) -> httpx.Client:
+    """Requests to the relay with a token."""
+    headers = {"Authorization": f"Bearer {token}"}
+    return httpx.Client(
+        base_url=f"http://127.0.0.1:{world.relay.http_port}{ROBOT}", headers=headers, timeout=30
+    )
+
+
+@pytest.fixture
+def operator(world: Any) -> Iterator[httpx.Client]:
+    """Requests of who may drive."""
+    with client_of(world, world.operator) as client:
+        yield client
+
+
+@pytest.fixture
+def viewer(world: Any) -> Iterator[httpx.Client]:
+    """Requests of who may look."""
+    with client_of(world, world.viewer) as client:
+        yield client
+
+
+def test_what_there_is_is_told_page_by_page(viewer: httpx.Client) -> None:
+    """By names and types, with what moves the robot."""
+    first = viewer.get("topics", params={"limit": 2}).json()
+    assert len(first["topics"]) == 2 and first["next"] == first["topics"][-1]["name"] and first["online"]
+    second = viewer.get("topics", params={"limit": 1000, "after": first["next"]}).json()
+    names = [each["name"] for each in first["topics"] + second["topics"]]
+    assert names == sorted(names) and "/odom" in names and second["next"] == ""
+    (odom,) = viewer.get("topics", params={"type": "nav_msgs/msg/Odometry"}).json()["topics"]
+    assert (odom["name"], odom["moves"]) == ("/odom", False)
+    (wheels,) = viewer.get("topics", params={"name": "/cmd_*l"}).json()["topics"]
+    assert wheels["moves"]
+    assert "/relay/stop" in [
+        each["name"] for each in viewer.get("services", params={"limit": 1000}).json()["services"]
+    ]
+
+
+def test_a_topic_is_read_again_only_when_it_has_changed(viewer: httpx.Client) -> None:
+    """Its newest message, with an entity tag; who knows it waits for the next."""
+    answer = viewer.get("topics/odom")
+    state = answer.json()
+    assert (state["topic"], state["type"]) == ("/odom", "nav_msgs/msg/Odometry")
+    assert "pose" in state["value"] and answer.headers[HEADER]
+    tag = answer.headers["etag"]
+    known = {"If-None-Match": tag}
+    following = viewer.get("topics/odom", headers=known, params={"wait": 10})
+    assert following.status_code == 200 and following.headers["etag"] != tag
+
+
+def test_a_topic_is_streamed(viewer: httpx.Client) -> None:
+    """As server-sent events, no more often than was asked for."""
+    heard: list[Any] = []
+    headers = {"Accept": "text/event-stream"}
+    with viewer.stream("GET", "topics/odom", headers=headers, params={"throttle_ms": 200}) as answer:
+        assert answer.headers["content-type"] == "text/event-stream"
+        for line in answer.iter_lines():
+            if line.startswith("data: "):
+                heard.append(json.loads(line.removeprefix("data: ")))
+            if len(heard) >= 8:
+                break
+    stamps = [each["header"]["stamp"]["sec"] + each["header"]["stamp"]["nanosec"] / 1e9 for each in heard]
+    assert stamps == sorted(stamps) and stamps[-1] - stamps[0] > 0.7, "half of what they are apart at least"
+
+
+def test_who_gives_back_a_moment_drives(world: Any, operator: httpx.Client) -> None:
+    """Without one, or with one that is too old, nothing moves; control comes by the first command, and ends."""
+    needed = operator.put("topics/cmd_vel", json=GO)
+    assert (needed.status_code, needed.json()["code"]) == (428, "moment_needed")
+    moment = needed.headers[HEADER]
+
+    def drives() -> bool:
+        nonlocal moment
+        answer = operator.put("topics/cmd_vel", json=GO, headers={HEADER: moment})
+        moment = answer.headers[HEADER]
+        assert answer.status_code in (204, 412), answer.text
+        return bool(world.robot.moving())
+
+    wait_for("it moves", drives)
+    assert operator.get("control").json()["holder"]["user"] == "operator"
+    assert operator.put("topics/cmd_vel", json=STILL, headers={HEADER: moment}).status_code == 204
+    wait_for("it stands", lambda: not world.robot.moving())
+    time.sleep(0.6)  # so the first moment is older than any command may be
+    late = operator.put("topics/cmd_vel", json=GO, headers={HEADER: needed.headers[HEADER]})
+    assert (late.status_code, late.json()["code"]) == (412, "too_old")
+    operator.post("control/release")
+    made_up = operator.put("topics/cmd_vel", json=GO, headers={HEADER: "ffff.0000"})
+    assert made_up.status_code == 428
+    assert not world.robot.moving()
+
+
+def test_another_type_does_not_make_a_command_young(world: Any, operator: httpx.Client) -> None:
+    """What moves the robot is known by the topic, whatever type is named."""
+    moment = operator.get("topics").headers[HEADER]
+    assert operator.put("topics/cmd_vel", json=STILL, headers={HEADER: moment}).status_code == 204
+    for kind in ("std_msgs/msg/String", "geometry_msgs/Twist", ""):
+        answer = operator.put("topics/cmd_vel", json={**GO, "type": kind})
+        assert answer.status_code in (400, 428), answer.text
+    assert not world.robot.moving()
+    operator.post("control/release")
+
+
+def test_who_went_on_commanding_in_vain_lets_go_first(world: Any, operator: httpx.Client) -> None:
+    """As by rosbridge: whoever takes control with his hand on the stick moves nothing by that."""
+    token = world.relay.user("driver")
+    world.relay.cli("right", "grant", "driver", "rover", "operator")
+    moment = operator.get("topics").headers[HEADER]
+
+    def commands() -> httpx.Response:
+        nonlocal moment
+        answer = operator.put("topics/cmd_vel", json=GO, headers={HEADER: moment})
+        moment = answer.headers[HEADER]
+        return answer
+
+    with world.relay.connect("rover", token) as other:
+
+        def insists() -> httpx.Response | None:
+            """What he hears, unless the machine was so slow that he has let go."""
+            nonlocal moment
+            assert other.call("/relay/take_control")["values"]["success"]
+            moment = operator.get("topics").headers[HEADER]
+            begun = time.monotonic()
+            vain = commands()
+            assert other.call("/relay/release_control")["values"]["success"]
+            taken = operator.post("services/relay/take_control", json={})
+            assert taken.json()["values"]["success"], taken.text
+            answer = commands()
+            if vain.status_code == 403 and time.monotonic() - begun < LET_GO_SECONDS / 2:
+                return answer
+            assert operator.post("control/release").status_code == 200
+            return None
+
+        refused = wait_for("he went on without a pause", insists)
+    assert refused.status_code == 403 and "let go" in refused.json()["detail"]
+    time.sleep(LET_GO_SECONDS)  # so long he must say nothing
+    moment = operator.get("topics").headers[HEADER]
+    wait_for("it moves", lambda: commands().status_code == 204 and world.robot.moving())
+    operator.post("control/release")
+    wait_for("it stands", lambda: not world.robot.moving())
+
+
+def test_what_the_relay_says_itself_is_there_at_once(viewer: httpx.Client) -> None:
+    """Also what it tells only when it changes; read and streamed."""
+    state = viewer.get("topics/relay/control", params={"wait": 0.5})
+    assert state.status_code == 200 and state.json()["value"]["robot"] == "rover"
+    with viewer.stream("GET", "topics/relay/control", headers={"Accept": "text/event-stream"}) as answer:
+        data = next(each for each in answer.iter_lines() if each.startswith("data: "))
+    assert json.loads(data.removeprefix("data: "))["robot"] == "rover"
+
+
+def test_a_right_that_is_withdrawn_ends_what_is_read(world: Any) -> None:
+    """What was heard before is shown no more; a stream ends with the reason; and all is back with the right."""
+    token = world.relay.user("reader")
+    world.relay.cli("right", "grant", "reader", "rover", "operator")
+    with client_of(world, token) as reader:
+        assert reader.get("topics/odom").status_code == 200
+        headers = {"Accept": "text/event-stream"}
+        with reader.stream("GET", "topics/odom", headers=headers, params={"throttle_ms": 200}) as answer:
+            lines = answer.iter_lines()
+            next(each for each in lines if each.startswith("data: "))
+            world.relay.cli("right", "grant", "reader", "rover", "operator", "--deny", "subscribe:/odom")
+            assert any(each == "event: ended" for each in lines)
+        refused = reader.get("topics/odom")
+        assert refused.status_code == 403, refused.text
+        world.relay.cli("right", "grant", "reader", "rover", "operator")
+        wait_for("it may again", lambda: reader.get("topics/odom").status_code == 200)
+        first = reader.get("topics/odom").json()["value"]["header"]["stamp"]
+        wait_for("it is new", lambda: reader.get("topics/odom").json()["value"]["header"]["stamp"] != first)
+
+
+def test_who_may_only_look_changes_nothing(world: Any, viewer: httpx.Client) -> None:
+    """In the same words as by rosbridge."""
+    moment = viewer.get("topics").headers[HEADER]
+    for way in (
+        viewer.put("topics/cmd_vel", json=GO, headers={HEADER: moment}),
+        viewer.put("topics/chatter", json={"value": {"data": "x"}, "type": "std_msgs/msg/String"}),
+        viewer.post("services/reset"),
+    ):
+        assert way.status_code in (400, 403), way.text
+    assert not world.robot.moving()
+
+
+def test_a_message_reaches_who_listens(world: Any, operator: httpx.Client) -> None:
+    """Checked against its type before it goes out."""
+    topic = {"topic": "/resources/said", "type": "std_msgs/msg/String"}
+    with world.relay.connect("rover", world.operator) as client:
+        client.send(op="advertise", **topic)
+        client.send(op="subscribe", **topic)
+        said = {"value": {"data": "by hand"}, "type": topic["type"]}
+        assert operator.post("topics/resources/said", json=said).status_code == 204
+        assert client.until(op="publish", topic=topic["topic"])["msg"] == {"data": "by hand"}
+        wrong = operator.post("topics/resources/said", json={"value": {"data": 5}, "type": topic["type"]})
+        assert wrong.status_code == 400 and "data" in wrong.json()["detail"]
+
+
+def test_a_service_is_called(operator: httpx.Client) -> None:
+    """Its answer, or in words why there is none."""
+    answer = operator.post("services/reset", json={})
+    assert answer.status_code == 200 and answer.json()["values"]["success"] is True
+    missing = operator.post("services/nowhere", json={"timeout": 1})
+    assert missing.status_code == 404 and "/nowhere" in missing.json()["detail"]
+
+
+def test_a_parameter_is_read_and_written_as_it_was_read(operator: httpx.Client) -> None:
+    """Who has read another value than there is now changes nothing."""
+    names = [each["name"] for each in operator.get("params", params={"limit": 1000}).json()["params"]]
+    name = next(each for each in names if each.endswith(":use_sim_time"))
+    address = f"params/{name.lstrip('/')}"
+    read = operator.get(address)
+    assert read.json() == {"name": name.lstrip("/"), "value": False}
+    stale = operator.put(address, json={"value": True}, headers={"If-Match": '"other"'})
+    assert stale.status_code == 412
+    tag = {"If-Match": read.headers["etag"]}
+    assert operator.put(address, json={"value": False}, headers=tag).status_code == 204
+    assert operator.get("params/nowhere:x").status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("address", "status"),
+    [
+        ("topics?limit=0", 400),
+        ("topics?sort=name", 400),
+        ("topics/nothing/there", 404),
+        ("topics/odom?wait=1e9", 400),
+        ("topics/odom?wait=nan", 400),
+        ("topics/odom?wait=1&wait=2", 400),
+        ("topics/no name", 400),
+        ("services/reset", 404),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_words(viewer: httpx.Client, address: str, status: int) -> None:
+    """As problem details."""
+    answer = viewer.get(address)
+    assert answer.status_code == status
+    assert answer.headers["content-type"] == "application/problem+json" and answer.json()["detail"]
+
+
+def test_the_relay_has_logged_no_failure_of_its_own(world: Any, viewer: httpx.Client) -> None:
+    """Neither of streams that ended nor of readers who left."""
+    assert viewer.get("topics").status_code == 200
+    assert "Traceback" not in world.relay.log

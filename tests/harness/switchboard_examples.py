@@ -1,0 +1,152 @@
+"""Lines of shell that the documents show, and what they come to when they are run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from switchboard_processes import mortal
+from switchboard_waiting import PATIENCE, wait_for
+
+_BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_CURL = re.compile(r"(^|[\s;|&(])curl\s")
+_SETTING = re.compile(r"[A-Z]+=")
+_REMARK = re.compile(r"\s+# .*\Z", re.DOTALL)
+# Behind its progress, in the same line, where it shows that.
+_STATUS = re.compile(r"< HTTP/[0-9.]+ ([0-9]{3})")
+
+
+class Example(NamedTuple):
+    """One command of a document.
+
+    :param place: the document and the line where it begins
+    :param text: as it stands there, over however many lines
+    """
+
+    place: str
+    text: str
+
+    @property
+    def asks(self) -> bool:
+        """Whether it asks something by curl."""
+        return _CURL.search(self.text) is not None
+
+    @property
+    def sets(self) -> bool:
+        """Whether it begins by setting a variable."""
+        return _SETTING.match(self.text) is not None
+
+    @property
+    def command(self) -> str:
+        """Without the remark behind it."""
+        return _REMARK.sub("", self.text)
+
+
+class Came(NamedTuple):
+    """What came of an example.
+
+    :param status: of HTTP; that of the last answer
+    :param words: curl's own
+    """
+
+    code: int
+    status: int
+    output: str
+    words: str
+
+
+def examples(path: Path) -> Iterator[Example]:
+    """The commands in a document's blocks of shell."""
+    text = path.read_text()
+    for block in _BLOCK.finditer(text):
+        line = text.count("\n", 0, block.start(1)) + 1
+        # A backslash at its end joins a line with the next.
+        for lines in re.findall(r"(?:.*\\\n)*.*\n", block[1]):
+            if lines.strip():
+                yield Example(f"{path.name}:{line}", lines.rstrip("\n"))
+            line += lines.count("\n")
+
+
+class Shell:
+    """Runs examples in a folder, by bash and curl.
+
+    :param folder: where they leave what they make; with curl's settings for them, which have it tell what it does
+    :param environment: variables
+    :param places: what stands in examples for what is there, by what it stands for
+    """
+
+    def __init__(self, folder: Path, environment: Mapping[str, str], places: Mapping[str, str]) -> None:
+        self.folder = folder
+        (folder / ".curlrc").write_text("verbose\n")
+        self.environment = {**environment, "CURL_HOME": str(folder)}
+        self._places = dict(places)
+
+    def set(self, settings: list[Example]) -> None:
+        """Set variables as examples do, for all that follow."""
+        text = "\n".join(self._here(each.text, {}) for each in settings)
+        script = f"set -euo pipefail -o allexport\n{text}\nenv -0"
+        done = subprocess.run(
+            ["bash", "-c", script],
+            cwd=self.folder,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        self.environment = dict(each.split("=", 1) for each in done.stdout.split("\0") if each)
+
+    def run(
+        self, example: Example, places: Mapping[str, str], over: Callable[[str], bool] | None = None
+    ) -> Came:
+        """Run one.
+
+        :param places: further ones, for this example
+        :param over: says by what was printed whether to end one that would go on, as Ctrl-C does
+        """
+        lines = [self._here(example.text, places)]
+        if example.sets:
+            lines.append(f'printf %s "${example.text.partition("=")[0]}"')
+        out, words = self.folder / "out", self.folder / "words"
+        with out.open("wb") as printed, words.open("wb") as told:
+            running = subprocess.Popen(
+                mortal(["bash", "-c", "set -euo pipefail\n" + "\n".join(lines)]),
+                cwd=self.folder,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=printed,
+                stderr=told,
+                start_new_session=True,
+            )
+            try:
+                if over is not None:
+                    wait_for(
+                        f"{example.place} has come so far",
+                        lambda: running.poll() is not None or over(out.read_text(errors="replace")),
+                    )
+                    _signal(running.pid, signal.SIGINT)
+                code = running.wait(PATIENCE)
+            finally:
+                _signal(running.pid, signal.SIGKILL)
+                running.wait()
+        said = words.read_text(errors="replace")
+        found = _STATUS.findall(said)
+        return Came(code, int(found[-1]) if found else 0, out.read_text(errors="replace"), said)
+
+    def _here(self, text: str, places: Mapping[str, str]) -> str:
+        for stands, there in {**self._places, **places}.items():
+            text = text.replace(stands, there)
+        return text
+
+
+def _signal(group: int, number: signal.Signals) -> None:
+    """Send a signal to all processes of a group, if there are any."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(group, number)
