@@ -28,6 +28,9 @@ MEASUREMENTS = {
     "standstill": "from a fault to standstill",
     "control": "twenty clients race for control; how long it takes to hand over",
     "stopping": "from anybody's stop to standstill, under full load",
+    "alerts": "from a robot's unplugging to the webhook",
+    "apps": "from a word, a stick and a scan to what the robot does",
+    "memory": "a million events: asked, written by the thousand, killed",
 }
 
 
@@ -50,8 +53,10 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("names", nargs="*", metavar="measurement", choices=[*MEASUREMENTS, []])
     parser.add_argument("--quick", action="store_true", help="tiny counts: does it run? figures say nothing")
-    parser.add_argument("--seconds", type=float, help="length of 'crowd' and 'soak'")
-    parser.add_argument("--runs", type=int, help="of each fault, of the race, of stops (50, 1000, 200)")
+    parser.add_argument("--seconds", type=float, help="length of 'crowd', 'soak' and 'memory'")
+    parser.add_argument(
+        "--runs", type=int, help="of each fault, of the race, of stops (50, 20 of 'alerts', 1000, 200)"
+    )
     parser.add_argument(
         "--json",
         type=Path,

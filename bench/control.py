@@ -150,6 +150,8 @@ class Race:
         await giver.call("/relay/take_control")
         await giver.drive(0)
         await taker.call("/relay/take_control")
+        # As people do. Who has control is told ten times a second: at once, unless something was told just before.
+        await asyncio.sleep(PACE)
         said = time.monotonic_ns()
         granting = asyncio.create_task(giver.call("/relay/grant_control"))
         async with asyncio.timeout(20):

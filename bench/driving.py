@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from switchboard_client import Client
+from switchboard_drive import LET_GO_SECONDS
 from switchboard_waiting import wait_for
 from websockets.sync.client import connect
 
@@ -35,6 +36,9 @@ _UNIT = 1e-14
 """Of the turning speed, for a microsecond; a double of this size is exact to a hundredth of it."""
 _ROUND = 10**10
 """Microseconds after which the count begins anew."""
+
+EXACT_MS = 0.01
+"""How exactly a command tells when it was sent."""
 
 
 def stamped_turn(now: int) -> float:
@@ -61,6 +65,15 @@ def ages_ms(events: Iterable[dict[str, Any]]) -> list[float]:
     return [age_ms(each["w"], each["t"]) for each in events if each["event"] == "command" and each["v"]]
 
 
+def sent_before(moment: int, events: Iterable[dict[str, Any]]) -> bool:
+    """Whether any command to move among some events of a record was sent before a moment.
+
+    :param moment: monotonic nanoseconds
+    """
+    moving = (each for each in events if each["event"] == "command" and each["v"])
+    return any(age_ms(each["w"], each["t"]) - (each["t"] - moment) / 1e6 > EXACT_MS for each in moving)
+
+
 def connected(port: int, robot: str, token: str) -> Client:
     """A client that does not wait long for an answer to its goodbye."""
     headers = {"Authorization": f"Bearer {token}"}
@@ -81,11 +94,13 @@ class TimedDriver(threading.Thread):
     """Takes control and drives, until it is stopped or the connection breaks.
 
     :param client: connected
+    :param pauses: whether he lets go once after his first command, as who drove before the robot's link broke must
     """
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, pauses: bool = False) -> None:
         super().__init__(daemon=True)
         self._client = client
+        self._pauses = pauses
         self._end = threading.Event()
         self._silent = threading.Event()
         self.broken = ""
@@ -95,6 +110,9 @@ class TimedDriver(threading.Thread):
         try:
             take_control(self._client)
             self._client.send(op="advertise", topic=TOPIC, type=TWIST)
+            if self._pauses:
+                self._client.drive(AHEAD, stamped_turn(time.monotonic_ns()), TOPIC)
+                self._end.wait(LET_GO_SECONDS)  # so long he must say nothing
             due = time.monotonic()
             while not self._end.is_set():
                 if not self._silent.is_set():

@@ -2,7 +2,9 @@
 
 A real relay, daemon and simulated robot, driven in circles through proxies that can be broken. Each command says when
 it was sent, so the record tells as well whether any was carried out too late. After each fault everything heals, and
-what was held up arrives: the robot must not move by it.
+what was held up arrives: the robot must not move by it. A client that was frozen goes on commanding when it is thawed,
+and may; what it said before must not be carried out any more. A tab that was away for more than half a second finds its
+key still held: that moves nothing until it is pressed anew.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from typing import Any
 
 from switchboard_drive import LIMIT_MS, SIM_STEP_MS, Drive
 
-from bench.driving import DriverProcess, TimedDriver, ages_ms, connected
+from bench.driving import DriverProcess, TimedDriver, ages_ms, connected, sent_before
 from bench.report import Options, Row, Unavailable
 from bench.tab import FAULTS as tab_faults
 from bench.tab import Tab, struck
@@ -51,6 +53,7 @@ class Fault:
     :param heal: mends it
     :param process: whether the driver must be a process of its own
     :param goes_on: whether the driver may rightly go on when it is mended
+    :param parts: whether robot and relay part by it, after which who drove lets go first
     """
 
     name: str
@@ -58,6 +61,7 @@ class Fault:
     heal: Heal = _nothing
     process: bool = False
     goes_on: bool = False
+    parts: bool = False
 
 
 FAULTS = (
@@ -81,33 +85,48 @@ FAULTS = (
         _client_heals,
     ),
     Fault("client link: reset", lambda drive, driver: drive.client_side.reset()),
-    Fault("robot link: black hole", lambda drive, driver: drive.robot_side.black_hole(), _robot_heals),
+    Fault(
+        "robot link: black hole",
+        lambda drive, driver: drive.robot_side.black_hole(),
+        _robot_heals,
+        parts=True,
+    ),
     Fault(
         "robot link: relay to robot only",
         lambda drive, driver: drive.robot_side.forward_down.clear(),
         _robot_heals,
+        parts=True,
     ),
     Fault(
         "robot link: robot to relay only",
         lambda drive, driver: drive.robot_side.forward_up.clear(),
         _robot_heals,
+        parts=True,
     ),
-    Fault("robot link: reset", lambda drive, driver: drive.robot_side.reset()),
+    Fault("robot link: reset", lambda drive, driver: drive.robot_side.reset(), parts=True),
     Fault(
-        "relay frozen (SIGSTOP)", lambda drive, driver: drive.relay.freeze(), lambda drive: drive.relay.thaw()
+        "relay frozen (SIGSTOP)",
+        lambda drive, driver: drive.relay.freeze(),
+        lambda drive: drive.relay.thaw(),
+        parts=True,
     ),
     Fault(
-        "relay killed (SIGKILL)", lambda drive, driver: drive.relay.kill(), lambda drive: drive.relay.start()
+        "relay killed (SIGKILL)",
+        lambda drive, driver: drive.relay.kill(),
+        lambda drive: drive.relay.start(),
+        parts=True,
     ),
     Fault(
         "daemon frozen (SIGSTOP)",
         lambda drive, driver: drive.robot.daemon.signal(signal.SIGSTOP),
         lambda drive: drive.robot.daemon.signal(signal.SIGCONT),
+        parts=True,
     ),
     Fault(
         "daemon killed (SIGKILL)",
         lambda drive, driver: drive.robot.daemon.kill(),
         lambda drive: drive.robot.start_daemon(),
+        parts=True,
     ),
 )
 
@@ -119,11 +138,22 @@ class Tally:
     :ivar ages: of all commands that were carried out, milliseconds
     :ivar looked: runs in which it was looked whether the robot moves again by itself
     :ivar moved: those of them in which it did
+    :ivar frozen: runs among them in which the driver went on commanding anew
+    :ivar held: runs among them in which a key was held in a tab all the time
     """
 
     ages: list[float]
     looked: int = 0
     moved: int = 0
+    frozen: int = 0
+    held: int = 0
+
+    def look(self, name: str, moved: bool) -> None:
+        """One more run in which it was looked, after the fault of this name."""
+        self.looked += 1
+        self.moved += moved
+        if moved:
+            print(f"    {name}: moved again by itself", flush=True)
 
 
 def run(options: Options) -> list[Row]:
@@ -139,7 +169,7 @@ def run(options: Options) -> list[Row]:
                 times = [_once(drive, fault, tally) for _ in range(runs)]
                 rows.append(_row(fault.name, times))
             if not options.quick:
-                rows += _of_tabs(drive, runs)
+                rows += _of_tabs(drive, runs, tally)
         finally:
             drive.stop()
     return rows + _sum(tally)
@@ -167,7 +197,16 @@ def _sum(tally: Tally) -> list[Row]:
     )
     return [
         Row("standstill", words, "commands", len(late), bar=0, note=note),
-        Row("standstill", f"of {tally.looked} runs: moved again by itself", "runs", tally.moved, bar=0),
+        Row(
+            "standstill",
+            f"of {tally.looked} runs: moved again by itself",
+            "runs",
+            tally.moved,
+            bar=0,
+            note=f"looked at when all had healed, {HELD_BACK} s after the standstill or later, and what was held up "
+            f"had come; in {tally.frozen} runs by commands from before the client was frozen, which goes on with new "
+            f"ones, in {tally.held} with a key that was held in the tab all the time",
+        ),
     ]
 
 
@@ -177,7 +216,7 @@ def _once(drive: Drive, fault: Fault, tally: Tally) -> float:
     driver: Any = (
         DriverProcess(port, "rover", drive.token)
         if fault.process
-        else TimedDriver(connected(port, "rover", drive.token))
+        else TimedDriver(connected(port, "rover", drive.token), pauses=fault.parts)
     )
     begun = time.monotonic_ns()
     drive.start_driving(driver)
@@ -187,12 +226,15 @@ def _once(drive: Drive, fault: Fault, tally: Tally) -> float:
     driver.fall_silent()
     time.sleep(HELD_BACK)  # what is held up is too old now, whenever it arrives
     fault.heal(drive)
+    thawed = time.monotonic_ns()
     if fault.goes_on:
         driver.popen.send_signal(signal.SIGCONT)
+    _settle(drive)
+    if fault.goes_on:
+        tally.frozen += 1
+        tally.look(fault.name, sent_before(thawed, drive.robot.events("command", thawed)))
     else:
-        _settle(drive)
-        tally.looked += 1
-        tally.moved += bool(drive.robot.events("moving", broken))
+        tally.look(fault.name, bool(drive.robot.events("moving", broken)))
     driver.stop()
     drive.stands()
     tally.ages += ages_ms(drive.robot.events("command", begun))
@@ -206,7 +248,7 @@ def _settle(drive: Drive) -> None:
         drive.answers(client)
 
 
-def _of_tabs(drive: Drive, runs: int) -> list[Row]:
+def _of_tabs(drive: Drive, runs: int, tally: Tally) -> list[Row]:
     """The portal in a browser whose tab is not looked at any more. Without a browser or portal there are no rows."""
     found: dict[str, list[float]] = {name: [] for name in tab_faults}
     with contextlib.ExitStack() as stack:
@@ -219,8 +261,14 @@ def _of_tabs(drive: Drive, runs: int) -> list[Row]:
             for name, fault in tab_faults.items():
                 for _ in range(runs):
                     tab.drive()
-                    found[name].append(drive.standstill_ms(struck(tab, fault)))
+                    at = struck(tab, fault)
+                    found[name].append(drive.standstill_ms(at))
+                    time.sleep(HELD_BACK)  # what lasts less than half a second a page may go on after
                     tab.recover()
+                    time.sleep(HELD_BACK)  # the key is still held, and nothing must come of it
+                    tally.held += 1
+                    tally.look(name, bool(drive.robot.events("moving", at)))
+                    tab.let_go()
         except AssertionError as reason:
             # What was measured before, in an hour perhaps, is not lost with it; each row says of how many runs it is.
             print(f"    cut short: tabs: {reason}", flush=True)

@@ -124,6 +124,8 @@ class Tab:
         control = WHERE % "control"
         take = WHERE % "control-take"
         self._until(f"{control} !== null && ({take}?.click(), {control}.dataset.standing === 'yours')")
+        # A robot whose daemon has just begun may not have told its topics yet, and a key that is held is pressed once.
+        self._until(f"{WHERE % 'drive-blocked'} === null && {WHERE % 'joystick'} !== null")
         self._until("document.activeElement.blur() || true")
         self._do("Input.dispatchKeyEvent", type="rawKeyDown", **TURN_LEFT)
         wait_for("the robot turns", self._drive.robot.moving)
@@ -144,13 +146,16 @@ class Tab:
         self._browser.signal(signal.SIGSTOP)
 
     def recover(self) -> None:
-        """All is as before; the key is let go."""
+        """All is as before, and the key still held."""
         self._browser.signal(signal.SIGCONT)
         for each in self._browser.do("Target.getTargets")["targetInfos"]:
             if each["type"] == "page" and each["targetId"] != self._name:
                 self._browser.do("Target.closeTarget", targetId=each["targetId"])
         self._browser.do("Target.activateTarget", targetId=self._name)
         self._until("true")  # behind whatever it was stuck with
+
+    def let_go(self) -> None:
+        """The key comes up."""
         self._do("Input.dispatchKeyEvent", type="keyUp", **TURN_LEFT)
         self._drive.stands()
 

@@ -12,8 +12,10 @@ import json
 import statistics
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -22,13 +24,15 @@ import numpy as np
 from switchboard_processes import running
 from switchboard_threads import Driver
 from switchboard_waiting import wait_for
-from websockets.sync.client import connect
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
 
 from bench.cameras import CAMERAS, USERS, Camera, Clock, Scene, counts, glass_to_glass, scene
 from bench.child import Child
 from bench.cpu import measured
 from bench.relay import Relay
 from bench.report import Options, Row, Unavailable
+from relay_protocol.pictures import look_at
 
 VIEWERS = (1, 10, 50)
 GROUP = 25
@@ -36,6 +40,12 @@ GROUP = 25
 
 SLOW_BYTES = 20_000
 """Per second."""
+
+LATE_SECONDS = 0.7
+"""After that a viewer of H.264 takes a picture who is too slow for it: what came meanwhile is too old by then."""
+
+FAST = 3
+"""Viewers of H.264 that keep up; this process reads for them."""
 
 
 class Watched(Protocol):
@@ -170,10 +180,15 @@ def by_multipart(at: Scene) -> Iterator[bytes]:
                 yield answer.read(length)
 
 
+def websocket(at: Scene, codec: str) -> ClientConnection:
+    """One that shows the camera."""
+    address = f"ws://127.0.0.1:{at.relay.http_port}{at.path('ws', f'&codec={codec}')}"
+    return connect(address, additional_headers=at.headers, close_timeout=1)
+
+
 def by_websocket(at: Scene, codec: str) -> Iterator[bytes]:
     """The pictures, each taken when the next is wanted."""
-    address = f"ws://127.0.0.1:{at.relay.http_port}{at.path('ws', f'&codec={codec}')}"
-    with connect(address, additional_headers=at.headers, close_timeout=1) as connection:
+    with websocket(at, codec) as connection:
         while True:
             message = json.loads(connection.recv(timeout=20))
             if message["op"] == "picture":
@@ -268,12 +283,81 @@ def mixed(at: Scene, options: Options) -> list[Row]:
     return [Row("video", what, "ms", beside, alone, "by themselves", 1.1, note=note)]
 
 
+class Looker:
+    """A viewer of H.264, read by a thread: what has come since the count was set back.
+
+    :param late: seconds after which it takes a picture
+    """
+
+    def __init__(self, at: Scene, late: float = 0) -> None:
+        self._at = at
+        self._late = late
+        self._left = threading.Event()
+        self.pictures = self.keys = self.bytes = 0
+
+    def look(self) -> None:
+        """Until it leaves."""
+        with contextlib.closing(by_websocket(self._at, "h264")) as pictures:
+            for body in pictures:
+                self.pictures += 1
+                self.bytes += len(body)
+                self.keys += look_at("h264", body).key
+                if self._left.wait(self._late):
+                    return
+
+    def leave(self) -> None:
+        """No more after the next picture."""
+        self._left.set()
+
+    def anew(self) -> None:
+        """Count from here."""
+        self.pictures = self.keys = self.bytes = 0
+
+
+def mixed_h264(at: Scene, options: Options) -> list[Row]:
+    """Some that keep up by themselves, then beside one that takes each picture late and one that takes none."""
+    seconds = options.pick(1, 20)
+    fast, slow = [Looker(at) for _ in range(FAST)], Looker(at, LATE_SECONDS)
+
+    def watched() -> tuple[float, Looker]:
+        """Milliseconds between two pictures of the one that has the fewest, and that one."""
+        for each in (*fast, slow):
+            each.anew()
+        began = time.monotonic()
+        time.sleep(seconds)  # what is measured: how much comes in this time
+        least = min(fast, key=lambda each: each.pictures)
+        return (time.monotonic() - began) * 1000 / max(1, least.pictures), least
+
+    with ThreadPoolExecutor(FAST + 1) as pool, contextlib.ExitStack() as stack:
+        for each in (*fast, slow):
+            stack.callback(each.leave)
+        looking = [pool.submit(each.look) for each in fast]
+        wait_for("each has a picture", lambda: all(each.pictures for each in fast))
+        alone, one = watched()
+        keys = one.keys
+        with websocket(at, "h264"):
+            looking.append(pool.submit(slow.look))
+            wait_for("the slow one has a picture", lambda: slow.pictures)
+            beside, one = watched()
+    for each in looking:
+        with contextlib.suppress(ConnectionClosed):
+            each.result()
+    name = at.camera.name
+    note = (
+        f"{name}, H.264: in {seconds:g} s {one.keys} key frames beside the slow ones, {keys} without them; "
+        f"the one that takes each picture {LATE_SECONDS:g} s late had {slow.pictures}"
+    )
+    what = f"{name}, H.264, {FAST} fast viewers beside a slow and a stopped one: time between two pictures"
+    return [Row("video", what, "ms", beside, alone, "by themselves", 1.1, note=note)]
+
+
 def run(options: Options) -> list[Row]:
     """All of it, with a relay and a robot for each camera."""
     rows = []
     for camera in CAMERAS[:1] if options.quick else CAMERAS:
         with scene(camera) as at:
-            rows += [*ways(at, options), *mixed(at, options), *costs(at, options), *weight(at, options)]
+            rows += [*ways(at, options), *mixed(at, options), *mixed_h264(at, options)]
+            rows += [*costs(at, options), *weight(at, options)]
     for row in rows:
         print(f"    {row.what}: {row.ours:.1f} {row.unit}", flush=True)
     return rows

@@ -1,0 +1,321 @@
+"""The applications: how long words, a stick, a scan and a face take until the robot does what they mean.
+
+Words are spoken by eSpeak NG into the standard input of ``voice``, as a microphone's samples come. The gamepad of
+``joystick`` is SDL's virtual one. What counts is the simulated robot's own record, on the same clock. The bars are what
+SOM4R's authors measured of such applications: 500 ms for words, 300 ms for a joystick's answer, 83 ms for a scan.
+
+Whom ``greeting`` greets the measurement itself puts on the topic of the service ``faces``; what a look at a picture
+takes that service is measured apart. ``recharge`` drives the simulated robot to its charger with the service
+``markers``, turned to another side before each run.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from switchboard_client import Client
+from switchboard_fed import Fed
+from switchboard_processes import Process, ros_environment, running
+from switchboard_robot import Robot
+from switchboard_speech import Mouth, silence, speech
+from switchboard_threads import Listener
+from switchboard_waiting import wait_for
+
+from bench import ROOT
+from bench.relay import Relay
+from bench.report import Options, Row
+from robot_client.apps.line import Line
+from robot_client.apps.runaway import Link, Manners, Runaway
+
+HAND = ROOT / "tests" / "e2e" / "clients" / "joystick_in_hand.py"
+HOLD, LEFT_Y = 10, 1
+RAYS = 360
+WORD_BAR_MS, STICK_BAR_MS, SCAN_BAR_MS = 500, 300, 83
+FAILED = 180.0
+"""Seconds after which a robot has not reached its charger."""
+CHARGING = 1
+REST = 0.3
+"""Seconds that the robot stands between two measurements: its odometry has to have said so."""
+
+
+class Odometry(Listener):
+    """When the robot's odometry first said that it moves."""
+
+    def __init__(self, client: Client) -> None:
+        super().__init__(client)
+        self._moves = threading.Event()
+        self._at = 0
+        client.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
+
+    def take(self, message: dict[str, Any]) -> None:
+        """Look at it."""
+        if message["op"] == "publish" and message["msg"]["twist"]["twist"]["linear"]["x"] > 0:
+            if not self._moves.is_set():
+                self._at = time.monotonic_ns()
+            self._moves.set()
+
+    def forget(self) -> None:
+        """From now on the next movement counts."""
+        self._moves.clear()
+
+    def moved_at(self) -> int:
+        """Monotonic nanoseconds."""
+        assert self._moves.wait(60), "the odometry does not say that the robot moves"
+        return self._at
+
+
+class Said(Listener):
+    """When the robot was told to say something."""
+
+    def __init__(self, client: Client) -> None:
+        super().__init__(client)
+        self.at: dict[str, int] = {}
+        client.send(op="advertise", topic="/faces/seen", type="std_msgs/msg/String")
+        client.send(op="subscribe", topic="/say", type="std_msgs/msg/String")
+
+    def take(self, message: dict[str, Any]) -> None:
+        """Write it down."""
+        if message["op"] == "publish":
+            self.at[message["msg"]["data"]] = time.monotonic_ns()
+
+    def show(self, name: str) -> None:
+        """A picture with somebody in it."""
+        seen = {"stamp": time.time(), "frame": "camera", "faces": [{"name": name}]}
+        self.client.send(op="publish", topic="/faces/seen", msg={"data": json.dumps(seen)})
+
+
+class _Scans:
+    """A websocket by which the same scan comes for ever."""
+
+    def __init__(self) -> None:
+        ranges = [1.4 + 0.1 * math.sin(number) for number in range(RAYS)]
+        scan = {"ranges": ranges, "angle_min": -math.pi, "angle_increment": math.tau / RAYS}
+        self._text = json.dumps({"op": "publish", "topic": "/scan", "msg": scan})
+
+    def send(self, text: str) -> None:
+        """Nobody listens."""
+
+    def recv(self, timeout: float) -> str:
+        """The scan."""
+        return self._text
+
+
+def scans(runs: int) -> list[float]:
+    """Milliseconds to read a scan and to decide."""
+    link, runaway = Link(Line(_Scans()), "/scan", "/cmd_vel"), Runaway(Manners())
+    took = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        scan = link.scan(1.0)
+        assert scan is not None
+        runaway.see(scan)
+        took.append((time.perf_counter() - began) * 1000)
+    return took
+
+
+def _moving(robot: Robot, since: int) -> int:
+    """When the first command to move came, monotonic nanoseconds; 0 before."""
+    events = robot.events("command", since)
+    return next((int(each["t"]) for each in events if each["v"] or each["w"]), 0)
+
+
+def _rest(robot: Robot) -> None:
+    wait_for("the robot stands", lambda: not robot.moving())
+    time.sleep(REST)
+
+
+def words(relay: Relay, robot: Robot, environment: dict[str, str], runs: int, first: int = 0) -> list[float]:
+    """Milliseconds from the end of a word to the command that the robot carried out.
+
+    :param first: the number of the first; what has number 0 is not counted
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "robot_client.apps.voice",
+        relay.url("rover"),
+        "--pcm",
+        "--seconds",
+        "0.4",
+    ]
+    voice = Fed(command, relay.folder, "voice", environment)
+    voice.wait_to_say("listening")
+    mouth = Mouth(os.dup(voice.feed))
+    took = []
+    with running(voice, mouth):
+        mouth.start()
+        mouth.say(silence(REST))  # what is silence here is heard before the first word
+        for number in range(first, runs + 1):
+            ended = mouth.say(speech(("ahead", "right", "left")[number % 3]))
+            came = wait_for("the word is obeyed", lambda ended=ended: _moving(robot, ended))
+            if number:  # with number 0 control was taken, and the robot's guard got ready
+                took.append((came - ended) / 1e6)
+            _rest(robot)
+    return took
+
+
+def sticks(
+    relay: Relay, robot: Robot, environment: dict[str, str], runs: int, first: int = 0
+) -> tuple[list[float], list[float]]:
+    """Milliseconds from a push of the stick to the command, and to odometry of it that a client hears."""
+    token = environment["SWITCHBOARD_TOKEN"]
+    pad = Fed([sys.executable, str(HAND), relay.url("rover")], relay.folder, "pad", environment)
+    pad.wait_to_say("no gamepad")
+    odometry = Odometry(relay.connect("rover", token))
+    commands, seen = [], []
+    with running(pad, odometry):
+        odometry.start()
+        pad.tell("plug")
+        pad.wait_to_say("press the button")
+        for word in ("you have control", "driving"):
+            pad.tell(f"button {HOLD} 1")
+            pad.wait_to_say(word)
+            if word != "driving":
+                pad.tell(f"button {HOLD} 0")
+                pad.wait_to_say("hold the button")
+        for number in range(first, runs + 1):
+            odometry.forget()
+            pushed = time.monotonic_ns()
+            pad.tell(f"axis {LEFT_Y} -1")
+            came = wait_for("the stick is obeyed", lambda pushed=pushed: _moving(robot, pushed))
+            if number:  # until number 0 the robot's guard got ready
+                commands.append((came - pushed) / 1e6)
+                seen.append((odometry.moved_at() - pushed) / 1e6)
+            pad.tell(f"axis {LEFT_Y} 0")
+            _rest(robot)
+    return commands, seen
+
+
+def greetings(relay: Relay, environment: dict[str, str], runs: int) -> list[float]:
+    """Milliseconds from the second picture with somebody in it to the words that the robot is to say."""
+    command = [sys.executable, "-m", "robot_client.apps.greeting", relay.url("rover"), "--text", "{name}"]
+    program = Process(command, relay.folder, "greeting", environment)
+    program.wait_to_say("looking for people")
+    said = Said(relay.connect("rover", environment["SWITCHBOARD_TOKEN"]))
+    took = []
+    with running(program, said):
+        said.start()
+
+        def known() -> bool:
+            said.show("somebody")
+            time.sleep(REST)
+            return "somebody" in said.at
+
+        wait_for("the topics have found each other", known)
+        for number in range(runs):
+            name = f"person {number}"
+            said.show(name)
+            time.sleep(REST)  # so long the next picture takes
+            seen = time.monotonic_ns()
+            said.show(name)
+            wait_for("the greeting is said", lambda name=name: name in said.at)
+            took.append((said.at[name] - seen) / 1e6)
+    return took
+
+
+def looks(runs: int) -> list[float]:
+    """Milliseconds that the service ``faces`` takes for a picture of 640 × 480 with a face that it knows."""
+    import cv2
+    from skimage import data
+
+    from robot_client.services.faces import Finder, People, grey_of, look
+    from robot_client.services.lens import of_view
+
+    cv2.setNumThreads(1)
+    pixels = np.full((480, 640, 3), 110, np.uint8)
+    pixels[:, :512] = data.astronaut()[:480, :, ::-1]
+    finder, people, lens = Finder(), People(), of_view(640, 480, 75)
+    people.add("eileen", grey_of(pixels), finder.find(grey_of(pixels))[0])
+    took = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        look(pixels, lens, finder, people)
+        took.append((time.perf_counter() - began) * 1000)
+    return took
+
+
+def recharges(relay: Relay, environment: dict[str, str], runs: int) -> list[float]:
+    """Seconds from control over a robot with a low battery until it charges, of those runs in which it does."""
+    robot = Robot(relay, "hungry", camera=True, sim_options=("--charge", "15"))
+    relay.cli("right", "grant", "driver", "hungry", "operator")
+    see = [sys.executable, "-m", "robot_client.services.main", "markers", "--view", "75", "--size", "0.4"]
+    markers = Process(see, relay.folder, "markers", ros_environment(robot.domain))
+    client = relay.connect("hungry", environment["SWITCHBOARD_TOKEN"])
+    took = []
+    with running(robot, markers), client:
+        markers.wait_to_say("READY")
+        client.send(op="advertise", topic="/cmd_vel", type="geometry_msgs/msg/Twist")
+        client.send(
+            op="subscribe", topic="/battery_state", type="sensor_msgs/msg/BatteryState", queue_length=1
+        )
+        for number in range(runs):
+            client.call("/reset")
+            for _ in range(5 * number):
+                client.drive(0.0, 1.0)
+                time.sleep(0.1)
+            client.drive(0.0)
+            _rest(robot)
+            client.call("/relay/release_control")
+            took += _recharge(relay, client, environment, number)
+    return took
+
+
+def _recharge(relay: Relay, client: Client, environment: dict[str, str], number: int) -> list[float]:
+    command = [sys.executable, "-m", "robot_client.apps.recharge", relay.url("hungry")]
+    program = Process(command, relay.folder, f"recharge{number}", environment)
+    with running(program):
+        program.wait_to_say("looking for marker")
+        began = time.monotonic()
+        while time.monotonic() < began + FAILED:
+            state = client.until(op="publish", topic="/battery_state")["msg"]["power_supply_status"]
+            if state == CHARGING:
+                return [time.monotonic() - began]
+    return []
+
+
+def _pair(what: str, took: list[float], bar: float | None = None) -> list[Row]:
+    return [
+        Row("apps", f"{what}, median", "ms", statistics.median(took), bar=bar),
+        Row("apps", f"{what}, longest of {len(took)}", "ms", max(took)),
+    ]
+
+
+def run(options: Options) -> list[Row]:
+    """All of them."""
+    runs, first = options.runs or int(options.pick(1, 60)), int(options.pick(1, 0))
+    rows = _pair("runaway: a scan of 360 rays read and decided upon", scans(runs * 20), SCAN_BAR_MS)
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+        relay = Relay(Path(folder))
+        with running(relay):
+            robot = Robot(relay, "rover")
+            with running(robot):
+                environment = {**os.environ, "SWITCHBOARD_TOKEN": relay.user("driver")}
+                relay.cli("right", "grant", "driver", "rover", "operator")
+                commands, seen = sticks(relay, robot, environment, runs, first)
+                heard = words(relay, robot, environment, runs, first)
+                greeted = greetings(relay, environment, runs)
+            drives = int(options.pick(1, 10))
+            charged = recharges(relay, environment, drives)
+    rows += _pair("joystick: stick pushed → command carried out", commands, STICK_BAR_MS)
+    rows += _pair("joystick: stick pushed → odometry of it is back", seen, STICK_BAR_MS)
+    rows += _pair("voice: end of the word → command carried out", heard, WORD_BAR_MS)
+    rows += _pair("faces: a picture of 640×480 looked at", looks(runs))
+    rows += _pair("greeting: second picture of somebody → what the robot is to say", greeted)
+    rows.append(
+        Row("apps", f"recharge: of {drives} runs without a charge", "runs", drives - len(charged), bar=0)
+    )
+    if charged:
+        rows.append(
+            Row("apps", "recharge: control taken → battery charges, median", "s", statistics.median(charged))
+        )
+    return rows
