@@ -43,6 +43,9 @@ async def stop(session: Session, args: Any) -> Any:
         done = await session.desk.stopping.stop(actor_of(session), reason_of(argument(args, "why")))
     except (NotDone, Unavailable) as error:
         return {**Answer(False, str(error))._asdict(), "done": False}
+    finally:
+        # Who has the answer may resume at once.
+        session.ping()
     said = (
         f"robot {name} is stopped" if done else f"robot {name} will be stopped as soon as it can be reached"
     )

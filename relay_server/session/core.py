@@ -339,6 +339,11 @@ class Session:
         self.tell("error", str(error), operation.id)
         answer_failed(self, operation, error)
 
+    def ping(self) -> None:
+        """Ping the client now: what it says after it has read what it was told before counts as said after that."""
+        if not self._closed:
+            self._pinging.ping()
+
     def judge_again(self) -> None:
         """The robot's topics or cameras are others: what is subscribed is judged anew."""
         self.listening.judge_again()

@@ -130,6 +130,9 @@ class Listening:
     def _push(self) -> None:
         if not self._tell(pushed=True):
             self._session.desk.pushing.forget(self._session)
+        elif self._session.desk.standing.stopped is not None:
+            # Who knows that the robot stands may let it move again at once.
+            self._session.ping()
 
     def _tell(self, *, pushed: bool) -> bool:
         """Publish the relay's own topics of one kind; whether any is subscribed."""

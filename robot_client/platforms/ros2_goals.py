@@ -61,6 +61,8 @@ class Goals:
         self._types = types
         self._clients: dict[tuple[str, str], _Client] = {}
         self._watching: Timer | None = None
+        self.left = False
+        """Whether the executor turns no more."""
 
     def pursue(self, action: str, type: str, body: bytes, on_feedback: OnSample | None) -> RosGoal:
         """Begin one; see :meth:`robot_client.platforms.base.Platform.pursue`."""
@@ -106,6 +108,7 @@ class Goals:
         for client in self._clients.values():
             self.spinner.do(client.ros.destroy)
         self._clients.clear()
+        self.left = True
 
     def servers(self, action: str) -> frozenset[bytes]:
         """Who serves an action, by identities that a server that was started anew does not share."""
@@ -307,6 +310,8 @@ class RosGoal:
     # --- in the reactor's thread
 
     def _answered(self, handle: Any) -> None:
+        if self._state is _State.ENDED and self._goals.left:
+            return  # what is cancelled after the farewell reaches nobody
         if self._state is _State.ENDED:
             self._goals.spinner.do(self._client.ros.hush, bytes(handle.goal_id.uuid))
             if handle.accepted:  # given up, and taken after all: nobody would ever end it

@@ -18,6 +18,7 @@ import queue
 import signal
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -382,7 +383,12 @@ def main() -> None:
 def _spin(executor: MultiThreadedExecutor, leaving: queue.SimpleQueue[ActionClient]) -> None:
     with contextlib.suppress(ExternalShutdownException):
         while rclpy.ok():
-            executor.spin_once()
+            try:
+                executor.spin_once()
+            except ExternalShutdownException:
+                raise
+            except Exception:  # one callback's fault, such as a client that left while it was answered
+                traceback.print_exc()
             # By no other thread: this one looks at all action clients when it begins to wait (rclpy 7.1).
             with contextlib.suppress(queue.Empty):
                 leaving.get_nowait().destroy()

@@ -18,6 +18,7 @@ from switchboard_browser import (
     sound_pages,
     stands,
     take_control,
+    was_told,
 )
 from switchboard_relay import Relay
 from switchboard_robot import Robot
@@ -150,7 +151,7 @@ def test_a_refused_request_leaves_everything_as_it_was(house: House, open_page: 
     ask(bob)
     seen(ann, "control-refuse").click()
     stands(bob, "held")
-    expect(seen(bob, "toast")).to_contain_text("ann keeps control")
+    was_told(bob, "ann keeps control")
     stands(ann, "yours")
     drive(house, ann)
     ann.keyboard.up("a")
@@ -169,7 +170,7 @@ def test_an_owner_takes_over_who_got_no_answer(house: House, open_page: OpenPage
     stands(olga, "yours")
     house.stands()
     expect(seen(ann, "drive-words")).to_have_text("olga has control now.")
-    expect(seen(ann, "toast").first).to_contain_text("you have lost control of rover: olga has taken over")
+    was_told(ann, "you have lost control of rover: olga has taken over")
     ann.keyboard.up("a")
 
 
@@ -341,7 +342,7 @@ def test_who_looks_elsewhere_is_told_that_a_robot_is_gone(house: House, open_pag
     expect(seen(vera, "alerts-empty")).to_be_visible()
     house.robot.daemon.stop()
     try:
-        expect(seen(ann, "toast").first).to_contain_text("rover")
+        was_told(ann, "rover")
         expect(seen(ann, "alerts-count")).to_have_text("1")
         alert = vera.locator("[data-testid=alert][data-kind=offline]")
         expect(alert).to_contain_text("rover")

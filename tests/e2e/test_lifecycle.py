@@ -199,7 +199,7 @@ def test_a_call_under_way_is_answered_when_the_robot_is_lost(house: House) -> No
     """Who waits for an answer gets words as soon as the robot is gone, not the end of a timeout."""
     with house.relay.connect("rover", house.driver) as client:
         wait_for("the robot answers a call", lambda: client.call("/reset")["result"])
-        house.robot.daemon.signal(signal.SIGSTOP)
+        house.robot.daemon.freeze()
         try:
             begun = time.monotonic()
             answer = client.call("/reset", seconds=20)

@@ -186,7 +186,7 @@ def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
     """A daemon that hangs with its links open is stopped by the guard, and is itself again when it wakes."""
     driver = drive.start_driving()
     since = time.monotonic_ns()
-    drive.robot.daemon.signal(signal.SIGSTOP)
+    drive.robot.daemon.freeze()
     try:
         drive.stands_within_limit(since)
         driver.stop()

@@ -11,8 +11,19 @@ from typing import Any, Protocol, TypeVar
 
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from switchboard_waiting import wait_for
 
 import relay_server
+
+NOTES_TOASTS = """
+window.toastsTold = [];
+new MutationObserver((changes) => {
+  for (const { addedNodes } of changes)
+    for (const node of addedNodes)
+      if (node instanceof Element && node.matches("[data-testid=toast]")) toastsTold.push(node.textContent);
+}).observe(document, { childList: true, subtree: true });
+"""
+"""Toasts go after a moment: on a busy machine they may be gone before a test looks."""
 
 ARGUMENTS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--disable-background-networking"]
 
@@ -76,6 +87,7 @@ def sound_pages(browser: Browser, url: str, seconds: float) -> Iterator[Callable
         context = browser.new_context(viewport={"width": width, "height": height}, base_url=url, **options)
         context.set_default_timeout(seconds * 1000)
         contexts.append(context)
+        context.add_init_script(NOTES_TOASTS)
         page = context.new_page()
         page.on("pageerror", lambda error: faults.append(f"uncaught: {error}"))
         page.on("console", lambda message: heard(message.text))
@@ -93,6 +105,11 @@ def sound_pages(browser: Browser, url: str, seconds: float) -> Iterator[Callable
 def seen(page: Page, testid: str) -> Locator:
     """An element of the page by its name for tests."""
     return page.get_by_test_id(testid)
+
+
+def was_told(page: Page, words: str) -> None:
+    """Wait until a toast with these words has been shown, were it for a moment."""
+    wait_for(f"a toast with '{words}'", lambda: any(words in each for each in page.evaluate("toastsTold")))
 
 
 def stands(page: Page, how: str) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from switchboard_forks import Forked, forkable, start
-from switchboard_waiting import wait_for
+from switchboard_waiting import freeze, wait_for
 
 BIN = Path(sys.executable).parent
 START_SECONDS = 60.0
@@ -84,6 +84,10 @@ class Process:
     def signal(self, number: int) -> None:
         """Send a signal."""
         self.popen.send_signal(number)
+
+    def freeze(self) -> None:
+        """SIGSTOP; it stands still when this returns."""
+        freeze(self.popen.pid)
 
     def kill(self) -> None:
         """kill -9, and reap."""

@@ -92,9 +92,9 @@ class Relay:
         return Client(connect(url, additional_headers=headers, open_timeout=PATIENCE))
 
     def freeze(self) -> None:
-        """SIGSTOP."""
+        """SIGSTOP; it stands still when this returns."""
         assert self.process is not None
-        self.process.signal(signal.SIGSTOP)
+        self.process.freeze()
 
     def thaw(self) -> None:
         """SIGCONT."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import selectors
+import signal
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 PATIENCE = 60.0
@@ -29,3 +33,21 @@ def readable(connection: socket.socket, seconds: float) -> bool:
     with selectors.DefaultSelector() as selector:
         selector.register(connection, selectors.EVENT_READ)
         return bool(selector.select(seconds))
+
+
+def freeze(pid: int) -> None:
+    """Stop a process by SIGSTOP, and wait until all of it stands still.
+
+    The kernel hands the signal to one of its threads; until that one has a processor, the others go on.
+    """
+    os.kill(pid, signal.SIGSTOP)
+    wait_for(f"process {pid} stands still", lambda: all(state == "T" for state in _states(pid)))
+
+
+def _states(pid: int) -> list[str]:
+    """How each thread of a process is, by its letter in ``stat`` (proc(5)): after the name, which may hold anything."""
+    states = []
+    for stat in Path(f"/proc/{pid}/task").glob("*/stat"):
+        with suppress(OSError):  # a thread that has ended meanwhile
+            states.append(stat.read_text().rpartition(")")[2].split()[0])
+    return states

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from switchboard_domains import free_domain
+from switchboard_waiting import freeze
 from twisted.internet import reactor, task
 
 PATIENCE = 60.0
@@ -95,7 +96,7 @@ class Peer:
     @contextmanager
     def frozen(self) -> Iterator[None]:
         """Let it stand still for a while."""
-        self._process.send_signal(signal.SIGSTOP)
+        freeze(self._process.pid)
         try:
             yield
         finally:

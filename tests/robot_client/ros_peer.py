@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+import traceback
 
 import rclpy
 from builtin_interfaces.msg import Time
@@ -202,13 +203,22 @@ def battery(topic: str, charge: float) -> None:
     node.create_timer(0.1, lambda: publisher.publish(BatteryState(percentage=charge)))
 
 
+def spin(executor: MultiThreadedExecutor) -> None:
+    """Turn for good: rclpy ends at one callback's fault, such as a handle that was just destroyed (rclpy #1355)."""
+    while rclpy.ok():
+        try:
+            executor.spin()
+        except Exception:
+            traceback.print_exc()
+
+
 def main() -> None:
     global node
     rclpy.init()
     node = rclpy.create_node("peer", namespace="/robot")
     executor = MultiThreadedExecutor(12)  # a goal that goes on holds one
     executor.add_node(node)
-    threading.Thread(target=executor.spin, daemon=True).start()
+    threading.Thread(target=spin, args=(executor,), daemon=True).start()
     tell(ready=True)
     for line in sys.stdin:
         name, *arguments = json.loads(line)

@@ -16,6 +16,7 @@ import pytest
 from geometry_msgs.msg import Twist
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Joy
+from switchboard_waiting import freeze
 
 from relay_protocol import link
 from tests.robot_client.fake_relay import FakeRelay, Peer
@@ -286,7 +287,7 @@ def test_killed_daemon_lets_go_of_a_joystick(drive: Drive) -> None:
 def test_frozen_daemon_stops(drive: Drive) -> None:
     """SIGSTOP of the daemon: its guard sends zero in time; what waited in the frozen daemon is not executed."""
     last = drive.drive()
-    drive.process.send_signal(signal.SIGSTOP)
+    freeze(drive.process.pid)
     for _ in range(5):
         drive.channel.command(5, GO)
     assert drive.zero_after(last) < STOP_MS

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from example_interfaces.action import Fibonacci
 from rclpy.serialization import serialize_message
+from switchboard_waiting import freeze
 
 from relay_protocol import link
 from robot_client.lasting import GOALS
@@ -95,7 +96,7 @@ def test_goals_of_a_killed_daemon_are_cancelled(robot: Robot, node: Node) -> Non
 def test_goals_of_a_frozen_daemon_are_cancelled(robot: Robot, node: Node) -> None:
     """SIGSTOP of the daemon: its guard has them cancelled; it goes on when it may, and leaves none when it ends."""
     errand = Errand(robot, node)
-    errand.process.send_signal(signal.SIGSTOP)
+    freeze(errand.process.pid)
     until(lambda: errand.cancelled)
     errand.process.send_signal(signal.SIGCONT)
     assert errand.channel.expect(link.ActionResult).status == CANCELED
@@ -110,7 +111,7 @@ def test_goals_of_a_frozen_daemon_are_cancelled(robot: Robot, node: Node) -> Non
 def test_goals_of_a_stalled_daemon_go_on(robot: Robot, node: Node) -> None:
     """What a driver would hardly notice does not end a long way."""
     errand = Errand(robot, node)
-    errand.process.send_signal(signal.SIGSTOP)
+    freeze(errand.process.pid)
     time.sleep(0.8)  # longer than commands may cease
     errand.process.send_signal(signal.SIGCONT)
     time.sleep(1.5)  # proves absence

@@ -264,3 +264,31 @@ def test_a_resume_from_before_a_stop_does_not_lift_it(world: World, people: dict
     olga.answers_pings()
     assert ask(olga, "/relay/resume")["success"] is True
     assert world.control.all(link.Resume)
+
+
+def test_who_has_just_stopped_it_may_resume_at_once(world: World, people: dict[str, Person]) -> None:
+    """With the answer comes a ping: what its client sends after it has read both is no older than the stop."""
+    olga = people["olga"]
+    olga.answers_pings()
+    world.clock.advance(0.05)
+    ask(olga, "/relay/stop")
+    olga.answers_pings()
+    assert ask(olga, "/relay/resume")["success"] is True
+
+
+def test_who_is_told_of_a_stop_may_resume_at_once(world: World, people: dict[str, Person]) -> None:
+    """A ping comes with what is told of a robot that stands, and of one that may move none."""
+    olga = people["olga"]
+    olga.says("subscribe", topic="/relay/control")
+    pinged = []
+    for order in ("/relay/take_control", "/relay/stop"):
+        world.clock.advance(0.21)
+        olga.hears("publish")
+        olga.client.pings.clear()
+        ask(people["ann"], order)
+        world.clock.advance(0)
+        assert told(olga)
+        pinged.append(len(olga.client.pings))
+    assert pinged == [0, 1]
+    olga.answers_pings()
+    assert ask(olga, "/relay/resume")["success"] is True

@@ -133,14 +133,15 @@ async def test_goal_cancelled_at_once_never_begins(ros: Ros2Platform, peer: Peer
 @pytest_twisted.ensureDeferred
 async def test_all_goals_of_an_action_are_cancelled_whoever_gave_them(ros: Ros2Platform, peer: Peer) -> None:
     """One request without a goal's id is enough; where there is no goal left it is no error."""
-    await serve(ros, peer, "/forever", "forever")
-    wanted = [Wanted(ros, "/forever", 3), Wanted(ros, "/forever", 3)]
+    await serve(ros, peer, "/swept", "forever")
+    wanted = [Wanted(ros, "/swept", 3), Wanted(ros, "/swept", 3)]
     await until(lambda: all(each.fed for each in wanted))
-    sweep = Sweep(MotionPolicy(actions=["/forever"]), ros, reactor, lambda topic: False)
+    sweep = Sweep(MotionPolicy(actions=["/swept"]), ros, reactor, lambda topic: False)
     for _ in range(2):
         assert await sweep.stop() == []
         assert sweep.late() == []
         assert [(await each.end()).status for each in wanted] == [CANCELED, CANCELED]
+    sweep.end()
 
 
 @pytest_twisted.ensureDeferred
