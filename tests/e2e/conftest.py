@@ -26,6 +26,12 @@ class World:
     viewer: str
     stranger: str
 
+    def wait_known(self) -> None:
+        """Until the relay knows what the robot has: it is online before it has found out all of its own graph."""
+        self.robot.wait_online()
+        with self.relay.connect("rover", self.viewer) as client:
+            wait_for("its graph is known", lambda: {"/odom", "/scan", "/cmd_vel"} <= topics_of(client))
+
     @contextmanager
     def operating(self) -> Iterator[Client]:
         """An operator's connection, who wants to hear errors."""
@@ -49,10 +55,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             operator, viewer, stranger = (relay.user(name) for name in ("operator", "viewer", "stranger"))
             relay.cli("right", "grant", "operator", "rover", "operator")
             relay.cli("right", "grant", "viewer", "rover", "viewer")
-            with relay.connect("rover", viewer) as client:
-                # It is online before it has found out all of its own graph.
-                wait_for("its graph is known", lambda: {"/odom", "/scan", "/cmd_vel"} <= topics_of(client))
-            yield World(relay, robot, operator, viewer, stranger)
+            made = World(relay, robot, operator, viewer, stranger)
+            made.wait_known()
+            yield made
         finally:
             robot.stop()
     finally:

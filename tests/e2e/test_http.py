@@ -236,7 +236,7 @@ def test_the_stream_tells_when_a_robot_goes_and_comes(world: Any) -> None:
         assert next(each for each in told if each == "online")
     finally:
         connection.close()
-        world.robot.wait_online()
+        world.wait_known()
 
 
 def test_a_page_follows_by_websocket_until_its_session_ends(world: Any, cookie: dict[str, str]) -> None:
