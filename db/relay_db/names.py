@@ -15,15 +15,17 @@ def normal_name(text: str, what: str = "name") -> str:
     """The one form of a name: NFKC, lower case. ``Ann`` and ``ann`` are the same person.
 
     :param what: whose name it is, for the error
-    :raises Invalid: empty, over 63 characters, not printable, with blanks, or beginning with ``@`` or ``-``
+    :raises Invalid: empty, over 63 characters, not printable, with blanks or ``@``, or beginning with ``-``
     """
     name = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
     if not 0 < len(name) <= NAME:
         raise Invalid(f"the {what} must have 1 to {NAME} characters")
     if not name.isprintable() or any(character.isspace() for character in name):
         raise Invalid(f"the {what} must be printable, without spaces, line breaks or control characters")
-    if name[0] in "@-":
-        raise Invalid(f"the {what} must not begin with '{name[0]}'")
+    if "@" in name:
+        raise Invalid(f"the {what} must not have an '@' in it: what follows one is a realm, as in toad@lab1")
+    if name[0] == "-":
+        raise Invalid(f"the {what} must not begin with '-'")
     return name
 
 

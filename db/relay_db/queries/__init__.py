@@ -124,7 +124,6 @@ from relay_db.queries.tokens import (
     token_is_live,
 )
 from relay_db.queries.users import (
-    DEFAULT_REALM,
     add_group,
     add_member,
     add_realm,
@@ -138,6 +137,7 @@ from relay_db.queries.users import (
     list_users,
     remove_group,
     remove_member,
+    remove_realm,
     remove_user,
     set_admin,
     set_disabled,
@@ -146,7 +146,6 @@ from relay_db.queries.users import (
 )
 
 __all__ = [
-    "DEFAULT_REALM",
     "LIVE_KEYS",
     "AlertRecord",
     "AlertRuleRecord",
@@ -259,6 +258,7 @@ __all__ = [
     "remove_group",
     "remove_member",
     "remove_program",
+    "remove_realm",
     "remove_robot",
     "remove_robot_group",
     "remove_user",

@@ -18,15 +18,18 @@ SPARED = 10
 _TABLE: Any = Memory.__table__
 
 
-def remember(s: Session, events: Sequence[NewMemory]) -> list[MemoryRecord]:
-    """Write events, numbered in this order within each realm; as they are kept."""
+def remember(s: Session, events: Sequence[NewMemory]) -> list[MemoryRecord | None]:
+    """Write events, numbered in this order within each realm; each as it is kept, ``None`` where its realm is gone."""
     realms = _realms(s)
     following: dict[str, int] = {}
-    for realm in sorted({each.realm for each in events}):
+    for realm in sorted({each.realm for each in events} & realms.keys()):
         count = sum(each.realm == realm for each in events)
         following[realm] = _take_numbers(s, realms[realm], count)
-    kept = []
+    kept: list[MemoryRecord | None] = []
     for each in events:
+        if each.realm not in realms:
+            kept.append(None)
+            continue
         kept.append(MemoryRecord(following[each.realm], *each, used=0))
         following[each.realm] += 1
     rows = [
@@ -42,6 +45,7 @@ def remember(s: Session, events: Sequence[NewMemory]) -> list[MemoryRecord]:
             "used": 0,
         }
         for each in kept
+        if each is not None
     ]
     if rows:
         s.execute(insert(_TABLE), rows)
@@ -73,13 +77,15 @@ def use_memories(s: Session, uses: Mapping[tuple[str, int], int]) -> None:
     rows = [
         {"its_realm": realms[realm], "its_number": number, "more": times}
         for (realm, number), times in uses.items()
+        if realm in realms
     ]
     query = (
         update(_TABLE)
         .where(_TABLE.c.realm_id == bindparam("its_realm"), _TABLE.c.number == bindparam("its_number"))
         .values(used=_TABLE.c.used + bindparam("more"))
     )
-    s.connection().execute(query, rows)
+    if rows:
+        s.connection().execute(query, rows)
 
 
 def memory_sizes(s: Session) -> dict[str, int]:

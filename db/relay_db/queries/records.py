@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from relay_protocol.realms import full_name
 from relay_protocol.rights import Level
 
 
@@ -24,6 +25,11 @@ class UserRecord(NamedTuple):
     disabled: bool
     password_hash: str | None
 
+    @property
+    def full(self) -> str:
+        """Its name for the whole relay: ``toad@lab1``."""
+        return full_name(self.name, self.realm)
+
 
 class GroupRecord(NamedTuple):
     """A group and the names of its members."""
@@ -32,6 +38,11 @@ class GroupRecord(NamedTuple):
     name: str
     realm: str
     members: tuple[str, ...]
+
+    @property
+    def full(self) -> str:
+        """Its name for the whole relay: ``toad@lab1``."""
+        return full_name(self.name, self.realm)
 
 
 class RobotRecord(NamedTuple):
@@ -42,6 +53,11 @@ class RobotRecord(NamedTuple):
     realm: str
     description: str
 
+    @property
+    def full(self) -> str:
+        """Its name for the whole relay: ``toad@lab1``."""
+        return full_name(self.name, self.realm)
+
 
 class RobotGroupRecord(NamedTuple):
     """A group of robots and their names."""
@@ -50,6 +66,11 @@ class RobotGroupRecord(NamedTuple):
     name: str
     realm: str
     robots: tuple[str, ...]
+
+    @property
+    def full(self) -> str:
+        """Its name for the whole relay: ``toad@lab1``."""
+        return full_name(self.name, self.realm)
 
 
 class RobotKeyRecord(NamedTuple):

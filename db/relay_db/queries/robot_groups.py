@@ -10,8 +10,9 @@ from sqlalchemy.orm import Session
 from relay_db.models import Realm, Robot, RobotGroup, RobotMembership
 from relay_db.names import findable, normal_name
 from relay_db.queries.records import RobotGroupRecord
-from relay_db.queries.users import DEFAULT_REALM, realm_id
+from relay_db.queries.users import realm_id
 from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.realms import DEFAULT_REALM, full_name
 
 
 def find_robot_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> RobotGroupRecord | None:
@@ -43,7 +44,7 @@ def add_robot_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> RobotG
     """
     name, realm = normal_name(name, "name of a group"), findable(realm)
     if find_robot_group(s, name, realm) is not None:
-        raise Invalid(f"there is a group of robots '{name}' already")
+        raise Invalid(f"there is a group of robots '{full_name(name, realm)}' already")
     group_id = s.scalars(
         insert(RobotGroup).values(realm_id=realm_id(s, realm), name=name).returning(RobotGroup.id)
     ).one()

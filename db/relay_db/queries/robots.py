@@ -12,9 +12,10 @@ from relay_db.models import EnrolmentCode, Realm, Robot, RobotKey
 from relay_db.names import findable, findable_hex, label, recorded
 from relay_db.queries.records import KeyRecord, RobotKeyRecord, RobotRecord
 from relay_db.queries.state import bump
-from relay_db.queries.users import DEFAULT_REALM, realm_id
+from relay_db.queries.users import realm_id
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.identity import PUBLIC_KEY_BYTES, check_robot_name
+from relay_protocol.realms import DEFAULT_REALM, full_name
 
 LIVE_KEYS = 2
 """Keys of a robot that are good at a time: the one in use, and the one it changes to."""
@@ -63,7 +64,7 @@ def add_robot(s: Session, name: str, description: str = "", realm: str = DEFAULT
     label(description, "description of a robot")
     realm = findable(realm)
     if find_robot(s, name, realm) is not None:
-        raise Invalid(f"there is a robot '{name}' already")
+        raise Invalid(f"there is a robot '{full_name(name, realm)}' already")
     bump(s)
     robot_id = s.scalars(
         insert(Robot)

@@ -5,13 +5,24 @@ from __future__ import annotations
 from sqlalchemy import ColumnElement, Row, Select, delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import AccessToken, Group, Membership, Realm, TokenFamily, User
+from relay_db.models import (
+    AccessToken,
+    DirectoryEntry,
+    Group,
+    Membership,
+    Memory,
+    MemoryCount,
+    Realm,
+    Robot,
+    RobotGroup,
+    TokenFamily,
+    User,
+)
 from relay_db.names import findable, normal_name
 from relay_db.queries.records import GroupRecord, RealmRecord, UserRecord
 from relay_db.queries.state import bump
 from relay_protocol.errors import Invalid, NotFound, Refused
-
-DEFAULT_REALM = "default"
+from relay_protocol.realms import DEFAULT_REALM, full_name
 
 
 def add_realm(s: Session, name: str) -> RealmRecord:
@@ -21,6 +32,32 @@ def add_realm(s: Session, name: str) -> RealmRecord:
         raise Invalid(f"there is a realm '{name}' already")
     realm_id = s.scalars(insert(Realm).values(name=name).returning(Realm.id)).one()
     return RealmRecord(realm_id, name)
+
+
+def remove_realm(s: Session, name: str) -> None:
+    """Remove a realm in which nobody and nothing is left, with what its memory and its directory hold.
+
+    :raises NotFound: no such realm
+    :raises Refused: users, groups or robots are in it, or it is the one that every relay has
+    """
+    gone = realm_id(s, name)
+    if findable(name) == DEFAULT_REALM:
+        raise Refused(f"the realm '{DEFAULT_REALM}' stays: names without a realm are of it")
+    left = [
+        what
+        for what, kind in (
+            ("users", User),
+            ("groups", Group),
+            ("robots", Robot),
+            ("groups of robots", RobotGroup),
+        )
+        if _holds(s, kind.realm_id == gone)
+    ]
+    if left:
+        raise Refused(f"there are {' and '.join(left)} in the realm '{findable(name)}'; remove them first")
+    for kept in (DirectoryEntry, Memory, MemoryCount):
+        s.execute(delete(kept).where(kept.realm_id == gone))
+    s.execute(delete(Realm).where(Realm.id == gone))
 
 
 def list_realms(s: Session) -> list[RealmRecord]:
@@ -70,7 +107,7 @@ def add_user(
     """
     name, realm = normal_name(name, "name of a user"), findable(realm)
     if find_user(s, name, realm) is not None:
-        raise Invalid(f"there is a user '{name}' already")
+        raise Invalid(f"there is a user '{full_name(name, realm)}' already")
     bump(s)
     user_id = s.scalars(
         insert(User)
@@ -170,7 +207,7 @@ def add_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord:
     """
     name, realm = normal_name(name, "name of a group"), findable(realm)
     if find_group(s, name, realm) is not None:
-        raise Invalid(f"there is a group '{name}' already")
+        raise Invalid(f"there is a group '{full_name(name, realm)}' already")
     bump(s)
     group_id = s.scalars(
         insert(Group).values(realm_id=realm_id(s, realm), name=name).returning(Group.id)

@@ -52,6 +52,14 @@ def counted(database: Database, **ask: Any) -> int:
                 return count
 
 
+def test_an_event_of_no_realm_is_not_kept(database: Database) -> None:
+    """The others of the transaction are; each comes back in its place."""
+    with database.begin() as s:
+        kept = queries.remember(s, [new(1.0, realm="gone"), new(1.0), new(2.0, realm="gone"), new(3.0)])
+        queries.use_memories(s, {("gone", 1): 2})
+    assert [each and each.number for each in kept] == [None, 1, None, 2]
+
+
 def test_events_are_numbered_within_their_realm(database: Database) -> None:
     """In the order in which they were given, without a gap, from one transaction to the next."""
     with database.begin() as s:

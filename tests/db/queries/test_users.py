@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_protocol.errors import Invalid, NotFound
+from relay_db.queries import NewMemory
+from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.rights import Level
 
 TOKEN = "b" * 64
@@ -51,6 +52,34 @@ def test_any_text_can_be_looked_for(database: Database) -> None:
             assert queries.principal_by_token(s, text, 1.0) is None
 
     look_for()
+
+
+def test_a_realm_is_removed_when_nobody_is_left(database: Database) -> None:
+    """What its memory and its directory hold goes with it; the default one stays in any case."""
+    with database.begin() as s:
+        queries.add_realm(s, "Lab")
+        ann = queries.add_user(s, "ann", None, realm="lab")
+        rover = queries.add_robot(s, "rover", realm="lab")
+        crew = queries.add_group(s, "crew", realm="lab")
+        fleet = queries.add_robot_group(s, "fleet", realm="lab")
+        queries.remember(s, [NewMemory("lab", 1.0, "app", "x", None, None, "{}")])
+        for left, remove, id in (
+            ("users and groups and robots and groups of robots", queries.remove_user, ann.id),
+            ("groups and robots and groups of robots", queries.remove_group, crew.id),
+            ("robots and groups of robots", queries.remove_robot, rover.id),
+            ("groups of robots", queries.remove_robot_group, fleet.id),
+        ):
+            with pytest.raises(Refused, match=f"there are {left} in the realm 'lab'"):
+                queries.remove_realm(s, "LAB")
+            remove(s, id)
+        queries.remove_realm(s, "LAB")
+        assert [each.name for each in queries.list_realms(s)] == ["default"]
+        with pytest.raises(NotFound):
+            queries.remove_realm(s, "lab")
+        with pytest.raises(Refused, match="stays"):
+            queries.remove_realm(s, "default")
+        queries.add_realm(s, "lab")
+        assert queries.latest_memory(s, "lab") == 0
 
 
 def test_a_name_is_taken_once_per_realm(database: Database) -> None:
