@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from relay_db import queries
 from relay_db.queries import PrincipalRecord, RobotRecord
 from relay_protocol.errors import Refused
+from relay_protocol.realms import full_name
 from relay_protocol.rights import Grant, Operation, Rules, Verdict
 from relay_protocol.scopes import Scope
 from relay_server.store import Store
@@ -72,6 +73,11 @@ class Principal:
         admin = record.admin and (scope is None or scope.admin)
         token = record.token_id, record.expires, scope
         return cls(record.user_id, record.name, record.realm, admin, *token)
+
+    @property
+    def full(self) -> str:
+        """Its name for the whole relay: ``toad@lab1``."""
+        return full_name(self.name, self.realm)
 
     def needs_whole(self) -> None:
         """Refuse what reaches further than any one robot.

@@ -14,6 +14,7 @@ from twisted.logger import Logger
 from relay_db import queries
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
+from relay_protocol.realms import parted
 from relay_server import passwords
 from relay_server.access import BadCredentials, Principal
 from relay_server.limiter import LoginLimiter
@@ -115,6 +116,7 @@ class Authenticator:
     async def password(self, user: str, password: str, address: str) -> Login:
         """Check a password; unknown users cost the same time as known ones.
 
+        :param user: ``toad@lab1``; without a realm one of the default one
         :param address: where the ask comes from, for the limit on failures
         :raises BadCredentials: unknown user, wrong password or disabled account: one and the same answer
         :raises TooManyTries: judged before the password is hashed
@@ -132,7 +134,7 @@ class Authenticator:
             raise
 
     async def _password(self, user: str, password: str, address: str) -> Login:
-        record = await self._store.read(queries.find_user, user)
+        record = await self._store.read(queries.find_user, *parted(user))
         stored = record.password_hash if record is not None and not record.disabled else None
         right = await self._hashing.run(passwords.verify_password, password, stored)
         if record is None or not right:
@@ -258,9 +260,9 @@ def _open_session(s: Session, login: Login, token_hash: str, origin: str, how: s
     queries.append_audit(
         s,
         at=now,
-        actor=f"user:{login.name}",
+        actor=f"user:{login.full}",
         action="login",
-        target=login.name,
+        target=login.full,
         origin=origin,
         data={"how": how},
     )

@@ -216,6 +216,7 @@ class Console:
 
         Those that have been here since the relay began are told before the database is asked for the others.
 
+        :param robot: its name for the whole relay
         :param by: who is at the machine
         :raises NotFound: no such robot
         :raises Unavailable: the robot is not known here, and the database does not answer
@@ -226,10 +227,10 @@ class Console:
             for each in robots:
                 if each.robot_id not in given:
                     stopping = self._desks.of(each).stopping
-                    told = self._told(each.name, stopping.stop(_local(by), why))
-                    given[each.robot_id] = (each.name, Deferred.fromCoroutine(told))
+                    told = self._told(each.full, stopping.stop(_local(by), why))
+                    given[each.robot_id] = (each.full, Deferred.fromCoroutine(told))
 
-        stop([each for each in self._registry if robot in (None, each.name)])
+        stop([each for each in self._registry if robot in (None, each.full)])
         missed = ""
         if robot is None or not given:
             try:
@@ -261,7 +262,7 @@ class Console:
 
     async def _meant(self, robot: str | None) -> list[Presence]:
         records = await self._store.read(queries.list_robots)
-        found = [record for record in records if robot is None or record.name == robot]
+        found = [record for record in records if robot in (None, record.full)]
         if robot is not None and not found:
             raise NotFound(f"there is no robot '{robot}'; see 'switchboard robot list'")
         return [self._registry.presence(each.id, each.name, each.realm) for each in found]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ from relay_server.control import Desks
 from relay_server.freshness import Freshness
 from relay_server.journal import Journal
 from relay_server.local import RelayNode
+from relay_server.numbers import Numbers
 from relay_server.origins import Origins
 from relay_server.overview import NO_ROBOT, Overview
 from relay_server.people import People
@@ -102,7 +102,7 @@ class FrontDesk:
         self._clock_ns = clock_ns
         self._wall = wall
         # By them robots know who has to let go. They must not take a client for one of a relay that ran before.
-        self._numbers = itertools.count(secrets.randbelow(1 << 31) + 1)
+        self._numbers = Numbers()
         self._sessions: dict[int, dict[int, Session]] = {}
         self._watchings: set[Watching] = set()
         people = People(self.sessions_of, desks.holder, clock.seconds)
@@ -194,7 +194,7 @@ class FrontDesk:
             self._journal.event(
                 "client.refused",
                 "relay",
-                cause=f"user:{principal.name}",
+                cause=f"user:{principal.full}",
                 user_id=principal.user_id,
                 robot=robot[:64],
                 address=address,
@@ -224,7 +224,7 @@ class FrontDesk:
             self.timing,
             self._rounds,
             self._budgets.of(admission.permit.principal.user_id),
-            number=next(self._numbers),
+            number=self._numbers.take(),
             address=admission.address,
             since=self._wall(),
             ended=self._ended,
@@ -236,7 +236,7 @@ class FrontDesk:
         self._journal.event(
             "client.joined",
             f"user:{principal.name}",
-            cause=f"user:{principal.name}",
+            cause=f"user:{principal.full}",
             robot_id=robot.robot_id,
             user_id=principal.user_id,
             address=admission.address,
@@ -253,7 +253,7 @@ class FrontDesk:
         self._journal.event(
             "client.left",
             f"user:{principal.name}",
-            cause=f"user:{principal.name}",
+            cause=f"user:{principal.full}",
             robot_id=session.robot.robot_id,
             user_id=principal.user_id,
             drops=session.outbox.dropped,
@@ -343,7 +343,7 @@ class FrontDesk:
             kind,
             f"user:{principal.name}",
             # Not that of the user's other events: snapshots may come one a second.
-            cause=f"video:{principal.name}",
+            cause=f"video:{principal.full}",
             robot_id=watching.robot.robot_id,
             user_id=principal.user_id,
             camera=watching.camera,

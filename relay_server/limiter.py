@@ -7,6 +7,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 
 from relay_db.names import findable
+from relay_protocol.realms import parted
 
 FAILURES = 10
 WINDOW = 15 * 60.0
@@ -84,15 +85,21 @@ class LoginLimiter:
         """Forget the failures of this account here; the network's other failures stay."""
         self.forgive(account, address)
         if account is not None:
-            self._failures.pop((findable(account), network_of(address)), None)
+            self._failures.pop((_one(account), network_of(address)), None)
 
     def _keys(self, account: str | None, address: str) -> list[tuple[_Key, int]]:
         """What a try counts for, with the most failures each. An account is one however its name is written."""
         network = network_of(address)
         keys: list[tuple[_Key, int]] = [((None, network), self._of_network or FAILURES_OF_NETWORK)]
         if account is not None:
-            keys.append(((findable(account), network), FAILURES))
+            keys.append(((_one(account), network), FAILURES))
         return keys
+
+
+def _one(account: str) -> str:
+    """An account, however its name is written."""
+    name, realm = parted(account)
+    return f"{findable(name)}@{findable(realm)}"
 
 
 _Key = tuple[str | None, str]

@@ -96,7 +96,7 @@ class Overview:
 
     def _known(self, robot: Presence) -> dict[str, Any]:
         return {
-            "name": robot.name,
+            "name": robot.full,
             "realm": robot.realm,
             "state": robot.state.value,
             "address": robot.address,

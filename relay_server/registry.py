@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from relay_protocol import link
+from relay_protocol.realms import full_name
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.graph import GraphMirror
 from relay_server.linkmeter import NO_LINK, Reading
@@ -103,6 +104,11 @@ class Presence:
     users: int = 0
     onlookers: dict[Onlooker, float] = field(default_factory=dict)
     watchers: list[Watcher] = field(default_factory=list)
+
+    @property
+    def full(self) -> str:
+        """Its name for the whole relay: ``mobile@lab2``."""
+        return full_name(self.name, self.realm)
 
     @property
     def state(self) -> State:

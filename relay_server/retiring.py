@@ -29,6 +29,6 @@ async def retire(store: Store, registry: Registry, desks: Desks, videos: Videos)
             desks.forget(robot.robot_id)
             videos.end(robot, NotFound("this robot was removed from the relay"))
         elif control is not None and robot.control is control and (robot.robot_id, robot.key) not in live:
-            log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.name)
+            log.info("robot {robot} is cut: its key is not accepted any more", robot=robot.full)
             control.close("the robot's key is not accepted any more")
             videos.end(robot, Unavailable("the robot's key is not accepted any more"))

@@ -16,6 +16,7 @@ from twisted.python.failure import Failure
 
 from relay_protocol.errors import Invalid, SwitchboardError
 from relay_protocol.identity import check_robot_name
+from relay_protocol.realms import parted
 from relay_protocol.text import inert
 from robot_client import config, logs
 from robot_client.enrolling import enroll as hand_in
@@ -90,7 +91,7 @@ def enroll(
 ) -> None:
     """Make this robot's key and register it at a relay."""
     host, port = split_address(relay)
-    check_robot_name(robot)
+    check_robot_name(parted(robot)[0])
     folder = StateFolder(state)
     if folder.enrolled and not replace:
         raise Invalid(f"{state} holds an enrolment already; give another folder, or --replace")

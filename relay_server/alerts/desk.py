@@ -176,7 +176,7 @@ class AlertDesk:
             self._journal.event(
                 "alert.acknowledged",
                 f"user:{principal.name}",
-                cause=f"user:{principal.name}",
+                cause=f"user:{principal.full}",
                 robot_id=found.robot_id,
                 user_id=principal.user_id,
                 alert=found.id,
@@ -340,7 +340,7 @@ def _audit(
     queries.append_audit(
         s,
         at=now,
-        actor=f"user:{principal.name}",
+        actor=f"user:{principal.full}",
         action=action,
         target=str(record.id),
         origin=address,

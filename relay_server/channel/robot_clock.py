@@ -84,7 +84,7 @@ class RobotClock:
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """What a client would be told goes to the log."""
         self.log.warn(
-            "the simulated time of {robot}: {text}", robot=self._wire.robot.name, text=text, severity=level
+            "the simulated time of {robot}: {text}", robot=self._wire.robot.full, text=text, severity=level
         )
 
     def dropped(self, listener: Listener) -> None:

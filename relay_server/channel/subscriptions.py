@@ -281,7 +281,7 @@ class Subscriptions:
         self.log.warn(
             "a sample of {topic} from {robot} can't be converted: {failure}",
             topic=uplink.topic,
-            robot=self._wire.robot.name,
+            robot=self._wire.robot.full,
             failure=reason,
         )
 

@@ -363,4 +363,4 @@ class Desk(Steering):
         self.pushing.push()
 
     def _level_unknown(self, failure: Any) -> None:
-        self.log.warn("{robot} has not taken the new level: {why}", robot=self.robot.name, why=failure.value)
+        self.log.warn("{robot} has not taken the new level: {why}", robot=self.robot.full, why=failure.value)

@@ -14,6 +14,7 @@ from relay_db import queries
 from relay_db.queries import StopRecord
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
+from relay_protocol.realms import full_name
 from relay_server.journal import Journal
 from relay_server.registry import Presence
 from relay_server.store import Store
@@ -116,7 +117,7 @@ class DatabaseRecord:
             self.log.error(
                 "'{kind}' of {robot} by {source} is not on record: the database does not keep up",
                 kind=kind,
-                robot=robot.name,
+                robot=robot.full,
                 source=actor.source,
             )
             return
@@ -149,7 +150,7 @@ class DatabaseRecord:
             kind,
             actor.source,
             # Not that of the user's other events: who comes and goes must not hide who stops a robot.
-            cause=f"control:{actor.source}",
+            cause=f"control:{robot.realm}/{actor.source}",
             robot_id=robot.robot_id,
             user_id=actor.user,
             robot=robot.name,
@@ -163,15 +164,20 @@ class DatabaseRecord:
     def _entry(self, kind: str, robot: Presence, actor: Actor, data: dict[str, Any]) -> dict[str, Any]:
         return {
             "at": self._wall(),
-            "actor": actor.source,
+            "actor": _full(actor, robot),
             "action": kind,
-            "target": robot.name,
+            "target": robot.full,
             "origin": actor.address,
             "data": {"connection": actor.connection, **data},
         }
 
     def _written(self, _: object) -> None:
         self._waiting -= 1
+
+
+def _full(actor: Actor, robot: Presence) -> str:
+    """Who it is for the whole relay: users are those of the robot's realm."""
+    return actor.source if actor.user is None else full_name(actor.source, robot.realm)
 
 
 def _order(s: Session, order: StopRecord, entry: dict[str, Any] | None) -> None:

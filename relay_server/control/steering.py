@@ -231,7 +231,7 @@ class Steering:
 
     def _not_settled(self, error: SwitchboardError, asked: Lease) -> None:
         """The robot has not said that it obeys: nobody has control."""
-        self.log.warn("control of {robot} is free: {why}", robot=self.robot.name, why=str(error))
+        self.log.warn("control of {robot} is free: {why}", robot=self.robot.full, why=str(error))
         client = None if asked.coming is None else asked.coming.client
         if client is not None:
             # It may have heard us all the same. First: whoever waits for a free robot is given it by what follows.

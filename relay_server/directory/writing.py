@@ -8,6 +8,7 @@ from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.queries import EntryRecord
+from relay_protocol.realms import full_name
 from relay_server.access import Principal
 
 
@@ -43,7 +44,7 @@ def _audit(
     queries.append_audit(
         s,
         at=now,
-        actor=f"user:{principal.name}",
+        actor=f"user:{principal.full}",
         action=action,
         target=record.id,
         origin=address,
@@ -56,7 +57,7 @@ def audited(record: EntryRecord) -> dict[str, Any]:
     return {
         "kind": record.kind,
         "name": record.name,
-        "robot": record.robot,
-        "registrant": record.user,
+        "robot": record.robot and full_name(record.robot, record.realm),
+        "registrant": full_name(record.user, record.realm),
         "address": record.address,
     }

@@ -10,8 +10,10 @@ from klein import Klein
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.web.server import Request
 
+from relay_db.names import findable
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
+from relay_protocol.realms import full_name, parted
 from relay_server.clock import to_the_end
 from relay_server.console import Halted
 from relay_server.control import reason_in
@@ -39,6 +41,14 @@ class StopOrder(msgspec.Struct):
     by: str
     robot: str | None = None
     why: msgspec.Raw = msgspec.Raw(b"")
+
+    @property
+    def full(self) -> str | None:
+        """The robot's name for the whole relay, however it was written."""
+        if self.robot is None:
+            return None
+        name, realm = parted(self.robot)
+        return full_name(name, findable(realm))
 
 
 _order_decoder = msgspec.json.Decoder(StopOrder)
@@ -86,7 +96,7 @@ class AdminSocket:
 
     async def _stop(self, request: Request) -> Any:
         order = jsontext.decode(_order_decoder, request.content.read())
-        halted = await self._stopping.stop_here(order.robot, reason_in(order.why), order.by)
+        halted = await self._stopping.stop_here(order.full, reason_in(order.why), order.by)
         return halted._asdict()
 
     @app.route("/resume", methods=["POST"])
@@ -97,7 +107,7 @@ class AdminSocket:
         order = jsontext.decode(_order_decoder, request.content.read())
         # Of which nobody says when it was given, it is older than any stop.
         sent = sent_of(request) or 0
-        await self._stopping.resume_here(order.robot or "", reason_in(order.why), order.by, sent)
+        await self._stopping.resume_here(order.full or "", reason_in(order.why), order.by, sent)
         return {}
 
     async def _told(self, request: Request, work: Awaitable[Any]) -> bytes:

@@ -23,6 +23,7 @@ from werkzeug.routing import RequestRedirect
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
+from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import Principal
 from relay_server.auth import SESSION_SECONDS, BadCredentials, Opening
 from relay_server.clock import Clock, to_the_end
@@ -283,8 +284,10 @@ class Api:
 
     async def _show_metrics(self, request: Request) -> Any:
         principal = await self.principal(request)
-        if not principal.admin:
-            raise Refused("metrics are for administrators")
+        if not principal.admin or principal.realm != DEFAULT_REALM:
+            raise Refused(
+                f"metrics are for administrators of the realm '{DEFAULT_REALM}': they tell of all realms"
+            )
         request.setHeader(b"content-type", CONTENT_TYPE_LATEST.encode())
         request.write(generate_latest(self._metrics))
         return STREAMED

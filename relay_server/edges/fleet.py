@@ -13,10 +13,11 @@ from werkzeug.exceptions import HTTPException
 
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
+from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
-from relay_server.fleet import LOCAL, Order, Plan, Result, StopOrder
+from relay_server.fleet import Order, Plan, Result, StopOrder, local_of
 from relay_server.moments import HEADER, Moments
 from relay_server.openapi import Answer, Operation, described, header
 from relay_server.openapi.told import Groups
@@ -127,11 +128,13 @@ def beside(clock: Clock, desk: Desk, moments: Moments, api: Api) -> IResource:
 
 
 async def local(clock: Clock, desk: Desk, request: Request) -> Any:
-    """The order of whoever may open the relay's local socket, who owns all robots.
+    """The order of whoever may open the relay's local socket, who owns all robots; ``?realm=`` says which.
 
     :raises SwitchboardError: it can't be begun, in words
     """
-    return await _carry_out(clock, desk, request, _order_of(request), LOCAL, "local", sent_of(request))
+    realm = request.args.get(b"realm", [DEFAULT_REALM.encode()])[0].decode(errors="replace")
+    asker = local_of(realm)
+    return await _carry_out(clock, desk, request, _order_of(request), asker, "local", sent_of(request))
 
 
 def sent_of(request: Request) -> int | None:

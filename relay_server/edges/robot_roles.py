@@ -20,6 +20,7 @@ from relay_db.queries import RobotRecord
 from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
 from relay_protocol.errors import Invalid, MalformedMessage, Refused, Unavailable
 from relay_protocol.frames import SampleFrame
+from relay_protocol.realms import parted
 from relay_server import passwords
 from relay_server.channel import Channel, Channels
 from relay_server.control import Desks
@@ -35,6 +36,9 @@ MOST_PATIENCE = 60.0
 FLAPPING_SECONDS = 2 * MOST_PATIENCE
 """Who replaces a registration younger than this doubles the time the next one must wait, up to
 :data:`MOST_PATIENCE`: two daemons with one key would take the robot from each other for ever."""
+
+CLAIMED = 2 * limits.ROBOT_NAME
+"""Characters of what somebody said he is that are put on record."""
 
 FAILURES_OF_NETWORK = 1000
 """Failed proofs and enrolments of one network: many robots may dial from behind one address."""
@@ -117,7 +121,7 @@ class Opening(Role):
         if self._over_limit(claimed):
             return
         with self._counted(claimed, "robot.refused"):
-            record = await hall.store.read(queries.robot_key, hello.robot, hello.key)
+            record = await _key_of(hall, hello)
             if record is None or not identity.verify(
                 record.public_key, hall.relay, hello.robot, self._nonce, signature
             ):
@@ -131,21 +135,21 @@ class Opening(Role):
             return
         Control(hall, connection, robot, hello).begin()
         # A key that was revoked since it was read: whoever looked for robots to cut may have missed this one.
-        again = await hall.store.read(queries.robot_key, hello.robot, hello.key)
+        again = await _key_of(hall, hello)
         if again is None or again.robot_id != record.robot_id:
             connection.close("the robot's key is not accepted any more")
 
     async def _enroll(self, message: link.Enroll) -> None:
         hall, connection = self._hall, self._connection
-        identity.check_robot_name(message.robot)
+        identity.check_robot_name(parted(message.robot)[0])
         public_key = link.from_base64(message.public_key, "the public key")
         if len(public_key) != identity.PUBLIC_KEY_BYTES:
             raise Invalid(f"an Ed25519 public key has {identity.PUBLIC_KEY_BYTES} bytes")
         if self._over_limit(message.robot):
             return
         with self._counted(message.robot, "robot.enrolment_refused"):
-            record = await hall.store.write(_redeem, message, public_key, connection.address, hall.wall())
-        connection.send(link.Enrolled(robot=record.name, relay=hall.relay))
+            await hall.store.write(_redeem, message, public_key, connection.address, hall.wall())
+        connection.send(link.Enrolled(robot=message.robot, relay=hall.relay))
         connection.finish("enrolled")
 
     def _over_limit(self, claimed: str) -> bool:
@@ -171,9 +175,7 @@ class Opening(Role):
         try:
             yield
         except Refused:
-            hall.journal.event(
-                refused, "relay", cause=address, claimed=claimed[: limits.ROBOT_NAME], address=address
-            )
+            hall.journal.event(refused, "relay", cause=address, claimed=claimed[:CLAIMED], address=address)
             raise
         except Unavailable:
             # Nothing was tried.
@@ -201,19 +203,26 @@ class Opening(Role):
         self._connection.proven(end, frame_limit)
 
 
+async def _key_of(hall: RobotHall, hello: link.Hello) -> queries.RobotKeyRecord | None:
+    """The key that a robot says it has, if it is live."""
+    name, realm = parted(hello.robot)
+    return await hall.store.read(queries.robot_key, name, hello.key, realm)
+
+
 def _redeem(s: Session, message: link.Enroll, public_key: bytes, origin: str, now: float) -> RobotRecord:
     """Enroll the robot and put that on record, both or neither."""
     fingerprint = identity.fingerprint(public_key)
     code = passwords.code_hash(message.code)
+    name, realm = parted(message.robot)
     record = queries.redeem_enrolment_code(
-        s, message.robot, code, public_key, fingerprint, message.agent[:200], now
+        s, name, code, public_key, fingerprint, message.agent[:200], now, realm
     )
     queries.append_audit(
         s,
         at=now,
-        actor=f"robot:{record.name}",
+        actor=f"robot:{record.full}",
         action="robot.enrolled",
-        target=record.name,
+        target=record.full,
         origin=origin,
         data={"key": fingerprint},
     )
@@ -271,7 +280,7 @@ class Control(Role):
         self._event("robot.online", address=connection.address)
         self.log.info(
             "robot {robot} is online from {address} ({agent})",
-            robot=robot.name,
+            robot=robot.full,
             address=connection.address,
             agent=self._hello.agent[:100],
         )
@@ -335,7 +344,7 @@ class Control(Role):
         was_ours = robot.control is self._connection
         self._hall.registry.lost(robot, self._connection)
         if was_ours:
-            self.log.info("robot {robot} is offline: {reason}", robot=robot.name, reason=reason)
+            self.log.info("robot {robot} is offline: {reason}", robot=robot.full, reason=reason)
             self._event("robot.offline", reason=reason[:200])
 
     def _round_trip(self, seconds: float) -> None:

@@ -4,8 +4,8 @@
 that is a client's like any other (``client``), ``rank`` by many side by side; ``desk`` is what edges ask.
 """
 
-from relay_server.fleet.desk import LOCAL, FleetDesk, Plan
+from relay_server.fleet.desk import FleetDesk, Plan, local_of
 from relay_server.fleet.order import Order, StopOrder
 from relay_server.fleet.result import Result
 
-__all__ = ["LOCAL", "FleetDesk", "Order", "Plan", "Result", "StopOrder"]
+__all__ = ["FleetDesk", "Order", "Plan", "Result", "StopOrder", "local_of"]

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from twisted.internet.defer import CancelledError, Deferred
@@ -14,9 +14,11 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_db import queries
+from relay_db.names import findable
 from relay_db.queries import RobotRecord
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from relay_protocol.realms import DEFAULT_REALM, full_name
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Access, Permit, Principal
 from relay_server.bucket import Buckets
@@ -52,8 +54,18 @@ STOP_SECONDS = 18.0
 """What a stop and a resume have, whatever the order says: they are given up by who carries them out before that, though
 the database be asked first."""
 
-LOCAL = Principal(0, "admin (local)", "default", True, 0, None)
+LOCAL = Principal(0, "admin (local)", DEFAULT_REALM, True, 0, None)
 """Whoever may open the relay's local socket. No user can have this name: it has a space in it."""
+
+
+def local_of(realm: str) -> Principal:
+    """The same, for the robots of a realm."""
+    return replace(LOCAL, realm=findable(realm))
+
+
+def _is_local(asker: Principal) -> bool:
+    return asker.user_id == LOCAL.user_id
+
 
 OWNS = Rules([Grant(Level.OWNER, source=LOCAL.name)])
 """What he may do on every robot."""
@@ -85,7 +97,7 @@ class Plan:
     @property
     def actor(self) -> Actor:
         """Who gives it, as the record of control knows him."""
-        if self.asker is LOCAL:
+        if _is_local(self.asker):
             return Actor(LOCAL.name, "cli", address=self.address)
         return Actor(self.asker.name, f"user:{self.asker.name}", self.asker.user_id, self.address)
 
@@ -185,7 +197,7 @@ class FleetDesk:
             for each in self._registry
             if each.control is not None
             and each.realm == asker.realm
-            and (asker is LOCAL or self._access.knows(asker, each.robot_id))
+            and (_is_local(asker) or self._access.knows(asker, each.robot_id))
         }
         robots = {name: here[name] for name in meant(order.robots, here, {}).robots}
         plan = Plan(order, asker, address, robots, [])
@@ -266,7 +278,7 @@ class FleetDesk:
             running.cancel()
             raise
         except Exception:
-            self.log.failure("an order failed on {robot}", robot=robot.name)
+            self.log.failure("an order failed on {robot}", robot=robot.full)
             outcome = Outcome(False, "the relay failed on this order; its log tells more")
         return Result(robot.name, outcome, self._clock.seconds() - began)
 
@@ -314,13 +326,13 @@ class FleetDesk:
             session.end()
 
     async def _admit(self, plan: Plan, record: RobotRecord) -> Admission:
-        if plan.asker is not LOCAL:
+        if not _is_local(plan.asker):
             return await self._front.admit(plan.asker, record.name, plan.address)
         robot = self._registry.presence(record.id, record.name, record.realm)
         return Admission(Permit(LOCAL, record.id, OWNS), robot, plan.address)
 
     async def _mine(self, asker: Principal) -> list[RobotRecord]:
-        if asker is LOCAL:
+        if _is_local(asker):
             return await self._store.read(queries.list_robots, asker.realm)
         return [record for record, _ in await self._access.robots(asker)]
 
@@ -341,9 +353,9 @@ class FleetDesk:
         await self._store.write(
             queries.append_audit,
             at=self._wall(),
-            actor=plan.asker.name if plan.asker is LOCAL else f"user:{plan.asker.name}",
+            actor=plan.asker.name if _is_local(plan.asker) else f"user:{plan.asker.full}",
             action=f"fleet.{order.do}",
-            target=", ".join(order.robots),
+            target=", ".join(full_name(each, plan.asker.realm) for each in order.robots),
             origin=plan.address,
             data={"robots": len(plan.robots), "what": order.subject, "why": order.why},
         )
@@ -353,7 +365,7 @@ class FleetDesk:
         self._journal.event(
             "fleet.done",
             f"user:{asker.name}",
-            cause=f"fleet:{asker.name}",
+            cause=f"fleet:{asker.full}",
             user_id=asker.user_id,
             what=f"{plan.order.do} {plan.order.subject}".strip(),
             robots=len(plan.robots),

@@ -11,8 +11,9 @@ from typing import Any
 from relay_db.base import canonical_json
 from relay_db.models import NAME
 from relay_db.names import recorded
-from relay_db.queries import DEFAULT_REALM, AlertRecord, NewMemory
+from relay_db.queries import AlertRecord, NewMemory
 from relay_db.queries.recalling import OURS
+from relay_protocol.realms import DEFAULT_REALM, parted
 from relay_server.bucket import Buckets
 from relay_server.memory.limits import DATA, NOTED, NOTED_A_SECOND, NOTED_AT_ONCE
 from relay_server.memory.writer import Writer
@@ -102,7 +103,7 @@ class Noticing:
         if robot_id is not None and robot is None:
             # It was removed: nobody may see this any more.
             return
-        realm = DEFAULT_REALM if robot is None else robot.realm
+        realm = _meant(data) if robot is None else robot.realm
         if not self._buckets.take((robot_id, user)):
             self._writer.drop(realm)
             return
@@ -111,6 +112,15 @@ class Noticing:
         self._writer.note(
             NewMemory(realm, self._wall(), source, kind, robot_id, user and recorded(user, NAME), text)
         )
+
+
+def _meant(data: Mapping[str, Any]) -> str:
+    """The realm of what is about no robot: that of the name somebody has given, whether there is one or not.
+
+    To whom a failed login is told must not tell him what there is in other realms.
+    """
+    user = data.get("user")
+    return parted(user)[1] if isinstance(user, str) else DEFAULT_REALM
 
 
 def _text(data: Mapping[str, Any]) -> str:

@@ -17,7 +17,8 @@ from relay_db import queries
 from relay_db.base import canonical_json
 from relay_db.queries import MemoryRecord, NewMemory
 from relay_db.queries.recalling import OURS
-from relay_protocol.errors import SwitchboardError, Unavailable
+from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
+from relay_protocol.realms import DEFAULT_REALM
 from relay_server.clock import Clock, Timer
 from relay_server.memory.limits import AGAIN_SECONDS, BATCH, DROPS_SECONDS, GATHER_SECONDS, OWN_QUEUE, QUEUE
 from relay_server.store import Store
@@ -68,6 +69,8 @@ class Writer:
         """By realm, the relay's own events that were dropped and of which nobody has been told."""
         self._due: dict[str, float] = {}
         """By realm, when the next of that may be told."""
+        self._realms = {DEFAULT_REALM}
+        """Those that are known to exist: what strangers name is not counted by realm."""
         self.waiting = 0
         self.own_waiting = 0
         self.written = 0
@@ -84,7 +87,8 @@ class Writer:
     def drop(self, realm: str) -> None:
         """An event of the relay's own is not kept; it is counted, and that is told with what is written later."""
         self.dropped += 1
-        self._untold[realm] += 1
+        if realm in self._realms:
+            self._untold[realm] += 1
 
     async def write(self, events: Sequence[NewMemory]) -> list[MemoryRecord]:
         """Keep these events, all or none; they are safe when this returns.
@@ -157,14 +161,20 @@ class Writer:
             self.own_waiting -= own
             self.waiting -= sum(len(lot.events) for lot in lots)
         self._due |= dict.fromkeys(untold, self._clock.seconds() + DROPS_SECONDS)
-        self.written += len(kept)
         at = 0
         for lot in lots:
-            mine = kept[at : at + len(lot.events)]
+            mine = [each for each in kept[at : at + len(lot.events)] if each is not None]
             at += len(lot.events)
-            if lot.waiting is not None and not lot.waiting.called:
+            if lot.waiting is None or lot.waiting.called:
+                continue
+            if len(mine) == len(lot.events):
                 lot.waiting.callback(mine)
-        self._told(kept)
+            else:
+                lot.waiting.errback(NotFound("the realm was removed"))
+        safe = [each for each in kept if each is not None]
+        self.written += len(safe)
+        self._realms.update(each.realm for each in safe)
+        self._told(safe)
 
     def _failed(self, lots: list[_Lot], error: Exception) -> None:
         words = str(error) if isinstance(error, SwitchboardError) else "the relay failed; its log tells more"

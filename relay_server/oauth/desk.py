@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from relay_db import queries
 from relay_db.queries import IssuedRecord, ProgramRecord
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
+from relay_protocol.realms import full_name
 from relay_protocol.scopes import Scope
 from relay_server import passwords
 from relay_server.access import Access, BadCredentials, Principal
@@ -300,7 +301,7 @@ def _begin(s: Session, login: Login, granted: Granted, address: str, now: float)
         now=now,
     )
     _keep(s, login.user_id, granted, now, family_id=family)
-    _audit(s, login.name, "password", granted, address, now)
+    _audit(s, login.full, "password", granted, address, now)
 
 
 def _to_program(s: Session, program: ProgramRecord, granted: Granted, address: str, now: float) -> None:
@@ -308,7 +309,7 @@ def _to_program(s: Session, program: ProgramRecord, granted: Granted, address: s
     if queries.find_program(s, program.key) is None:
         raise BadCredentials("the key is unknown or the secret is wrong")
     _keep(s, program.user_id, granted, now, program_id=program.id)
-    _audit(s, program.user, "program", granted, address, now, program=program.key)
+    _audit(s, full_name(program.user, program.realm), "program", granted, address, now, program=program.key)
 
 
 def _refresh(s: Session, old: str, new: str, wanted: Scope | None, now: float) -> Granted | OAuthError:

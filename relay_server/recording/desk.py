@@ -13,6 +13,7 @@ import msgspec
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
+from relay_protocol.realms import full_name
 from relay_protocol.rights import Operation
 from relay_server.access import Permit, Principal
 from relay_server.bucket import TokenBucket
@@ -298,9 +299,9 @@ class RecordingDesk:
         await self._store.write(
             queries.append_audit,
             at=self._wall(),
-            actor=f"user:{principal.name}",
+            actor=f"user:{principal.full}",
             action=action,
-            target=f"{entry.robot}/{entry.id}",
+            target=f"{full_name(entry.robot, principal.realm)}/{entry.id}",
             origin=admission.address,
             data={"topics": list(entry.topics), "cameras": list(entry.cameras)},
         )
@@ -331,7 +332,7 @@ class RecordingDesk:
         self._journal.event(
             kind,
             f"user:{entry.user}",
-            cause=f"user:{entry.user}",
+            cause=f"user:{entry.user_id}",
             robot_id=entry.robot_id,
             user_id=entry.user_id,
             recording=entry.id,

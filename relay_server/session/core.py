@@ -157,9 +157,9 @@ class Session:
         self.log.info(
             "client {number}: {user} from {address} works with {robot}",
             number=self.number,
-            user=self.name,
+            user=self.permit.principal.full,
             address=self.address,
-            robot=self.robot.name,
+            robot=self.robot.full,
         )
 
     def end(self) -> None:

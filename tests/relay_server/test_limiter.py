@@ -39,6 +39,17 @@ def test_an_account_is_one_however_it_is_written(time: Time) -> None:
     limiter = exhausted(time)
     assert limiter.wait("ANN", "192.0.2.1") > 0
     assert limiter.wait("\uff21nn", "192.0.2.1") > 0
+    assert limiter.wait("ann@Default", "192.0.2.1") > 0
+
+
+def test_accounts_of_two_realms_are_two(time: Time) -> None:
+    """Who guesses at one locks no other of the same name, nor all that have a realm."""
+    limiter = exhausted(time)
+    assert limiter.wait("ann@lab1", "192.0.2.1") == 0
+    for _ in range(FAILURES):
+        limiter.failed("ann@lab1", "192.0.2.2")
+    assert limiter.wait("Ann@LAB1", "192.0.2.2") > 0
+    assert limiter.wait("ann@lab2", "192.0.2.2") == limiter.wait("bob@lab1", "192.0.2.2") == 0
 
 
 def test_guessing_names_is_no_way_around(time: Time) -> None:

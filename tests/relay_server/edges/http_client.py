@@ -29,7 +29,7 @@ from relay_server.origins import Origins
 from relay_server.session import Timing
 
 ANN = Principal(1, "ann", "main", False, 1, None)
-ROOT = Principal(2, "root", "main", True, 2, None)
+ROOT = Principal(2, "root", "default", True, 2, None)
 HOST = "127.0.0.1:9090"
 ORIGIN = f"http://{HOST}"
 

@@ -17,9 +17,9 @@ from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_server.access import Principal
 from relay_server.control import Actor
-from relay_server.fleet import LOCAL, FleetDesk, Order, Result
+from relay_server.fleet import FleetDesk, Order, Result
 from relay_server.fleet import desk as module
-from relay_server.fleet.desk import Plan
+from relay_server.fleet.desk import LOCAL, Plan
 from relay_server.fleet.result import VALUES_BYTES
 from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP
 from relay_server.inside.publishing import MATCHING_SECONDS, SUBSCRIBER_SECONDS

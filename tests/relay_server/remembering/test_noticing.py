@@ -68,6 +68,15 @@ def test_a_refused_login_is_told_in_full(notes: Notes, noticing: Noticing) -> No
     assert (event.realm, event.source, event.user, json.loads(event.data)) == ("default", "relay", None, data)
 
 
+@pytest.mark.parametrize("user", ["ann@lab", "nobody@lab"])
+def test_a_refused_login_is_told_in_the_realm_that_was_named(
+    notes: Notes, noticing: Noticing, user: str
+) -> None:
+    """Whether there is such a user or realm or not: nobody learns that from where he finds it."""
+    noticing.happened("login.refused", "relay", None, {"user": user})
+    assert [each.realm for each in notes.events] == ["lab"]
+
+
 def test_what_is_not_for_the_memory_leaves_nothing(notes: Notes, noticing: Noticing) -> None:
     """Nor does what is about a robot that is gone."""
     noticing.happened("video.joined", "user:ann", 1, {})

@@ -13,7 +13,7 @@ from twisted.internet.task import Clock
 from twisted.logger import capturedLogs
 
 from relay_db.queries import MemoryRecord, NewMemory
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import NotFound, Unavailable
 from relay_server.memory import writer as module
 from relay_server.memory.limits import DROPS_SECONDS, GATHER_SECONDS
 from relay_server.memory.writer import Full, Writer
@@ -23,21 +23,29 @@ class Paper:
     """A store that writes when the test says so."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[list[NewMemory], Deferred[list[MemoryRecord]]]] = []
+        self.asked: list[tuple[list[NewMemory], Deferred[list[MemoryRecord | None]]]] = []
         self.number = 0
 
-    def write(self, query: Any, events: list[NewMemory]) -> Deferred[list[MemoryRecord]]:
+    def write(self, query: Any, events: list[NewMemory]) -> Deferred[list[MemoryRecord | None]]:
         """One transaction."""
-        done: Deferred[list[MemoryRecord]] = Deferred()
+        done: Deferred[list[MemoryRecord | None]] = Deferred()
         self.asked.append((events, done))
         return done
 
-    def commit(self) -> list[NewMemory]:
-        """It is safe; what it holds."""
+    def commit(self, *gone: str) -> list[NewMemory]:
+        """It is safe; what it holds.
+
+        :param gone: realms that are not there any more
+        """
         events, done = self.asked.pop(0)
         self.number += len(events)
         first = self.number - len(events) + 1
-        done.callback([MemoryRecord(first + at, *each, used=0) for at, each in enumerate(events)])
+        done.callback(
+            [
+                None if each.realm in gone else MemoryRecord(first + at, *each, used=0)
+                for at, each in enumerate(events)
+            ]
+        )
         return events
 
     def fail(self, error: Exception) -> None:
@@ -114,12 +122,38 @@ def test_what_fills_a_transaction_does_not_wait(scene: Scene, monkeypatch: pytes
     assert [each.number for each in works[5].result] == [21, 22, 23, 24]
 
 
+def test_events_of_a_realm_that_is_gone_are_lost_alone(scene: Scene) -> None:
+    """Who brought them is told so; all that was written with them is safe."""
+    first, second = scene.write(), Deferred.fromCoroutine(scene.writer.write([new("lab")]))
+    scene.writer.note(new("lab"))
+    scene.gather()
+    with fails(second, NotFound):
+        scene.paper.commit("lab")
+    assert [each.number for each in first.result] == scene.told == [1]
+    assert (scene.writer.waiting, scene.writer.own_waiting, scene.writer.written) == (0, 0, 1)
+
+
+def test_realms_that_strangers_name_are_not_counted_one_by_one(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is dropped of a realm nobody has seen is dropped, and nothing is kept of it."""
+    monkeypatch.setattr(module, "OWN_QUEUE", 1)
+    for name in ("default", "a", "b", "c"):
+        scene.writer.note(new(name))
+    scene.gather()
+    assert [each.kind for each in scene.paper.commit()] == ["x"]
+    assert scene.writer.dropped == 3
+
+
 def test_when_the_queue_is_full_who_brings_more_has_to_come_again(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The relay's own are dropped; how many is told with what is written next."""
     monkeypatch.setattr(module, "QUEUE", 10)
     monkeypatch.setattr(module, "OWN_QUEUE", 3)
+    scene.writer.note(new("lab"))
+    scene.gather()
+    scene.paper.commit()
     for _ in range(5):
         scene.writer.note(new())
     scene.write(7)
@@ -141,6 +175,9 @@ def test_when_the_queue_is_full_who_brings_more_has_to_come_again(
 def test_that_something_was_dropped_is_not_told_all_the_time(scene: Scene) -> None:
     """In each realm once in a while, with all that were dropped meanwhile."""
     told = []
+    scene.writer.note(new("lab"))
+    scene.gather()
+    scene.paper.commit()
     for _ in range(4):
         scene.writer.drop("default")
         scene.write()
