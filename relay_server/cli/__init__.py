@@ -15,6 +15,7 @@ _COMMANDS = {
     "status": Entry("relay_server.cli.status", "status", "Show which robots are online, and with whom."),
     "stop": Entry("relay_server.cli.stopping", "stop", "Stop a robot, or all of them."),
     "resume": Entry("relay_server.cli.stopping", "resume", "Let a robot that was stopped move again."),
+    "realm": Entry("relay_server.cli.realms", "realm", "Keep users and robots apart."),
     "user": Entry("relay_server.cli.users", "user", "Add, list, change and remove users."),
     "group": Entry("relay_server.cli.groups", "group", "Give users rights together."),
     "robot": Entry(

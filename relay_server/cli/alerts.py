@@ -5,13 +5,16 @@ from __future__ import annotations
 import secrets
 import sys
 import time
+from collections.abc import Iterable
 from typing import Any
 
 import click
 import msgspec
+from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.realms import full_name
 from relay_server.alerts import kinds
 from relay_server.alerts import rules as wording
 from relay_server.alerts.desk import keep
@@ -51,6 +54,7 @@ def list_(app: App, robot: str | None, lasting: bool, limit: int, as_json: bool)
     with app.reading() as session:
         wanted = None if robot is None else [robot_of(session, robot).id]
         found = queries.list_alerts(session, wanted, open=True if lasting else None, limit=limit)
+        found = _with_realms(session, found)
     cells = (
         (each.id, each.robot, each.level, _what(each), _state(each), moment(each.last), each.text)
         for each in found
@@ -66,7 +70,8 @@ def ack(app: App, alert: str, as_json: bool) -> None:
     """Say that somebody looks after the alert ID."""
     with app.change() as change:
         now = time.time()
-        found = queries.acknowledge_alert(change.session, alert, f"cli:{os_user()}", now)
+        acknowledged = queries.acknowledge_alert(change.session, alert, f"cli:{os_user()}", now)
+        (found,) = _with_realms(change.session, [acknowledged])
         if found.ack_at == now:
             change.audit("alert.acknowledge", f"{found.kind} of {found.robot}", id=found.id)
     tell(as_json, view(found), f"{found.ack_by} looks after {found.kind} of {found.robot}.")
@@ -84,7 +89,8 @@ def rules() -> None:
 def rules_list(app: App, user: str | None, as_json: bool) -> None:
     """List rules, without addresses and secrets."""
     with app.reading() as session:
-        found = queries.list_alert_rules(session, None if user is None else user_of(session, user).id)
+        kept = queries.list_alert_rules(session, None if user is None else user_of(session, user).id)
+    found = [_with_realm(each) for each in kept]
     cells = (
         (
             str(each.id),
@@ -160,7 +166,7 @@ def rules_add(
     if webhook is not None:
         parse(webhook)
     with app.change() as change:
-        record = keep(change.session, change.user(user).id, ask, time.time())
+        record = _with_realm(keep(change.session, change.user(user).id, ask, time.time()))
         change.audit("alert_rule.add", str(record.id), user=record.user, channel=record.channel)
     answer = {**_json(record), **({"secret": ask.secret} if webhook else {})}
     told = [f"Rule {record.id}: {record.user} is told by {record.channel}."]
@@ -197,6 +203,16 @@ def _quiet(text: str | None) -> dict[str, str] | None:
     if not dash:
         raise Invalid(f"'{text}' are no hours; write 22:00-07:00@Europe/Rome")
     return {"from": begin, "to": end, "zone": zone or "UTC"}
+
+
+def _with_realms(session: Session, records: Iterable[queries.AlertRecord]) -> list[queries.AlertRecord]:
+    """Alerts with the names that their robots have for the whole relay."""
+    names = {each.id: each.full for each in queries.list_robots(session)}
+    return [each._replace(robot=names[each.robot_id]) for each in records]
+
+
+def _with_realm(record: queries.AlertRuleRecord) -> queries.AlertRuleRecord:
+    return record._replace(user=full_name(record.user, record.realm))
 
 
 def _what(record: queries.AlertRecord) -> str:

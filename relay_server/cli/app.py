@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from relay_protocol.errors import NotFound
+from relay_protocol.realms import parted
 from relay_server.cli.relaysocket import knock
 
 if TYPE_CHECKING:
@@ -103,24 +104,27 @@ class Change:
 
 
 def user_of(session: Session, name: str) -> UserRecord:
-    """:raises NotFound: no such user"""
+    """:param name: as ``toad@lab1``; without a realm one of the default one
+    :raises NotFound: no such user"""
     from relay_db import queries
 
-    return _found(queries.find_user(session, name), "user", name)
+    return _found(queries.find_user(session, *parted(name)), "user", name)
 
 
 def group_of(session: Session, name: str) -> GroupRecord:
-    """:raises NotFound: no such group"""
+    """:param name: as of :func:`user_of`
+    :raises NotFound: no such group"""
     from relay_db import queries
 
-    return _found(queries.find_group(session, name), "group", name)
+    return _found(queries.find_group(session, *parted(name)), "group", name)
 
 
 def robot_of(session: Session, name: str) -> RobotRecord:
-    """:raises NotFound: no such robot"""
+    """:param name: as of :func:`user_of`
+    :raises NotFound: no such robot"""
     from relay_db import queries
 
-    return _found(queries.find_robot(session, name), "robot", name)
+    return _found(queries.find_robot(session, *parted(name)), "robot", name)
 
 
 def _found(record: _Record | None, what: str, name: str) -> _Record:

@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterator, Sequence
 import click
 
 from relay_db import queries
-from relay_db.queries import DEFAULT_REALM, MemoryAsk, MemoryPlace, MemoryRecord
+from relay_db.queries import MemoryAsk, MemoryPlace, MemoryRecord
 from relay_protocol.errors import Invalid
+from relay_protocol.realms import full_name
 from relay_server.cli.app import App, examples, json_option, pass_app
+from relay_server.cli.naming import known_realm, of_one_realm, one_realm_option
 from relay_server.cli.output import say, show, show_json
 from relay_server.cli.text import moment
 from relay_server.memory import Ask, Forms, ask_of
@@ -32,6 +34,7 @@ PAGE = 500
     epilog=examples(
         "switchboard events --robot rover --last 60",
         "switchboard events --kind 'control.*' --follow",
+        "switchboard events --realm lab1 --robot 'cleaner-*'",
         "switchboard events --source greeting --limit 100000 --csv > greeted.csv",
     )
 )
@@ -41,6 +44,7 @@ PAGE = 500
 @click.option("--kind", metavar="NAME", help="Only of this kind, in the same way.")
 @click.option("--robot", metavar="NAME", help="Only about this robot, in the same way.")
 @click.option("--user", metavar="NAME", help="Only what this user did or wrote.")
+@one_realm_option
 @click.option("--last", metavar="SECONDS", help="Only of the last so many seconds.")
 @click.option(
     "--limit", default=LATEST, show_default=True, type=click.IntRange(1, 1_000_000), help="How many."
@@ -55,22 +59,27 @@ def events(
     kind: str | None,
     robot: str | None,
     user: str | None,
+    realm: str | None,
     last: str | None,
     limit: int,
     as_csv: bool,
     follow: bool,
     as_json: bool,
 ) -> None:
-    """Show what happened of late, the latest last. With --follow --json an event is a line."""
+    """Show what happened of late in a realm, the latest last. With --follow --json an event is a line."""
     if as_csv and (as_json or follow):
         raise Invalid("--csv goes without --json and --follow")
-    options = {"source": source, "kind": kind, "robot": robot, "user": user, "last": last}
+    named = {what: name for what, name in (("robot", robot), ("user", user)) if name is not None}
+    realm, names = of_one_realm(list(named.values()), realm)
+    options = {"source": source, "kind": kind, "last": last, **dict(zip(named, names, strict=True))}
     ask = ask_of({name: value for name, value in options.items() if value is not None}, time.time())
     with app.reading() as session:
+        realm = known_realm(session, realm)
         # Before it is looked: what is written meanwhile is told then, and not passed over.
-        latest = queries.latest_memory(session, DEFAULT_REALM)
-        sight = _sight({each.id: each.name for each in queries.list_robots(session)}, ask)
-    forms = Forms(sight.names)
+        latest = queries.latest_memory(session, realm)
+        robots = queries.list_robots(session, realm)
+    sight = _sight(realm, {each.id: each.name for each in robots}, ask)
+    forms = Forms({each.id: each.full for each in robots})
     found = _found(app, sight.ask, limit)
     if as_csv:
         table = csv.writer(sys.stdout)
@@ -89,11 +98,11 @@ def events(
     show(as_json, (_json(forms, each) for each in rows), columns, (_cells(forms, each) for each in rows))
 
 
-def _sight(names: dict[int, str], ask: Ask) -> Sight:
+def _sight(realm: str, names: dict[int, str], ask: Ask) -> Sight:
     """Whoever may read the database may see all of it."""
     return Sight(
         MemoryAsk(
-            DEFAULT_REALM,
+            realm,
             chosen(ask, names),
             ask.robot is None,
             True,
@@ -112,7 +121,7 @@ def _found(app: App, ask: MemoryAsk, limit: int) -> Iterator[MemoryRecord]:
     while limit > 0:
         with app.reading() as session:
             page = queries.recall(session, ask, place, min(limit, PAGE))
-        yield from page.events
+        yield from map(_with_realm, page.events)
         limit, place = limit - len(page.events), page.place
         if place is None:
             return
@@ -121,14 +130,21 @@ def _found(app: App, ask: MemoryAsk, limit: int) -> Iterator[MemoryRecord]:
 def _follow(app: App, sight: Sight, number: int, tell: Callable[[MemoryRecord], None]) -> None:
     while True:
         with app.reading() as session:
-            news = queries.memories_since(session, DEFAULT_REALM, number, PAGE)
+            news = queries.memories_since(session, sight.ask.realm, number, PAGE)
         for each in news:
             if sight.shows(each):
-                tell(each)
+                tell(_with_realm(each))
         number = news[-1].number if news else number
         sys.stdout.flush()
         if len(news) < PAGE:
             time.sleep(FOLLOW_SECONDS)
+
+
+def _with_realm(event: MemoryRecord) -> MemoryRecord:
+    """With its user's name for the whole relay. Who sits at the relay's machine is no user: he has a space in his."""
+    if event.user is None or " " in event.user:
+        return event
+    return event._replace(user=full_name(event.user, event.realm))
 
 
 def _json(forms: Forms, event: MemoryRecord) -> dict[str, object]:

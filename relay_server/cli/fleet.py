@@ -11,7 +11,9 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound, Unavailable
+from relay_protocol.realms import DEFAULT_REALM, full_name, parted
 from relay_server.cli.app import App, examples, json_option, pass_app, sure, why_option, yes_option
+from relay_server.cli.naming import listed, new_name, of_one_realm, one_realm_option, realm_option
 from relay_server.cli.output import progress, say, show, show_json, table, tell
 from relay_server.cli.relaysocket import give_order
 
@@ -31,6 +33,7 @@ timeout_option: Callable[[Any], Any] = click.option(
     epilog=examples(
         "switchboard robot call 'cleaner-*' /start",
         "switchboard robot call group:cleaners /set_mode '{\"data\": true}' --type std_srvs/srv/SetBool",
+        "switchboard robot call 'cleaner-*' /start --realm lab2",
     )
 )
 @click.argument("robots")
@@ -38,10 +41,18 @@ timeout_option: Callable[[Any], Any] = click.option(
 @click.argument("args", default="{}")
 @click.option("--type", "type_name", default="", help="Of the service, where the robot does not tell.")
 @timeout_option
+@one_realm_option
 @json_option
 @pass_app
 def call(
-    app: App, robots: str, service: str, args: str, type_name: str, timeout: float, as_json: bool
+    app: App,
+    robots: str,
+    service: str,
+    args: str,
+    type_name: str,
+    timeout: float,
+    realm: str | None,
+    as_json: bool,
 ) -> None:
     """Call SERVICE with ARGS (JSON) on many robots.
 
@@ -49,7 +60,7 @@ def call(
     A service that moves a robot takes control of it where that is free.
     """
     order = {"do": "call", "service": service, "args": _json(args, "ARGS"), "type": type_name}
-    _give(app, robots, order, timeout, as_json)
+    _give(app, robots, order, timeout, realm, as_json)
 
 
 @click.command(
@@ -62,10 +73,18 @@ def call(
 @click.argument("msg")
 @click.option("--type", "type_name", default="", help="Of the topic, where the robot does not tell.")
 @timeout_option
+@one_realm_option
 @json_option
 @pass_app
 def publish(
-    app: App, robots: str, topic: str, msg: str, type_name: str, timeout: float, as_json: bool
+    app: App,
+    robots: str,
+    topic: str,
+    msg: str,
+    type_name: str,
+    timeout: float,
+    realm: str | None,
+    as_json: bool,
 ) -> None:
     """Publish MSG (JSON) once to TOPIC on many robots.
 
@@ -73,7 +92,7 @@ def publish(
     Not for topics that move a robot: one message moves none.
     """
     order = {"do": "publish", "topic": topic, "msg": _json(msg, "MSG"), "type": type_name}
-    _give(app, robots, order, timeout, as_json)
+    _give(app, robots, order, timeout, realm, as_json)
 
 
 @click.command(epilog=examples("switchboard robot set 'cleaner-*' /driver:max_speed 0.5"))
@@ -81,9 +100,12 @@ def publish(
 @click.argument("parameter")
 @click.argument("value")
 @timeout_option
+@one_realm_option
 @json_option
 @pass_app
-def set_(app: App, robots: str, parameter: str, value: str, timeout: float, as_json: bool) -> None:
+def set_(
+    app: App, robots: str, parameter: str, value: str, timeout: float, realm: str | None, as_json: bool
+) -> None:
     """Set PARAMETER (node:name) to VALUE on many robots.
 
     ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
@@ -93,34 +115,36 @@ def set_(app: App, robots: str, parameter: str, value: str, timeout: float, as_j
         meant = json.loads(value)
     except ValueError:
         meant = value
-    _give(app, robots, {"do": "set", "name": parameter, "value": meant}, timeout, as_json)
+    _give(app, robots, {"do": "set", "name": parameter, "value": meant}, timeout, realm, as_json)
 
 
 @click.command(epilog=examples("switchboard robot stop 'cleaner-*' --why \"wet floor\""))
 @click.argument("robots")
 @why_option
+@one_realm_option
 @json_option
 @pass_app
-def stop(app: App, robots: str, why: str, as_json: bool) -> None:
+def stop(app: App, robots: str, why: str, realm: str | None, as_json: bool) -> None:
     """Stop many robots; those that are offline before anything else when they are back.
 
     ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
     Where no relay runs, 'switchboard stop' keeps the order.
     """
-    _give(app, robots, {"do": "stop", "why": why}, SECONDS, as_json)
+    _give(app, robots, {"do": "stop", "why": why}, SECONDS, realm, as_json)
 
 
 @click.command(epilog=examples("switchboard robot resume 'cleaner-*'"))
 @click.argument("robots")
 @why_option
+@one_realm_option
 @json_option
 @pass_app
-def resume(app: App, robots: str, why: str, as_json: bool) -> None:
+def resume(app: App, robots: str, why: str, realm: str | None, as_json: bool) -> None:
     """Let many robots that were stopped move again.
 
     ROBOTS is a name, a pattern ('cleaner-*') or a group (group:NAME), or several of them with commas between.
     """
-    _give(app, robots, {"do": "resume", "why": why}, SECONDS, as_json)
+    _give(app, robots, {"do": "resume", "why": why}, SECONDS, realm, as_json)
 
 
 def _json(text: str, what: str) -> Any:
@@ -131,18 +155,28 @@ def _json(text: str, what: str) -> Any:
         raise Invalid(f"{what} is no JSON: {error}") from None
 
 
-def _give(app: App, robots: str, order: dict[str, Any], timeout: float, as_json: bool) -> None:
-    """Give an order, show how it goes, and what came of it; exit code 1 when it failed on any robot."""
-    asked = [each.strip() for each in robots.split(",") if each.strip()]
+def _give(
+    app: App, robots: str, order: dict[str, Any], timeout: float, realm: str | None, as_json: bool
+) -> None:
+    """Give an order, show how it goes, and what came of it; exit code 1 when it failed on any robot.
+
+    :param realm: the one that was named besides the robots
+    """
+    where, asked = of_one_realm([each.strip() for each in robots.split(",") if each.strip()], realm)
     if not order.get("type", True):
         del order["type"]
-    lines = give_order(app.data, {"robots": asked, "timeout": timeout, **order})
-    done = _Done(next(lines, {}))
+    lines = give_order(app.data, {"robots": asked, "timeout": timeout, **order}, where)
+    try:
+        done = _Done(next(lines, {}), where)
+    except NotFound as error:
+        if where == DEFAULT_REALM:
+            raise
+        raise NotFound(f"{error} in the realm '{where}'; see 'switchboard realm list'") from None
     with progress(len(done.meant), shown=not as_json and sys.stderr.isatty()) as step:
         try:
             for line in lines:
                 if "robot" in line:
-                    done.results.append(line)
+                    done.results.append({**line, "robot": full_name(str(line["robot"]), where)})
                     step()
         except Unavailable as error:
             done.broken = str(error)
@@ -159,9 +193,11 @@ class _Done:
     """What came of an order.
 
     :param head: the first line of the relay's answer
+    :param realm: whose robots it was for
     """
 
-    def __init__(self, head: dict[str, Any]) -> None:
+    def __init__(self, head: dict[str, Any], realm: str) -> None:
+        self._where = "" if realm == DEFAULT_REALM else f" of the realm '{realm}'"
         self.meant = [str(each) for each in head.get("robots") or ()]
         self.unmatched = [str(each) for each in head.get("unmatched") or ()]
         self.missed = str(head.get("missed") or "")
@@ -193,7 +229,7 @@ class _Done:
         if self.missed:
             say(f"There may be more robots that are meant: {self.missed}.")
         for each in self.unmatched:
-            say(f"No robot is meant by '{each}'.")
+            say(f"No robot{self._where} is meant by '{each}'.")
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:
@@ -215,22 +251,27 @@ def group() -> None:
     """Put robots into groups, for orders to all of them."""
 
 
-@group.command(epilog=examples("switchboard robot group add cleaners cleaner-1 cleaner-2"))
+@group.command(
+    epilog=examples(
+        "switchboard robot group add cleaners cleaner-1 cleaner-2",
+        "switchboard robot group add cleaners@lab2 cleaner-1@lab2",
+    )
+)
 @click.argument("name")
 @click.argument("robots", nargs=-1)
 @json_option
 @pass_app
 def add(app: App, name: str, robots: tuple[str, ...], as_json: bool) -> None:
-    """Put ROBOTS into group NAME, which is made when there is none."""
+    """Put ROBOTS into group NAME of their realm, which is made when there is none."""
     with app.change() as change:
-        found = queries.find_robot_group(change.session, name) or queries.add_robot_group(
-            change.session, name
-        )
-        for each in robots:
-            queries.add_to_robot_group(change.session, found.id, change.robot(each).id)
-        change.audit("robot.group.add", found.name, robots=list(robots))
-        found = _group(change.session, name)
-    tell(as_json, _told(found), f"Group {found.name}: {', '.join(found.robots) or 'no robots'}.")
+        s = change.session
+        found = queries.find_robot_group(s, *parted(name)) or queries.add_robot_group(s, *new_name(s, name))
+        meant = [change.robot(each) for each in robots]
+        for each in meant:
+            queries.add_to_robot_group(s, found.id, each.id)
+        change.audit("robot.group.add", found.full, robots=[each.full for each in meant])
+        found = _group(s, name)
+    tell(as_json, _told(found), _words(found))
 
 
 @group.command(
@@ -247,43 +288,55 @@ def remove(app: App, name: str, robots: tuple[str, ...], yes: bool, as_json: boo
     """Take ROBOTS out of group NAME; without any, remove the group. Its robots stay."""
     if not robots:
         with app.reading() as session:
-            sure(f"Remove group of robots {_group(session, name).name}?", yes)
+            sure(f"Remove group of robots {_group(session, name).full}?", yes)
     with app.change() as change:
         found = _group(change.session, name)
-        for each in robots:
-            if not queries.remove_from_robot_group(change.session, found.id, change.robot(each).id):
-                raise Invalid(f"{each} is not in group {found.name}")
+        meant = [change.robot(each) for each in robots]
+        for each in meant:
+            if not queries.remove_from_robot_group(change.session, found.id, each.id):
+                raise Invalid(f"{each.full} is not in group {found.full}")
         if not robots:
             queries.remove_robot_group(change.session, found.id)
-        change.audit("robot.group.remove", found.name, robots=list(robots))
+        change.audit("robot.group.remove", found.full, robots=[each.full for each in meant])
         left = _group(change.session, name) if robots else None
     if left is None:
-        tell(as_json, {"group": found.name, "removed": True}, f"Removed group of robots {found.name}.")
+        tell(as_json, {"group": found.full, "removed": True}, f"Removed group of robots {found.full}.")
     else:
-        tell(as_json, _told(left), f"Group {left.name}: {', '.join(left.robots) or 'no robots'}.")
+        tell(as_json, _told(left), _words(left))
 
 
-@group.command("list", epilog=examples("switchboard robot group list"))
+@group.command(
+    "list", epilog=examples("switchboard robot group list", "switchboard robot group list --realm lab2")
+)
+@realm_option
 @json_option
 @pass_app
-def list_(app: App, as_json: bool) -> None:
-    """List all groups of robots and what is in them."""
+def list_(app: App, realm: str | None, as_json: bool) -> None:
+    """List all groups of robots, or those of one realm, and what is in them."""
     with app.reading() as session:
-        groups = queries.list_robot_groups(session)
-    cells = ((each.name, ", ".join(each.robots)) for each in groups)
+        groups = listed(session, queries.list_robot_groups, realm)
+    cells = ((each.full, ", ".join(_robots(each))) for each in groups)
     show(as_json, map(_told, groups), ("group", "robots"), cells)
 
 
 def _group(session: Any, name: str) -> queries.RobotGroupRecord:
     """:raises NotFound: no such group"""
-    found = queries.find_robot_group(session, name)
+    found = queries.find_robot_group(session, *parted(name))
     if found is None:
         raise NotFound(f"there is no group of robots '{name}'; see 'switchboard robot group list'")
     return found
 
 
 def _told(record: queries.RobotGroupRecord) -> dict[str, Any]:
-    return {"group": record.name, "robots": list(record.robots)}
+    return {"group": record.full, "robots": _robots(record)}
+
+
+def _words(record: queries.RobotGroupRecord) -> str:
+    return f"Group {record.full}: {', '.join(_robots(record)) or 'no robots'}."
+
+
+def _robots(record: queries.RobotGroupRecord) -> list[str]:
+    return [full_name(each, record.realm) for each in record.robots]
 
 
 ORDERS = {

@@ -8,7 +8,9 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid
+from relay_protocol.realms import full_name
 from relay_server.cli.app import App, examples, json_option, pass_app, yes_option
+from relay_server.cli.naming import listed, new_name, realm_option
 from relay_server.cli.output import show, tell
 from relay_server.cli.removing import remove_named
 
@@ -18,26 +20,27 @@ def group() -> None:
     """Give users rights together."""
 
 
-@group.command(epilog=examples("switchboard group add lab"))
+@group.command(epilog=examples("switchboard group add lab", "switchboard group add lab@lab1"))
 @click.argument("name")
 @json_option
 @pass_app
 def add(app: App, name: str, as_json: bool) -> None:
-    """Add a group NAME."""
+    """Add a group NAME, or NAME@REALM."""
     with app.change() as change:
-        added = queries.add_group(change.session, name)
-        change.audit("group.add", added.name)
-    tell(as_json, _json(added), f"Added group {added.name}.")
+        added = queries.add_group(change.session, *new_name(change.session, name))
+        change.audit("group.add", added.full)
+    tell(as_json, _json(added), f"Added group {added.full}.")
 
 
-@group.command("list", epilog=examples("switchboard group list"))
+@group.command("list", epilog=examples("switchboard group list", "switchboard group list --realm lab1"))
+@realm_option
 @json_option
 @pass_app
-def list_(app: App, as_json: bool) -> None:
-    """List all groups and who is in them."""
+def list_(app: App, realm: str | None, as_json: bool) -> None:
+    """List all groups, or those of one realm, and who is in them."""
     with app.reading() as session:
-        groups = queries.list_groups(session)
-    cells = ((each.name, ", ".join(each.members)) for each in groups)
+        groups = listed(session, queries.list_groups, realm)
+    cells = ((each.full, ", ".join(_members(each))) for each in groups)
     show(as_json, map(_json, groups), ("group", "members"), cells)
 
 
@@ -61,9 +64,9 @@ def join(app: App, group_name: str, user_name: str, as_json: bool) -> None:
     with app.change() as change:
         found, member = change.group(group_name), change.user(user_name)
         queries.add_member(change.session, found.id, member.id)
-        change.audit("group.join", found.name, user=member.name)
+        change.audit("group.join", found.full, user=member.full)
         found = change.group(group_name)
-    tell(as_json, _json(found), f"{member.name} is in group {found.name}.")
+    tell(as_json, _json(found), f"{member.full} is in group {found.full}.")
 
 
 @group.command(epilog=examples("switchboard group leave lab ann"))
@@ -76,11 +79,15 @@ def leave(app: App, group_name: str, user_name: str, as_json: bool) -> None:
     with app.change() as change:
         found, member = change.group(group_name), change.user(user_name)
         if not queries.remove_member(change.session, found.id, member.id):
-            raise Invalid(f"{member.name} is not in group {found.name}")
-        change.audit("group.leave", found.name, user=member.name)
+            raise Invalid(f"{member.full} is not in group {found.full}")
+        change.audit("group.leave", found.full, user=member.full)
         found = change.group(group_name)
-    tell(as_json, _json(found), f"{member.name} is no longer in group {found.name}.")
+    tell(as_json, _json(found), f"{member.full} is no longer in group {found.full}.")
 
 
 def _json(record: queries.GroupRecord) -> dict[str, Any]:
-    return {"group": record.name, "members": list(record.members)}
+    return {"group": record.full, "members": _members(record)}
+
+
+def _members(record: queries.GroupRecord) -> list[str]:
+    return [full_name(each, record.realm) for each in record.members]

@@ -10,6 +10,7 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.realms import full_name
 from relay_protocol.scopes import Scope
 from relay_server import passwords
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of
@@ -42,13 +43,13 @@ def add(app: App, user: str, scope: str | None, label: str, as_json: bool) -> No
     with app.change() as change:
         found = change.user(user)
         if found.disabled:
-            raise Invalid(f"user '{found.name}' is disabled; enable it first")
+            raise Invalid(f"user '{found.full}' is disabled; enable it first")
         known = passwords.verifier(key, secret)
         number = queries.add_program(
             change.session, found.id, key, known, scope=checked, label=label, now=now
         )
-        change.audit("program.add", found.name, id=number, key=key, scope=checked, label=label)
-    answer = {"key": key, "secret": secret, "id": number, "user": found.name, "scope": checked}
+        change.audit("program.add", found.full, id=number, key=key, scope=checked, label=label)
+    answer = {"key": key, "secret": secret, "id": number, "user": found.full, "scope": checked}
     tell(as_json, answer, f"key     {key}\nsecret  {secret}")
     if not as_json:
         click.echo("The secret is not shown again.", err=True)
@@ -63,7 +64,7 @@ def list_(app: App, user: str | None, as_json: bool) -> None:
     with app.reading() as session:
         programs = queries.list_programs(session, None if user is None else user_of(session, user).id)
     cells = (
-        (str(each.id), each.user, each.key, each.scope or "all", moment(each.created), each.label)
+        (str(each.id), _user(each), each.key, each.scope or "all", moment(each.created), each.label)
         for each in programs
     )
     columns = ("id", "user", "key", "scope", "created", "label")
@@ -87,4 +88,8 @@ def _json(record: queries.ProgramRecord) -> dict[str, Any]:
     row = record._asdict()
     for hidden in ("user_id", "verifier"):
         del row[hidden]
-    return row
+    return {**row, "user": _user(record)}
+
+
+def _user(record: queries.ProgramRecord) -> str:
+    return full_name(record.user, record.realm)

@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
@@ -140,9 +141,10 @@ def order_motion(
     return _line(body)
 
 
-def give_order(folder: Path, order: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def give_order(folder: Path, order: dict[str, Any], realm: str) -> Iterator[dict[str, Any]]:
     """Have the relay carry out an order to many robots; its lines as they come. Who stops reading ends the order.
 
+    :param realm: whose robots are meant
     :raises Unavailable: no relay runs on this folder, or it went away before the order was done
     :raises Invalid: the order makes no sense
     :raises NotFound: it means no robot
@@ -151,7 +153,7 @@ def give_order(folder: Path, order: dict[str, Any]) -> Iterator[dict[str, Any]]:
     headers = _dated()
     try:
         try:
-            connection.request("POST", "/fleet", json.dumps(order), headers)
+            connection.request("POST", f"/fleet?realm={quote(realm)}", json.dumps(order), headers)
             answer = connection.getresponse()
             if answer.status != http.client.OK:
                 raise _refusal(answer.status, answer.read(_ANSWER_BYTES))

@@ -43,15 +43,15 @@ def remove_named(app: App, what: str, name: str, yes: bool, as_json: bool) -> No
         found = kind.find(session, name)
     recordings = _recordings(app, found.id) if what == "robot" else None
     also = f", and {recordings.words}" if recordings else ""
-    sure(f"Remove {what} {found.name} with {kind.along}{also}?", yes)
+    sure(f"Remove {what} {found.full} with {kind.along}{also}?", yes)
     with app.change() as change:
         found = kind.find(change.session, name)
         kind.delete(change.session, found.id)
         change.audit(
-            f"{what}.remove", found.name, **({"recordings": recordings.number} if recordings else {})
+            f"{what}.remove", found.full, **({"recordings": recordings.number} if recordings else {})
         )
-    answer: dict[str, Any] = {what: found.name, "removed": True}
-    sentences = [f"Removed {what} {found.name}."]
+    answer: dict[str, Any] = {what: found.full, "removed": True}
+    sentences = [f"Removed {what} {found.full}."]
     if recordings:
         answer["recordings"] = recordings.number
         sentences.append(f"The relay deletes {recordings.words}: now if it runs, else when it starts.")

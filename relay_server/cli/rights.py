@@ -8,6 +8,7 @@ import click
 
 from relay_db import queries
 from relay_protocol.errors import Invalid
+from relay_protocol.realms import full_name
 from relay_protocol.rights import Level
 from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, user_of
 from relay_server.cli.output import show, tell
@@ -33,6 +34,7 @@ class _Holder(NamedTuple):
         "switchboard right grant ann rover operator",
         "switchboard right grant @lab rover viewer --allow call:/reset",
         "switchboard right grant bob rover operator --deny 'publish:/arm/*'",
+        "switchboard right grant @crew@lab2 mobile@lab2 operator",
     )
 )
 @click.argument("holder", metavar="USER|@GROUP")
@@ -51,7 +53,7 @@ def grant(
     deny: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Give USER or GROUP a right on ROBOT; it replaces the one they have there.
+    """Give USER or GROUP a right on ROBOT, which is of their realm; it replaces the one they have there.
 
     A viewer may subscribe, an operator also publish and call, an owner do everything. Patterns are
     operation:resource with subscribe, view, record, publish, call, provide, manage or *, and wildcards in the
@@ -69,11 +71,11 @@ def grant(
             deny=deny,
         )
         detail = {"level": level, "allow": list(allow), "deny": list(deny)}
-        change.audit("right.grant", f"{whose.text} on {found.name}", **detail)
+        change.audit("right.grant", f"{whose.text} on {found.full}", **detail)
     tell(
         as_json,
-        {"holder": whose.text, "robot": found.name, **detail},
-        f"{whose.text} is {level} on {found.name}.",
+        {"holder": whose.text, "robot": found.full, **detail},
+        f"{whose.text} is {level} on {found.full}.",
     )
 
 
@@ -87,10 +89,10 @@ def revoke(app: App, holder: str, robot: str, as_json: bool) -> None:
     with app.change() as change:
         found, whose = change.robot(robot), _holder(change, holder)
         if not queries.revoke_right(change.session, found.id, user_id=whose.user_id, group_id=whose.group_id):
-            raise Invalid(f"{whose.text} has no right of its own on {found.name}")
-        change.audit("right.revoke", f"{whose.text} on {found.name}")
-    answer = {"holder": whose.text, "robot": found.name, "revoked": True}
-    tell(as_json, answer, f"{whose.text} has no right of its own on {found.name} any more.")
+            raise Invalid(f"{whose.text} has no right of its own on {found.full}")
+        change.audit("right.revoke", f"{whose.text} on {found.full}")
+    answer = {"holder": whose.text, "robot": found.full, "revoked": True}
+    tell(as_json, answer, f"{whose.text} has no right of its own on {found.full} any more.")
 
 
 @right.command("list", epilog=examples("switchboard right list", "switchboard right list --user ann --json"))
@@ -106,19 +108,29 @@ def list_(app: App, robot: str | None, user: str | None, as_json: bool) -> None:
             robot_id=None if robot is None else robot_of(session, robot).id,
             user_id=None if user is None else user_of(session, user).id,
         )
+        realms = {each.id: each.realm for each in queries.list_robots(session)}
+    full = [_full(each, realms[each.robot_id]) for each in rights]
     cells = (
-        (_text(each), each.robot, str(each.level), " ".join(each.allow), " ".join(each.deny))
-        for each in rights
+        (_text(each), each.robot, str(each.level), " ".join(each.allow), " ".join(each.deny)) for each in full
     )
-    show(as_json, map(_json, rights), ("holder", "robot", "level", "allow", "deny"), cells)
+    show(as_json, map(_json, full), ("holder", "robot", "level", "allow", "deny"), cells)
 
 
 def _holder(change: Change, text: str) -> _Holder:
     if text.startswith(_GROUP_MARK):
         group = change.group(text.removeprefix(_GROUP_MARK))
-        return _Holder(None, group.id, f"{_GROUP_MARK}{group.name}")
+        return _Holder(None, group.id, f"{_GROUP_MARK}{group.full}")
     user = change.user(text)
-    return _Holder(user.id, None, user.name)
+    return _Holder(user.id, None, user.full)
+
+
+def _full(record: queries.RightRecord, realm: str) -> queries.RightRecord:
+    """With names for the whole relay: who holds a right is of the robot's realm."""
+    return record._replace(
+        robot=full_name(record.robot, realm),
+        user=record.user and full_name(record.user, realm),
+        group=record.group and full_name(record.group, realm),
+    )
 
 
 def _text(record: queries.RightRecord) -> str:

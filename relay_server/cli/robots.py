@@ -15,6 +15,7 @@ from relay_protocol.limits import ENROLMENT_SECONDS
 from relay_server import passwords
 from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, yes_option
 from relay_server.cli.fleet import ORDERS
+from relay_server.cli.naming import listed, new_name, realm_option
 from relay_server.cli.output import show, tell
 from relay_server.cli.relaysocket import ask_status
 from relay_server.cli.removing import remove_named
@@ -33,20 +34,25 @@ for _name, _order in ORDERS.items():
 
 
 @robot.command(
-    epilog=examples("switchboard robot add rover", 'switchboard robot add arm-2 --description "Lab 3"')
+    epilog=examples(
+        "switchboard robot add rover",
+        'switchboard robot add arm-2 --description "Lab 3"',
+        "switchboard robot add mobile@lab2",
+    )
 )
 @click.argument("name")
 @click.option("--description", default="", help="One line for people.")
 @json_option
 @pass_app
 def add(app: App, name: str, description: str, as_json: bool) -> None:
-    """Add a robot NAME and print the code with which it enrols."""
+    """Add a robot NAME, or NAME@REALM, and print the code with which it enrols."""
     code = passwords.new_enrolment_code()
     with app.change() as change:
-        added = queries.add_robot(change.session, name, description)
+        bare, realm = new_name(change.session, name)
+        added = queries.add_robot(change.session, bare, description, realm)
         _issue(change, added, code)
-        change.audit("robot.add", added.name, description=description)
-    _tell_code(app, added, code, as_json, f"Added robot {added.name}.")
+        change.audit("robot.add", added.full, description=description)
+    _tell_code(app, added, code, as_json, f"Added robot {added.full}.")
 
 
 @robot.command(epilog=examples("switchboard robot code rover"))
@@ -59,21 +65,22 @@ def code(app: App, name: str, as_json: bool) -> None:
     with app.change() as change:
         found = change.robot(name)
         _issue(change, found, new)
-        change.audit("robot.code", found.name)
+        change.audit("robot.code", found.full)
     _tell_code(app, found, new, as_json)
 
 
-@robot.command("list", epilog=examples("switchboard robot list --json"))
+@robot.command("list", epilog=examples("switchboard robot list --realm lab2 --json"))
+@realm_option
 @json_option
 @pass_app
-def list_(app: App, as_json: bool) -> None:
-    """List all robots; 'switchboard status' tells which are online."""
+def list_(app: App, realm: str | None, as_json: bool) -> None:
+    """List all robots, or those of one realm; 'switchboard status' tells which are online."""
     with app.reading() as session:
-        robots = queries.list_robots(session)
+        robots = listed(session, queries.list_robots, realm)
         live = {each.id: _live_keys(queries.list_keys(session, each.id)) for each in robots}
-    rows = ({"robot": each.name, "description": each.description, "keys": live[each.id]} for each in robots)
+    rows = ({"robot": each.full, "description": each.description, "keys": live[each.id]} for each in robots)
     cells = (
-        (each.name, str(live[each.id]) if live[each.id] else "not enrolled", each.description)
+        (each.full, str(live[each.id]) if live[each.id] else "not enrolled", each.description)
         for each in robots
     )
     show(as_json, rows, ("robot", "live keys", "description"), cells)
@@ -102,7 +109,7 @@ def keys(app: App, name: str, revoke: str | None, as_json: bool) -> None:
         with app.change() as change:
             found = change.robot(name)
             queries.revoke_key(change.session, found.id, revoke, time.time())
-            change.audit("robot.key.revoke", found.name, fingerprint=revoke)
+            change.audit("robot.key.revoke", found.full, fingerprint=revoke)
     with app.reading() as session:
         known = queries.list_keys(session, robot_of(session, name).id)
     cells = ((each.fingerprint, moment(each.created), _state(each), each.agent) for each in known)
@@ -115,13 +122,13 @@ def _issue(change: Change, found: queries.RobotRecord, new: str) -> None:
 
 
 def _tell_code(app: App, found: queries.RobotRecord, new: str, as_json: bool, *before: str) -> None:
-    answer: dict[str, Any] = {"robot": found.name, "enrolment_code": new, "expires_in": ENROLMENT_SECONDS}
+    answer: dict[str, Any] = {"robot": found.full, "enrolment_code": new, "expires_in": ENROLMENT_SECONDS}
     if as_json:
         tell(True, answer)
         return
     address, tls = _relay_address(app)
     command = ["switchboard-robot", "enroll", "--relay", address, *(["--tls"] if tls else [])]
-    command += ["--robot", found.name, "--code", "-", "--state", "/var/lib/switchboard-robot/state"]
+    command += ["--robot", found.full, "--code", "-", "--state", "/var/lib/switchboard-robot/state"]
     tell(
         False,
         answer,

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import click
 
 from relay_protocol.errors import NotFound, Unavailable
+from relay_protocol.realms import full_name, parted
 from relay_server.cli.app import App, examples, json_option, pass_app
 from relay_server.cli.output import Sheet, say, show_json, table, watch_sheets
 from relay_server.cli.relaysocket import ask_status
@@ -63,7 +64,8 @@ def _asked(app: App, robot: str | None) -> dict[str, Any]:
     answer = ask_status(app.data)
     if robot is None:
         return answer
-    mine = [each for each in _dicts(answer.get("robots")) if each.get("name") == robot]
+    full = full_name(*parted(robot))
+    mine = [each for each in _dicts(answer.get("robots")) if each.get("name") == full]
     if not mine:
         raise NotFound(
             f"the relay has not seen a robot '{robot}'; 'switchboard robot list' shows which may dial in"

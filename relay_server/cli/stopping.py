@@ -13,6 +13,7 @@ from relay_db import queries
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.cli.app import App, examples, json_option, os_user, pass_app, why_option
 from relay_server.cli.failure import REFUSED, UNREACHABLE
+from relay_server.cli.naming import known_as
 from relay_server.cli.output import say_aside, show_json, tell
 from relay_server.cli.relaysocket import NoRelay, order_motion
 
@@ -20,12 +21,13 @@ from relay_server.cli.relaysocket import NoRelay, order_motion
 @click.command(
     epilog=examples(
         "switchboard stop rover",
+        "switchboard stop mobile@lab2",
         'switchboard stop rover --why "somebody is under it"',
         "switchboard stop --all",
     )
 )
 @click.argument("robot", required=False)
-@click.option("--all", "everything", is_flag=True, help="Every robot of this relay.")
+@click.option("--all", "everything", is_flag=True, help="Every robot of this relay, of all realms.")
 @why_option
 @json_option
 @pass_app
@@ -37,7 +39,7 @@ def stop(app: App, robot: str | None, everything: bool, why: str, as_json: bool)
     """
     if (robot is None) is not everything:
         raise click.UsageError("name a robot, or say --all")
-    told, unanswered = _Stop(app, robot, why).give()
+    told, unanswered = _Stop(app, None if robot is None else known_as(robot), why).give()
     if as_json:
         show_json({"robots": told})
     else:
@@ -61,6 +63,7 @@ def resume(app: App, robot: str, why: str, as_json: bool) -> None:
 
     A stop that a robot was not told of is taken back. One that it has confirmed it keeps, so it must be online.
     """
+    robot = known_as(robot)
     try:
         order_motion(app.data, "resume", {"robot": robot, "why": why, "by": os_user()})
     except NoRelay:
@@ -71,7 +74,7 @@ def resume(app: App, robot: str, why: str, as_json: bool) -> None:
 class _Stop:
     """One order to stop: given to the relay, and kept in the database where that does not confirm it.
 
-    :param robot: its name, ``None`` for all
+    :param robot: its name, as ``mobile@lab2``; ``None`` for all
     """
 
     def __init__(self, app: App, robot: str | None, why: str) -> None:
@@ -129,10 +132,10 @@ class _Stop:
                 queries.list_robots(change.session) if self._robot is None else [change.robot(self._robot)]
             )
             for each in robots:
-                if each.name not in told:
+                if each.full not in told:
                     queries.order_stop(change.session, each.id, os_user(), self._why, time.time(), tell=True)
-                    change.audit("robot.stopped", each.name, why=self._why)
-                    kept.append({"robot": each.name, "done": False})
+                    change.audit("robot.stopped", each.full, why=self._why)
+                    kept.append({"robot": each.full, "done": False})
         return kept
 
 
@@ -147,7 +150,7 @@ def _take_back(app: App, robot: str, why: str) -> None:
                 "no relay runs on this data folder, and no stop of this robot waits to be told; "
                 "what the robot has confirmed can be resumed only while it is online"
             )
-        change.audit("robot.resumed", found.name, why=why)
+        change.audit("robot.resumed", found.full, why=why)
 
 
 def _words(told: dict[str, Any]) -> str:

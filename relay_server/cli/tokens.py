@@ -43,7 +43,7 @@ def create(app: App, user: str, ttl: str, scope: str | None, label: str, as_json
     with app.change() as change:
         found = change.user(user)
         if found.disabled:
-            raise Invalid(f"user '{found.name}' is disabled; enable it first")
+            raise Invalid(f"user '{found.full}' is disabled; enable it first")
         number = queries.create_token(
             change.session,
             found.id,
@@ -54,8 +54,8 @@ def create(app: App, user: str, ttl: str, scope: str | None, label: str, as_json
             now=now,
             scope=checked,
         )
-        change.audit("token.create", found.name, id=number, ttl_s=seconds, scope=checked, label=label)
-    answer = {"token": secret, "expires_in": seconds, "id": number, "user": found.name}
+        change.audit("token.create", found.full, id=number, ttl_s=seconds, scope=checked, label=label)
+    answer = {"token": secret, "expires_in": seconds, "id": number, "user": found.full}
     tell(as_json, answer, secret)
     if not as_json:
         # not to stdout, which a script may take as the token
@@ -69,7 +69,9 @@ def create(app: App, user: str, ttl: str, scope: str | None, label: str, as_json
 def list_(app: App, user: str | None, as_json: bool) -> None:
     """List tokens and browser sessions, without the tokens themselves."""
     with app.reading() as session:
-        tokens = queries.list_tokens(session, None if user is None else user_of(session, user).id)
+        found = queries.list_tokens(session, None if user is None else user_of(session, user).id)
+        names = {each.id: each.full for each in queries.list_users(session)}
+    tokens = [each._replace(user=names[each.user_id]) for each in found]
     now = time.time()
     cells = (
         (

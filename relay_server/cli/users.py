@@ -9,7 +9,9 @@ import click
 from relay_db import queries
 from relay_db.names import normal_name
 from relay_protocol.errors import Invalid
+from relay_protocol.realms import full_name, parted
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of, yes_option
+from relay_server.cli.naming import listed, new_name, realm_option
 from relay_server.cli.output import show, tell
 from relay_server.cli.removing import remove_named
 from relay_server.cli.secrets_in import new_password_hash, stdin_option
@@ -25,38 +27,41 @@ def user() -> None:
         "switchboard user add ann",
         "switchboard user add ops --admin --password-stdin < password.txt",
         "switchboard user add fleet-report --no-password",
+        "switchboard user add toad@lab1",
     )
 )
 @click.argument("name")
-@click.option("--admin", is_flag=True, help="An administrator: owner of every robot.")
+@click.option("--admin", is_flag=True, help="An administrator: owner of every robot of the realm.")
 @stdin_option
 @click.option("--no-password", is_flag=True, help="No password: only access tokens let this user in.")
 @json_option
 @pass_app
 def add(app: App, name: str, admin: bool, password_stdin: bool, no_password: bool, as_json: bool) -> None:
-    """Add a user NAME. Asks for the password unless told otherwise."""
+    """Add a user NAME, or NAME@REALM. Asks for the password unless told otherwise."""
     if password_stdin and no_password:
         raise click.UsageError("--password-stdin and --no-password exclude each other.")
-    name = normal_name(name, "name of a user")
+    bare = normal_name(parted(name)[0], "name of a user")
     with app.reading() as session:
         # before anyone types a password twice for nothing
-        if queries.find_user(session, name) is not None:
-            raise Invalid(f"there is a user '{name}' already")
+        _, realm = new_name(session, name)
+        if queries.find_user(session, bare, realm) is not None:
+            raise Invalid(f"there is a user '{full_name(bare, realm)}' already")
     hashed = None if no_password else new_password_hash(password_stdin)
     with app.change() as change:
-        added = queries.add_user(change.session, name, hashed, admin=admin)
-        change.audit("user.add", added.name, admin=admin)
-    tell(as_json, _json(added), f"Added {'administrator' if admin else 'user'} {added.name}.")
+        added = queries.add_user(change.session, bare, hashed, admin=admin, realm=realm)
+        change.audit("user.add", added.full, admin=admin)
+    tell(as_json, _json(added), f"Added {'administrator' if admin else 'user'} {added.full}.")
 
 
-@user.command("list", epilog=examples("switchboard user list", "switchboard user list --json"))
+@user.command("list", epilog=examples("switchboard user list", "switchboard user list --realm lab1 --json"))
+@realm_option
 @json_option
 @pass_app
-def list_(app: App, as_json: bool) -> None:
-    """List all users."""
+def list_(app: App, realm: str | None, as_json: bool) -> None:
+    """List all users, or those of one realm."""
     with app.reading() as session:
-        users = queries.list_users(session)
-    cells = ((each.name, _role(each), "yes" if each.password_hash else "no") for each in users)
+        users = listed(session, queries.list_users, realm)
+    cells = ((each.full, _role(each), "yes" if each.password_hash else "no") for each in users)
     show(as_json, map(_json, users), ("user", "role", "password"), cells)
 
 
@@ -73,8 +78,8 @@ def passwd(app: App, name: str, password_stdin: bool, as_json: bool) -> None:
     with app.change() as change:
         found = change.user(name)
         queries.set_password(change.session, found.id, hashed)
-        change.audit("user.password", found.name)
-    tell(as_json, _json(found._replace(password_hash=hashed)), f"Changed the password of {found.name}.")
+        change.audit("user.password", found.full)
+    tell(as_json, _json(found._replace(password_hash=hashed)), f"Changed the password of {found.full}.")
 
 
 @user.command(epilog=examples("switchboard user disable ann"))
@@ -109,14 +114,14 @@ def _set_disabled(app: App, name: str, disabled: bool, as_json: bool) -> None:
     with app.change() as change:
         found = change.user(name)
         queries.set_disabled(change.session, found.id, disabled)
-        change.audit("user.disable" if disabled else "user.enable", found.name)
-    sentence = f"{'Disabled' if disabled else 'Enabled'} user {found.name}."
+        change.audit("user.disable" if disabled else "user.enable", found.full)
+    sentence = f"{'Disabled' if disabled else 'Enabled'} user {found.full}."
     tell(as_json, _json(found._replace(disabled=disabled)), sentence)
 
 
 def _json(record: queries.UserRecord) -> dict[str, Any]:
     return {
-        "user": record.name,
+        "user": record.full,
         "admin": record.admin,
         "disabled": record.disabled,
         "password": record.password_hash is not None,

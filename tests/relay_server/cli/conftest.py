@@ -100,11 +100,12 @@ class _Handler(BaseHTTPRequestHandler):
     def _respond(self) -> None:
         self.server.asked.append(f"{self.command} {self.path}")
         status, body = self.server.answer if self.command == "GET" else (204, b"")
-        if self.path in ("/fleet", "/stop", "/resume"):
+        path, _, _ = self.path.partition("?")
+        if path in ("/fleet", "/stop", "/resume"):
             length = int(self.headers["Content-Length"])
             self.server.ordered.append(json.loads(self.rfile.read(length)))
             self.server.sent.append(int(self.headers["Switchboard-Sent"]))
-            status, body = self.server.lines if self.path == "/fleet" else self.server.motion
+            status, body = self.server.lines if path == "/fleet" else self.server.motion
             self.server.may_answer.wait(30)
             if not status or self.server.gone:
                 return

@@ -68,7 +68,7 @@ def test_an_order_goes_to_the_relay(
     relay.lines = lines({"robot": "rover", **OK})
     live.ok("robot", *arguments)
     assert relay.ordered == [{"timeout": 10.0, **order}]
-    assert relay.asked == ["POST /fleet"]
+    assert relay.asked == ["POST /fleet?realm=default"]
 
 
 def test_each_robot_is_told_of(live: Any, relay: Any) -> None:

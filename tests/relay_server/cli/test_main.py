@@ -20,6 +20,8 @@ from relay_server.cli import main
 from relay_server.cli.relaysocket import SOCKET_NAME
 
 CHANGES = [
+    ("realm.add", ("realm", "add", "lab1")),
+    ("realm.remove", ("realm", "remove", "lab0", "--yes")),
     ("user.add", ("user", "add", "bob", "--no-password")),
     ("user.password", ("user", "passwd", "ann", "--password-stdin")),
     ("user.disable", ("user", "disable", "ann")),
@@ -38,6 +40,7 @@ CHANGES = [
     ("token.revoke", ("token", "revoke", "1")),
 ]
 LOOKS = [
+    ("realm", "list"),
     ("user", "list"),
     ("group", "list"),
     ("robot", "list"),
@@ -51,6 +54,7 @@ LOOKS = [
 
 def _fill(cli: Any) -> None:
     for arguments in (
+        ("realm", "add", "lab0"),
         ("user", "add", "ann", "--no-password"),
         ("user", "add", "cat", "--no-password"),
         ("group", "add", "lab"),
@@ -224,7 +228,7 @@ def test_each_command_has_help_examples_and_json(path: tuple[str, ...], command:
 def test_the_help_names_all_commands(cli: Any) -> None:
     """Without importing them."""
     shown = cli.ok("--help")
-    for name in ("user", "group", "robot", "right", "token", "audit", "db", "status"):
+    for name in ("realm", "user", "group", "robot", "right", "token", "audit", "db", "status"):
         assert re.search(rf"^  {name} ", shown, re.MULTILINE)
 
 

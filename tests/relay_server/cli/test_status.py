@@ -216,7 +216,7 @@ def test_no_relay_is_exit_code_3(cli: Any, short_folder: Path) -> None:
     [
         ("_ASK_SECONDS", lambda folder: relaysocket.ask_status(folder)),
         ("_MOTION_SECONDS", lambda folder: relaysocket.order_motion(folder, "stop", {})),
-        ("_LINE_SECONDS", lambda folder: list(relaysocket.give_order(folder, {}))),
+        ("_LINE_SECONDS", lambda folder: list(relaysocket.give_order(folder, {}, "default"))),
     ],
 )
 def test_a_relay_that_does_not_answer_is_told_with_the_time_that_was_waited(

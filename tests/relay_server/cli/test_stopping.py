@@ -92,7 +92,7 @@ def test_an_order_says_when_it_was_given(live: Any, relay: Any) -> None:
     before = now_ns()
     live.ok("resume", "rover")
     live("robot", "call", "rover", "/reset")
-    assert relay.asked == ["POST /resume", "POST /fleet"]
+    assert relay.asked == ["POST /resume", "POST /fleet?realm=default"]
     first, second = relay.sent
     assert before < first < second < now_ns()
 
