@@ -1,0 +1,335 @@
+"""Two realms on one relay: names stand in both, and nothing of one can be seen, reached or inferred from the other."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from switchboard_http import Answer, ask, log_in
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+from switchboard_small_robot import SmallRobot
+from switchboard_waiting import wait_for
+from websockets.exceptions import InvalidStatus
+
+PASSWORD = "correct horse"
+LABS = ("lab1", "lab2")
+
+
+class Labs:
+    """A relay with two realms. Each has a robot ``mobile``, an operator ``toad`` and an administrator ``root``; the
+    second also has a robot ``secret`` and a user ``mole``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.relay = Relay(folder)
+        self.tokens: dict[str, str] = {}
+        self.robots: dict[str, SmallRobot] = {}
+        for lab in LABS:
+            self.relay.cli("realm", "add", lab)
+            self.tokens[f"toad@{lab}"] = self.relay.user(f"toad@{lab}")
+            self.tokens[f"root@{lab}"] = self.relay.user(f"root@{lab}", admin=True)
+            self.enter(f"mobile@{lab}")
+            self.relay.cli("right", "grant", f"toad@{lab}", f"mobile@{lab}", "operator")
+        self.tokens["mole@lab2"] = self.relay.user("mole@lab2")
+        self.enter("secret@lab2")
+
+    def enter(self, name: str) -> None:
+        """A robot that answers ``/where``, and dials in."""
+        self.robots[name] = SmallRobot(self.relay, name, {"/where": lambda *_: {"message": name}}).comes()
+
+    def ask(self, who: str, method: str, path: str, body: Any = None, **headers: str) -> Answer:
+        """What somebody is answered."""
+        sent = {name.replace("_", "-"): value for name, value in headers.items()}
+        return ask(self.relay.http_port, method, path, body, headers=sent, token=self.tokens[who])
+
+    def stop(self) -> None:
+        """End everything."""
+        for each in self.robots.values():
+            each.goes()
+        self.relay.stop()
+
+
+@pytest.fixture(scope="module")
+def labs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Labs]:
+    """Both of them, for all tests."""
+    made = Labs(tmp_path_factory.mktemp("realms"))
+    yield made
+    made.stop()
+
+
+# --- names ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lab", LABS)
+def test_a_name_means_what_it_is_in_ones_own_realm(labs: Labs, lab: str) -> None:
+    """Both toads call a service of ``mobile``, by websocket and over HTTP, and each is answered by his own robot."""
+    who, robot = f"toad@{lab}", labs.robots[f"mobile@{lab}"]
+    before = len(robot.calls)
+    with labs.relay.connect("mobile", labs.tokens[who]) as client:
+        assert client.call("/where")["values"]["message"] == f"mobile@{lab}"
+    answer = labs.ask(who, "POST", "/api/v1/robots/mobile/services/where", {})
+    assert (answer.status, answer.json["values"]["message"]) == (200, f"mobile@{lab}")
+    assert len(robot.calls) == before + 2
+
+
+@pytest.mark.parametrize("lab", LABS)
+def test_everybody_sees_the_robots_of_his_realm(labs: Labs, lab: str) -> None:
+    """Its administrator all of them, an operator those he has a right on, and nobody one of another realm."""
+    of_root = {"lab1": {"mobile"}, "lab2": {"mobile", "secret"}}[lab]
+    for who, expected in ((f"root@{lab}", of_root), (f"toad@{lab}", {"mobile"})):
+        told = labs.ask(who, "GET", "/api/v1/robots").json["robots"]
+        assert {each["name"] for each in told} == expected
+
+
+def test_a_name_without_a_realm_is_of_the_default_one(labs: Labs) -> None:
+    """There is no toad there, and the robot's operator is not let in by his bare name."""
+    port = labs.relay.http_port
+    origin = {"Origin": f"http://127.0.0.1:{port}"}
+    for user in ("toad", "toad@lab2x", "toad@", "toad@lab1@lab2"):
+        body = {"user": user, "password": PASSWORD}
+        answer = ask(port, "POST", "/api/v1/session", body, headers=origin)
+        assert (answer.status, answer.json["code"]) == (401, "bad_credentials"), user
+    cookie = log_in(port, "Toad@LAB1", PASSWORD)
+    told = ask(port, "GET", "/api/v1/session", headers={"Cookie": cookie, **origin}).json
+    assert (told["user"], told["realm"], told["admin"]) == ("toad", "lab1", False)
+
+
+def test_oauth_knows_realms(labs: Labs) -> None:
+    """A token for the password of ``toad@lab1`` is one of that realm; elsewhere it is neither known nor revoked."""
+    port = labs.relay.http_port
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+    granted = _form(port, "/oauth/token", f"grant_type=password&username=toad@lab1&password={PASSWORD}", form)
+    assert granted.status == 200, granted.body
+    token = granted.json["access_token"]
+    for who, active in (("toad@lab1", True), ("root@lab2", False), ("toad@lab2", False)):
+        asking = {**form, "Authorization": f"Bearer {labs.tokens[who]}"}
+        assert _form(port, "/oauth/introspect", f"token={token}", asking).json["active"] is active
+    stranger = {**form, "Authorization": f"Bearer {labs.tokens['root@lab2']}"}
+    assert _form(port, "/oauth/revoke", f"token={token}", stranger).status == 200
+    assert ask(port, "GET", "/api/v1/robots", token=token).status == 200
+    own = {**form, "Authorization": f"Bearer {labs.tokens['toad@lab1']}"}
+    told = _form(port, "/oauth/introspect", f"token={token}", own).json
+    assert (told["sub"], told["realm"]) == ("toad@lab1", "lab1")
+
+
+def _form(port: int, path: str, body: str, headers: dict[str, str]) -> Answer:
+    """A form, as OAuth has it."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    try:
+        connection.request("POST", path, body.replace(" ", "+"), headers)
+        return Answer(connection.getresponse())
+    finally:
+        connection.close()
+
+
+# --- nothing crosses --------------------------------------------------------------------------------------
+
+OF_A_ROBOT = [
+    ("GET", "", None),
+    ("GET", "/topics", None),
+    ("GET", "/topics/mode", None),
+    ("POST", "/topics/mode", {"value": {"data": "x"}}),
+    ("GET", "/services", None),
+    ("POST", "/services/where", {}),
+    ("GET", "/params", None),
+    ("GET", "/actions", None),
+    ("GET", "/cameras", None),
+    ("POST", "/stop", {}),
+    ("POST", "/resume", {}),
+    ("POST", "/control/take", {}),
+    ("GET", "/presence", None),
+    ("GET", "/recordings", None),
+]
+
+
+@pytest.mark.parametrize("who", ["toad@lab1", "root@lab1"])
+@pytest.mark.parametrize(("method", "path", "body"), OF_A_ROBOT)
+def test_a_robot_of_another_realm_is_none(labs: Labs, who: str, method: str, path: str, body: Any) -> None:
+    """Whatever is asked of it, the answer is that of a name nobody has: status, headers and words."""
+    answers = [labs.ask(who, method, f"/api/v1/robots/{name}{path}", body) for name in ("secret", "nobody")]
+    assert _without_names(answers[0]) == _without_names(answers[1])
+    assert answers[0].status in (403, 404, 405, 428)
+
+
+def _without_names(answer: Answer) -> tuple[Any, ...]:
+    """An answer but for what differs from one to the next: the name that was asked for, and the time."""
+    changing = {"date", "switchboard-moment", "ratelimit", "ratelimit-policy", "content-length"}
+    headers = sorted((name.lower(), value) for name, value in answer.headers.items())
+    body = re.sub(rb"secret|nobody", b"*", answer.body)
+    return answer.status, body, [each for each in headers if each[0] not in changing]
+
+
+@pytest.mark.parametrize(
+    "path", ["/robots/{}", "/robots/{}/video/stream?topic=/x", "/robots/{}/video/snapshot?topic=/x"]
+)
+def test_neither_a_websocket_nor_a_picture_tells_that_it_is_there(labs: Labs, path: str) -> None:
+    """The same refusal as for a name nobody has."""
+    told = []
+    for name in ("secret", "nobody"):
+        if "video" in path:
+            answer = labs.ask("root@lab1", "GET", path.format(name))
+            told.append((answer.status, re.sub(rb"secret|nobody", b"*", answer.body)))
+        else:
+            with pytest.raises(InvalidStatus) as refused:
+                labs.relay.connect(name, labs.tokens["root@lab1"])
+            body = refused.value.response.body or b""
+            told.append((refused.value.response.status_code, re.sub(rb"secret|nobody", b"*", body)))
+    assert told[0] == told[1]
+
+
+def test_what_programs_register_stays_in_their_realm(labs: Labs) -> None:
+    """The directory of one realm shows nothing of the other's, and an entry's address is none there."""
+    entry = {"kind": "service", "name": "speech", "address": "http://10.0.0.9/", "ttl": 600}
+    made = labs.ask("toad@lab2", "POST", "/api/v1/directory", entry)
+    assert made.status == 201
+    assert _names(labs.ask("mole@lab2", "GET", "/api/v1/directory?kind=service")) == ["speech"]
+    for query in ("?kind=service&name=spe*", "?realm=lab2", "?name=speech"):
+        assert _names(labs.ask("root@lab1", "GET", f"/api/v1/directory{query}")) == []
+    place = made.headers["Location"]
+    strange = re.sub(r"[^/]+$", lambda found: found[0][::-1], place)
+    there, nowhere = (labs.ask("root@lab1", "GET", each) for each in (place, strange))
+    assert (there.status, there.json["code"]) == (nowhere.status, nowhere.json["code"]) == (404, "not_found")
+
+
+def _names(answer: Answer) -> list[str]:
+    return [each["name"] for each in answer.json["entries"]]
+
+
+def test_events_are_remembered_in_their_realm(labs: Labs) -> None:
+    """Neither what there is, nor how many there are, nor their numbers say anything of the other realm."""
+    numbers = []
+    for lab in LABS:
+        event = {"kind": "coffee", "data": {"in": lab}}
+        numbers.append(labs.ask(f"toad@{lab}", "POST", "/api/v1/events", event).json)
+    assert [each["data"] for each in numbers] == [{"in": lab} for lab in LABS]
+    for lab in LABS:
+        told = labs.ask(f"root@{lab}", "GET", "/api/v1/events?kind=coffee&limit=1000").json["events"]
+        assert [each["data"] for each in told] == [{"in": lab}]
+        count = labs.ask(f"root@{lab}", "GET", "/api/v1/events?kind=coffee&count=true").json["count"]
+        assert count == 1
+    before = labs.ask("toad@lab1", "POST", "/api/v1/events", {"kind": "tick"}).json["id"]
+    for _ in range(3):
+        labs.ask("toad@lab2", "POST", "/api/v1/events", {"kind": "tock"})
+    own = labs.ask("root@lab1", "GET", "/api/v1/events?limit=1000").json["events"]
+    after = labs.ask("toad@lab1", "POST", "/api/v1/events", {"kind": "tick"}).json["id"]
+    noticed = [each for each in own if each["id"] > before]
+    assert after - before <= len(noticed) + 2
+    assert "tock" not in {each["kind"] for each in own}
+
+
+def test_a_failed_login_is_told_where_it_was_tried(labs: Labs) -> None:
+    """Also for a user nobody has; and to no other realm, whether the named one exists or not."""
+    port = labs.relay.http_port
+    origin = {"Origin": f"http://127.0.0.1:{port}"}
+    for user in ("toad@lab2", "ghost@lab2", "ghost@lab9"):
+        body = {"user": user, "password": "wrong"}
+        assert ask(port, "POST", "/api/v1/session", body, headers=origin).status == 401
+
+    def tried(who: str) -> set[str]:
+        events = labs.ask(who, "GET", "/api/v1/events?kind=login.refused&limit=1000").json["events"]
+        return {each["data"]["user"] for each in events if "ghost" in each["data"]["user"]}
+
+    wait_for("it is remembered", lambda: tried("root@lab2"))
+    assert tried("root@lab2") == {"ghost@lab2"}
+    assert tried("root@lab1") == set()
+
+
+@pytest.mark.parametrize("order", [{"do": "stop"}, {"do": "call", "service": "/where"}])
+def test_an_order_to_all_robots_means_those_of_ones_own_realm(labs: Labs, order: dict[str, Any]) -> None:
+    """Though patterns and names of the other realm's are given: those are unmatched like any that nobody has."""
+    others = [robot for name, robot in labs.robots.items() if name.endswith("lab2")]
+    calls = [len(robot.calls) for robot in others]
+    body = {"robots": ["*", "secret", "nobody"], **order}
+    answer = labs.ask("root@lab1", "POST", "/api/v1/fleet", body)
+    head, *results = [json.loads(line) for line in answer.body.splitlines()]
+    assert head["robots"] == ["mobile"]
+    assert head["unmatched"] == ["secret", "nobody"]
+    assert [(each["robot"], each["ok"]) for each in results if "robot" in each] == [("mobile", True)]
+    assert [len(robot.calls) for robot in others] == calls
+    assert [robot.stopped for robot in others] == [None, None]
+    labs.relay.cli("resume", "mobile@lab1")
+
+
+def test_the_machines_administrator_reaches_all_realms_by_full_names(labs: Labs) -> None:
+    """``switchboard stop mobile@lab2`` stops that one, and ``status`` tells them from each other."""
+    told = labs.relay.cli("stop", "mobile@lab2")
+    assert told["robots"] == [{"robot": "mobile@lab2", "done": True}]
+    stopped = {name: robot.stopped is not None for name, robot in labs.robots.items()}
+    assert stopped == {"mobile@lab1": False, "mobile@lab2": True, "secret@lab2": False}
+    labs.relay.cli("resume", "mobile@lab2")
+    shown = {each["name"] for each in labs.relay.cli("status")["robots"]}
+    assert shown >= {"mobile@lab1", "mobile@lab2", "secret@lab2"}
+    answer = labs.relay.cli("robot", "call", "mobile@lab2", "/where")
+    assert [(each["robot"], each["values"]["message"]) for each in answer["results"]] == [
+        ("mobile@lab2",) * 2
+    ]
+    assert labs.robots["mobile@lab2"].calls
+
+
+def test_a_daemon_enrols_and_dials_with_its_realm(labs: Labs) -> None:
+    """``switchboard-robot`` takes the full name; its realm's administrator sees it by the short one."""
+    robot = Robot(labs.relay, "rover@lab2")
+    try:
+        told = {
+            each["name"]: each["state"]
+            for each in labs.ask("root@lab2", "GET", "/api/v1/robots").json["robots"]
+        }
+        assert told["rover"] == "online"
+        of_others = labs.ask("root@lab1", "GET", "/api/v1/robots").json["robots"]
+        assert [each["name"] for each in of_others] == ["mobile"]
+    finally:
+        robot.stop()
+        labs.relay.cli("robot", "remove", "rover@lab2", "--yes")
+
+
+def test_rights_do_not_cross_realms(labs: Labs) -> None:
+    """A right of one realm's user on another's robot can't be given; the command says why."""
+    done = labs.relay.run_cli("right", "grant", "toad@lab1", "secret@lab2", "viewer")
+    assert done.returncode != 0
+    assert "different realms" in done.stderr
+
+
+def test_the_record_tells_whose_it_was(labs: Labs) -> None:
+    """In the audit log users and robots have their full names."""
+    labs.relay.cli("stop", "mobile@lab1")
+    labs.relay.cli("resume", "mobile@lab1")
+    assert labs.ask("toad@lab1", "POST", "/api/v1/robots/mobile/stop", {"why": "a test"}).status == 200
+    labs.relay.cli("resume", "mobile@lab1")
+
+    def entries() -> list[dict[str, Any]]:
+        told = labs.relay.cli("audit", "list", "--limit", "1000")
+        return [each for each in told if each["actor"] == "user:toad@lab1"]
+
+    wait_for("it is on record", lambda: [each for each in entries() if each["action"] == "robot.stopped"])
+    assert {each["target"] for each in entries() if each["action"] == "robot.stopped"} == {"mobile@lab1"}
+
+
+def test_numbers_of_the_whole_relay_are_for_its_own_administrators(labs: Labs) -> None:
+    """An administrator of another realm may not read them: they count everybody's."""
+    assert labs.ask("root@lab1", "GET", "/metrics").status == 403
+    labs.tokens["root"] = labs.relay.user("root", admin=True)
+    assert labs.ask("root", "GET", "/metrics").status == 200
+    assert labs.ask("root", "GET", "/api/v1/robots").json["robots"] == []
+
+
+def test_a_realm_with_somebody_in_it_stays(labs: Labs) -> None:
+    """An empty one goes, with what its memory held; one with users or robots is refused with the reason."""
+    done = labs.relay.run_cli("realm", "remove", "lab1", "--yes")
+    assert done.returncode != 0
+    assert "there are users and robots in the realm 'lab1'" in done.stderr
+    labs.relay.cli("realm", "add", "lab3")
+    token = labs.relay.user("ann@lab3")
+    assert ask(labs.relay.http_port, "POST", "/api/v1/events", {"kind": "x"}, token=token).status == 201
+    labs.relay.cli("user", "remove", "ann@lab3", "--yes")
+    labs.relay.cli("realm", "remove", "lab3", "--yes")
+    assert {each["realm"] for each in labs.relay.cli("realm", "list")} == {"default", "lab1", "lab2"}
+    wait_for(
+        "her token ends with her",
+        lambda: ask(labs.relay.http_port, "GET", "/api/v1/events", token=token).status == 401,
+    )
