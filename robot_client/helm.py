@@ -204,7 +204,7 @@ class Helm:
 
     def _stop(self, message: link.Stop) -> None:
         new = self._authority.stopped is None
-        stopped = link.Stopped(by=message.by, since=self._wall(), why=message.why)
+        stopped = link.Stopped(by=message.by, since=message.at or self._wall(), why=message.why)
         self._authority.stop(stopped, self._now())
         self._resuming = None
         order = _Stopping(message.id)

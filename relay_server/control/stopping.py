@@ -224,7 +224,9 @@ class Stopping:
             return given
         self._under_way += 1
         given = self._orders.give(
-            lambda id: link.Stop(id=id, by=order.by[:255], why=order.why), seconds=STOP_SECONDS, always=True
+            lambda id: link.Stop(id=id, by=order.by[:255], why=order.why, at=order.at),
+            seconds=STOP_SECONDS,
+            always=True,
         )
         return given.addBoth(self._answered)
 

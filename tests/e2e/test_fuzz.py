@@ -104,7 +104,8 @@ def connected(world: Any, token: str) -> ClientConnection:
 def test_random_operations_are_told_or_cut(world: Any, seed: int) -> None:
     """Each refusal is a sentence; who is cut gets a code and a reason, comes again and goes on."""
     chance = random.Random(seed)
-    left, told = MESSAGES, 0
+    left = MESSAGES
+    told: list[str] = []
     while left:
         with connected(world, world.operator) as client:
             try:
@@ -114,14 +115,23 @@ def test_random_operations_are_told_or_cut(world: Any, seed: int) -> None:
                     if left % 100 == 0:
                         client.send(TELL)  # one of the messages may have asked for silence
                     client.send(message(chance))
-                    with contextlib.suppress(TimeoutError):
-                        while True:
-                            heard = client.recv(timeout=0)
-                            told += isinstance(heard, str) and '"level":"error"' in heard
+                    errors(client, 0, told)
+                errors(client, 1, told)
             except ConnectionClosed as cut:
                 assert cut.rcvd is not None
                 assert cut.rcvd.reason
-    assert told > MESSAGES / 20
+                with contextlib.suppress(ConnectionClosed):
+                    errors(client, 1, told)
+    assert len(told) > MESSAGES / 20
+
+
+def errors(client: ClientConnection, seconds: float, told: list[str]) -> None:
+    """Note the errors it is told, until nothing comes for so long."""
+    with contextlib.suppress(TimeoutError):
+        while True:
+            heard = client.recv(timeout=seconds)
+            if isinstance(heard, str) and '"level":"error"' in heard:
+                told.append(heard)
 
 
 def test_random_bytes_after_the_handshake_are_cut(world: Any) -> None:

@@ -280,6 +280,13 @@ def test_resume_moves_nothing_by_itself(scene: Scene, control: Line) -> None:
     assert scene.platform.published[-1] == ("/cmd_vel", GO)
 
 
+def test_a_stop_is_told_with_the_time_at_which_it_was_ordered(scene: Scene, control: Line) -> None:
+    """By the relay's clock, so that nobody takes its confirmation for another stop."""
+    assert order(control, link.Stop(id=2, by="eve", at=1700.25)) == {"op": "done", "id": 2}
+    assert scene.daemon.authority.stopped == link.Stopped(by="eve", since=1700.25)
+    assert scene.latch.stopped == link.Stopped(by="eve", since=1700.25)
+
+
 def test_second_stop_and_needless_resume_are_done(scene: Scene, control: Line) -> None:
     """Whoever stops a stopped robot, or resumes one that is not, is told that it is so."""
     assert order(control, resume())["id"] == 3

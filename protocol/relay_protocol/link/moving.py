@@ -43,10 +43,14 @@ class Control(Order, frozen=True, kw_only=True):
 
 
 class Stop(Order, frozen=True, kw_only=True):
-    """Relay: stop, and stay so until somebody resumes."""
+    """Relay: stop, and stay so until somebody resumes.
+
+    :param at: Unix time it was ordered, by the relay's clock; 0: now
+    """
 
     by: Label
     why: str = ""
+    at: float = 0.0
 
     def __post_init__(self) -> None:
         cut(self, "why")

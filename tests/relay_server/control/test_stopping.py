@@ -50,6 +50,20 @@ def test_what_the_robot_has_done_is_known_before_it_says_so_of_itself() -> None:
     assert stopped.told
 
 
+def test_a_stop_is_the_same_before_and_after_it_is_confirmed() -> None:
+    """The robot is told when it was ordered, to say that of itself: whoever resumes it meanwhile is not put off."""
+    place = Place().online()
+    place.link.silent = True
+    place.desk.stopping.stop(ANN, "smoke")
+    stopped = place.desk.stopping.stopped
+    (order,) = place.link.orders(link.Stop)
+    assert stopped is not None
+    assert (stopped.told, order.at) == (False, stopped.since)
+    place.link.answers(order)
+    place.desk.told(link.Safety(stopped=link.Stopped(by=order.by, why=order.why, since=order.at)))
+    assert place.desk.stopping.stopped == stopped._replace(told=True)
+
+
 def test_until_the_robot_confirms_it_is_kept() -> None:
     """Everybody sees that it is ordered, and whether the robot says so itself."""
     place = Place().online()
