@@ -7,6 +7,7 @@ from collections import Counter
 import click
 
 from relay_db import queries
+from relay_protocol.errors import Invalid
 from relay_server.cli.app import App, examples, json_option, pass_app, sure, yes_option
 from relay_server.cli.naming import known_realm
 from relay_server.cli.output import show, tell
@@ -41,10 +42,57 @@ def list_(app: App, as_json: bool) -> None:
         realms = queries.list_realms(session)
         users = Counter(each.realm for each in queries.list_users(session))
         robots = Counter(each.realm for each in queries.list_robots(session))
-    names = [each.name for each in realms]
-    rows = ({"realm": name, "users": users[name], "robots": robots[name]} for name in names)
-    cells = ((name, str(users[name]), str(robots[name])) for name in names)
-    show(as_json, rows, ("realm", "users", "robots"), cells)
+    rows = (
+        {
+            "realm": each.name,
+            "users": users[each.name],
+            "robots": robots[each.name],
+            "events_days": each.events_days,
+        }
+        for each in realms
+    )
+    cells = (
+        (each.name, str(users[each.name]), str(robots[each.name]), _kept(each.events_days)) for each in realms
+    )
+    show(as_json, rows, ("realm", "users", "robots", "events kept"), cells)
+
+
+@realm.command(
+    "set",
+    epilog=examples(
+        "switchboard realm set lab1 --events-days 7", "switchboard realm set lab1 --events-days relay"
+    ),
+)
+@click.argument("name")
+@click.option(
+    "--events-days",
+    required=True,
+    metavar="DAYS",
+    help="How long its memory keeps events; 'relay': as long as 'serve --events-days' says.",
+)
+@json_option
+@pass_app
+def set_(app: App, name: str, events_days: str, as_json: bool) -> None:
+    """Say how long the memory of realm NAME keeps events. A running relay goes by it within ten minutes."""
+    days = None if events_days == "relay" else _days(events_days)
+    with app.change() as change:
+        name = known_realm(change.session, name)
+        queries.keep_events(change.session, name, days)
+        change.audit("realm.set", name, events_days=days)
+    told = {"realm": name, "events_days": days}
+    tell(as_json, told, f"The memory of realm {name} keeps events {_kept(days)}.")
+
+
+def _days(text: str) -> float:
+    """:raises Invalid: it is no number"""
+    try:
+        return float(text)
+    except ValueError:
+        raise Invalid("--events-days is a number of days, or 'relay'") from None
+
+
+def _kept(days: float | None) -> str:
+    return "as long as the relay's" if days is None else f"for {days:g} days"
 
 
 @realm.command(epilog=examples("switchboard realm remove lab1 --yes"))

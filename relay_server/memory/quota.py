@@ -25,6 +25,8 @@ LOOK_SECONDS = 1.0
 GONE = 500
 """Events that go in one transaction."""
 
+DAY = 86400.0
+
 PURGE_SECONDS = 600.0
 """How often what is old is looked for."""
 
@@ -37,7 +39,7 @@ class Quota:
 
     :param wall: Unix time in seconds
     :param of_source: events that a source may have in a realm
-    :param kept: seconds after which an event goes
+    :param kept: seconds after which an event goes, where its realm says nothing else
     :param of_realm: events that a realm may have
     """
 
@@ -138,8 +140,10 @@ class Quota:
 
         :raises Unavailable: the database can't be asked
         """
-        before = self._wall() - self._kept
+        days = {each.name: each.events_days for each in await self._store.read(queries.list_realms)}
         for realm in list(self._sizes):
+            own = days.get(realm)
+            before = self._wall() - (self._kept if own is None else own * DAY)
             while await self._forget(realm, queries.old_memories, before, GONE):
                 pass
 

@@ -17,6 +17,7 @@ class Realm(Base):
 
     id: Mapped[Key]
     name: Mapped[Name]
+    events_days: Mapped[Seconds | None]
 
 
 class User(Base):

@@ -60,6 +60,7 @@ from relay_db.queries.oauth import (
     remove_program,
     revoke_issued,
 )
+from relay_db.queries.realms import MOST_DAYS, add_realm, keep_events, list_realms, remove_realm
 from relay_db.queries.recalling import count_memories, data_fits, latest_memory, memories_since, recall
 from relay_db.queries.records import (
     AlertRecord,
@@ -126,18 +127,15 @@ from relay_db.queries.tokens import (
 from relay_db.queries.users import (
     add_group,
     add_member,
-    add_realm,
     add_user,
     count_users,
     find_group,
     find_user,
     get_user,
     list_groups,
-    list_realms,
     list_users,
     remove_group,
     remove_member,
-    remove_realm,
     remove_user,
     set_admin,
     set_disabled,
@@ -147,6 +145,7 @@ from relay_db.queries.users import (
 
 __all__ = [
     "LIVE_KEYS",
+    "MOST_DAYS",
     "AlertRecord",
     "AlertRuleRecord",
     "AuditRecord",
@@ -214,6 +213,7 @@ __all__ = [
     "grants_for",
     "issue_enrolment_code",
     "issued",
+    "keep_events",
     "latest_memory",
     "leases",
     "list_alert_rules",

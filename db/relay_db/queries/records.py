@@ -9,10 +9,14 @@ from relay_protocol.rights import Level
 
 
 class RealmRecord(NamedTuple):
-    """A realm."""
+    """A realm.
+
+    :param events_days: how long its memory keeps events; ``None``: as long as that of the whole relay
+    """
 
     id: int
     name: str
+    events_days: float | None
 
 
 class UserRecord(NamedTuple):

@@ -9,8 +9,8 @@ from sqlalchemy.orm import Session
 
 from relay_db.models import Realm, Robot, RobotGroup, RobotMembership
 from relay_db.names import findable, normal_name
+from relay_db.queries.realms import realm_id
 from relay_db.queries.records import RobotGroupRecord
-from relay_db.queries.users import realm_id
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.realms import DEFAULT_REALM, full_name
 

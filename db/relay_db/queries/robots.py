@@ -10,9 +10,9 @@ from sqlalchemy.orm import Session
 
 from relay_db.models import EnrolmentCode, Realm, Robot, RobotKey
 from relay_db.names import findable, findable_hex, label, recorded
+from relay_db.queries.realms import realm_id
 from relay_db.queries.records import KeyRecord, RobotKeyRecord, RobotRecord
 from relay_db.queries.state import bump
-from relay_db.queries.users import realm_id
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.identity import PUBLIC_KEY_BYTES, check_robot_name
 from relay_protocol.realms import DEFAULT_REALM, full_name

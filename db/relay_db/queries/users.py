@@ -1,76 +1,17 @@
-"""Realms, users, groups and who is in them."""
+"""Users, groups and who is in them."""
 
 from __future__ import annotations
 
 from sqlalchemy import ColumnElement, Row, Select, delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import (
-    AccessToken,
-    DirectoryEntry,
-    Group,
-    Membership,
-    Memory,
-    MemoryCount,
-    Realm,
-    Robot,
-    RobotGroup,
-    TokenFamily,
-    User,
-)
+from relay_db.models import AccessToken, Group, Membership, Realm, TokenFamily, User
 from relay_db.names import findable, normal_name
-from relay_db.queries.records import GroupRecord, RealmRecord, UserRecord
+from relay_db.queries.realms import realm_id
+from relay_db.queries.records import GroupRecord, UserRecord
 from relay_db.queries.state import bump
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.realms import DEFAULT_REALM, full_name
-
-
-def add_realm(s: Session, name: str) -> RealmRecord:
-    """:raises Invalid: the name can't be, or is taken"""
-    name = normal_name(name, "name of a realm")
-    if s.scalar(select(Realm.id).where(Realm.name == name)) is not None:
-        raise Invalid(f"there is a realm '{name}' already")
-    realm_id = s.scalars(insert(Realm).values(name=name).returning(Realm.id)).one()
-    return RealmRecord(realm_id, name)
-
-
-def remove_realm(s: Session, name: str) -> None:
-    """Remove a realm in which nobody and nothing is left, with what its memory and its directory hold.
-
-    :raises NotFound: no such realm
-    :raises Refused: users, groups or robots are in it, or it is the one that every relay has
-    """
-    gone = realm_id(s, name)
-    if findable(name) == DEFAULT_REALM:
-        raise Refused(f"the realm '{DEFAULT_REALM}' stays: names without a realm are of it")
-    left = [
-        what
-        for what, kind in (
-            ("users", User),
-            ("groups", Group),
-            ("robots", Robot),
-            ("groups of robots", RobotGroup),
-        )
-        if _holds(s, kind.realm_id == gone)
-    ]
-    if left:
-        raise Refused(f"there are {' and '.join(left)} in the realm '{findable(name)}'; remove them first")
-    for kept in (DirectoryEntry, Memory, MemoryCount):
-        s.execute(delete(kept).where(kept.realm_id == gone))
-    s.execute(delete(Realm).where(Realm.id == gone))
-
-
-def list_realms(s: Session) -> list[RealmRecord]:
-    """All realms, by name."""
-    return [RealmRecord(*row) for row in s.execute(select(Realm.id, Realm.name).order_by(Realm.name))]
-
-
-def realm_id(s: Session, name: str) -> int:
-    """:raises NotFound: no such realm"""
-    found = s.scalar(select(Realm.id).where(Realm.name == findable(name)))
-    if found is None:
-        raise NotFound("there is no such realm")
-    return found
 
 
 def find_user(s: Session, name: str, realm: str = DEFAULT_REALM) -> UserRecord | None:

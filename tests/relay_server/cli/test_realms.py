@@ -50,10 +50,23 @@ def test_realms_are_listed_with_how_many_are_in_them(labs: Any) -> None:
     """The one that every relay has is among them."""
     labs.ok("user", "add", "bob@lab1", "--no-password")
     assert labs.json("realm", "list") == [
-        {"realm": "default", "users": 1, "robots": 1},
-        {"realm": "lab1", "users": 2, "robots": 1},
+        {"realm": "default", "users": 1, "robots": 1, "events_days": None},
+        {"realm": "lab1", "users": 2, "robots": 1, "events_days": None},
     ]
-    assert labs.ok("realm", "list").splitlines()[-1].split() == ["lab1", "2", "1"]
+    assert labs.ok("realm", "list").splitlines()[-1].split()[:3] == ["lab1", "2", "1"]
+
+
+def test_a_realm_has_a_time_of_its_own_for_events(labs: Any) -> None:
+    """In days, until it is the relay's again; what is no time is refused in words."""
+    assert labs.json("realm", "set", "LAB1", "--events-days", "7.5") == {"realm": "lab1", "events_days": 7.5}
+    assert [each["events_days"] for each in labs.json("realm", "list")] == [None, 7.5]
+    assert "for 7.5 days" in labs.ok("realm", "list")
+    assert targets(labs, "realm.set") == ["lab1"]
+    for days in ("0", "-1", "4000", "nan", "week"):
+        assert "days" in labs.fails("realm", "set", "lab1", "--events-days", days)
+    assert "no realm 'lab9'" in labs.fails("realm", "set", "lab9", "--events-days", "7")
+    assert "as long as the relay's" in labs.ok("realm", "set", "lab1", "--events-days", "relay")
+    assert [each["events_days"] for each in labs.json("realm", "list")] == [None, None]
 
 
 def test_a_realm_is_added_once(cli: Any) -> None:

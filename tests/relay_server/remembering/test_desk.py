@@ -221,6 +221,23 @@ async def test_a_realm_has_no_more_than_its_share_and_nothing_is_kept_for_ever(r
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_realm_may_keep_events_for_a_time_of_its_own(room: Room) -> None:
+    """Shorter or longer than the relay does; of the other realm nothing goes sooner or later."""
+    await room.write("ann", {"kind": "here"})
+    await room.write("cleo", {"kind": "there"})
+    with room.store.database.begin() as s:
+        queries.keep_events(s, "lab", 5000 / 86400)
+    room.time.now += 4000
+    await room.quota.purge()
+    assert (await room.reads("ann"), await room.reads("cleo")) == ([], ["there"])
+    with room.store.database.begin() as s:
+        queries.keep_events(s, "lab", 1000 / 86400)
+    await room.write("ann", {"kind": "later"})
+    await room.quota.purge()
+    assert (await room.reads("ann"), await room.reads("cleo")) == (["later"], [])
+
+
+@pytest_twisted.ensureDeferred
 async def test_who_follows_hears_what_is_new_and_his_to_see(room: Room) -> None:
     """Woken when it is safe; from an event on that he names, from the database where memory does not reach."""
     ann = room.people["ann"]

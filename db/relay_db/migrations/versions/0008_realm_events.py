@@ -1,0 +1,24 @@
+"""How long each realm's memory keeps events.
+
+Revision ID: 0008
+Revises: 0007
+"""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0008"
+down_revision = "0007"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    op.add_column("realm", sa.Column("events_days", sa.Double(), nullable=True))
+
+
+def downgrade() -> None:
+    with op.batch_alter_table("realm") as batch:
+        batch.drop_column("events_days")
