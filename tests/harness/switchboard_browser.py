@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -24,6 +24,9 @@ new MutationObserver((changes) => {
 }).observe(document, { childList: true, subtree: true });
 """
 """Toasts go after a moment: on a busy machine they may be gone before a test looks."""
+
+ASKED_MOST, ASKED_MS = 10, 5000
+"""How often control is asked for, and milliseconds for an answer."""
 
 ARGUMENTS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--disable-background-networking"]
 
@@ -121,10 +124,17 @@ def stands(page: Page, how: str) -> None:
 
 
 def take_control(page: Page) -> None:
-    """Have control of a robot that is free, or is the page's already."""
+    """Have control of a robot that is free, or is the page's already.
+
+    One that has just come back may refuse: whoever wants it asks once more.
+    """
     stands(page, "free|yours")
-    if seen(page, "control").get_attribute("data-standing") == "free":
-        seen(page, "control-take").click()
+    for _ in range(ASKED_MOST):
+        if seen(page, "control").get_attribute("data-standing") == "free":
+            seen(page, "control-take").click()
+        with suppress(AssertionError):
+            expect(seen(page, "control")).to_have_attribute("data-standing", "yours", timeout=ASKED_MS)
+            return
     stands(page, "yours")
 
 
