@@ -147,7 +147,7 @@ class Recordable(TypedDict):
     """What the caller could record now.
 
     :param denied: why it is nothing
-    :param megabytes: what all recordings may have together
+    :param megabytes: what all recordings of the realm may have together
     :param full: why there can't be one more
     """
 

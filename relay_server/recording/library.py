@@ -13,10 +13,17 @@ import msgspec
 from twisted.logger import Logger
 
 from relay_protocol.errors import Invalid, NotFound, Unavailable
+from relay_protocol.realms import DEFAULT_REALM
 
 KEPT = 10_000
 ROBOT_KEPT = 1000
 """Recordings that may be kept in all, and of one robot, however small they are."""
+
+SMALLEST = 10**6
+"""Bytes that every recording may have."""
+
+NO_ROOM_NOW = "there is no room for such a recording on this relay now"
+"""All that a realm is told where the recordings of others are in the way."""
 
 UNKNOWN = "there is no such recording, or it holds what you may not record and see"
 
@@ -51,6 +58,7 @@ class Entry(msgspec.Struct):
     :param bytes: of the file
     :param drops: messages that came and are not in it
     :param problems: what was not recorded as it was wanted, in words
+    :param realm: of the robot and of the user
     """
 
     id: str
@@ -71,6 +79,7 @@ class Entry(msgspec.Struct):
     messages: int = 0
     drops: int = 0
     problems: list[str] = []
+    realm: str = DEFAULT_REALM
 
 
 FOLDER = "recordings"
@@ -115,9 +124,11 @@ def _file(folder: Path, id: str) -> Path:
 class Library:
     """The folder of recordings. What is in it is read once, by :meth:`open`.
 
+    Each realm has all the room there is, as far as others leave it, and is told of nobody's recordings but its own.
+
     :param quota: bytes all recordings together may have
     :param reserve: bytes of the disk that stay free; other things of the relay are on it too
-    :ivar copied: bytes that are taken twice, while a file is mended
+    :ivar copied: the recording that takes its room twice, while its file is mended
     """
 
     log = Logger()
@@ -126,7 +137,7 @@ class Library:
         self._folder = folder
         self.quota = quota
         self.reserve = reserve
-        self.copied = 0
+        self.copied: Entry | None = None
         self._entries: dict[str, Entry] = {}
         self._robots: dict[int, dict[str, Entry]] = {}
 
@@ -186,22 +197,31 @@ class Library:
     @property
     def used(self) -> int:
         """Bytes that are taken, with all that is being recorded may still become."""
-        kept = (entry.limit if entry.state in RUNNING else entry.bytes for entry in self._entries.values())
-        return sum(kept) + self.copied
+        return self._taken()
 
-    @property
-    def left(self) -> int:
-        """Bytes that one more may take."""
-        return max(0, self.quota - self.used)
+    def left(self, realm: str) -> int:
+        """Bytes that one more of a realm may take, if only those of its own are counted."""
+        return max(0, self.quota - self._taken(realm))
 
-    def full(self, robot_id: int) -> str:
-        """Why there can't be one more of a robot, however small; empty when there can."""
+    def _taken(self, realm: str | None = None) -> int:
+        """By one realm, or by all."""
+        copied = () if self.copied is None else (self.copied,)
+        return sum(
+            entry.limit if entry.state in RUNNING else entry.bytes
+            for entry in (*self._entries.values(), *copied)
+            if realm in (None, entry.realm)
+        )
+
+    def full(self, robot_id: int, realm: str) -> str:
+        """Why there can't be one more of a robot of this realm, however small; empty when there can."""
         if len(self._robots.get(robot_id, {})) >= ROBOT_KEPT:
             return (
                 f"{ROBOT_KEPT} recordings of this robot are kept, the most there may be: delete some of them"
             )
-        if len(self._entries) >= KEPT:
+        if sum(entry.realm == realm for entry in self._entries.values()) >= KEPT:
             return f"{KEPT} recordings are kept, the most there may be in all: delete some, of any robot"
+        if len(self._entries) >= KEPT or self.left(realm) >= SMALLEST > self.quota - self.used:
+            return NO_ROOM_NOW
         return ""
 
     def path(self, entry: Entry) -> Path:
@@ -215,14 +235,17 @@ class Library:
 
         :raises Unavailable: it would be one too many, or could become more than there may be
         """
-        full = self.full(entry.robot_id)
+        full = self.full(entry.robot_id, entry.realm)
         if full:
             raise Unavailable(full)
-        if entry.limit > self.left:
+        left = self.left(entry.realm)
+        if entry.limit > left:
             raise Unavailable(
-                f"recordings may have {self.quota // 10**6} MB in all, of which {self.left // 10**6} MB "
+                f"recordings may have {self.quota // 10**6} MB in all, of which {left // 10**6} MB "
                 f"are left: delete some, or record at most that much"
             )
+        if entry.limit > self.quota - self.used:
+            raise Unavailable(NO_ROOM_NOW)
         self._keep(entry)
 
     def forget(self, entry: Entry) -> None:

@@ -154,7 +154,7 @@ class Mender:
     async def _mend(self, entry: Entry) -> None:
         # The copy takes room beside the file. Asked of the disk, not of what recordings may have in all: else one
         # that has more than half of that would be lost.
-        self._library.copied = entry.bytes
+        self._library.copied = entry
         try:
             mended = await self._threads.run(self._work, entry)
         except FileNotFoundError:
@@ -163,7 +163,7 @@ class Mender:
             self._library.forget(entry)
             return
         finally:
-            self._library.copied = 0
+            self._library.copied = None
         if mended is not None:
             entry.messages, entry.bytes = mended.messages, mended.size
             entry.state, entry.ended = State.RECOVERED, entry.ended or mended.written

@@ -21,7 +21,7 @@ from relay_server.access import Permit
 from relay_server.channel import Channels, resolve
 from relay_server.clock import Clock, as_twisted, to_the_end
 from relay_server.recording import compressed
-from relay_server.recording.library import Entry, Library, State, text_of
+from relay_server.recording.library import NO_ROOM_NOW, SMALLEST, Entry, Library, State, text_of
 from relay_server.recording.mender import Mender
 from relay_server.recording.recorder import Recorder
 from relay_server.recording.rights import why_denied
@@ -62,7 +62,7 @@ class Ask(msgspec.Struct, forbid_unknown_fields=True):
     topics: Annotated[list[_Name], Meta(max_length=64)] = []
     cameras: Annotated[list[_Name], Meta(max_length=8)] = []
     seconds: Annotated[float, Meta(ge=1, le=SECONDS)] = 600.0
-    megabytes: Annotated[float, Meta(ge=1, le=MEGABYTES)] = 1000.0
+    megabytes: Annotated[float, Meta(ge=SMALLEST // 10**6, le=MEGABYTES)] = 1000.0
 
 
 class Recordings:
@@ -176,6 +176,7 @@ class Recordings:
             seconds=ask.seconds,
             pictures=tuple(topic for topic in topics if carries_pictures(robot, topic)),
             limit=round(ask.megabytes * 10**6),
+            realm=robot.realm,
         )
 
     async def start(
@@ -251,12 +252,12 @@ class Recordings:
         )
         return recorder
 
-    async def full(self, robot_id: int) -> str:
+    async def full(self, robot: Presence) -> str:
         """Why there can't be one more recording of a robot, however small; empty when there can.
 
         :raises Unavailable: too much is done with recordings to find out
         """
-        full = self.library.full(robot_id)
+        full = self.library.full(robot.robot_id, robot.realm)
         try:
             return full or await self._threads.run(self._why_nearly_full)
         except OSError as error:
@@ -327,12 +328,14 @@ class Recordings:
     def _check_room(self, entry: Entry) -> None:
         begun = {id: recorder.entry for id, recorder in self._running.items()}
         running = {**self._starting, **begun}.values()
-        if len(running) >= RECORDINGS:
+        if sum(each.realm == entry.realm for each in running) >= RECORDINGS:
             raise Unavailable(f"{RECORDINGS} recordings run, the most there may be")
         if sum(each.robot_id == entry.robot_id for each in running) >= ROBOT_RECORDINGS:
             raise Unavailable(f"{ROBOT_RECORDINGS} recordings of this robot run, the most there may be")
         if sum(each.user_id == entry.user_id for each in running) >= USER_RECORDINGS:
             raise Unavailable(f"you have {USER_RECORDINGS} recordings running, the most one user may have")
+        if len(running) >= RECORDINGS:
+            raise Unavailable(NO_ROOM_NOW)
 
     # --- what is kept -------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ from twisted.logger import Logger
 
 from relay_db import queries
 from relay_protocol.errors import Unavailable
+from relay_protocol.realms import full_name
 from relay_server.journal import Journal
 from relay_server.recording.recordings import Recordings
 from relay_server.store import Store
@@ -25,9 +26,12 @@ async def sweep(recordings: Recordings, store: Store, journal: Journal) -> None:
     """
     there = {record.id for record in await store.read(queries.list_robots)}
     left = [entry for entry in recordings.library if entry.robot_id not in there]
-    removed = await store.read(queries.removed_robots, {entry.robot for entry in left})
+    removed = await store.read(
+        queries.removed_robots, {full_name(entry.robot, entry.realm) for entry in left}
+    )
     for entry in left:
-        if entry.begun > removed.get(entry.robot, -SLACK_SECONDS) + SLACK_SECONDS:
+        robot = full_name(entry.robot, entry.realm)
+        if entry.begun > removed.get(robot, -SLACK_SECONDS) + SLACK_SECONDS:
             continue
         try:
             await recordings.stop(entry, "the robot was removed from the relay")
@@ -42,8 +46,8 @@ async def sweep(recordings: Recordings, store: Store, journal: Journal) -> None:
             journal.event(
                 "recording.removed",
                 "relay",
-                cause=f"robot:{entry.robot}",
-                robot=entry.robot,
+                cause=f"robot:{robot}",
+                robot=robot,
                 recording=entry.id,
                 bytes=entry.bytes,
             )

@@ -17,11 +17,14 @@ from relay_db import queries
 from relay_db.queries import RobotRecord
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import Access, Principal
 from relay_server.frontdesk import NO_ROBOT, Admission
 from relay_server.journal import Journal
 from relay_server.recording import Ask, Library, RecordingDesk, Recordings
+from relay_server.recording import recordings as module
 from relay_server.recording.desk import FETCH_SECONDS
+from relay_server.recording.library import NO_ROOM_NOW, Entry
 from relay_server.recording.mcap_file import McapFile
 from relay_server.recording.mender import PAUSE_SECONDS
 from relay_server.recording.recordings import FINISH_SECONDS, THREADS, USER_RECORDINGS, WAITING
@@ -71,9 +74,9 @@ class Desk:
         self.access = Access(store, self.wall)
         self.doors = Doors(store, self.access, self.world)
         self.recordings = self.begins()
-        journal = Journal(store, self.wall)
+        self.journal = Journal(store, self.wall)
         # Doors are all of a front desk that it needs.
-        self.desk = RecordingDesk(self.doors, self.recordings, store, journal, self.wall)  # type: ignore[arg-type]
+        self.desk = RecordingDesk(self.doors, self.recordings, store, self.journal, self.wall)  # type: ignore[arg-type]
         with store.database.begin() as session:
             self._robot = queries.add_robot(session, "rover").id
         self.ann, self.bob, self.eve = (self._principal(name) for name in ("ann", "bob", "eve"))
@@ -91,9 +94,23 @@ class Desk:
         """Unix time."""
         return 1000.0 + self.world.clock.seconds()
 
-    def _principal(self, name: str) -> Principal:
+    def others(self, limit: int) -> Entry:
+        """A recording of another realm, that runs."""
+        entry = Entry("z", 99, "rover", 99, "zoe", ("/odom",), (), 1.0, limit, 60.0, realm="lab1")
+        self.recordings.library.add(entry)
+        return entry
+
+    def moves(self, realm: str, name: str) -> Principal:
+        """The robot at work is one of another realm from now on, where somebody may record it."""
         with self.store.database.begin() as session:
-            user = queries.add_user(session, name, None)
+            queries.add_realm(session, realm)
+            self._robot = queries.add_robot(session, "rover", realm=realm).id
+        self.world.robot.realm = realm
+        return self._principal(name, realm)
+
+    def _principal(self, name: str, realm: str = DEFAULT_REALM) -> Principal:
+        with self.store.database.begin() as session:
+            user = queries.add_user(session, name, None, realm=realm)
             token = queries.create_token(
                 session, user.id, name.encode().hex().ljust(64, "0"), kind="access", expires=None, now=1000.0
             )
@@ -407,6 +424,51 @@ async def test_no_more_is_recorded_than_there_is_room_for(desk: Desk) -> None:
         desk.desk.start(desk.ann, "rover", CHATTER, HERE), Unavailable
     )
     await desk.desk.start(desk.bob, "rover", CHATTER, HERE)
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_other_realms_record_is_told_nobody(desk: Desk) -> None:
+    """Neither how much room is left, nor how many run: only that there is no room, where they take it."""
+    desk.others(limit=4 * 10**6 + 1)
+    assert (await desk.desk.possible(desk.ann, "rover", HERE))["left"] == 5.0
+    assert (await desk.desk.possible(desk.ann, "rover", HERE))["full"] == NO_ROOM_NOW
+    assert await failure(desk.desk.start(desk.ann, "rover", CHATTER, HERE), Unavailable) == NO_ROOM_NOW
+    assert desk.doors.inside == 0
+
+
+@pytest_twisted.ensureDeferred
+async def test_how_many_others_run_is_told_nobody(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who runs them himself is told the most there may be."""
+    monkeypatch.setattr(module, "RECORDINGS", 2)
+    other = desk.others(limit=1)
+    desk.recordings._starting[other.id] = other
+    await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    assert await failure(desk.desk.start(desk.bob, "rover", CHATTER, HERE), Unavailable) == NO_ROOM_NOW
+    del desk.recordings._starting[other.id]
+    await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
+    assert "2 recordings run, the most there may be" in await failure(
+        desk.desk.start(desk.bob, "rover", CHATTER, HERE), Unavailable
+    )
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_recording_is_of_the_realm_of_its_robot(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its file says so; who looks at it is told nothing of realms, and the journal counts it by the full name."""
+    causes: list[str] = []
+    event = desk.journal.event
+
+    def noted(kind: str, source: str, *, cause: str, **more: Any) -> bool:
+        causes.append(cause)
+        return event(kind, source, cause=cause, **more)
+
+    monkeypatch.setattr(desk.journal, "event", noted)
+    zoe = desk.moves("lab1", "zoe")
+    done = await desk.recorded(zoe, "a")
+    (entry,) = desk.recordings.library
+    assert (entry.realm, "realm" in done) == ("lab1", False)
+    assert b'"realm":"lab1"' in (desk.folder / f"{entry.id}.json").read_bytes()
+    assert causes == ["user:zoe@lab1", "user:zoe@lab1"]
+    assert [each.target for each in await desk.store.read(queries.list_audit)] == [f"rover@lab1/{entry.id}"]
 
 
 @pytest_twisted.ensureDeferred

@@ -7,13 +7,18 @@ from pathlib import Path
 import pytest
 
 from relay_protocol.errors import Invalid, NotFound, Unavailable
+from relay_protocol.realms import DEFAULT_REALM
 from relay_server.recording import library as module
-from relay_server.recording.library import Entry, Library, State, text_of
+from relay_server.recording.library import NO_ROOM_NOW, Entry, Library, State, text_of
 
 
-def entry(id: str = "a", *, robot: int = 1, begun: float = 1.0, limit: int = 1000) -> Entry:
+def entry(
+    id: str = "a", *, robot: int = 1, begun: float = 1.0, limit: int = 1000, realm: str = DEFAULT_REALM
+) -> Entry:
     """A recording that runs."""
-    return Entry(id, robot, "rover", 7, "ann", ("/odom",), (), begun=begun, limit=limit, seconds=60.0)
+    return Entry(
+        id, robot, "rover", 7, "ann", ("/odom",), (), begun=begun, limit=limit, seconds=60.0, realm=realm
+    )
 
 
 @pytest.fixture
@@ -79,15 +84,19 @@ def test_what_broke_off_takes_the_room_that_its_file_has(
     again = Library(tmp_path / "recordings", 3000)
     again.open()
     assert (again.find(1, "a").bytes, again.find(1, "b").bytes) == (2900, 0)
-    assert (again.used, again.left) == (2900, 100)
+    assert (again.used, again.left(DEFAULT_REALM)) == (2900, 100)
 
 
 def test_a_copy_takes_room_too(library: Library) -> None:
     """As long as it is there."""
-    library.copied = 2500
+    broken = entry("b", limit=2500)
+    broken.state, broken.bytes = State.INCOMPLETE, 1500
+    library.add(broken)
+    library.copied = broken
+    assert (library.left(DEFAULT_REALM), library.left("lab1")) == (0, 3000)
     with pytest.raises(Unavailable, match="delete some"):
         library.add(entry())
-    library.copied = 0
+    library.copied = None
     library.add(entry())
 
 
@@ -103,9 +112,65 @@ def test_there_are_only_so_many(library: Library, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(Unavailable, match=r"3 recordings are kept.*in all: delete some, of any robot"):
         library.add(entry("d", robot=2, limit=1))
     library.forget(library.find(1, "a"))
-    assert library.full(1) == library.full(2) == ""
+    assert library.full(1, DEFAULT_REALM) == library.full(2, DEFAULT_REALM) == ""
     library.add(entry("d", robot=1, limit=1))
     assert [each.id for each in library.of(1)] == ["d", "b"]
+
+
+def test_a_realm_is_told_of_its_own_recordings_only(library: Library) -> None:
+    """What others keep takes nothing off what it is told to have left."""
+    library.add(entry("a", limit=2000))
+    library.add(entry("b", robot=2, limit=500, realm="lab1"))
+    assert (library.left(DEFAULT_REALM), library.left("lab1"), library.left("lab2")) == (1000, 2500, 3000)
+    library.quota = 3 * 10**6
+    with pytest.raises(Unavailable, match="3 MB in all, of which 2 MB are left"):
+        library.add(entry("c", robot=2, limit=4 * 10**6, realm="lab1"))
+
+
+def test_all_realms_together_have_no_more_than_there_is(library: Library) -> None:
+    """Where others take the room a realm is told that there is none, and not how much they have."""
+    library.add(entry("a", limit=2000))
+    with pytest.raises(Unavailable) as caught:
+        library.add(entry("b", robot=2, limit=1001, realm="lab1"))
+    assert str(caught.value) == NO_ROOM_NOW
+    library.add(entry("b", robot=2, limit=1000, realm="lab1"))
+    assert library.used == 3000
+
+
+def test_who_could_record_nothing_beside_others_is_told_before(library: Library) -> None:
+    """Who takes the room himself is told how much it is."""
+    library.quota = 3 * 10**6
+    library.add(entry("a", limit=2 * 10**6 + 1))
+    assert library.full(2, "lab1") == NO_ROOM_NOW
+    assert library.full(1, DEFAULT_REALM) == ""
+    with pytest.raises(Unavailable, match="of which 0 MB are left"):
+        library.add(entry("b", limit=10**6))
+
+
+def test_realms_keep_only_so_many_together(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who keeps them himself is told the number; others are told only that there is no room."""
+    monkeypatch.setattr(module, "KEPT", 2)
+    library.add(entry("a", limit=1))
+    library.add(entry("b", robot=2, limit=1, realm="lab1"))
+    assert library.full(1, DEFAULT_REALM) == library.full(2, "lab1") == NO_ROOM_NOW
+    library.forget(library.find(2, "b"))
+    library.add(entry("b", limit=1))
+    assert "2 recordings are kept" in library.full(1, DEFAULT_REALM)
+    assert library.full(2, "lab1") == NO_ROOM_NOW
+
+
+def test_what_was_kept_before_there_were_realms_is_of_the_default_one(
+    library: Library, tmp_path: Path
+) -> None:
+    """Its file says nothing of any; what is written now does."""
+    for each in (entry("a"), entry("b", robot=2, realm="lab1")):
+        library.save(each.id, text_of(each).replace(b',"realm":"default"', b""))
+    again = Library(tmp_path / "recordings", 3000)
+    again.open()
+    assert [(each.id, each.realm) for each in (again.find(1, "a"), again.find(2, "b"))] == [
+        ("a", DEFAULT_REALM),
+        ("b", "lab1"),
+    ]
 
 
 def test_of_the_disk_some_stays_free(library: Library, tmp_path: Path) -> None:

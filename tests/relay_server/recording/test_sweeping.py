@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from twisted.internet.task import Clock
 
 from relay_db import queries
 from relay_protocol.errors import Unavailable
+from relay_protocol.realms import DEFAULT_REALM
 from relay_server.channel import Channels
 from relay_server.journal import Journal
 from relay_server.recording import Library, Recordings, kept_of, sweep
@@ -38,11 +40,19 @@ class Left:
         self.journal = Journal(store, lambda: BEGUN)
         folder.mkdir()
 
-    def recording(self, id: str, robot: str, state: State = State.COMPLETE) -> int:
+    def recording(
+        self, id: str, robot: str, state: State = State.COMPLETE, *, realm: str = DEFAULT_REALM
+    ) -> int:
         """A recording of a robot; the robot's number."""
         with self.store.database.begin() as session:
-            found = queries.find_robot(session, robot) or queries.add_robot(session, robot)
-        entry = Entry(id, found.id, robot, 1, "ann", ("/odom",), (), BEGUN, 1000, 60.0, state=state)
+            if realm not in {each.name for each in queries.list_realms(session)}:
+                queries.add_realm(session, realm)
+            found = queries.find_robot(session, robot, realm) or queries.add_robot(
+                session, robot, realm=realm
+            )
+        entry = Entry(
+            id, found.id, robot, 1, "ann", ("/odom",), (), BEGUN, 1000, 60.0, state=state, realm=realm
+        )
         (self.folder / f"{id}.json").write_bytes(text_of(entry))
         (self.folder / f"{id}.mcap").write_bytes(b"x" * 500)
         return found.id
@@ -84,6 +94,64 @@ async def test_recordings_go_with_their_robot(left: Left) -> None:
     await left.sweep()
     assert left.files == ["c.json", "c.mcap", "d.json", "d.mcap"]
     assert sorted(entry.id for entry in left.recordings.library) == ["c", "d"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_recordings_go_with_a_robot_of_any_realm(left: Left) -> None:
+    """Those of its namesakes in other realms stay, also where that one is not in this database."""
+    removed = left.recording("a", "rover", realm="lab1")
+    unknown = left.recording("b", "rover", realm="lab2")
+    left.recording("c", "rover")
+    left.removes(removed, "rover@lab1")
+    left.removes(unknown, "rover@lab2", at=None)
+    left.recordings.open()
+    await left.sweep()
+    assert sorted(entry.id for entry in left.recordings.library) == ["b", "c"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_removed_namesake_in_the_default_realm_takes_nothing_along(left: Left) -> None:
+    """Its name alone is not that of a robot of another realm."""
+    removed = left.recording("a", "rover")
+    unknown = left.recording("b", "rover", realm="lab1")
+    left.removes(removed, "rover")
+    left.removes(unknown, "rover@lab1", at=None)
+    left.recordings.open()
+    await left.sweep()
+    assert [entry.id for entry in left.recordings.library] == ["b"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_recording_from_before_there_were_realms_is_of_the_default_one(left: Left) -> None:
+    """It goes with its robot as ever."""
+    rover = left.recording("a", "rover")
+    file = left.folder / "a.json"
+    found = json.loads(file.read_bytes())
+    del found["realm"]
+    file.write_text(json.dumps(found))
+    left.removes(rover, "rover")
+    left.recordings.open()
+    await left.sweep()
+    assert left.files == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_becomes_of_recordings_is_told_with_the_full_name(
+    left: Left, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Events are counted by it too, so that many of one robot hide none of its namesakes."""
+    told: list[tuple[str, str]] = []
+
+    def noted(kind: str, source: str, *, cause: str, robot: str, **more: Any) -> bool:
+        told.append((cause, robot))
+        return True
+
+    monkeypatch.setattr(left.journal, "event", noted)
+    for realm in ("lab1", "lab2"):
+        left.removes(left.recording(realm, "rover", realm=realm), f"rover@{realm}")
+    left.recordings.open()
+    await left.sweep()
+    assert sorted(told) == [("robot:rover@lab1", "rover@lab1"), ("robot:rover@lab2", "rover@lab2")]
 
 
 @pytest.mark.parametrize("at", [None, BEGUN - SLACK_SECONDS - 1])
