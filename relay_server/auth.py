@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
@@ -12,6 +13,8 @@ from twisted.internet.interfaces import IReactorThreads
 from twisted.logger import Logger
 
 from relay_db import queries
+from relay_db.models import NAME
+from relay_db.names import findable
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
 from relay_protocol.realms import parted
@@ -21,13 +24,18 @@ from relay_server.limiter import LoginLimiter
 from relay_server.origins import Origins
 from relay_server.store import Store, Threads
 
-__all__ = ["Authenticator", "BadCredentials", "TooManyTries", "session_token"]
+__all__ = ["Authenticator", "BadCredentials", "TooManyTries", "named_realm", "session_token"]
 
 SESSION_SECONDS = 12 * 3600.0
 HASHING_THREADS = 2
 TICKETS = 10_000
+"""Tickets all users may have open; for a further one the user who has most gives his oldest."""
+
 TICKETS_OF_ONE = 100
 """Tickets one user may have open; a further one takes the place of the oldest."""
+
+NAMED = 2 * NAME + 1
+"""Characters of a name with its realm that are put on record of who could not log in."""
 
 LOGINS_WAITING = 64
 """Logins that wait for their password to be hashed; further ones are asked to come back."""
@@ -186,7 +194,7 @@ class Authenticator:
         return token
 
     def issue_ticket(self, principal: Principal, opens: Opening) -> str:
-        """A ticket, good once for :data:`TICKET_SECONDS`."""
+        """A ticket, good once for :data:`TICKET_SECONDS`; where too many are open, another one is no more."""
         now = self._seconds()
         for key in [key for key, ticket in self._tickets.items() if ticket.until <= now]:
             del self._tickets[key]
@@ -194,10 +202,15 @@ class Authenticator:
         if len(own) >= TICKETS_OF_ONE:
             del self._tickets[own[0]]
         if len(self._tickets) >= TICKETS:
-            raise Refused("too many tickets are open; use them or wait a minute")
+            del self._tickets[self._most_dispensable()]
         ticket = passwords.new_token()
         self._tickets[passwords.token_hash(ticket)] = _Ticket(principal, opens, now + TICKET_SECONDS)
         return ticket
+
+    def _most_dispensable(self) -> str:
+        """The oldest ticket of the user who has most."""
+        [(greedy, _)] = Counter(each.principal.user_id for each in self._tickets.values()).most_common(1)
+        return next(key for key, each in self._tickets.items() if each.principal.user_id == greedy)
 
     async def ticket(self, ticket: str, asked: Opening, *, spend: bool = True) -> Principal:
         """The principal of a ticket.
@@ -216,6 +229,11 @@ class Authenticator:
         if not live:
             raise BadCredentials("the session that asked for this ticket has ended; log in again")
         return found.principal
+
+
+def named_realm(user: str) -> str:
+    """The realm that somebody names with a user's name, there or not; empty where it can't be."""
+    return findable(parted(user)[1])
 
 
 def session_token(origins: Origins, name: str, header: str, origin: str | None, host: str) -> str | None:

@@ -15,7 +15,7 @@ from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server import closing, passwords
 from relay_server.access import Access, Permit, Principal
-from relay_server.auth import Authenticator, Opening, TooManyTries, session_token
+from relay_server.auth import NAMED, Authenticator, Opening, TooManyTries, named_realm, session_token
 from relay_server.budget import Budgets
 from relay_server.channel import Channels
 from relay_server.clock import Clock, within
@@ -129,7 +129,8 @@ class FrontDesk:
                     "login.refused",
                     "relay",
                     cause=address,
-                    user=user[:64],
+                    user=user[:NAMED],
+                    realm=named_realm(user),
                     address=address,
                     reason=error.code,
                 )

@@ -6,6 +6,7 @@ import time
 
 from relay_db import queries
 from relay_protocol.errors import Invalid
+from relay_protocol.realms import DEFAULT_REALM, parted
 from relay_server import passwords
 from relay_server.store import Store
 
@@ -17,7 +18,7 @@ async def first_login(store: Store, url: str) -> str | None:
 
     :param url: where people go
     """
-    users = await store.read(queries.list_users)
+    users = await store.read(queries.list_users, DEFAULT_REALM)
     if any(user.password_hash is not None or user.name != "admin" for user in users):
         return None
     return await login_link(store, url, "admin", create=True)
@@ -27,14 +28,16 @@ async def login_link(store: Store, url: str, user: str, create: bool = False) ->
     """A link for a user.
 
     :param url: where people go
+    :param user: ``toad@lab1``; without a realm one of the default one
     :param create: make the user, an administrator, when there is none
     :raises Invalid: no such user
     """
-    record = await store.read(queries.find_user, user)
+    name, realm = parted(user)
+    record = await store.read(queries.find_user, name, realm)
     if record is None:
         if not create:
             raise Invalid(f"there is no user '{user}'")
-        record = await store.write(queries.add_user, user, None, admin=True)
+        record = await store.write(queries.add_user, name, None, admin=True, realm=realm)
     code = passwords.new_token()
     now = time.time()
     await store.write(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import ipaddress
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -32,6 +33,17 @@ def network_of(address: str) -> str:
     return str(parsed)
 
 
+def person(account: str) -> str:
+    """A user, however his name is written."""
+    name, realm = parted(account)
+    return f"{findable(name)}@{findable(realm)}"
+
+
+def robot(claimed: str) -> str:
+    """What a robot claims to be, however long that is: each text is another one."""
+    return hashlib.sha256(claimed.encode("utf-8", "surrogatepass")).hexdigest()
+
+
 class LoginLimiter:
     """At most :data:`FAILURES` failures per account and network in :data:`WINDOW` seconds, and per network
     :data:`FAILURES_OF_NETWORK`.
@@ -43,10 +55,17 @@ class LoginLimiter:
 
     :param seconds: a monotonic clock
     :param of_network: failures of one network on all accounts together, if not :data:`FAILURES_OF_NETWORK`
+    :param known_as: what an account is known as: :func:`person` or :func:`robot`
     """
 
-    def __init__(self, seconds: Callable[[], float], of_network: int | None = None) -> None:
+    def __init__(
+        self,
+        seconds: Callable[[], float],
+        of_network: int | None = None,
+        known_as: Callable[[str], str] = person,
+    ) -> None:
         self._seconds = seconds
+        self._known_as = known_as
         self._of_network = of_network
         self._failures: OrderedDict[_Key, deque[float]] = OrderedDict()
 
@@ -85,21 +104,15 @@ class LoginLimiter:
         """Forget the failures of this account here; the network's other failures stay."""
         self.forgive(account, address)
         if account is not None:
-            self._failures.pop((_one(account), network_of(address)), None)
+            self._failures.pop((self._known_as(account), network_of(address)), None)
 
     def _keys(self, account: str | None, address: str) -> list[tuple[_Key, int]]:
-        """What a try counts for, with the most failures each. An account is one however its name is written."""
+        """What a try counts for, with the most failures each."""
         network = network_of(address)
         keys: list[tuple[_Key, int]] = [((None, network), self._of_network or FAILURES_OF_NETWORK)]
         if account is not None:
-            keys.append(((_one(account), network), FAILURES))
+            keys.append(((self._known_as(account), network), FAILURES))
         return keys
-
-
-def _one(account: str) -> str:
-    """An account, however its name is written."""
-    name, realm = parted(account)
-    return f"{findable(name)}@{findable(realm)}"
 
 
 _Key = tuple[str | None, str]

@@ -1,4 +1,4 @@
-"""Numbers of clients, by which robots and people tell them apart.
+"""Numbers of clients, by which robots and people tell them apart; and names of what robots join.
 
 They are drawn, not counted: who sees his own one after the other must not learn how many others come to the relay.
 """
@@ -7,11 +7,24 @@ from __future__ import annotations
 
 import secrets
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 MOST = 1 << 31
 KEPT = 1 << 16
 """Numbers given last that are not given again: more than there are clients at a time, and what robots remember."""
+
+
+def name_of(stem: str, taken: Iterable[str], draw: Callable[[], str] = lambda: secrets.token_hex(4)) -> str:
+    """A name that none of those that are taken is.
+
+    :param stem: what it begins with
+    :param draw: an unguessable text
+    """
+    others = set(taken)
+    name = f"{stem}{draw()}"
+    while name in others:
+        name = f"{stem}{draw()}"
+    return name
 
 
 def _drawn() -> int:

@@ -1,6 +1,8 @@
-"""Robots that may not be here any more: cut when their key was revoked, forgotten when they were removed."""
+"""What may not be here any more: robots are cut when their key was revoked, and like realms forgotten when removed."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Collection
 
 from twisted.logger import Logger
 
@@ -12,6 +14,29 @@ from relay_server.store import Store
 from relay_server.video import Videos
 
 log = Logger()
+
+Told = Callable[[Collection[str], Collection[str]], None]
+"""Hears the names of realms that are gone, and of all that there are; one made anew is both."""
+
+
+class Realms:
+    """Tells which realms that were there are gone. By their ids: one of the same name may have come in between."""
+
+    def __init__(self, store: Store, *told: Told) -> None:
+        self._store = store
+        self._told = told
+        self._seen: dict[str, int] = {}
+
+    async def look(self) -> None:
+        """Look, and tell.
+
+        :raises Unavailable: the database can't be asked
+        """
+        there = {each.name: each.id for each in await self._store.read(queries.list_realms)}
+        gone = [name for name, number in self._seen.items() if there.get(name) != number]
+        self._seen = there
+        for told in self._told:
+            told(gone, there.keys())
 
 
 async def retire(store: Store, registry: Registry, desks: Desks, videos: Videos) -> None:

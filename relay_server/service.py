@@ -65,7 +65,7 @@ from relay_server.oauth import OAuthDesk
 from relay_server.origins import Origins
 from relay_server.recording import FOLDER, Library, RecordingDesk, Recordings, sweep
 from relay_server.registry import Registry
-from relay_server.retiring import retire
+from relay_server.retiring import Realms, retire
 from relay_server.session import Timing
 from relay_server.store import Store
 from relay_server.tls import ServerTls
@@ -111,9 +111,9 @@ class Relay:
         judged = self._store, self._access, self._registry
         self._memory = MemoryHouse(reactor, *judged, *told, settings)
         self._directory = DirectoryHouse(reactor, *judged, self._channels, self._memory.note)
+        self._realms = Realms(self._store, self._memory.realms, self._directory.realms)
         record = DatabaseRecord(self._store, self._journal, time.time)
-        rules, changed = ControlRules.of(settings), self._registry.changed
-        self._desks = Desks(reactor, record, rules, changed, time.time)
+        self._desks = Desks(reactor, record, ControlRules.of(settings), self._registry.changed, time.time)
         self._ports: list[Any] = []
         self._revision = -1
         self._polling = LoopingCall(self._poll)
@@ -144,11 +144,11 @@ class Relay:
         await sweep(self._recordings, self._store, self._journal)
         self._recordings.recover()
         name = self.settings.name or self._folder.relay_name()
+        await self._realms.look()
         await self._memory.start()
         await self._directory.leases.start()
         await self._alerts.start(name)
-        http = await self._listen(self.settings.http, self._site(name))
-        self.http_port = http.getHost().port
+        self.http_port = (await self._listen(self.settings.http, self._site(name))).getHost().port
         rooms = self._store, self._registry, self._channels, self._videos, self._desks, self._journal
         hall = RobotHall(name, *rooms, time.monotonic, time.time)
         robots = await self._listen(self.settings.robots, self._robot_factory(hall))
@@ -272,6 +272,7 @@ class Relay:
 
     async def _take_up(self, revision: int) -> None:
         await self._access.refresh()
+        await self._realms.look()
         await retire(self._store, self._registry, self._desks, self._videos)
         self._desks.expect(await self._store.read(queries.pending_stops))
         await self._alerts.alerts.refresh()

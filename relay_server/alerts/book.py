@@ -146,11 +146,11 @@ class Book:
     # --- what happens -------------------------------------------------------------------------------------
 
     def tell(
-        self, robot_id: int, name: str, kind: str, about: str, level: str, text: str, now: Moment
+        self, robot_id: int, name: str, realm: str, kind: str, about: str, level: str, text: str, now: Moment
     ) -> list[Change]:
         """Something is wrong: it joins what is known of the same, or is a new alert.
 
-        :param name: of the robot
+        :param name: of the robot, in its realm
         """
         robot = self._robots.setdefault(robot_id, _Robot(filled=now.tick))
         key, text = (kind, about), text[: kinds.TEXT]
@@ -165,11 +165,12 @@ class Book:
             # Not what they say: whoever sees this may have no right to see them. But how bad it is.
             words = f"{robot.full} more alerts of {name} are not kept one by one"
             worst = max(level, "warning", key=kinds.severity)
-            return self.tell(robot_id, name, kinds.FLOOD, "", worst, words, now)
+            return self.tell(robot_id, name, realm, kinds.FLOOD, "", worst, words, now)
         made = AlertRecord(
             self._new_id(),
             robot_id,
             name,
+            realm,
             kind,
             about,
             level,

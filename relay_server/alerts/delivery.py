@@ -18,6 +18,7 @@ from twisted.python.failure import Failure
 
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import SwitchboardError
+from relay_protocol.realms import full_name
 from relay_server.alerts import kinds, rules
 from relay_server.alerts.book import Change
 from relay_server.alerts.heap import Heap, Waiting
@@ -345,7 +346,7 @@ class Delivery:
             "{count} alerts were not told by rule {rule} of {user}: {reason}",
             count=count,
             rule=self.rule.id,
-            user=self.rule.user,
+            user=full_name(self.rule.user, self.rule.realm),
             reason=self.status.reason,
         )
 
@@ -362,7 +363,9 @@ async def test(office: Office, rule: AlertRuleRecord, places: DeferredSemaphore)
     """Send a made-up alert now; why it did not arrive, or nothing."""
     now = office.wall()
     text = "This is a test: alerts of your robots arrive like this."
-    alert = AlertRecord("test", 0, "test", "robot", "", "info", text, now, now, 1, 1, None, None, None)
+    alert = AlertRecord(
+        "test", 0, "test", rule.realm, "robot", "", "info", text, now, now, 1, 1, None, None, None
+    )
     try:
         async with places, office.room(rule, False):
             await office.send(rule, Message(office.name(), [Notice(alert, "test")]))

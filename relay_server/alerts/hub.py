@@ -172,8 +172,8 @@ class Alerts:
 
     def tell(self, robot: Presence, kind: str, about: str, level: str, text: str) -> None:
         """Something is wrong with a robot."""
-        told = self.book.tell(robot.robot_id, robot.name, kind, about, level, text, self._moment())
-        self._changed(told)
+        who = robot.robot_id, robot.name, robot.realm
+        self._changed(self.book.tell(*who, kind, about, level, text, self._moment()))
 
     def over(self, robot: Presence, kind: str, about: str = "") -> None:
         """It is well again."""

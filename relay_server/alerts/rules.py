@@ -71,6 +71,10 @@ def check(ask: Ask, channels: Collection[str]) -> None:
         raise Invalid(f"'level' is one of {', '.join(kinds.LEVELS)}, not '{ask.level[:32]}'")
     if not all(each.isprintable() for each in (ask.label, ask.robots, *ask.kinds)):
         raise Invalid("'label', 'robots' and 'kinds' must be printable lines")
+    if "@" in ask.robots:
+        raise Invalid(
+            f"'robots' has names of your own realm: '{ask.robots[:64]}' must be written without '@' and a realm"
+        )
     if (ask.channel == "portal") == bool(ask.url):
         raise Invalid("'url' says where a message goes; leave it out with the channel 'portal' alone")
     if ask.secret and ask.channel != "webhook":
@@ -104,7 +108,9 @@ def as_quiet(kept: dict[str, str] | None) -> Quiet | None:
 def wants(rule: AlertRuleRecord, alert: AlertRecord, event: Event) -> bool:
     """Whether the rule tells of this, now or later."""
     return (
-        fnmatchcase(alert.robot, rule.robots)
+        # Before all else: names are those of a realm.
+        alert.realm == rule.realm
+        and fnmatchcase(alert.robot, rule.robots)
         and (not rule.kinds or alert.kind in rule.kinds)
         and kinds.severity(alert.level) >= kinds.severity(rule.level)
         and (rule.over or event is not Event.OVER)

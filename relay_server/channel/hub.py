@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 
 from relay_protocol.errors import Refused
 from relay_server.channel.lifecycle import Channel
 from relay_server.clock import Clock
+from relay_server.numbers import name_of
 from relay_server.registry import Presence
 from relay_server.tickets import Tickets
 
@@ -33,7 +33,6 @@ class Channels:
         self._wall_ns = wall_ns
         self._channels: dict[int, Channel] = {}
         self._tickets: Tickets[Channel] = Tickets(clock, new_ticket)
-        self._counter = itertools.count(1)
 
     def __iter__(self) -> Iterator[Channel]:
         return iter(list(self._channels.values()))
@@ -45,7 +44,7 @@ class Channels:
             channel = self._channels[robot.robot_id] = Channel(
                 self._clock,
                 robot,
-                f"{robot.name}#{next(self._counter)}",
+                name_of(f"{robot.name}#", (each.name for each in self)),
                 linger=self._linger,
                 issue_ticket=self._tickets.issue,
                 closed=self._forget,

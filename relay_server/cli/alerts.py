@@ -5,16 +5,15 @@ from __future__ import annotations
 import secrets
 import sys
 import time
-from collections.abc import Iterable
 from typing import Any
 
 import click
 import msgspec
-from sqlalchemy.orm import Session
 
 from relay_db import queries
+from relay_db.names import findable
 from relay_protocol.errors import Invalid, NotFound
-from relay_protocol.realms import full_name
+from relay_protocol.realms import full_name, parted
 from relay_server.alerts import kinds
 from relay_server.alerts import rules as wording
 from relay_server.alerts.desk import keep
@@ -53,8 +52,8 @@ def list_(app: App, robot: str | None, lasting: bool, limit: int, as_json: bool)
     """List alerts, the latest first. Those of the last half second may be missing."""
     with app.reading() as session:
         wanted = None if robot is None else [robot_of(session, robot).id]
-        found = queries.list_alerts(session, wanted, open=True if lasting else None, limit=limit)
-        found = _with_realms(session, found)
+        kept = queries.list_alerts(session, wanted, open=True if lasting else None, limit=limit)
+    found = [_named(each) for each in kept]
     cells = (
         (each.id, each.robot, each.level, _what(each), _state(each), moment(each.last), each.text)
         for each in found
@@ -70,8 +69,7 @@ def ack(app: App, alert: str, as_json: bool) -> None:
     """Say that somebody looks after the alert ID."""
     with app.change() as change:
         now = time.time()
-        acknowledged = queries.acknowledge_alert(change.session, alert, f"cli:{os_user()}", now)
-        (found,) = _with_realms(change.session, [acknowledged])
+        found = _named(queries.acknowledge_alert(change.session, alert, f"cli:{os_user()}", now))
         if found.ack_at == now:
             change.audit("alert.acknowledge", f"{found.kind} of {found.robot}", id=found.id)
     tell(as_json, view(found), f"{found.ack_by} looks after {found.kind} of {found.robot}.")
@@ -149,7 +147,7 @@ def rules_add(
     fields: dict[str, Any] = {
         "channel": channel or "webhook",
         "label": label,
-        "robots": robots,
+        "robots": _own(robots, user),
         "kinds": list(wanted),
         "level": level,
         "url": webhook or (_piped() if channel == "apprise" else ""),
@@ -205,10 +203,21 @@ def _quiet(text: str | None) -> dict[str, str] | None:
     return {"from": begin, "to": end, "zone": zone or "UTC"}
 
 
-def _with_realms(session: Session, records: Iterable[queries.AlertRecord]) -> list[queries.AlertRecord]:
-    """Alerts with the names that their robots have for the whole relay."""
-    names = {each.id: each.full for each in queries.list_robots(session)}
-    return [each._replace(robot=names[each.robot_id]) for each in records]
+def _own(robots: str, user: str) -> str:
+    """A pattern of robots of the user's realm, as it is written there.
+
+    :param user: as ``toad@lab1``
+    :raises Invalid: it is of another realm
+    """
+    pattern, at, _ = robots.partition("@")
+    if at and findable(parted(robots)[1]) != findable(parted(user)[1]):
+        raise Invalid(f"'{robots}' are robots of another realm; {user} is told only of those of his own")
+    return pattern
+
+
+def _named(record: queries.AlertRecord) -> queries.AlertRecord:
+    """An alert with the name that its robot has for the whole relay."""
+    return record._replace(robot=full_name(record.robot, record.realm))
 
 
 def _with_realm(record: queries.AlertRuleRecord) -> queries.AlertRuleRecord:

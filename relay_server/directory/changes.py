@@ -59,6 +59,11 @@ class Changes:
             if realm == entry.realm:
                 follower.wake()
 
+    def forget(self, realm: str) -> None:
+        """A realm is gone; one of its name is another, of which those who follow this one hear nothing."""
+        self._kept.pop(realm, None)
+        self._followers = {follower: of for follower, of in self._followers.items() if of != realm}
+
     def follow(self, realm: str, last: str | None) -> tuple[Following, bool]:
         """Begin to follow, until :meth:`leave`; and whether what the follower knows is not known here.
 
@@ -83,7 +88,7 @@ class Changes:
         """What he has not heard yet, some of it."""
         follower.fresh = False
         kept = self._kept.get(realm)
-        if not kept or kept[-1].number <= follower.number:
+        if follower not in self._followers or not kept or kept[-1].number <= follower.number:
             return News([])
         begin = follower.number + 1 - kept[0].number
         found = list(islice(kept, max(0, begin), max(0, begin) + AT_ONCE))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from relay_db.queries import EntryRecord, NewMemory
@@ -52,6 +52,11 @@ class DirectoryHouse:
             reactor.seconds,
             lambda: secrets.token_hex(12),
         )
+
+    def realms(self, gone: Collection[str], there: Collection[str]) -> None:
+        """Realms as :class:`relay_server.retiring.Realms` tells of them."""
+        for realm in gone:
+            self._changes.forget(realm)
 
     def _gone(self, what: str, record: EntryRecord) -> None:
         self._changes.tell(what, record)

@@ -199,7 +199,7 @@ def _argument(request: Request, name: bytes) -> str:
 
 
 def _number(text: str) -> int:
-    if not (text.isascii() and text.isdecimal() and len(text) <= 9):
+    if not (text.isascii() and text.isdecimal() and len(text) <= 10):
         raise NotFound("the number of a rule is a number")
     return int(text)
 

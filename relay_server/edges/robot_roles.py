@@ -21,7 +21,7 @@ from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
 from relay_protocol.errors import Invalid, MalformedMessage, Refused, Unavailable
 from relay_protocol.frames import SampleFrame
 from relay_protocol.realms import parted
-from relay_server import passwords
+from relay_server import limiter, passwords
 from relay_server.channel import Channel, Channels
 from relay_server.control import Desks
 from relay_server.edges.robot_video import VideoEnd
@@ -65,7 +65,8 @@ class RobotHall:
     failures: LoginLimiter = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "failures", LoginLimiter(self.seconds, FAILURES_OF_NETWORK))
+        failures = LoginLimiter(self.seconds, FAILURES_OF_NETWORK, limiter.robot)
+        object.__setattr__(self, "failures", failures)
 
 
 class Opening(Role):
@@ -327,12 +328,15 @@ class Control(Role):
             self._connection.close("bye")
 
     def _alert(self, alert: link.Alert) -> None:
-        name, level, text = self._robot.name, alert.level[:20], alert.text[:500]
+        level, text = alert.level[:20], alert.text[:500]
         of = {"alert_kind": alert.kind, "about": alert.about, "over": alert.over}
         # A cause of its own: however much a robot says, that it comes and goes is kept.
-        kept = self._event("robot.alert", f"robot:{name}", "robot's words", level=level, text=text, **of)
+        source = f"robot:{self._robot.name}"
+        kept = self._event("robot.alert", source, "robot's words", level=level, text=text, **of)
         if kept and not alert.over:
-            self.log.warn("robot {robot}: {severity}: {text}", robot=name, severity=level, text=text)
+            self.log.warn(
+                "robot {robot}: {severity}: {text}", robot=self._robot.full, severity=level, text=text
+            )
 
     def sample(self, frame: SampleFrame) -> None:
         """The control link never carries bulk data."""

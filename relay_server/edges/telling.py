@@ -1,5 +1,8 @@
 """What a page is told of its robots, and when: at every change, and so often that silence means a lost relay.
 
+Somebody who sees nothing of what changed must not learn that it did: whatever wakes a look, it tells only what is other
+than what was told, and what is told without news comes so long after the last telling, whoever wakes when.
+
 Nothing here touches a socket. Two edges carry it: ``stream`` as server-sent events, ``pages`` over a websocket.
 """
 
@@ -13,23 +16,26 @@ from twisted.internet.defer import Deferred
 from relay_protocol import jsontext
 from relay_protocol.errors import Unavailable
 from relay_server.access import Principal
-from relay_server.clock import Clock, Timer, cancel, looping, sleep
+from relay_server.clock import Clock, Timer, cancel, sleep
 
 STREAM_SECONDS = 5.0
 """Something is told at least so often (SPEC section 1.7)."""
 
 COALESCE_SECONDS = 0.25
 QUIET_SECONDS = 3.0
-"""Without a change it is looked again after so long."""
+"""So long after the last telling it is told again, changed or not."""
 
 LOOK_SECONDS = 1.5
-"""A look that takes longer is told to be under way, again and again. With the pauses before it, that is in time."""
+"""A look that is due and takes longer is told to be under way, again and again, which is in time."""
 
 STALL_SECONDS = 5.0
 """A page that takes nothing for so long is cut."""
 
 FIRST = "robots"
-"""The event that every look tells; the others are told when they are another list."""
+"""The event that is told without news as well; the others are told when they are another list."""
+
+PASSING = frozenset({"rtt_ms", "last_seen", "last", "count", "text"})
+"""Fields that are other at nearly every look, though nothing happened: alone they are no news before it is time."""
 
 UNKNOWN = "unknown"
 """The event that says that the relay lives and can't tell the others, and why."""
@@ -74,9 +80,14 @@ class Telling:
         self._sources = sources
         self._on_change = on_change
         self._told: dict[str, list[dict[str, Any]]] = {}
+        self._reason = ""
+        """What was told to be why the others are not known; empty when they are."""
+        self._due = clock.seconds()
+        """When something is told, whatever there is, monotonic seconds."""
         self._dirty = False
         """Whether anything has changed since what was told last was looked up."""
         self._wake: Deferred[None] | None = None
+        self._late: Timer | None = None
         self._stalled: Timer | None = None
         """Cuts the page; there while it takes nothing."""
 
@@ -89,7 +100,7 @@ class Telling:
         try:
             while True:
                 await self._look()
-                await sleep(self._clock, COALESCE_SECONDS)
+                await sleep(self._clock, min(COALESCE_SECONDS, self._left()))
                 await self._until_change()
         finally:
             forget()
@@ -104,14 +115,14 @@ class Telling:
         """It does again."""
         cancel(self._stalled)
         self._stalled = None
+        self._due = self._clock.seconds()
         self._changed()
 
     # --- telling ------------------------------------------------------------------------------------------
 
     async def _look(self) -> None:
         self._dirty = False
-        slow = looping(self._clock, lambda: self._unknown(NO_ANSWER))
-        slow.start(LOOK_SECONDS, now=False)
+        self._expect()
         try:
             principal = await self._principal()
             found = [(name, await source(principal)) for name, source in self._sources.items()]
@@ -120,18 +131,50 @@ class Telling:
             self._unknown(str(error))
             return
         finally:
-            slow.stop()
+            cancel(self._late)
+        due = self._left() == 0
+        if due:
+            self._put_off()
         for name, now in found:
             # Once it is paused nothing more is told: it would only wait, and be old by then.
-            if self._stalled is None and (name == FIRST or now is not self._told.get(name)):
+            if self._stalled is None and self._is_told(name, now, due):
                 self._told[name] = now
+                if name == FIRST:
+                    self._reason = ""
+                    self._put_off()
                 self._page.tell(name, jsontext.encode({name: now}))
 
+    def _is_told(self, name: str, now: list[dict[str, Any]], due: bool) -> bool:
+        before = self._told.get(name)
+        if before is None or (due and name == FIRST):
+            return True
+        return now != before if due else now is not before and _lasting(now) != _lasting(before)
+
+    def _expect(self) -> None:
+        """Have it told when what is looked up now does not come in time."""
+        self._late = self._clock.callLater(self._left() + LOOK_SECONDS, self._is_late)
+
+    def _is_late(self) -> None:
+        self._unknown(NO_ANSWER)
+        self._expect()
+
     def _unknown(self, reason: str) -> None:
+        if reason == self._reason and self._left() > 0:
+            return
+        self._put_off()
         if self._stalled is None:
+            self._reason = reason
+            self._told.pop(FIRST, None)
             self._page.tell(UNKNOWN, jsontext.encode({"reason": reason}))
 
     # --- waiting ------------------------------------------------------------------------------------------
+
+    def _left(self) -> float:
+        """Seconds until something is told, whatever there is; 0 when that is now."""
+        return max(0.0, self._due - self._clock.seconds())
+
+    def _put_off(self) -> None:
+        self._due = self._clock.seconds() + QUIET_SECONDS
 
     def _changed(self) -> None:
         self._dirty = True
@@ -147,9 +190,14 @@ class Telling:
             return
         wake: Deferred[None] = Deferred()
         self._wake = wake
-        timer = self._clock.callLater(QUIET_SECONDS, self._wake_up)
+        timer = self._clock.callLater(self._left(), self._wake_up)
         try:
             await wake
         finally:
             self._wake = None
             cancel(timer)
+
+
+def _lasting(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What is told, without what passes."""
+    return [{name: value for name, value in row.items() if name not in PASSING} for row in rows]

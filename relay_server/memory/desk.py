@@ -97,6 +97,10 @@ class Recent:
         for follower in list(self._followers):
             follower.wake()
 
+    def forget(self, realm: str) -> None:
+        """A realm is gone; one of its name is another."""
+        self._events.pop(realm, None)
+
     def since(self, realm: str, number: int) -> list[MemoryRecord] | None:
         """Some of those with greater numbers, in their order; ``None`` when not all of them are known here."""
         events = self._events.get(realm)

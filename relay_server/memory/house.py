@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, Protocol
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -69,6 +69,14 @@ class MemoryHouse(Collector):
         :raises Unavailable: the database can't be asked
         """
         await self._quota.start()
+
+    def realms(self, gone: Collection[str], there: Collection[str]) -> None:
+        """Realms as :class:`relay_server.retiring.Realms` tells of them."""
+        for realm in gone:
+            self._quota.forget(realm)
+            self._writer.forget(realm)
+            self._recent.forget(realm)
+        self._writer.exist(there)
 
     async def keep(self) -> None:
         """Keep what waits, if the database takes it soon, and look after it no more."""

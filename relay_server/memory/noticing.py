@@ -13,7 +13,7 @@ from relay_db.models import NAME
 from relay_db.names import recorded
 from relay_db.queries import AlertRecord, NewMemory
 from relay_db.queries.recalling import OURS
-from relay_protocol.realms import DEFAULT_REALM, parted
+from relay_protocol.realms import DEFAULT_REALM
 from relay_server.bucket import Buckets
 from relay_server.memory.limits import DATA, NOTED, NOTED_A_SECOND, NOTED_AT_ONCE
 from relay_server.memory.writer import Writer
@@ -46,6 +46,10 @@ KINDS = frozenset(
     }
 )
 """What of the journal is noted (SPEC section 1.14)."""
+
+_REALM = "realm"
+"""The field in which an event about no robot says whose it is: empty or ``None`` where nobody is to be told. To whom a
+failed login is told must not tell him what there is in other realms, so it is the one that was named, there or not."""
 
 _UNTOLD = frozenset({"robot", "user", "address"})
 """Fields that an event has in other places, or that are not everybody's who may see the robot."""
@@ -93,18 +97,24 @@ class Noticing:
 
     def note(self, event: NewMemory) -> None:
         """What another part of this relay has put together."""
-        if self._buckets.take((event.robot_id, event.user)):
+        if self._may_pass(event.realm, event.robot_id, event.user):
             self._writer.note(event)
         else:
             self._writer.drop(event.realm)
+
+    def _may_pass(self, realm: str, robot_id: int | None, user: str | None) -> bool:
+        """Whether there is one more; what strangers name for realms has one share together."""
+        return self._buckets.take((realm if self._writer.knows(realm) else None, robot_id, user))
 
     def _note(self, kind: str, robot_id: int | None, user: str | None, data: Mapping[str, Any]) -> None:
         robot = None if robot_id is None else self._registry.find(robot_id)
         if robot_id is not None and robot is None:
             # It was removed: nobody may see this any more.
             return
-        realm = _meant(data) if robot is None else robot.realm
-        if not self._buckets.take((robot_id, user)):
+        realm = data.get(_REALM, DEFAULT_REALM) if robot is None else robot.realm
+        if not realm:
+            return
+        if not self._may_pass(realm, robot_id, user):
             self._writer.drop(realm)
             return
         source = OURS if robot is None else f"{OURS}:{robot.name}"
@@ -114,17 +124,12 @@ class Noticing:
         )
 
 
-def _meant(data: Mapping[str, Any]) -> str:
-    """The realm of what is about no robot: that of the name somebody has given, whether there is one or not.
-
-    To whom a failed login is told must not tell him what there is in other realms.
-    """
-    user = data.get("user")
-    return parted(user)[1] if isinstance(user, str) else DEFAULT_REALM
-
-
 def _text(data: Mapping[str, Any]) -> str:
     """Data as it is kept; words are cut, and what is too large all the same is left out."""
-    cut = {name: recorded(value) if isinstance(value, str) else value for name, value in data.items()}
+    cut = {
+        name: recorded(value) if isinstance(value, str) else value
+        for name, value in data.items()
+        if name != _REALM
+    }
     text = canonical_json(cut)
     return text if len(text) <= DATA else canonical_json({"left_out": len(text)})

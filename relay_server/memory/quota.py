@@ -85,6 +85,12 @@ class Quota:
             self._grown.add((each.realm, each.source))
             self._sizes[each.realm] += 1
 
+    def forget(self, realm: str) -> None:
+        """A realm is gone; one of its name is another."""
+        self._grown = {each for each in self._grown if each[0] != realm}
+        self._sizes.pop(realm, None)
+        self._uses = Counter({each: times for each, times in self._uses.items() if each[0] != realm})
+
     def used(self, events: Iterable[MemoryRecord]) -> None:
         """A query has given these."""
         for each in events:
@@ -140,11 +146,10 @@ class Quota:
 
         :raises Unavailable: the database can't be asked
         """
-        days = {each.name: each.events_days for each in await self._store.read(queries.list_realms)}
-        for realm in list(self._sizes):
-            own = days.get(realm)
+        for realm in await self._store.read(queries.list_realms):
+            own = realm.events_days
             before = self._wall() - (self._kept if own is None else own * DAY)
-            while await self._forget(realm, queries.old_memories, before, GONE):
+            while await self._forget(realm.name, queries.old_memories, before, GONE):
                 pass
 
     async def _trim(self, realm: str, source: str) -> None:

@@ -7,7 +7,7 @@ for that one at most.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from twisted.internet.defer import Deferred
@@ -89,6 +89,20 @@ class Writer:
         self.dropped += 1
         if realm in self._realms:
             self._untold[realm] += 1
+
+    def knows(self, realm: str) -> bool:
+        """Whether a realm is known to exist."""
+        return realm in self._realms
+
+    def exist(self, realms: Iterable[str]) -> None:
+        """These realms are all that there are."""
+        self._realms = {DEFAULT_REALM, *realms}
+
+    def forget(self, realm: str) -> None:
+        """A realm is gone; one of its name is another."""
+        self._realms.discard(realm)
+        self._untold.pop(realm, None)
+        self._due.pop(realm, None)
 
     async def write(self, events: Sequence[NewMemory]) -> list[MemoryRecord]:
         """Keep these events, all or none; they are safe when this returns.

@@ -19,7 +19,7 @@ from relay_protocol.realms import full_name
 from relay_protocol.scopes import Scope
 from relay_server import passwords
 from relay_server.access import Access, BadCredentials, Principal
-from relay_server.auth import Authenticator, Login, TooManyTries
+from relay_server.auth import NAMED, Authenticator, Login, TooManyTries, named_realm
 from relay_server.journal import Journal
 from relay_server.limiter import LoginLimiter
 from relay_server.oauth.digest import Digest
@@ -149,17 +149,22 @@ class OAuthDesk:
                 raise BadCredentials("the key is unknown or the secret is wrong")
         except BadCredentials as error:
             if error.code == BadCredentials.code:
-                self._note_refused(key, address)
+                self._note_refused(key, found, address)
             else:  # right, but late: no guess
                 self._limiter.forgive(key, address)
             raise
         self._limiter.succeeded(key, address)
         return found
 
-    def _note_refused(self, key: str, address: str) -> None:
-        reason = BadCredentials.code
+    def _note_refused(self, key: str, found: ProgramRecord | None, address: str) -> None:
         self._journal.event(
-            "login.refused", "relay", cause=address, program=key[:64], address=address, reason=reason
+            "login.refused",
+            "relay",
+            cause=address,
+            program=key[:64],
+            realm=None if found is None else found.realm,
+            address=address,
+            reason=BadCredentials.code,
         )
 
     # --- tokens -------------------------------------------------------------------------------------------
@@ -190,9 +195,14 @@ class OAuthDesk:
             granted = _new(scope, passwords.new_token())
             await self._store.write(_begin, login, granted, address, self._wall())
         except BadCredentials as error:
-            user, reason = ask.username[:64], error.code
             self._journal.event(
-                "login.refused", "relay", cause=address, user=user, address=address, reason=reason
+                "login.refused",
+                "relay",
+                cause=address,
+                user=ask.username[:NAMED],
+                realm=named_realm(ask.username),
+                address=address,
+                reason=error.code,
             )
             raise OAuthError("invalid_grant", str(error)) from None
         except Refused as error:

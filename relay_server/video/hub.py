@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 
@@ -10,6 +9,7 @@ from relay_protocol import link
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.bucket import TokenBucket
 from relay_server.clock import Clock
+from relay_server.numbers import name_of
 from relay_server.registry import Presence
 from relay_server.tickets import Tickets
 from relay_server.video.ends import TooOften, Viewer, Wish
@@ -46,7 +46,6 @@ class Videos:
         self._streams: dict[Key, Stream] = {}
         self._tickets: Tickets[Stream] = Tickets(clock, new_ticket)
         self._hooks = Hooks(self._tickets.issue, self._busy, self._left, self._forget)
-        self._counter = itertools.count(1)
         self._begun: dict[tuple[int, int], TokenBucket] = {}
         """By user and robot. Each is kept for good: who comes back has what he has left."""
         self._refused: Stream | None = None
@@ -132,7 +131,7 @@ class Videos:
         return self._new(robot, camera, settings)
 
     def _new(self, robot: Presence, camera: str, settings: link.VideoSettings) -> Stream:
-        name = f"{robot.name}#video{next(self._counter)}"
+        name = name_of(f"{robot.name}#video", (each.name for each in self))
         stream = Stream(self._clock, robot, camera, settings, name, self._hooks)
         self._streams[robot.robot_id, camera, settings] = stream
         return stream

@@ -27,7 +27,12 @@ async def test_logging_in_and_out_are_on_record(front: Desk) -> None:
     with pytest.raises(BadCredentials):
         await front.desk.password("ann", "hunter2hunter2", HERE)
     (refused,) = await front.events("login.refused")
-    assert refused.data == {"user": "ann", "address": HERE, "reason": "bad_credentials"}
+    assert refused.data == {
+        "user": "ann",
+        "realm": "default",
+        "address": HERE,
+        "reason": "bad_credentials",
+    }
     entry = (await front.store.read(queries.list_audit))[-1]
     assert (entry.actor, entry.action, entry.origin, entry.data) == (
         "user:ann",
@@ -35,6 +40,16 @@ async def test_logging_in_and_out_are_on_record(front: Desk) -> None:
         HERE,
         {"how": "password"},
     )
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_refused_login_is_of_the_realm_that_the_whole_name_gives(front: Desk) -> None:
+    """However that is written, and however long the name is; what can be no realm is none."""
+    for user in ("toad@LAB1", f"{'x' * 63}@{'y' * 63}z", f"{'x' * 200}@lab1"):
+        with pytest.raises(BadCredentials):
+            await front.desk.password(user, "x", HERE)
+    told = {each.data["user"]: each.data["realm"] for each in await front.events("login.refused")}
+    assert told == {"toad@LAB1": "lab1", f"{'x' * 63}@{'y' * 63}": "", "x" * 127: "lab1"}
 
 
 @pytest_twisted.ensureDeferred

@@ -52,6 +52,18 @@ def test_accounts_of_two_realms_are_two(time: Time) -> None:
     assert limiter.wait("ann@lab2", "192.0.2.2") == limiter.wait("bob@lab1", "192.0.2.2") == 0
 
 
+def test_a_robot_is_one_however_long_what_it_claims_is(time: Time) -> None:
+    """Each text is a robot of its own: who claims to be another one with a long name locks nobody out."""
+    limiter = LoginLimiter(time, known_as=module.robot)
+    first, second = (f"rover@lab#{key * 64}" for key in "ab")
+    for _ in range(FAILURES):
+        limiter.failed(first, "192.0.2.1")
+    assert limiter.wait(first, "192.0.2.1") > 0
+    assert limiter.wait(second, "192.0.2.1") == 0
+    limiter.succeeded(first, "192.0.2.1")
+    assert limiter.wait(first, "192.0.2.1") == 0
+
+
 def test_guessing_names_is_no_way_around(time: Time) -> None:
     """A network has a limit over all accounts together, and others have their own."""
     limiter = LoginLimiter(time)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from relay_server import numbers
-from relay_server.numbers import MOST, Numbers
+from relay_server.numbers import MOST, Numbers, name_of
 
 
 def test_no_number_is_given_twice_in_a_row_of_many() -> None:
@@ -13,6 +13,15 @@ def test_no_number_is_given_twice_in_a_row_of_many() -> None:
     drawn = iter([7, 7, 8, 7, 8, 9])
     taken = Numbers(lambda: next(drawn))
     assert [taken.take() for _ in range(3)] == [7, 8, 9]
+
+
+def test_a_name_is_drawn_until_nobody_has_it() -> None:
+    """Others may have it again when its bearer is gone."""
+    drawn = iter("aabaa")
+    taken = {name_of("r#", (), lambda: next(drawn))}
+    taken.add(name_of("r#", taken, lambda: next(drawn)))
+    assert taken == {"r#a", "r#b"}
+    assert name_of("r#", {"r#b"}, lambda: next(drawn)) == "r#a"
 
 
 def test_numbers_of_long_ago_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:

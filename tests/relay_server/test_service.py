@@ -11,6 +11,7 @@ from twisted.internet import reactor
 from twisted.internet.defer import Deferred
 
 from relay_db import queries
+from relay_db.queries import NewMemory
 from relay_protocol.clocks import now_ns
 from relay_server import passwords
 from relay_server.access import BadCredentials
@@ -18,6 +19,7 @@ from relay_server.alerts import hub, kinds
 from relay_server.config import Endpoint, Settings
 from relay_server.registry import Presence
 from relay_server.service import Relay
+from tests.relay_server.directory.test_entries import RECORD
 from tests.relay_server.memory import MemoryLink, hangs
 
 GOING = "the relay is going down"
@@ -105,6 +107,28 @@ async def test_a_token_that_was_revoked_proves_nobody_after_the_relay_has_looked
         await relay.refresh()
         with pytest.raises(BadCredentials):
             await relay._desk.token("secret")
+    finally:
+        await relay.stop()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_realm_that_is_made_anew_is_empty_while_the_relay_runs(tmp_path: Path) -> None:
+    """Its memory and its directory at hand tell nothing of what was in the former."""
+    relay = made(tmp_path)
+    await relay.start()
+    try:
+        await relay._store.write(queries.add_realm, "lab")
+        await relay.refresh()
+        memory, changes = relay._memory, relay._directory._changes
+        memory.note(NewMemory("lab", 1.0, "relay", "x", None, None, "{}"))
+        await memory._writer.flush()
+        changes.tell("registered", RECORD._replace(realm="lab"))
+        assert memory._recent.since("lab", 0) and changes.follow("lab", None)[0].number == 1
+        await relay._store.write(queries.remove_realm, "lab")
+        await relay._store.write(queries.add_realm, "lab")
+        await relay.refresh()
+        assert memory._recent.since("lab", 0) is None and changes.follow("lab", None)[0].number == 0
+        assert memory._quota._sizes["lab"] == 0 and memory._writer.knows("lab")
     finally:
         await relay.stop()
 

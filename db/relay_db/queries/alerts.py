@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -20,9 +21,14 @@ RULES = 32
 """Most rules of one user."""
 
 ALERTS = 100_000
-"""Most alerts kept, whatever their age."""
+"""Most alerts kept of one realm, whatever their age."""
 
-_RECENT = 10_000
+NUMBERS = 2**31 - 1
+"""The greatest number of a rule."""
+
+_RECENT = 1000
+"""Most alerts of one robot that are over, of those of late."""
+
 _PAGE = 1000
 _BY_ROBOT = 8
 """Of no more robots alerts are looked up by robot."""
@@ -115,12 +121,16 @@ def list_alerts(
 
 
 def recent_alerts(s: Session, since: float) -> list[AlertRecord]:
-    """Alerts that last, or were over after this moment.
+    """All alerts that last, and of each robot the latest that were over after this moment.
 
     :param since: Unix seconds
     """
-    query = _alerts().where(or_(Alert.over_at.is_(None), Alert.over_at >= since))
-    return [AlertRecord(*row) for row in s.execute(query.order_by(Alert.last_at.desc()).limit(_RECENT))]
+    # By robot: what one tells must not keep another's alerts from being known.
+    place = func.row_number().over(partition_by=Alert.robot_id, order_by=(Alert.last_at.desc(), Alert.id))
+    late = select(Alert.id, place.label("place")).where(Alert.over_at >= since).subquery()
+    chosen = select(late.c.id).where(late.c.place <= _RECENT)
+    query = _alerts().where(or_(Alert.over_at.is_(None), Alert.id.in_(chosen)))
+    return [AlertRecord(*row) for row in s.execute(query.order_by(Alert.last_at.desc()))]
 
 
 def get_alert(s: Session, alert_id: str) -> AlertRecord | None:
@@ -155,23 +165,28 @@ def acknowledgements(s: Session) -> dict[str, tuple[str, float]]:
     query = select(Alert.id, Alert.ack_by, Alert.ack_at).where(
         Alert.over_at.is_(None), Alert.ack_at.is_not(None)
     )
-    return {row.id: (row.ack_by or "", row.ack_at) for row in s.execute(query.limit(_RECENT))}
+    return {row.id: (row.ack_by or "", row.ack_at) for row in s.execute(query)}
 
 
 def purge_alerts(s: Session, before: float, most: int = ALERTS, batch: int = _PAGE) -> int:
-    """Forget one batch of the alerts that are over and too old, or too many; how many. Call again until it is 0.
+    """Forget a batch of what is over and too old, or too much for its realm; how many. Call again until it is 0.
 
     :param before: Unix seconds; what was told last before that goes
-    :param most: rows that may stay, whatever their age
+    :param most: rows of a realm that may stay, whatever their age
+    :param batch: most that go at once, of each realm
     """
     over = Alert.over_at.is_not(None)
     old = select(Alert.id).where(over, Alert.last_at < before).limit(batch)
     gone = len(s.scalars(delete(Alert).where(Alert.id.in_(old)).returning(Alert.id)).all())
-    surplus = (s.scalar(select(func.count()).select_from(Alert)) or 0) - most
-    if gone or surplus <= 0:
+    if gone:
         return gone
-    oldest = select(Alert.id).where(over).order_by(Alert.last_at).limit(min(batch, surplus))
-    return len(s.scalars(delete(Alert).where(Alert.id.in_(oldest)).returning(Alert.id)).all())
+    count = func.count()
+    full = select(Robot.realm_id, count).join(Alert, Alert.robot_id == Robot.id).group_by(Robot.realm_id)
+    for realm, rows in s.execute(full.having(count > most)).all():
+        theirs = Alert.robot_id.in_(select(Robot.id).where(Robot.realm_id == realm))
+        oldest = select(Alert.id).where(over, theirs).order_by(Alert.last_at).limit(min(batch, rows - most))
+        gone += len(s.scalars(delete(Alert).where(Alert.id.in_(oldest)).returning(Alert.id)).all())
+    return gone
 
 
 def add_alert_rule(
@@ -203,7 +218,9 @@ def add_alert_rule(
     if mine >= RULES:
         raise Invalid(f"a user has at most {RULES} rules for alerts; delete one first")
     bump(s)
+    number = _fresh_number(s)
     values = {
+        "id": number,
         "user_id": user_id,
         "label": label(name, "label of a rule"),
         "robots": robots,
@@ -217,8 +234,16 @@ def add_alert_rule(
         "quiet": None if quiet is None else dict(quiet),
         "created": created,
     }
-    number = s.scalars(insert(AlertRule).values(**values).returning(AlertRule.id)).one()
+    s.execute(insert(AlertRule).values(**values))
     return next(each for each in list_alert_rules(s, user_id) if each.id == number)
+
+
+def _fresh_number(s: Session) -> int:
+    """A number that no rule has. Drawn: who sees his own must not learn how many others are made."""
+    while True:
+        number = secrets.randbelow(NUMBERS) + 1
+        if s.scalar(select(AlertRule.id).where(AlertRule.id == number)) is None:
+            return number
 
 
 def list_alert_rules(s: Session, user_id: int | None = None) -> list[AlertRuleRecord]:
@@ -243,7 +268,7 @@ def list_alert_rules(s: Session, user_id: int | None = None) -> list[AlertRuleRe
         )
         .join(User, User.id == AlertRule.user_id)
         .join(Realm, Realm.id == User.realm_id)
-        .order_by(AlertRule.id)
+        .order_by(AlertRule.created, AlertRule.id)
     )
     query = query.where(User.disabled.is_(False) if user_id is None else User.id == user_id)
     rows = (AlertRuleRecord(*row) for row in s.execute(query))
@@ -269,6 +294,7 @@ def _alerts() -> Any:
         Alert.id,
         Alert.robot_id,
         Robot.name,
+        Realm.name,
         Alert.kind,
         Alert.about,
         Alert.level,
@@ -281,4 +307,4 @@ def _alerts() -> Any:
         Alert.ack_by,
         Alert.ack_at,
     ).join(Robot, Robot.id == Alert.robot_id)
-    return query
+    return query.join(Realm, Realm.id == Robot.realm_id)

@@ -20,9 +20,9 @@ _TABLE: Any = Memory.__table__
 
 def remember(s: Session, events: Sequence[NewMemory]) -> list[MemoryRecord | None]:
     """Write events, numbered in this order within each realm; each as it is kept, ``None`` where its realm is gone."""
-    realms = _realms(s)
+    realms = _lasting(s, {each.realm for each in events})
     following: dict[str, int] = {}
-    for realm in sorted({each.realm for each in events} & realms.keys()):
+    for realm in sorted(realms):
         count = sum(each.realm == realm for each in events)
         following[realm] = _take_numbers(s, realms[realm], count)
     kept: list[MemoryRecord | None] = []
@@ -62,6 +62,15 @@ def _take_numbers(s: Session, realm_id: int, count: int) -> int:
         s.execute(insert(MemoryCount).values(realm_id=realm_id, last=count))
         last = count
     return int(last) - count + 1
+
+
+def _lasting(s: Session, names: Collection[str]) -> dict[str, int]:
+    """Those of these realms that there are; on PostgreSQL none is removed until the end of the transaction."""
+    # Names from strangers are compared here: the database fails on some texts.
+    used = {name: number for name, number in _realms(s).items() if name in names}
+    lock = select(Realm.id).where(Realm.id.in_(used.values())).with_for_update(read=True, key_share=True)
+    there = set(s.scalars(lock))
+    return {name: number for name, number in used.items() if number in there}
 
 
 def _realms(s: Session) -> dict[str, int]:

@@ -8,6 +8,7 @@ from sqlalchemy.orm import Session
 from relay_db.models import DirectoryEntry, Group, Memory, MemoryCount, Realm, Robot, RobotGroup, User
 from relay_db.names import findable, normal_name
 from relay_db.queries.records import RealmRecord
+from relay_db.queries.state import bump
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.realms import DEFAULT_REALM
 
@@ -20,6 +21,7 @@ def add_realm(s: Session, name: str) -> RealmRecord:
     name = normal_name(name, "name of a realm")
     if s.scalar(select(Realm.id).where(Realm.name == name)) is not None:
         raise Invalid(f"there is a realm '{name}' already")
+    bump(s)
     realm_id = s.scalars(insert(Realm).values(name=name).returning(Realm.id)).one()
     return RealmRecord(realm_id, name, None)
 
@@ -30,7 +32,11 @@ def remove_realm(s: Session, name: str) -> None:
     :raises NotFound: no such realm
     :raises Refused: users, groups or robots are in it, or it is the one that every relay has
     """
-    gone = realm_id(s, name)
+    bump(s)
+    # On PostgreSQL who writes to the realm's memory is done by now, or finds it gone.
+    gone = s.scalar(select(Realm.id).where(Realm.name == findable(name)).with_for_update())
+    if gone is None:
+        raise NotFound("there is no such realm")
     if findable(name) == DEFAULT_REALM:
         raise Refused(f"the realm '{DEFAULT_REALM}' stays: names without a realm are of it")
     left = [

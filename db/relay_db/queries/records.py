@@ -198,6 +198,7 @@ class AlertRecord(NamedTuple):
     id: str
     robot_id: int
     robot: str
+    realm: str
     kind: str
     about: str
     level: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from sqlalchemy import event
 
 from relay_db import queries
 from relay_db.engine import Database
+from relay_db.queries import alerts as module
 from relay_db.queries.alerts import RULES
 from relay_protocol.errors import Invalid, NotFound
 
@@ -16,7 +18,21 @@ from relay_protocol.errors import Invalid, NotFound
 def an_alert(robot: int, id: str = "a1", **other: object) -> queries.AlertRecord:
     """One that lasts."""
     made = queries.AlertRecord(
-        id, robot, "rover", "offline", "", "error", "it is gone", 10.0, 10.5, 1, 1, None, None, None
+        id,
+        robot,
+        "rover",
+        "default",
+        "offline",
+        "",
+        "error",
+        "it is gone",
+        10.0,
+        10.5,
+        1,
+        1,
+        None,
+        None,
+        None,
     )
     return made._replace(**other)  # type: ignore[arg-type]  # the fields of a record
 
@@ -61,6 +77,24 @@ def test_what_a_relay_begins_with_is_what_lasts_or_was_over_of_late(database: Da
             s, [an_alert(robot), an_alert(robot, "b2", over=20.0), an_alert(robot, "c3", over=30.0)]
         )
         assert sorted(each.id for each in queries.recent_alerts(s, 25.0)) == ["a1", "c3"]
+
+
+def test_one_robots_many_alerts_keep_no_others_from_being_known(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who begins gets all that last, who looks after them too, and of those that are over some of each robot."""
+    monkeypatch.setattr(module, "_RECENT", 2)
+    with database.begin() as s:
+        queries.add_realm(s, "lab1")
+        loud, quiet = queries.add_robot(s, "rover").id, queries.add_robot(s, "rover", realm="lab1").id
+        there = [an_alert(loud, f"l{each}", last=50.0, ack_by="ann", ack_at=60.0) for each in range(5)]
+        there += [an_alert(loud, f"o{each}", last=50.0 + each, over=70.0) for each in range(5)]
+        theirs = [an_alert(quiet, "q1", ack_by="bob", ack_at=60.0), an_alert(quiet, "q2", over=70.0)]
+        queries.save_alerts(s, [*there, *theirs])
+        known = queries.recent_alerts(s, 65.0)
+        assert sorted(each.id for each in known) == ["l0", "l1", "l2", "l3", "l4", "o3", "o4", "q1", "q2"]
+        assert {each.realm for each in known if each.robot_id == quiet} == {"lab1"}
+        assert sorted(queries.acknowledgements(s)) == ["l0", "l1", "l2", "l3", "l4", "q1"]
 
 
 def test_alerts_are_listed_on_from_where_a_list_ended_without_what_is_not_wanted(database: Database) -> None:
@@ -138,6 +172,21 @@ def test_old_alerts_and_too_many_are_forgotten_but_none_that_lasts(database: Dat
         assert [each.id for each in queries.list_alerts(s)] == ["o5", "o4", "open"]
 
 
+def test_a_realm_with_too_many_alerts_costs_no_other_one_any(database: Database) -> None:
+    """Each has so many; where all that are too many last, those of the next are looked after all the same."""
+    with database.begin() as s:
+        queries.add_realm(s, "lab1")
+        queries.add_realm(s, "lab2")
+        here = queries.add_robot(s, "rover").id
+        lab1, lab2 = (queries.add_robot(s, "rover", realm=each).id for each in ("lab1", "lab2"))
+        queries.save_alerts(s, [an_alert(here, f"h{each}") for each in range(4)])
+        queries.save_alerts(s, [an_alert(lab1, f"a{each}", last=1.0, over=5.0) for each in range(2)])
+        queries.save_alerts(s, [an_alert(lab2, f"b{each}", last=9.0 + each, over=20.0) for each in range(5)])
+        assert [queries.purge_alerts(s, 0.0, most=2, batch=2) for _ in range(3)] == [2, 1, 0]
+        assert [each.id for each in queries.list_alerts(s, [lab1, lab2])] == ["b4", "b3", "a0", "a1"]
+        assert len(queries.list_alerts(s, [here])) == 4
+
+
 def test_rules_are_kept_as_they_were_given(database: Database) -> None:
     """Whoever asks for all of them gets those of users who may log in."""
     quiet = {"from": "22:00", "to": "07:00", "zone": "Europe/Rome", "least": "error"}
@@ -158,7 +207,8 @@ def test_rules_are_kept_as_they_were_given(database: Database) -> None:
             quiet=quiet,
             created=1.5,
         )
-        other = queries.add_alert_rule(s, **a_rule(bob))  # type: ignore[arg-type]  # its fields by name
+        later = {**a_rule(bob), "created": 2.5}
+        other = queries.add_alert_rule(s, **later)  # type: ignore[arg-type]  # its fields by name
         assert made == (
             made.id, ann, "ann", "default", "pager", "r*", ("offline",), "error", "webhook",
             "https://example.org/hook", "s" * 32, False, 5.0, quiet, 1.5,
@@ -167,6 +217,19 @@ def test_rules_are_kept_as_they_were_given(database: Database) -> None:
         queries.set_disabled(s, bob, True)
         assert queries.list_alert_rules(s) == queries.list_alert_rules(s, ann) == [made]
         assert queries.list_alert_rules(s, bob) == [other]
+
+
+def test_numbers_of_rules_are_drawn(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    """None that is taken; whoever sees his own learns nothing of how many there are, and they stay in order."""
+    drawn = iter([2**31 - 2, 2**31 - 2, 6])
+    asked: list[int] = []
+    monkeypatch.setattr(secrets, "randbelow", lambda below: asked.append(below) or next(drawn))
+    with database.begin() as s:
+        ann = queries.add_user(s, "ann", None).id
+        for created in (1.0, 2.0):
+            queries.add_alert_rule(s, **{**a_rule(ann), "created": created})  # type: ignore[arg-type]  # as above
+        assert [each.id for each in queries.list_alert_rules(s)] == [2**31 - 1, 7]
+    assert asked == [2**31 - 1] * 3
 
 
 def test_a_rule_is_removed_by_whom_it_belongs_to(database: Database) -> None:

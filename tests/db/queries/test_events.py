@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 from sqlalchemy import text
+from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_db.queries import MemoryAsk, MemoryPlace, MemoryRecord, NameIs, NewMemory, recalling
+from relay_db.queries import MemoryAsk, MemoryPlace, MemoryRecord, NameIs, NewMemory, events, recalling
+from relay_protocol.errors import Unavailable
 
 ALL = MemoryAsk("default", frozenset({1, 2}), True, insider=True)
 
@@ -58,6 +60,35 @@ def test_an_event_of_no_realm_is_not_kept(database: Database) -> None:
         kept = queries.remember(s, [new(1.0, realm="gone"), new(1.0), new(2.0, realm="gone"), new(3.0)])
         queries.use_memories(s, {("gone", 1): 2})
     assert [each and each.number for each in kept] == [None, 1, None, 2]
+
+
+def test_a_realm_that_goes_meanwhile_takes_nothing_along(
+    postgresql: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others of the transaction are kept, though it was removed after it was looked up."""
+    with postgresql.begin() as s:
+        queries.add_realm(s, "lab")
+    looked_up = events._realms
+
+    def removed_then(s: Session) -> dict[str, int]:
+        found = looked_up(s)
+        with postgresql.begin() as other:
+            queries.remove_realm(other, "lab")
+        return found
+
+    monkeypatch.setattr(events, "_realms", removed_then)
+    kept = remembered(postgresql, new(1.0, realm="lab"), new(2.0))
+    assert [each and each.number for each in kept] == [None, 1]
+
+
+def test_a_realm_stays_until_what_is_written_to_it_is_safe(postgresql: Database) -> None:
+    """Also where nothing of it is in any table yet."""
+    with postgresql.begin() as s:
+        queries.add_realm(s, "lab")
+    with postgresql.begin() as writing:
+        assert events._lasting(writing, {"lab", "nowhere", "\0"}).keys() == {"lab"}
+        with pytest.raises(Unavailable, match="locked"), postgresql.begin() as s:
+            queries.remove_realm(s, "lab")
 
 
 def test_events_are_numbered_within_their_realm(database: Database) -> None:

@@ -16,10 +16,11 @@ KEY = b"k" * 32
 
 @pytest.fixture
 def filled(database: Database) -> Database:
-    """One of each, all with the number 1: user, group, robot, right, token, code."""
+    """One of each, all with the number 1: user, group, robot, right, token, code; and an empty realm."""
     with database.begin() as s:
         ann, lab = queries.add_user(s, "ann", None), queries.add_group(s, "lab")
         rover = queries.add_robot(s, "rover")
+        queries.add_realm(s, "empty")
         queries.add_member(s, lab.id, ann.id)
         queries.grant_right(s, rover.id, "viewer", user_id=ann.id)
         token = queries.create_token(s, ann.id, HASH, kind="access", expires=None, now=1.0)
@@ -29,6 +30,8 @@ def filled(database: Database) -> Database:
 
 
 CHANGES: dict[str, Callable[[Session], object]] = {
+    "a realm is added": lambda s: queries.add_realm(s, "plant"),
+    "a realm is removed": lambda s: queries.remove_realm(s, "empty"),
     "a user is added": lambda s: queries.add_user(s, "bob", None),
     "a password is set": lambda s: queries.set_password(s, 1, "x"),
     "a user is disabled": lambda s: queries.set_disabled(s, 1, True),

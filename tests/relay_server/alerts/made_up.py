@@ -13,7 +13,7 @@ SECRET = "0123456789abcdef"
 def alert(id: str = "a1", **other: Any) -> AlertRecord:
     """A robot that is offline."""
     made = AlertRecord(
-        id, 1, "rover", "offline", "", "error", "nothing comes", 10.0, 10.5, 1, 1, None, None, None
+        id, 1, "rover", "default", "offline", "", "error", "nothing comes", 10.0, 10.5, 1, 1, None, None, None
     )
     return made._replace(**other)
 

@@ -33,7 +33,7 @@ class Scene:
         self, kind: str = "offline", about: str = "", level: str = "error", text: str = "x"
     ) -> list[str]:
         """Something is wrong; what is worth telling of it."""
-        return events(self.book.tell(ROBOT, "rover", kind, about, level, text, self.moment))
+        return events(self.book.tell(ROBOT, "rover", "lab1", kind, about, level, text, self.moment))
 
     def over(self, kind: str = "offline", about: str = "") -> list[str]:
         """It is well again."""
@@ -75,7 +75,7 @@ def test_another_part_or_kind_is_another_alert(scene: Scene) -> None:
     scene.tell("diagnostics", "motor")
     scene.tell("diagnostics", "camera")
     scene.tell("module", "camera")
-    scene.book.tell(2, "other", "module", "camera", "error", "x", scene.moment)
+    scene.book.tell(2, "other", "default", "module", "camera", "error", "x", scene.moment)
     assert len(list(scene.book)) == 4
 
 
@@ -296,7 +296,7 @@ def test_new_alerts_of_a_robot_come_at_a_bounded_rate(scene: Scene) -> None:
         scene.tell("diagnostics", f"part {each}")
         scene.over("diagnostics", f"part {each}")
     assert len(list(scene.book)) <= kinds.OPEN + 52
-    other = scene.book.tell(2, "other", "offline", "", "error", "x", scene.moment)
+    other = scene.book.tell(2, "other", "default", "offline", "", "error", "x", scene.moment)
     assert events(other) == ["offline begun"]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from twisted.internet.defer import Deferred, DeferredSemaphore
 from twisted.internet.task import Clock
+from twisted.logger import capturedLogs, formatEvent
 
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import Unavailable
@@ -364,6 +365,30 @@ def test_alerts_of_other_peoples_robots_take_no_place(scene: Scene) -> None:
         way.offer(begun(f"x{number}", level="error", robot_id=2))
     scene.wait(61)
     assert [message.left_out for message in scene.got] == [0, 5]
+
+
+def test_alerts_of_another_realm_are_not_even_judged(scene: Scene) -> None:
+    """However many, while the database does not answer: they take no place of those of one's own."""
+    way = scene.delivery(realm="lab1", user="toad")
+    scene.dumb = True
+    for number in range(UNJUDGED + 50):
+        way.offer(begun(f"x{number}", robot_id=number))
+    assert (way.waiting, scene.asks) == (0, 0)
+    way.offer(begun("mine", realm="lab1"))
+    assert way.waiting == 1
+    scene.dumb = False
+    scene.wait(3)
+    assert scene.told() == [["mine begun"]]
+
+
+def test_the_log_says_of_which_realm_he_is_who_was_not_told(scene: Scene) -> None:
+    """Users of several realms may have one name."""
+    way = scene.delivery(realm="lab1", user="toad")
+    scene.errors = [Undelivered("no such page", again=False)]
+    with capturedLogs() as logs:
+        way.offer(begun(realm="lab1"))
+        scene.wait(1)
+    assert "by rule 7 of toad@lab1: no such page" in str(formatEvent(logs[-1]))
 
 
 def test_while_the_database_does_not_answer_a_robot_does_not_push_out_anothers_alerts(scene: Scene) -> None:

@@ -11,7 +11,7 @@ from twisted.logger import capturedLogs, formatEvent
 
 from relay_db import queries
 from relay_protocol import link
-from relay_protocol.errors import NotFound, Refused, Unavailable
+from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds
 from relay_server.alerts.desk import PAGE, REFUSED, AlertDesk, TooOften
@@ -295,6 +295,30 @@ async def test_a_rule_tells_nothing_of_a_robot_its_user_has_lost(scene: Scene) -
         scene.world.clock.advance(1)
     await until(lambda: len(scene.sent) == 2)
     assert [[each.alert.about for each in message.notices] for message in scene.sent] == [["one"], ["three"]]
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_is_told_of_a_robot_is_its_realms(scene: Scene) -> None:
+    """By which it is offered to the rules there, and to no others; also after another relay has begun."""
+    with scene.store.database.begin() as s:
+        queries.add_realm(s, "lab1")
+        number = queries.add_robot(s, "rover", realm="lab1").id
+    robot = scene.world.registry.presence(number, "rover", "lab1")
+    scene.alerts.tell(robot, "module", "arm", "error", "x")
+    await scene.alerts.flush()
+    later = scene.begin()
+    await later.start()
+    for book in (scene.alerts.book, later.book):
+        assert [each.realm for each in book] == ["lab1"]
+    later.hush()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_rule_of_robots_of_a_realm_is_refused(scene: Scene) -> None:
+    """Names are those of one's own; nothing is kept."""
+    with pytest.raises(Invalid, match="own realm"):
+        await scene.desk.add_rule(scene.people["ann"], Ask("portal", robots="rover@default"), "192.0.2.9")
+    assert (await scene.desk.rules(scene.people["ann"]))["rules"] == []
 
 
 @pytest_twisted.ensureDeferred

@@ -15,7 +15,9 @@ from relay_server.alerts import rules
 from relay_server.alerts.kinds import Event
 from relay_server.alerts.rules import Ask, Quiet
 
-ALERT = AlertRecord("a1", 1, "cleaner-7", "battery", "", "warning", "low", 1.0, 1.0, 1, 1, None, None, None)
+ALERT = AlertRecord(
+    "a1", 1, "cleaner-7", "default", "battery", "", "warning", "low", 1.0, 1.0, 1, 1, None, None, None
+)
 RULE = AlertRuleRecord(
     1, 7, "ann", "default", "", "*", (), "warning", "webhook", "https://example.org/hook?key=1", "s" * 32,
     True, 60.0, None, 1.0,
@@ -48,6 +50,13 @@ def at(text: str, zone: str = "Europe/Rome") -> float:
 def test_a_rule_tells_what_it_is_for(change: dict[str, object], event: Event, wanted: bool) -> None:
     """By robot, kind, level, and whether it is over."""
     assert rules.wants(RULE._replace(**change), ALERT, event) is wanted  # type: ignore[arg-type]  # its fields
+
+
+def test_a_rule_tells_nothing_of_another_realms_robots() -> None:
+    """Their names may be the same."""
+    theirs = RULE._replace(realm="lab1", robots="cleaner-7")
+    assert not rules.wants(theirs, ALERT, Event.BEGUN)
+    assert rules.wants(theirs, ALERT._replace(realm="lab1"), Event.BEGUN)
 
 
 @pytest.mark.parametrize(
@@ -132,6 +141,7 @@ def test_rules_that_make_sense_are_taken(ask: Ask) -> None:
         (Ask("webhook", url="https://x", secret="0123456789abcdef\n"), "printable"),
         (Ask("portal", label="a\nb"), "printable lines"),
         (Ask("portal", robots="a\x00b"), "printable lines"),
+        (Ask("portal", robots="r*@lab1"), "'r.@lab1' must be written without '@'"),
         (Ask("portal", quiet=Quiet("08:00", "08:00")), "are the same"),
         (Ask("portal", quiet=Quiet("08:00", "09:00", least="all")), "'least'"),
         (Ask("portal", quiet=Quiet("08:00", "09:00", "Mars/Olympus")), "no time zone"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -51,6 +52,13 @@ def test_every_event_in_every_state(world: World, state: State, event: Event) ->
     assert channel.state is NEXT.get((state, event), state)
     assert (channel.wire.link is not None) == (state is State.OPEN and channel.state is State.OPEN)
     assert (channel in world.robot.watchers) == (channel.state is not State.CLOSED)
+
+
+def test_a_channels_name_says_nothing_of_how_many_there_were(world: World) -> None:
+    """The robot is told it, and others' channels are nothing to it."""
+    other = world.channels.of(world.registry.presence(2, "rover", "lab"))
+    assert re.fullmatch(r"rover#[0-9a-f]{8}", world.channel.name)
+    assert other.name != world.channel.name
 
 
 def test_nobody_opens_a_channel_to_a_robot_that_is_away(world: World) -> None:

@@ -26,6 +26,7 @@ def people(cli: Any) -> Any:
             "a1",
             robot.id,
             "rover",
+            "default",
             "module",
             "arm",
             "error",
@@ -106,9 +107,23 @@ def test_rules_are_added_listed_and_removed(people: Any) -> None:
     assert "no rule" in people.fails("alerts", "rules", "remove", str(made["id"]), "--yes")
 
 
+def test_a_users_own_realm_is_left_out_of_the_robots_of_a_rule(people: Any) -> None:
+    """However it is written; the pattern is of names as they are in that realm."""
+    people.ok("realm", "add", "lab1")
+    people.ok("user", "add", "ann@lab1", "--no-password")
+    for user, robots in (("ann", "r*@default"), ("ann@lab1", "r*@LAB1"), ("ann@lab1", "r*")):
+        made = people.json("alerts", "rules", "add", user, "--portal", "--robots", robots)
+        assert made["robots"] == "r*"
+    assert "another realm" in people.fails(
+        "alerts", "rules", "add", "ann@lab1", "--portal", "--robots", "r*@default"
+    )
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        (("--portal", "--robots", "r*@lab1"), "'r*@lab1' are robots of another realm"),
+        (("--portal", "--robots", "@default"), "this is no rule"),
         ((), "give one of"),
         (("--portal", "--webhook", "https://example.org"), "give one of"),
         (("--webhook", "ftp://example.org"), "webhook's 'url'"),

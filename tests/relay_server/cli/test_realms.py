@@ -237,6 +237,7 @@ def test_alerts_are_told_with_full_names(labs: Any) -> None:
                     f"a{number}",
                     number,
                     "rover",
+                    "default",
                     "offline",
                     "",
                     "error",

@@ -62,3 +62,21 @@ def test_many_changes_come_some_at_a_time() -> None:
     first, second = changes.news("default", follower), changes.news("default", follower)
     assert (len(first.changes), first.more) == (AT_ONCE, True)
     assert (len(second.changes), second.more) == (1, False)
+
+
+def test_of_a_realm_that_is_gone_nothing_is_told_any_more() -> None:
+    """Neither what came in it, nor to who followed it what comes in another of its name."""
+    changes = Changes("e1")
+    former, _ = changes.follow("lab", None)
+    here, _ = changes.follow("default", None)
+    changes.tell("registered", ELSEWHERE)
+    changes.tell("registered", RECORD)
+    changes.forget("lab")
+    assert changes.news("lab", former).changes == []
+    later, _ = changes.follow("lab", "e1-0")
+    assert changes.news("lab", later).changes == []
+    changes.tell("changed", ELSEWHERE)
+    assert [each.what for each in changes.news("lab", later).changes] == ["changed"]
+    assert changes.news("lab", former).changes == []
+    assert len(changes.news("default", here).changes) == 1
+    changes.leave(former)

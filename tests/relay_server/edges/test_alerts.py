@@ -90,6 +90,8 @@ def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     assert desk.asked[-1] == ("ann", Ask("portal", group_s=30.0), "192.0.2.9")
     assert world.ask("DELETE", f"{HERE}/rules/7", **ANN).status == 204
     assert desk.asked[-1] == ("ann", 7, "192.0.2.9")
+    assert world.ask("DELETE", f"{HERE}/rules/{2**31 - 1}", **ANN).status == 204
+    assert desk.asked[-1] == ("ann", 2**31 - 1, "192.0.2.9")
     assert world.ask("POST", f"{HERE}/rules/7/test", **ANN).json["ok"]
 
 

@@ -116,6 +116,8 @@ def test_changes_are_told_and_so_is_what_is_not_known() -> None:
     tab.passes(1.0)
     tab.desk.changed()
     tab.client.run()
+    assert tab.told == [ROBOTS]
+    tab.passes(telling.QUIET_SECONDS)
     assert tab.told == [ROBOTS, ROBOTS]
     tab.desk.up = False
     tab.passes(telling.STREAM_SECONDS)

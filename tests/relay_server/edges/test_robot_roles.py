@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import pytest_twisted
+from twisted.logger import capturedLogs, formatEvent
 
 from relay_db import queries
 from relay_protocol import identity, limits, link
@@ -264,3 +265,28 @@ async def test_a_link_closed_by_the_relay_is_dropped_if_the_robot_does_not_close
     hall.world.clock.advance(2)
     assert robot.transport.aborted
     await until(lambda: not hall.world.clock.getDelayedCalls())
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_stranger_in_its_network_locks_no_robot_out(hall: Hall) -> None:
+    """He fails with the robot's name, or another's, and keys of his own."""
+    for number in range(limiter.FAILURES + 1):
+        stranger = hall.dial()
+        stranger.prove(stranger.hello("r2-d2", f"{number:064x}"), key=NEW_KEY)
+        await stranger.answered()
+        assert "not accepted" in stranger.refusal()["reason"]
+    await hall.registered()
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_log_says_of_which_realm_a_robot_is_that_tells_of_something_wrong(hall: Hall) -> None:
+    """Robots of several realms may have one name; events of a realm have no others in them."""
+    robot = await hall.registered()
+    assert hall.presence is not None
+    hall.presence.realm = "lab1"
+    with capturedLogs() as logs:
+        robot.says(link.Alert(level="warning", text="too hot"))
+    assert "robot r2-d2@lab1: warning: too hot" in [formatEvent(each) for each in logs]
+    await until(lambda: hall.journal._waiting == 0)
+    (event,) = await hall.store.read(queries.list_events, kind="robot.alert")
+    assert event.source == "robot:r2-d2"

@@ -9,7 +9,7 @@ import pytest
 
 from relay_server.access import Principal
 from relay_server.edges import telling
-from tests.relay_server.edges.http_client import World, parse
+from tests.relay_server.edges.http_client import ROOT, World, parse
 
 
 @pytest.fixture
@@ -49,9 +49,13 @@ def test_each_source_is_an_event(world: World) -> None:
 
 
 def test_it_goes_on(world: World) -> None:
-    """At every change, and without one."""
+    """At every change of what is seen, and without one."""
     transport = streaming(world)
     events(transport)
+    world.clock.advance(telling.COALESCE_SECONDS)
+    world.desk.changed()
+    assert events(transport) == []
+    world.desk.tokens["ann"] = ROOT
     world.clock.advance(telling.COALESCE_SECONDS)
     world.desk.changed()
     assert events(transport) == ["robots"]

@@ -65,6 +65,11 @@ class Room:
         for listener in list(self.listeners):
             listener()
 
+    def renamed(self, name: str) -> None:
+        """There is another robot."""
+        self.robots = [{"name": name}]
+        self.changed()
+
     def passes(self, seconds: float) -> None:
         """Time, in small steps that add up without a remainder."""
         for _ in range(round(seconds * 16)):
@@ -108,14 +113,73 @@ def test_changes_in_quick_succession_are_told_once(room: Room) -> None:
     room.passes(module.COALESCE_SECONDS)
     room.events()
     room.changed()
+    assert room.events() == []
+    room.renamed("one")
+    assert room.events() == []
+    room.passes(module.COALESCE_SECONDS)
     assert room.events() == ["robots"]
-    for _ in range(10):
+    for number in range(10):
+        room.renamed(f"robot {number}")
+    assert room.events() == []
+    room.passes(module.COALESCE_SECONDS)
+    assert room.events() == ["robots"]
+    room.passes(module.COALESCE_SECONDS)
+    assert room.events() == []
+
+
+def test_what_is_nothing_new_is_told_only_when_it_is_time(room: Room) -> None:
+    """Others come and go all the time: whoever sees nothing of them learns nothing of when they do."""
+    room.begin()
+    for _ in range(130):
         room.changed()
-    assert room.events() == []
+        room.alerts = list(room.alerts)
+        room.passes(1 / 16)
+    assert [name for name, _ in room.told] == ["robots", "alerts", "robots", "robots"]
+    assert room.at == [0.0, 0.0, module.QUIET_SECONDS, 2 * module.QUIET_SECONDS]
+
+
+def test_what_passes_is_no_news_before_it_is_time(room: Room) -> None:
+    """When something last came from a robot is other at each look, whoever has caused it; it is told then."""
+    room.alerts = [{"id": "a1", "count": 1}]
+    room.begin()
+    room.events()
+    for number in range(16):
+        room.robots = [{"name": "rover", "last_seen": float(number), "rtt_ms": number / 4}]
+        room.alerts = [{"id": "a1", "count": number}]
+        room.changed()
+        room.passes(0.25)
+    assert [name for name, _ in room.told] == ["robots", "alerts"]
+    assert room.at[2:] == [module.QUIET_SECONDS] * 2
+
+
+def test_that_the_database_is_away_is_told_again_only_when_it_is_time(room: Room) -> None:
+    """At once as soon as it is known; then by the last telling, whoever wakes meanwhile, as what there is after it."""
+    room.begin()
+    room.passes(1.0)
+    room.error = Unavailable("the database does not answer")
+    room.events()
+    for _ in range(16 * 7):
+        room.changed()
+        room.passes(1 / 16)
+    assert room.events() == ["unknown"] * 3
+    assert room.at[-3:] == [1.0, 1.0 + module.QUIET_SECONDS, 1.0 + 2 * module.QUIET_SECONDS]
+    room.error = None
+    room.changed()
     room.passes(module.COALESCE_SECONDS)
     assert room.events() == ["robots"]
-    room.passes(module.COALESCE_SECONDS)
-    assert room.events() == []
+
+
+@pytest.mark.parametrize("woken", [False, True])
+def test_that_a_look_takes_long_is_told_by_the_last_telling(room: Room, woken: bool) -> None:
+    """Not by when the look began, which may have been at what somebody else did."""
+    room.begin()
+    room.passes(1.0)
+    room.answers = Deferred()
+    if woken:
+        room.changed()
+    room.passes(module.STREAM_SECONDS)
+    assert room.at[2:] == [module.QUIET_SECONDS + module.LOOK_SECONDS]
+    assert room.told[-1][0] == module.UNKNOWN
 
 
 def test_what_changes_while_it_is_looked_up_is_told_after_it(room: Room) -> None:
@@ -126,7 +190,7 @@ def test_what_changes_while_it_is_looked_up_is_told_after_it(room: Room) -> None
         nonlocal begun
         if not begun:
             begun = True
-            room.changed()
+            room.renamed("digger")
 
     room.during = change
     room.begin()
@@ -136,7 +200,7 @@ def test_what_changes_while_it_is_looked_up_is_told_after_it(room: Room) -> None
 
 
 def test_other_events_are_told_when_they_are_another_list(room: Room) -> None:
-    """Robots are told all the time."""
+    """Robots are told without news as well."""
     room.begin()
     room.events()
     room.passes(module.COALESCE_SECONDS + module.QUIET_SECONDS)

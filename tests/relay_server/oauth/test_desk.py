@@ -97,7 +97,11 @@ async def test_a_wrong_password_gives_none(there: World) -> None:
     """It is an event; too many are refused before anything is hashed."""
     await there.fill()
     assert await there.error(there.by_password(password="wrong")) == "invalid_grant"
-    assert there.told[-1] == ("login.refused", {"user": "ann", "address": HERE, "reason": "bad_credentials"})
+    said = {"user": "ann", "realm": "default", "address": HERE, "reason": "bad_credentials"}
+    assert there.told[-1] == ("login.refused", said)
+    ask = TokenAsk("password", username=f"{'x' * 100}@LAB1", password="wrong")
+    assert await there.error(there.desk.token(ask, None, HERE)) == "invalid_grant"
+    assert there.told[-1] == ("login.refused", {**said, "user": f"{'x' * 100}@LAB1", "realm": "lab1"})
     for _ in range(FAILURES - 1):
         await there.error(there.by_password(password="wrong"))
     with pytest.raises(TooManyTries):
@@ -207,6 +211,23 @@ async def test_who_guesses_at_a_secret_is_soon_refused(there: World) -> None:
     with pytest.raises(TooManyTries):
         await prove(basic(KEY, SECRET), "POST", "/", HERE)
     assert (await prove(basic(KEY, SECRET), "POST", "/", "198.51.100.7")) is not None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_wrong_secret_is_told_in_the_realm_of_the_program(there: World) -> None:
+    """In none where nobody has such a program."""
+    await there.store.write(queries.add_realm, "lab")
+    await there.fill()
+    cleo = await there.store.write(queries.add_user, "cleo", None, realm="lab")
+    known = passwords.verifier("swp_lab", SECRET)
+    await there.store.write(
+        queries.add_program, cleo.id, "swp_lab", known, scope=None, label="", now=there.now
+    )
+    for key in (KEY, "swp_lab", "swp_2"):
+        with pytest.raises(BadCredentials):
+            await there.desk.program(basic(key, "wrong"), "POST", "/", HERE)
+    told = [(data["program"], data["realm"]) for kind, data in there.told if kind == "login.refused"]
+    assert told == [(KEY, "default"), ("swp_lab", "lab"), ("swp_2", None)]
 
 
 @pytest_twisted.ensureDeferred

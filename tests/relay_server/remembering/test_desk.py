@@ -423,3 +423,44 @@ async def test_a_page_looks_at_so_much_and_says_where_the_next_one_begins(
         ask = ask._replace(after=place)
     assert (sizes, numbers) == ([0, 1, 0, 1], [16, 1])
     assert await room.desk.count(ann, ask_of({"data.n": "0"}, 0.0)) == 2
+
+
+async def emptied(room: Room) -> None:
+    """The other realm is removed, with all that was in it, and made anew."""
+    with room.store.database.begin() as s:
+        queries.remove_robot(s, 3)
+        queries.remove_user(s, room.people["cleo"].user_id)
+        queries.remove_realm(s, "lab")
+        queries.add_realm(s, "lab")
+
+
+@pytest_twisted.ensureDeferred
+async def test_of_a_realm_that_is_gone_no_follower_hears_in_one_of_its_name(room: Room) -> None:
+    """What happened in it is forgotten, and other realms' events are not."""
+    await room.write("cleo", {"kind": "former"})
+    await room.write("ann", {"kind": "here"})
+    await emptied(room)
+    room.recent.forget("lab")
+    assert await heard(room, Following(0), room.people["cleo"]) == []
+    assert room.recent.since("default", 0) is not None
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_realm_that_is_gone_counts_for_none_of_its_name(room: Room) -> None:
+    """Neither how much it held, nor what of it was used; the new one's events grow old all the same."""
+    cleo = room.people["cleo"]
+    for each in range(50):
+        await room.write("cleo", {"kind": "former", "source": f"s{each}"})
+    await room.reads("cleo")
+    await emptied(room)
+    room.quota.forget("lab")
+    with room.store.database.begin() as s:
+        fresh = [queries.NewMemory("lab", 1000.0, f"n{each}", "fresh", None, None, "{}") for each in range(5)]
+        room.quota.written([each for each in queries.remember(s, fresh) if each is not None])
+    await room.quota.look()
+    page = await room.desk.page(cleo, Ask(), 100, uses=False)
+    assert [(each.kind, each.used) for each in page[0]] == [("fresh", 0)] * 5
+    room.quota.forget("lab")
+    room.time.now += 2000
+    await room.quota.purge()
+    assert (await room.desk.page(cleo, Ask(), 100))[0] == []

@@ -68,13 +68,40 @@ def test_a_refused_login_is_told_in_full(notes: Notes, noticing: Noticing) -> No
     assert (event.realm, event.source, event.user, json.loads(event.data)) == ("default", "relay", None, data)
 
 
-@pytest.mark.parametrize("user", ["ann@lab", "nobody@lab"])
-def test_a_refused_login_is_told_in_the_realm_that_was_named(
-    notes: Notes, noticing: Noticing, user: str
+def test_a_refused_login_is_told_in_the_realm_that_was_named(notes: Notes, noticing: Noticing) -> None:
+    """Whether there is such a realm or not; which it is belongs to the event, and not to what it says."""
+    noticing.happened("login.refused", "relay", None, {"user": "ann@LAB", "realm": "lab"})
+    assert [(each.realm, json.loads(each.data)) for each in notes.events] == [("lab", {"user": "ann@LAB"})]
+
+
+@pytest.mark.parametrize("realm", [None, ""])
+def test_a_refused_login_of_no_realm_is_told_to_nobody(
+    notes: Notes, noticing: Noticing, realm: str | None
 ) -> None:
-    """Whether there is such a user or realm or not: nobody learns that from where he finds it."""
-    noticing.happened("login.refused", "relay", None, {"user": user})
-    assert [each.realm for each in notes.events] == ["lab"]
+    """A program that nobody has, or a realm that can't be; the journal has it all the same."""
+    noticing.happened("login.refused", "relay", None, {"program": "swp_1", "realm": realm})
+    assert (notes.events, notes.dropped) == ([], 0)
+
+
+def test_a_flood_in_one_realm_leaves_room_in_others(notes: Notes, noticing: Noticing) -> None:
+    """Of logins, and of what users of the same name do; what strangers name for realms has one share together."""
+    notes.exist(["lab", "plant"])
+
+    def refused(realm: str) -> int:
+        before = len(notes.events)
+        noticing.happened("login.refused", "relay", None, {"user": "x", "realm": realm})
+        return len(notes.events) - before
+
+    assert sum(refused("lab") for _ in range(NOTED_AT_ONCE + 5)) == NOTED_AT_ONCE
+    assert refused("plant") == refused("default") == 1
+    assert sum(refused(f"nowhere{each}") for each in range(NOTED_AT_ONCE + 5)) == NOTED_AT_ONCE
+    assert refused("plant") == 1
+    notes.events.clear()
+    for realm in ("lab", "plant"):
+        event = NewMemory(realm, 5.0, "directory", "registered", None, "ann", "{}")
+        for _ in range(NOTED_AT_ONCE + 5):
+            noticing.note(event)
+    assert [each.realm for each in notes.events] == ["lab"] * NOTED_AT_ONCE + ["plant"] * NOTED_AT_ONCE
 
 
 def test_what_is_not_for_the_memory_leaves_nothing(notes: Notes, noticing: Noticing) -> None:
@@ -106,7 +133,9 @@ def test_words_of_an_alert_are_told_where_they_take_no_further_right(
     notes: Notes, noticing: Noticing, kind: str, told: bool
 ) -> None:
     """That there is one is told in any case."""
-    alert = AlertRecord("a1", 1, "rover", kind, "part", "error", "words", 1.0, 2.0, 1, 1, None, None, None)
+    alert = AlertRecord(
+        "a1", 1, "rover", "default", kind, "part", "error", "words", 1.0, 2.0, 1, 1, None, None, None
+    )
     noticing.alert("begun", alert)
     (event,) = notes.events
     words = {"about": "part", "text": "words"} if told else {}

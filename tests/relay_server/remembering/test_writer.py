@@ -243,3 +243,28 @@ async def test_who_goes_down_waits_for_what_is_under_way(scene: Scene) -> None:
     assert not flushing.called
     scene.paper.commit()
     assert flushing.called
+
+
+def test_what_was_dropped_in_a_realm_that_is_gone_is_told_to_nobody(scene: Scene) -> None:
+    """In another of its name that something was dropped is told at once."""
+    scene.writer.exist(["lab"])
+    scene.writer.drop("lab")
+    scene.writer.note(new())
+    scene.gather()
+    assert [each.realm for each in scene.paper.commit()] == ["default", "lab"]
+    scene.writer.drop("lab")
+    scene.writer.forget("lab")
+    assert not scene.writer.knows("lab") and scene.writer.knows("default")
+    scene.writer.exist(["lab"])
+    assert scene.writer.knows("lab")
+    scene.clock.advance(DROPS_SECONDS)
+    scene.writer.note(new())
+    scene.gather()
+    assert [each.realm for each in scene.paper.commit()] == ["default"]
+    scene.writer.drop("lab")
+    scene.writer.forget("lab")
+    scene.writer.exist(["lab"])
+    scene.writer.drop("lab")
+    scene.writer.note(new("lab"))
+    scene.gather()
+    assert [each.data for each in scene.paper.commit()] == ["{}", '{"count":1}']

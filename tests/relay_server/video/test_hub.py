@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from relay_protocol import link
@@ -59,6 +61,12 @@ def test_who_wants_the_same_shares_a_stream(world: World) -> None:
     assert len({each.name for each in world.videos}) == 4
     assert world.videos.of(world.robot) == [stream, small, rear]
     assert world.videos.of(other) == [elsewhere]
+
+
+def test_a_streams_name_says_nothing_of_how_many_there_were(world: World) -> None:
+    """The robot is told it, and others' streams are nothing to it."""
+    name = Watcher().watch(world).name
+    assert re.fullmatch(r"rover#video[0-9a-f]{8}", name)
 
 
 def test_a_ticket_is_for_its_stream_alone(world: World) -> None:
