@@ -104,16 +104,14 @@ class Relay:
         library = Library(settings.data / FOLDER, settings.recordings, settings.recordings_reserve)
         self._recordings = Recordings(reactor, reactor, library, self._channels, self._videos, time.time)
         self._journal = Journal(self._store, time.time)
-        self._alerts = AlertHouse(
-            reactor, self._store, self._access, self._registry, self._channels, self._journal, settings
-        )
-        told = self._journal, self._alerts.alerts
+        record = DatabaseRecord(self._store, self._journal, time.time)
+        self._desks = Desks(reactor, record, ControlRules.of(settings), self._registry.changed, time.time)
         judged = self._store, self._access, self._registry
+        self._alerts = AlertHouse(reactor, *judged, self._channels, self._desks, self._journal, settings)
+        told = self._journal, self._alerts.alerts
         self._memory = MemoryHouse(reactor, *judged, *told, settings)
         self._directory = DirectoryHouse(reactor, *judged, self._channels, self._memory.note)
         self._realms = Realms(self._store, self._memory.realms, self._directory.realms)
-        record = DatabaseRecord(self._store, self._journal, time.time)
-        self._desks = Desks(reactor, record, ControlRules.of(settings), self._registry.changed, time.time)
         self._ports: list[Any] = []
         self._revision = -1
         self._polling = LoopingCall(self._poll)

@@ -13,6 +13,7 @@ from relay_server.alerts.senses import Thresholds
 from relay_server.alerts.ways import Ways
 from relay_server.channel import Channels
 from relay_server.config import Settings
+from relay_server.control import Desks
 from relay_server.journal import Journal
 from relay_server.registry import Registry
 from relay_server.store import Store
@@ -32,6 +33,7 @@ class AlertHouse:
         access: Access,
         registry: Registry,
         channels: Channels,
+        desks: Desks,
         journal: Journal,
         settings: Settings,
     ) -> None:
@@ -44,6 +46,7 @@ class AlertHouse:
             access,
             registry,
             channels,
+            desks,
             journal,
             Thresholds(HEARTBEATS_MISSED * settings.heartbeat, own.battery_low, own.battery_critical),
             self._ways.send,

@@ -21,6 +21,7 @@ from relay_server.alerts.senses import LOOK_SECONDS, Senses, Thresholds, stopped
 from relay_server.alerts.tellers import Tellers
 from relay_server.channel import Channels
 from relay_server.clock import Clock, looping, within
+from relay_server.control import Desks
 from relay_server.journal import Journal
 from relay_server.registry import Presence, Registry
 from relay_server.store import Store
@@ -62,6 +63,7 @@ class Alerts:
         access: Access,
         registry: Registry,
         channels: Channels,
+        desks: Desks,
         journal: Journal,
         thresholds: Thresholds,
         send: Send,
@@ -81,7 +83,7 @@ class Alerts:
         self._store = store
         self._access = access
         self._registry = registry
-        self._senses = Senses(registry, channels, thresholds, self)
+        self._senses = Senses(registry, channels, desks, thresholds, self)
         self._looking = looping(clock, self._look)
         self._looks = 0
         self._shown = self._states = 0

@@ -12,6 +12,7 @@ from typing import Protocol
 from relay_server.alerts import kinds
 from relay_server.alerts.flow import Flow
 from relay_server.channel import Channel, Channels
+from relay_server.control import Desks
 from relay_server.registry import Presence, Registry
 
 LOOK_SECONDS = 0.25
@@ -71,12 +72,16 @@ class Thresholds:
 class Senses:
     """Looks at all robots.
 
+    :param desks: know of orders to stop that robots have not confirmed yet
     :param voice: is told what lasts and what is over
     """
 
-    def __init__(self, registry: Registry, channels: Channels, thresholds: Thresholds, voice: Voice) -> None:
+    def __init__(
+        self, registry: Registry, channels: Channels, desks: Desks, thresholds: Thresholds, voice: Voice
+    ) -> None:
         self._registry = registry
         self._channels = channels
+        self._desks = desks
         self._thresholds = thresholds
         self._voice = voice
         self._online: dict[int, tuple[str | None, float]] = {}
@@ -159,7 +164,7 @@ class Senses:
             self._voice.over(robot, kinds.BATTERY)
 
     def _stop(self, robot: Presence, now: float) -> None:
-        stopped = robot.safety.stopped
+        stopped = robot.safety.stopped or self._desks.standing(robot.robot_id).stopped
         if stopped is not None:
             if self._voice.lasts(robot, kinds.STOP) is None:
                 self._voice.tell(robot, kinds.STOP, "", "warning", stopped_by(stopped.by, stopped.why))

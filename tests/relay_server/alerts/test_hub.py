@@ -67,8 +67,8 @@ class Scene:
         world = self.world
         thresholds = Thresholds(6.0, 0.2, 0.1)
         return Alerts(
-            world.clock, self.wall, self.store, self.access, world.registry, world.channels, self.journal,
-            thresholds, self._send,
+            world.clock, self.wall, self.store, self.access, world.registry, world.channels, world.desks,
+            self.journal, thresholds, self._send,
         )  # fmt: skip
 
     async def _send(self, rule: Any, message: Message) -> None:

@@ -7,6 +7,7 @@ import pytest
 from relay_protocol import link
 from relay_server.alerts import kinds
 from relay_server.alerts.senses import Senses, Thresholds
+from relay_server.control import Actor
 from relay_server.registry import Presence
 from tests.relay_server.memory import STRING, TWIST, Person, World, text
 
@@ -45,7 +46,7 @@ class Scene:
     def __init__(self, world: World) -> None:
         self.world = world
         self.ear = Ear()
-        self.senses = Senses(world.registry, world.channels, THRESHOLDS, self.ear)
+        self.senses = Senses(world.registry, world.channels, world.desks, THRESHOLDS, self.ear)
         self.number = 0
         self.mute = False
         self.wall_step = 0.0
@@ -170,7 +171,9 @@ def test_a_battery_is_low_critical_and_well_again_with_room_between(scene: Scene
 
 def test_batteries_are_not_looked_at_where_that_is_switched_off(scene: Scene) -> None:
     """Not even an empty one is told."""
-    scene.senses = Senses(scene.world.registry, scene.world.channels, Thresholds(6.0, 0.0, 0.0), scene.ear)
+    scene.senses = Senses(
+        scene.world.registry, scene.world.channels, scene.world.desks, Thresholds(6.0, 0.0, 0.0), scene.ear
+    )
     scene.world.robot_comes()
     scene.world.robot.health = link.Health(battery=0.0)
     scene.goes_on(3)
@@ -198,6 +201,17 @@ def test_a_stop_is_not_over_because_the_robot_has_not_spoken_yet(scene: Scene) -
     scene.goes_on(60)
     scene.world.robot_comes()
     scene.goes_on(5)
+    assert scene.ear.told == []
+
+
+def test_a_stop_is_not_over_while_the_robot_has_yet_to_confirm_it(scene: Scene) -> None:
+    """Whoever looks between the order and the robot's word sees a robot that is being stopped."""
+    scene.world.robot_comes()
+    scene.goes_on(30)
+    scene.ear.now["stop", ""] = "warning"
+    scene.world.control.obeys = None
+    scene.world.desks.of(scene.world.robot).stopping.stop(Actor("ann", "user:ann", 7), "")
+    scene.goes_on(2)
     assert scene.ear.told == []
 
 
