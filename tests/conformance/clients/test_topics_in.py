@@ -8,7 +8,7 @@ import math
 import time
 
 from conformance_suite import NO_STATUS, SPEC_ONLY, Hand, Server, case
-from rosbridge_client import ABSENCE, Client
+from rosbridge_client import ABSENCE, PATIENCE, Client
 
 STRING = "std_msgs/msg/String"
 LATE = "its publishers stay for 10 s after the last unadvertise (rosbridge_server, unregister_timeout)"
@@ -26,8 +26,15 @@ def graph_knows(client: Client, topic: str, type_name: str) -> None:
 
 
 def ready(client: Client, hand: Hand, topic: str, type_name: str, **fields: object) -> None:
-    """The robot listens to a topic, and the client has advertised it."""
+    """The robot listens to a topic, which the server knows, and the client has advertised it.
+
+    A server that does not know yet who listens publishes the first messages to nobody.
+    """
     hand.listen(topic, type_name)
+    until = time.monotonic() + PATIENCE
+    while topic not in client.values("/rosapi/topics")["topics"]:
+        assert time.monotonic() < until, f"the server does not see that the robot listens to {topic}"
+        time.sleep(0.02)  # the robot's graph is another process's
     client.send("advertise", topic=topic, type=type_name, **fields)
     hand.publishers(topic, 1)
 
