@@ -19,7 +19,7 @@ PUBLISH = "rosbridge v2, 3.2.3 Publish"
 
 def graph_knows(client: Client, topic: str, type_name: str) -> None:
     """Wait until the server has seen a topic of the graph."""
-    until = time.monotonic() + 8
+    until = time.monotonic() + PATIENCE
     while client.values("/rosapi/topic_type", {"topic": topic})["type"] != type_name:
         assert time.monotonic() < until, f"the server does not see {topic}"
         time.sleep(0.05)
@@ -31,10 +31,7 @@ def ready(client: Client, hand: Hand, topic: str, type_name: str, **fields: obje
     A server that does not know yet who listens publishes the first messages to nobody.
     """
     hand.listen(topic, type_name)
-    until = time.monotonic() + PATIENCE
-    while topic not in client.values("/rosapi/topics")["topics"]:
-        assert time.monotonic() < until, f"the server does not see that the robot listens to {topic}"
-        time.sleep(0.02)  # the robot's graph is another process's
+    graph_knows(client, topic, type_name)
     client.send("advertise", topic=topic, type=type_name, **fields)
     hand.publishers(topic, 1)
 
