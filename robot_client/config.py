@@ -12,6 +12,8 @@ import msgspec
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
 from relay_protocol.link import MotionPolicy, moving
+from relay_protocol.wildcards import see_cheap
+from robot_client.camera.device import V4L2, read_device
 from robot_client.hardware import Switches
 from robot_client.platforms.definitions import normalise
 from robot_client.safety import Times
@@ -264,8 +266,9 @@ class Video(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings; each section is a table of the TOML file.
 
-    :param cameras: those without ROS, by a name like a topic's: ``v4l2:/dev/video0``, an address such as
-        ``rtsp://…``, or the path of a file
+    :param cameras: those without ROS, by a name like a topic's: ``v4l2:/dev/video0``, which may be told its size, rate
+        and format (``v4l2:/dev/video0?width=1280&height=720&fps=30&format=MJPG``), an address such as ``rtsp://…``, or
+        the path of a file
     """
 
     safety: Safety = msgspec.field(default_factory=Safety)
@@ -299,7 +302,10 @@ def _pattern(where: str, name: str) -> str:
     plain = not set("*?[") & set(full)
     if not (_TOPIC if plain else _PATTERN).match(full) or full.endswith("/") or "//" in full:
         raise ValueError(f"{where}: '{name}' matches no name; write /name, or a pattern such as /arm/*")
-    return full
+    try:
+        return see_cheap(full)
+    except Invalid as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def _check_command(where: str, command: list[str]) -> None:
@@ -323,6 +329,11 @@ def _camera_source(name: str, source: str) -> str:
             f"cameras: what {name} stands for can't be opened; "
             "write v4l2:/dev/video0, rtsp://host/path or /path/of/a/file"
         )
+    if source.startswith(V4L2):
+        try:
+            read_device(source)
+        except Invalid as error:
+            raise ValueError(f"cameras: of {name}: {error}") from None
     return source
 
 

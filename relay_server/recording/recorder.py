@@ -354,7 +354,12 @@ class _Eye:
         self._recorder.saw(self._camera, picture)
 
     def playing(self, playing: link.Playing) -> None:
-        """Pictures say themselves how large they are."""
+        """Pictures say themselves how large they are, but not that they were to be larger or more."""
+        if playing.reduced > 0:
+            self._recorder.tell(
+                "warning",
+                f"{self._camera}: the robot's uplink is thin; for a while its pictures are smaller, coarser or fewer",
+            )
 
     def moved(self, stream: Stream) -> None:
         """Where the robot is at its limit what others watch is recorded, and that is told."""

@@ -53,7 +53,8 @@ class Wish(NamedTuple):
 
     :param settings: the form he asked for, which is another one than he is shown while the robot is at its limit
     :param newest: whether he wants to see the newest picture of a slow camera until the next one comes
-    :param first: whether he gets a place that becomes free before others do: a recording can't be made again
+    :param first: whether he gets a place that becomes free before others do: a recording can't be made again. Pictures
+        that come too late to be shown he takes as well
     """
 
     settings: link.VideoSettings

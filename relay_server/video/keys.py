@@ -16,6 +16,9 @@ KEY_SECONDS = 0.5
 MOST_KEY_SECONDS = 8.0
 """For who leaves out pictures again and again it is asked after 0.5, 1, 2 s and so on, at last only so often."""
 
+ALONE_KEY_SECONDS = 1.0
+"""Who watches alone waits no longer: a key frame more costs nobody else anything."""
+
 STEADY_SECONDS = 10.0
 """Who leaves out nothing for so long after a key frame keeps up: what was before counts no more."""
 
@@ -27,20 +30,22 @@ class _Slow:
     """A viewer who has left out pictures.
 
     :ivar pause: seconds between the next request for him and the one after it
-    :ivar not_before: when he may be the reason of a request again, monotonic seconds
+    :ivar paused: seconds after the last request in which he is not the reason of another one
+    :ivar asked_at: when that was, monotonic seconds
     :ivar shown_at: when he got a key frame, if that was after he left out something
     """
 
-    __slots__ = ("not_before", "pause", "shown_at")
+    __slots__ = ("asked_at", "pause", "paused", "shown_at")
 
     def __init__(self) -> None:
         self.pause = KEY_SECONDS
-        self.not_before = float("-inf")
+        self.paused = 0.0
+        self.asked_at = float("-inf")
         self.shown_at: float | None = None
 
     def asked(self, now: float) -> None:
         """The robot was asked while he waited."""
-        self.not_before = now + self.pause
+        self.asked_at, self.paused = now, self.pause
         self.pause = min(2 * self.pause, MOST_KEY_SECONDS)
 
     def kept_up(self, now: float) -> bool:
@@ -52,11 +57,13 @@ class Keys:
     """Who waits for a picture that stands alone. Of JPEG and PNG each does, and nobody asks for any.
 
     :param ask: asks the robot for a key frame
+    :param shared: whether more than one watch now
     """
 
-    def __init__(self, clock: Clock, ask: Callable[[], None]) -> None:
+    def __init__(self, clock: Clock, ask: Callable[[], None], shared: Callable[[], bool]) -> None:
         self._clock = clock
         self._ask = ask
+        self._shared = shared
         self._waiting: set[Viewer] = set()
         self._slow: dict[Viewer, _Slow] = {}
         self._asked = float("-inf")
@@ -86,7 +93,7 @@ class Keys:
             slow = self._slow[viewer] = _Slow()
         slow.shown_at = None
         self._waiting.add(viewer)
-        self._ask_at(max(slow.not_before, self._asked + KEY_SECONDS))
+        self._ask_at(max(self._not_before(viewer), self._asked + KEY_SECONDS))
 
     def shown(self, viewer: Viewer) -> None:
         """He gets a picture that stands alone."""
@@ -112,7 +119,10 @@ class Keys:
         now = self._clock.seconds()
         if due <= now + _SLACK:
             self._ask_now(now)
-        elif self._timer is None or not self._timer.active() or due < self._due:
+            return
+        # The others may leave meanwhile, and then it is due earlier.
+        due = min(due, now + ALONE_KEY_SECONDS)
+        if self._timer is None or not self._timer.active() or due < self._due:
             cancel(self._timer)
             self._due = due
             self._timer = self._clock.callLater(due - now, self._look)
@@ -125,7 +135,10 @@ class Keys:
 
     def _not_before(self, viewer: Viewer) -> float:
         slow = self._slow.get(viewer)
-        return float("-inf") if slow is None else slow.not_before
+        if slow is None:
+            return float("-inf")
+        pause = slow.paused if self._shared() else min(slow.paused, ALONE_KEY_SECONDS)
+        return slow.asked_at + pause
 
     def _ask_now(self, now: float) -> None:
         cancel(self._timer)

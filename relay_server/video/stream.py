@@ -87,7 +87,7 @@ class Stream:
         self._link: VideoLink | None = None
         self._lateness = Lateness()
         self._patience = Patience(clock, self._due, self._in_vain)
-        self._keys = Keys(clock, self._ask_for_key)
+        self._keys = Keys(clock, self._ask_for_key, lambda: len(self.viewers) > 1)
         self._late = False
         """Whether the newest picture came too late for everybody."""
         self._viewers_told: link.Playing | None = None
@@ -182,6 +182,7 @@ class Stream:
             self._show(structs.replace(newest, good_until=now + STALE_SECONDS), [viewer])
 
     def _show(self, picture: Picture, viewers: list[Viewer]) -> None:
+        in_time = self._clock.seconds() <= picture.good_until
         for viewer in viewers:
             # One may leave while another is shown the picture.
             if viewer not in self.viewers:
@@ -189,7 +190,8 @@ class Stream:
             if picture.key:
                 self._keys.shown(viewer)
             if not self._keys.waits(viewer):
-                self._patience.ends(viewer)
+                if in_time or self.wishes[viewer].first:
+                    self._patience.ends(viewer)
                 viewer.picture(picture)
 
     def _due(self) -> float:

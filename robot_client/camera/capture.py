@@ -13,9 +13,9 @@ from urllib.request import url2pathname
 import cv2
 import numpy as np
 
+from robot_client.camera.device import V4L2, Device, read_device
 from robot_client.camera.formats import Pixels
 
-V4L2 = "v4l2:"
 _FILE = "file://"
 
 RETRY = (0.5, 5.0)
@@ -70,10 +70,12 @@ class Capture:
 
     Nothing it tells holds the address of a camera: passwords may stand anywhere in it.
 
-    :param source: ``v4l2:/dev/video0``, an address such as ``rtsp://…``, the path of a file or its ``file://…``
+    :param source: ``v4l2:/dev/video0`` (see :func:`~robot_client.camera.device.read_device`), an address such as
+        ``rtsp://…``, the path of a file or its ``file://…``
     :param on_picture: called with each picture, in the thread
     :param tell: called when it can't be read, and when it can again, in the thread; once each
     :param silence: see :data:`SILENCE`, seconds
+    :raises Invalid: what is asked of a device can't be
     """
 
     latched = False
@@ -89,7 +91,7 @@ class Capture:
         if source.startswith(_FILE):
             source = url2pathname(urlsplit(source).path)
         self._source = source
-        self._device = source.removeprefix(V4L2) if source.startswith(V4L2) else ""
+        self._device = read_device(source) if source.startswith(V4L2) else None
         self._is_file = source.startswith("/")
         self._on_picture = on_picture
         self._tell = tell
@@ -156,8 +158,8 @@ class Capture:
         if self._is_file:
             return cv2.VideoCapture(self._source)
         if self._device:
-            capture = cv2.VideoCapture(self._device, cv2.CAP_V4L2)
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, _BUFFERED)
+            capture = cv2.VideoCapture(self._device.path, cv2.CAP_V4L2)
+            _set(capture, self._device)
             return capture
         patience = round(1000 * self._silence)
         # By this alone: all others would be tried after it, which read no addresses but may log them.
@@ -176,7 +178,7 @@ class Capture:
 
     def _why_closed(self) -> str:
         """Why it could not be opened, as far as can be told."""
-        path = self._device or self._source
+        path = self._device.path if self._device else self._source
         if not self._device and not self._is_file:
             return "can't be reached, or is no film, or wants another password"
         if not Path(path).exists():
@@ -195,3 +197,16 @@ class Capture:
             return 0.0
         fps = capture.get(cv2.CAP_PROP_FPS)
         return 1.0 / fps if 0 < fps < 1000 else 0.04
+
+
+def _set(capture: cv2.VideoCapture, device: Device) -> None:
+    """Ask a driver for what is wanted of it; one that can't do that goes on as near to it as it can."""
+    # The format first: which sizes and rates there are depends on it.
+    if device.format:
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*device.format))
+    if device.width:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, device.width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, device.height)
+    if device.fps:
+        capture.set(cv2.CAP_PROP_FPS, device.fps)
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, _BUFFERED)

@@ -6,7 +6,7 @@ import struct
 from typing import Literal
 
 from relay_protocol.errors import Invalid
-from robot_client.camera.messages import check_size
+from robot_client.camera.messages import Damaged, check_size
 
 Kind = Literal["jpeg", "png"]
 
@@ -42,12 +42,12 @@ def kind_of(file: bytes, start: int = 0) -> Kind:
 def end_of(file: bytes, start: int, stop: int, kind: Kind) -> int:
     """Where the picture ends; cameras that give JPEG pad it with what fills their buffers.
 
-    :raises Invalid: it ends in the middle
+    :raises Damaged: it ends in the middle
     """
     end = _ENDS[kind]
     last = file.rfind(end, start, stop)
     if last < 0:
-        raise Invalid(f"the {kind.upper()} ends in the middle")
+        raise Damaged(f"the {kind.upper()} ends in the middle")
     return last + len(end)
 
 
@@ -61,12 +61,17 @@ def size_of(file: bytes, kind: Kind) -> tuple[int, int]:
     return width, height
 
 
+def is_grey_of_sixteen_bits(file: bytes) -> bool:
+    """Whether a PNG has one value of sixteen bits for each pixel (W3C, Portable Network Graphics, 11.2.1)."""
+    return file[24:26] == b"\x10\x00"
+
+
 def _png_size(file: bytes) -> tuple[int, int]:
     if len(file) < 24:
-        raise Invalid("the PNG ends in the middle")
+        raise Damaged("the PNG ends in the middle")
     _, name, width, height = _IHDR(file)
     if name != b"IHDR":
-        raise Invalid("the PNG has no head")
+        raise Damaged("the PNG has no head")
     return width, height
 
 
@@ -88,4 +93,4 @@ def _jpeg_size(file: bytes) -> tuple[int, int]:
             at += 2
         else:
             at += 2 + max(2, _LENGTH(file, at + 2)[0])
-    raise Invalid("the JPEG tells no size")
+    raise Damaged("the JPEG tells no size")

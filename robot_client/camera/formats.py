@@ -1,11 +1,15 @@
 """Pictures as cameras publish them, turned into arrays: every usual encoding of sensor_msgs/msg/Image, JPEG and PNG.
 
 Colours mean what cv_bridge and image_encodings.hpp say. Sixteen bits become eight by 255 / 65535, whatever the camera
-uses of them, so that the brightness doesn't jump; depth gets colours of a fixed scale for the same reason.
+uses of them, so that the brightness doesn't jump; depth gets colours of a fixed scale for the same reason, also where
+image_transport has made a PNG of it.
 """
 
 from __future__ import annotations
 
+import math
+import struct
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,23 +18,21 @@ import numpy as np
 import numpy.typing as npt
 
 from relay_protocol.errors import Invalid
-from robot_client.camera import files
-from robot_client.camera.messages import Image, read_compressed, read_image
+from robot_client.camera import depth, files
+from robot_client.camera.messages import Damaged, Image, read_compressed, read_image
 
 Pixels = npt.NDArray[np.uint8]
-
-NEAREST, FARTHEST = 250, 16_000
-"""Millimetres; depth is red up to the first and blue from the second. In between every doubling of the distance takes
-as many colours as the last, with green in the middle, at 2 m. What was not measured is black."""
 
 PIXELS = 1 << 25
 """Most pixels of a file that is decoded: a few bytes of PNG can stand for any number."""
 
-_MOST = 65_535
-"""Millimetres in sixteen bits."""
+_SIXTEEN = ("16UC1", "mono16")
+"""Encodings whose pixels are sixteen bits of a PNG, as they are."""
 
-_COLOURS = (235, 20)
-"""Part of OpenCV's palette Turbo that is used, near to far: its ends are nearly black."""
+_DEPTH_HEAD = struct.Struct("<iff")
+"""What stands before the file of compressedDepth: ConfigHeader of compressed_depth_image_transport, a kind and two
+numbers by which ``32FC1`` was quantised; in the byte order of the publisher,
+which is little endian on all that ROS 2 supports."""
 
 
 class Raw(NamedTuple):
@@ -64,22 +66,91 @@ def image(cdr: bytes) -> Raw:
     return Raw(found.encoding, found.width, found.height, layout.read(found))
 
 
-def compressed(cdr: bytes) -> tuple[files.Kind, bytes]:
-    """The file in a sensor_msgs/msg/CompressedImage, from its first byte to its last and not decoded.
+class Packed(NamedTuple):
+    """A picture that comes as a file.
+
+    :param file: from its first byte to its last, not decoded
+    :param encoding: what its sixteen bits were before: ``16UC1``, ``mono16``, ``32FC1``. Empty: what it shows is as it
+        stands in the file
+    :param scale: of ``32FC1``: numerator and offset, see :func:`~robot_client.camera.depth.coloured_inverse`
+    """
+
+    kind: files.Kind
+    file: bytes
+    encoding: str = ""
+    scale: tuple[float, float] = (0.0, 0.0)
+
+
+def compressed(cdr: bytes) -> Packed:
+    """The file in a sensor_msgs/msg/CompressedImage.
 
     :param cdr: the message as ROS serialised it, with its four-byte header
-    :returns: ``"jpeg"`` or ``"png"``, and the file
-    :raises Invalid: no such message, or neither a whole JPEG nor a whole PNG
+    :raises Invalid: no such message, or neither a whole JPEG nor a whole PNG, or depth in a form that can't be shown
     """
-    return _file(cdr)
+    return _packed(cdr)
 
 
-def _file(cdr: bytes) -> tuple[files.Kind, bytes]:
+def _packed(cdr: bytes) -> Packed:
     found = read_compressed(cdr)
+    encoding, _, codec = (part.strip() for part in found.format.partition(";"))
     if "compressedDepth" in found.format:
-        raise Invalid("compressedDepth can't be shown; take the topic with the raw depth")
-    kind = files.kind_of(cdr, found.start)
-    return kind, cdr[found.start : files.end_of(cdr, found.start, found.stop, kind)]
+        return _compressed_depth(cdr, found.start, found.stop, encoding, codec)
+    try:
+        kind = files.kind_of(cdr, found.start)
+    except Invalid as error:
+        if found.start == found.stop or any(name in found.format.lower() for name in ("jpeg", "jpg", "png")):
+            raise Damaged(str(error)) from None
+        raise
+    file = cdr[found.start : files.end_of(cdr, found.start, found.stop, kind)]
+    as_raw = encoding in _SIXTEEN and kind == "png" and files.is_grey_of_sixteen_bits(file)
+    return Packed(kind, file, encoding if as_raw else "")
+
+
+def _compressed_depth(cdr: bytes, start: int, stop: int, encoding: str, codec: str) -> Packed:
+    """What compressed_depth_image_transport makes; releases of old don't name the codec, which is PNG."""
+    if "rvl" in codec.lower():
+        raise Invalid(
+            "compressedDepth by RVL can't be shown; set compressedDepth.format of its publisher to png, "
+            "or take the topic with the raw depth"
+        )
+    if encoding not in (*_SIXTEEN, "32FC1"):
+        raise Invalid(
+            f"compressedDepth of encoding '{encoding}' can't be shown; these can: 16UC1, mono16, 32FC1"
+        )
+    at = start + _DEPTH_HEAD.size
+    if at >= stop:
+        raise Damaged("this compressedDepth ends before its PNG begins")
+    if files.kind_of(cdr, at) != "png":
+        raise Invalid("compressedDepth of another kind than PNG can't be shown")
+    file = cdr[at : files.end_of(cdr, at, stop, "png")]
+    if not files.is_grey_of_sixteen_bits(file):
+        raise Invalid("a PNG of compressedDepth has to be grey of sixteen bits, and this one is not")
+    _, *scale = _DEPTH_HEAD.unpack_from(cdr, start)
+    if encoding != "32FC1":
+        return Packed("png", file, encoding)
+    if not all(map(math.isfinite, scale)):
+        raise Damaged("this compressedDepth does not tell how it was quantised")
+    return Packed("png", file, encoding, (scale[0], scale[1]))
+
+
+def unpacked(packed: Packed) -> Raw:
+    """Pixels of a picture that came as a file: as those of the raw topic that it was made of.
+
+    :raises Invalid: as of :func:`decoded`
+    """
+    if not packed.encoding:
+        return decoded(packed.file)
+    values = _decoded(packed.kind, packed.file, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if values.dtype != np.uint16:
+        raise Damaged("the PNG is broken")
+    height, width = values.shape
+    if packed.encoding == "32FC1":
+        pixels = depth.coloured_inverse(values.astype(np.uint16, copy=False), *packed.scale)
+    else:
+        rows = np.ascontiguousarray(values).data.cast("B")
+        found = Image(packed.encoding, width, height, sys.byteorder == "big", 2 * width, rows)
+        pixels = _LAYOUTS[packed.encoding].read(found)
+    return Raw(packed.encoding, width, height, pixels)
 
 
 def decoded(file: bytes) -> Raw:
@@ -88,19 +159,22 @@ def decoded(file: bytes) -> Raw:
     :raises Invalid: it is neither, is broken, or has more than :data:`PIXELS`
     """
     kind = files.kind_of(file)
+    pixels = _decoded(kind, file, cv2.IMREAD_ANYCOLOR).astype(np.uint8, copy=False)
+    return Raw(kind, pixels.shape[1], pixels.shape[0], pixels)
+
+
+def _decoded(kind: files.Kind, file: bytes, how: int) -> npt.NDArray[Any]:
     width, height = files.size_of(file, kind)
     if width * height > PIXELS:
         raise Invalid(f"a {kind.upper()} of {width}×{height} pixels is too large to be decoded")
     try:
         # A camera's rotation is the viewer's to ask for: sizes are those of the file's head.
-        pixels = cv2.imdecode(
-            np.frombuffer(file, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        )
+        pixels = cv2.imdecode(np.frombuffer(file, np.uint8), how | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         pixels = None
     if pixels is None or pixels.shape[:2] != (height, width):
-        raise Invalid(f"the {kind.upper()} is broken")
-    return Raw(kind, width, height, pixels.astype(np.uint8, copy=False))
+        raise Damaged(f"the {kind.upper()} is broken")
+    return pixels
 
 
 def looked_at(cdr: bytes, compressed: bool) -> tuple[str, int, int]:
@@ -112,8 +186,8 @@ def looked_at(cdr: bytes, compressed: bool) -> tuple[str, int, int]:
     if not compressed:
         found = read_image(cdr)
         return found.encoding, found.width, found.height
-    kind, file = _file(cdr)
-    return kind, *files.size_of(file, kind)
+    packed = _packed(cdr)
+    return packed.encoding or packed.kind, *files.size_of(packed.file, packed.kind)
 
 
 class _Layout(NamedTuple):
@@ -144,7 +218,7 @@ def _check(found: Image, layout: _Layout) -> None:
         raise Invalid(f"{size} has rows of {row} bytes, but step says {found.step}")
     needed = found.step * found.height * layout.lines // 2
     if len(found.pixels) < needed:
-        raise Invalid(f"{size} and step {found.step} takes {needed} bytes; there are {len(found.pixels)}")
+        raise Damaged(f"{size} and step {found.step} takes {needed} bytes; there are {len(found.pixels)}")
 
 
 def _plane(found: Image, dtype: str = "u1", channels: int = 1) -> npt.NDArray[Any]:
@@ -183,37 +257,14 @@ def _converted(pixels: Pixels, code: int | None) -> Pixels:
     return pixels if code is None else cv2.cvtColor(pixels, code).astype(np.uint8, copy=False)
 
 
-def _depth_colours() -> Pixels:
-    """BGR for each millimetre."""
-    octaves = np.log2(np.maximum(np.arange(_MOST + 1), 1) / NEAREST) / np.log2(FARTHEST / NEAREST)
-    shade = _COLOURS[0] + (_COLOURS[1] - _COLOURS[0]) * np.clip(octaves, 0, 1)
-    # A square, because releases of OpenCV disagree on what comes of a single row.
-    square = np.rint(shade).astype(np.uint8).reshape(256, 256)
-    colours: Pixels = cv2.applyColorMap(square, cv2.COLORMAP_TURBO).astype(np.uint8).reshape(-1, 3)
-    colours[0] = 0
-    return colours
-
-
-_DEPTH = _depth_colours()
-
-
 def _millimetres(found: Image) -> Pixels:
     """Depth in millimetres, 0 where nothing was measured (REP 118)."""
-    return _coloured(_plane(found, "u2"))
+    return depth.coloured(_plane(found, "u2"))
 
 
 def _metres(found: Image) -> Pixels:
     """Depth in metres, NaN or infinite where nothing was measured (REP 118)."""
-    depth = _plane(found, "f4")
-    measured = np.isfinite(depth) & (depth > 0)
-    millimetres = (
-        np.minimum(depth, _MOST / 1000, where=measured, out=np.zeros(depth.shape, np.float32)) * 1000
-    )
-    return _coloured(millimetres.astype(np.uint16))
-
-
-def _coloured(millimetres: npt.NDArray[np.uint16]) -> Pixels:
-    return np.take(_DEPTH, millimetres, axis=0)
+    return depth.coloured(depth.whole_millimetres(_plane(found, "f4")))
 
 
 def _nv21(found: Image) -> Pixels:

@@ -31,11 +31,11 @@ def message_shot(stamp: int, arrived: float, cdr: bytes, compressed: bool) -> Sh
         return Look(*formats.looked_at(cdr, compressed))
 
     def jpeg() -> bytes | None:
-        kind, file = formats.compressed(cdr)
-        return file if kind == "jpeg" else None
+        packed = formats.compressed(cdr)
+        return packed.file if packed.kind == "jpeg" else None
 
     if compressed:
-        return Shot(stamp, arrived, look, lambda: formats.decoded(formats.compressed(cdr)[1]), jpeg)
+        return Shot(stamp, arrived, look, lambda: formats.unpacked(formats.compressed(cdr)), jpeg)
     return Shot(stamp, arrived, look, lambda: formats.image(cdr))
 
 

@@ -12,6 +12,11 @@ from typing import NamedTuple
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import LABEL, PICTURE_SIDE
 
+
+class Damaged(Invalid):
+    """This picture is broken; the camera's next one may not be."""
+
+
 _ORDERS = {b"\x00\x01": struct.Struct("<I"), b"\x00\x00": struct.Struct(">I")}
 _HEAD = 4
 """Bytes of the encapsulation; what follows is aligned from there."""
@@ -85,7 +90,7 @@ def check_size(width: int, height: int) -> None:
 class _Reader:
     def __init__(self, cdr: bytes) -> None:
         if len(cdr) < _HEAD:
-            raise Invalid(f"{len(cdr)} bytes are too short for a CDR message")
+            raise Damaged(f"{len(cdr)} bytes are too short for a CDR message")
         order = _ORDERS.get(cdr[:2])
         if order is None:
             raise Invalid(f"bytes 0 and 1 are {cdr[:2].hex()}; plain CDR has 0001 or 0000")
@@ -127,6 +132,6 @@ class _Reader:
         start = self._at
         if length > len(self._cdr) - start:
             left = max(0, len(self._cdr) - start)
-            raise Invalid(f"the message ends in the middle: {what} has {length} bytes, {left} are left")
+            raise Damaged(f"the message ends in the middle: {what} has {length} bytes, {left} are left")
         self._at = start + length
         return start

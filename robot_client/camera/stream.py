@@ -14,6 +14,7 @@ from relay_protocol import limits, link
 from relay_protocol.errors import SwitchboardError, Unavailable
 from robot_client.camera.leaving import Leaving
 from robot_client.camera.lines import Open
+from robot_client.camera.messages import Damaged
 from robot_client.camera.pace import TARGET, Pace
 from robot_client.camera.shot import Made, Shot, Wish
 from robot_client.camera.trip import RoundTrip
@@ -22,7 +23,12 @@ from robot_client.reactors import Clock, Timer
 from robot_client.transport import LinkLost, LinkProtocol
 
 FAULTS = 10
-"""Pictures in a row that may be broken before a stream that has shown some is given up."""
+"""Pictures in a row that may be damaged before a stream is given up; once it has shown some, those that could not be
+made count, too."""
+
+BEARS = 5.0
+"""Seconds after a damaged picture in which the first good one must come: viewers who wait are told what is wrong before
+the relay tells them that nothing came."""
 
 TELL_EVERY = 1.0
 """Seconds between two words of ``playing`` that differ in nothing but what is measured."""
@@ -93,6 +99,8 @@ class Stream:
         """Whether the relay lacks a picture that those made of H.264 need, up to one that stands alone."""
         self._number = 0
         self._faults = 0
+        self._damaged: tuple[float, str] | None = None
+        """When the first picture came that was damaged, while none was shown, and in what way."""
         self._told: link.Playing | None = None
         self._told_at = 0.0
         self._timer: Timer | None = None
@@ -213,6 +221,7 @@ class Stream:
             self._next()
             return
         self._broken = False
+        self._damaged = None
         self._number += 1
         self._tell(made, wish, self._view)
         self._leaving.put(self._number, shot, made.body, self._clock.seconds(), alone)
@@ -225,9 +234,14 @@ class Stream:
         failure.trap(SwitchboardError)
         self._key = self._key or wish.key
         self._faults += 1
-        if not self._number or self._faults >= FAULTS:
-            self.refuse(failure.getErrorMessage())
+        reason = failure.getErrorMessage()
+        # Cameras often begin with a damaged picture or two, but another encoding or size will not come by itself.
+        hopeless = not self._number and failure.check(Damaged) is None
+        if hopeless or self._faults >= FAULTS:
+            self.refuse(reason)
             return
+        if not self._number and self._damaged is None:
+            self._damaged = self._clock.seconds(), reason
         self._next()
 
     def _failed(self, failure: Failure) -> None:
@@ -245,7 +259,13 @@ class Stream:
         self._next()
 
     def _look(self) -> None:
-        """Who publishes the pictures may be known, or be another one, only after the picture that is shown."""
+        """Who publishes the pictures may be known, or be another one, only after the picture that is shown; and where a
+        picture was damaged, no other one may come.
+        """
+        if self._damaged is not None and self._clock.seconds() - self._damaged[0] >= BEARS:
+            self._looking = None
+            self.refuse(self._damaged[1])
+            return
         self._looking = self._clock.callLater(TELL_EVERY, self._look)
         if self._told is not None and self._view is not None and self._told.latched != self._view.latched:
             self._told = replace(self._told, latched=self._view.latched)

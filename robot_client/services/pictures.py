@@ -70,7 +70,7 @@ class Pictures:
         :raises Invalid: it can't be shown, or is broken
         """
         if self._asked.compressed:
-            return formats.decoded(formats.compressed(message)[1])
+            return formats.unpacked(formats.compressed(message))
         return formats.image(message)
 
     def lens(self, width: int, height: int) -> Lens:

@@ -17,6 +17,7 @@ import psutil
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 from switchboard_browser import lived_in, sound_pages
+from switchboard_proxy import ChaosProxy
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_video import CAMERA, decoded, get
@@ -107,17 +108,17 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
     """Opens cockpits; an uncaught error or a breach of the CSP in any of them fails the test."""
     with sound_pages(browser, f"http://127.0.0.1:{house.relay.http_port}", WAIT_SECONDS) as new_page:
+        yield lambda: in_cockpit(new_page(1280, 800))
 
-        def open_page() -> Page:
-            page = new_page(1280, 800)
-            credentials = {"user": "watcher", "password": PASSWORD}
-            headers = {"X-Requested-With": "switchboard"}
-            assert page.request.post("/api/v1/session", data=credentials, headers=headers).ok
-            page.goto("/cockpit/rover")
-            expect(part(page, "fps")).to_have_text(RUNS)
-            return page
 
-        yield open_page
+def in_cockpit(page: Page) -> Page:
+    """The cockpit, with a picture that runs."""
+    credentials = {"user": "watcher", "password": PASSWORD}
+    headers = {"X-Requested-With": "switchboard"}
+    assert page.request.post("/api/v1/session", data=credentials, headers=headers).ok
+    page.goto("/cockpit/rover")
+    expect(part(page, "fps")).to_have_text(RUNS)
+    return page
 
 
 RUNS = re.compile(r"^[1-9]\d* fps$")
@@ -261,6 +262,25 @@ def test_h264_is_shown(house: House, open_page: OpenPage) -> None:
     assert same_scene(shown(page), house.scene())
     expect(part(page, "fps")).to_have_text(RUNS)
     expect(part(page, "codec-note")).to_have_count(0)
+
+
+def test_h264_gives_way_to_jpeg_over_a_link_that_is_too_thin_for_it(house: House, browser: Browser) -> None:
+    """What comes of it now and then is no moving picture: after ten seconds the page asks for JPEG, and says why."""
+    proxy = ChaosProxy(house.relay.http_port)
+    try:
+        with sound_pages(browser, f"http://127.0.0.1:{proxy.port}", WAIT_SECONDS) as new_page:
+            page = in_cockpit(new_page(1280, 800))
+            ask_for(page, codec="h264")
+            house.until_streamed(COMPRESSED, codec="h264", width=640)
+            proxy.squeeze_down(300_000)
+            expect(part(page, "codec-note")).to_have_text(
+                "This link is too thin for H.264. JPEG is shown instead."
+            )
+            house.until_streamed(COMPRESSED, codec="jpeg")
+            proxy.squeeze_down(None)
+            expect(part(page, "fps")).to_have_text(RUNS)
+    finally:
+        proxy.close()
 
 
 def test_a_browser_without_webcodecs_shows_jpeg_and_says_why(house: House, open_page: OpenPage) -> None:

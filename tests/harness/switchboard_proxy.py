@@ -8,23 +8,52 @@ import threading
 import time
 
 PACKET_BYTES = 1460
-"""What goes at once over a thin uplink."""
+"""What goes at once over a thin line."""
+
+
+class _Line:
+    """One direction, which all connections share."""
+
+    def __init__(self) -> None:
+        self.bytes = 0
+        self._rate: float | None = None
+        self._free_at = 0.0
+        self._lock = threading.Lock()
+
+    def squeeze(self, bits_per_second: float | None) -> None:
+        with self._lock:
+            self._rate = None if bits_per_second is None else bits_per_second / 8
+
+    def send(self, sink: socket.socket, data: bytes) -> None:
+        """Packet by packet where it is thin, so that connections take turns."""
+        rest = memoryview(data)
+        while rest:
+            with self._lock:
+                rate = self._rate
+                packet = rest if rate is None else rest[:PACKET_BYTES]
+                self._free_at = max(self._free_at, time.monotonic()) if rate else 0.0
+                if rate:
+                    self._free_at += len(packet) / rate
+                free_at = self._free_at
+            # A packet is there when its last bit is.
+            time.sleep(max(0.0, free_at - time.monotonic()))
+            sink.sendall(packet)
+            rest = rest[len(packet) :]
+            with self._lock:
+                self.bytes += len(packet)
 
 
 class ChaosProxy:
-    """A TCP proxy on loopback that can swallow bytes in either direction, be thin upwards, be far, or reset everything.
+    """A TCP proxy on loopback that can swallow bytes or be thin in either direction, be far, or reset everything.
 
     :param target: port it leads to
     """
 
     def __init__(self, target: int) -> None:
-        self.up = 0
-        """Bytes that went to the target, of all connections."""
+        self._up, self._down = _Line(), _Line()
         self._target = target
         self.seconds_away = 0.0
         """By so much later what comes leaves, each way."""
-        self._up_rate: float | None = None
-        self._up_free_at = 0.0
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._server.getsockname()[1])
         self._open: set[socket.socket] = set()
@@ -46,10 +75,18 @@ class ChaosProxy:
         self.forward_up.set()
         self.forward_down.set()
 
+    @property
+    def up(self) -> int:
+        """Bytes that went to the target, of all connections."""
+        return self._up.bytes
+
     def squeeze(self, bits_per_second: float | None) -> None:
         """From now on all connections share an uplink of this rate; ``None``: as fast as it goes."""
-        with self._lock:
-            self._up_rate = None if bits_per_second is None else bits_per_second / 8
+        self._up.squeeze(bits_per_second)
+
+    def squeeze_down(self, bits_per_second: float | None) -> None:
+        """The same of what comes from the target."""
+        self._down.squeeze(bits_per_second)
 
     def reset(self) -> None:
         """Cut all connections at once."""
@@ -81,19 +118,17 @@ class ChaosProxy:
                 each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with self._lock:
                 self._open |= {near, far}
-            threading.Thread(target=self._pump, args=(near, far, self.forward_up), daemon=True).start()
-            threading.Thread(target=self._pump, args=(far, near, self.forward_down), daemon=True).start()
+            ways = (near, far, self.forward_up, self._up), (far, near, self.forward_down, self._down)
+            for way in ways:
+                threading.Thread(target=self._pump, args=way, daemon=True).start()
 
-    def _pump(self, source: socket.socket, sink: socket.socket, gate: threading.Event) -> None:
+    def _pump(self, source: socket.socket, sink: socket.socket, gate: threading.Event, line: _Line) -> None:
         try:
             while data := source.recv(65536):
                 gate.wait()
                 # What comes meanwhile goes together with what comes next.
                 time.sleep(self.seconds_away)
-                if gate is self.forward_up:
-                    self._send_up(sink, data)
-                else:
-                    sink.sendall(data)
+                line.send(sink, data)
         except OSError:
             pass
         finally:
@@ -104,21 +139,3 @@ class ChaosProxy:
                 with contextlib.suppress(OSError):
                     each.shutdown(socket.SHUT_RDWR)
             source.close()
-
-    def _send_up(self, sink: socket.socket, data: bytes) -> None:
-        """Packet by packet where it is thin, so that connections take turns."""
-        rest = memoryview(data)
-        while rest:
-            with self._lock:
-                rate = self._up_rate
-                packet = rest if rate is None else rest[:PACKET_BYTES]
-                self._up_free_at = max(self._up_free_at, time.monotonic()) if rate else 0.0
-                if rate:
-                    self._up_free_at += len(packet) / rate
-                free_at = self._up_free_at
-            # A packet is there when its last bit is.
-            time.sleep(max(0.0, free_at - time.monotonic()))
-            sink.sendall(packet)
-            rest = rest[len(packet) :]
-            with self._lock:
-                self.up += len(packet)

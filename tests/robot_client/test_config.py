@@ -58,6 +58,7 @@ def test_lists_in_variables_have_commas() -> None:
         ("[safety\n", "not TOML"),
         ('[cameras]\n"a b" = "/film.mp4"\n', "a b"),
         ('[cameras]\nusb = "video0"\n', "v4l2:/dev/video0"),
+        ('[cameras]\nusb = "v4l2:/dev/video0?width=1280"\n', "of usb: width and height are set together"),
         ("[video]\nstreams = 0\n", "streams"),
         ("[video]\nstreams = 17\n", "streams"),
         ("[video]\ntarget_ms = 49\n", "target_ms"),
@@ -93,6 +94,14 @@ def test_cameras_are_named_like_topics(tmp_path: Path) -> None:
     settings = load(file, {})
     assert settings.cameras == {"/usb": "v4l2:/dev/video0", "/gate/left": "rtsp://gate/1"}
     assert (settings.video.streams, settings.video.target_ms) == (3, 150)
+
+
+def test_device_may_be_told_how_to_give_its_pictures(tmp_path: Path) -> None:
+    """It is read by whoever opens it, as it is written here."""
+    source = "v4l2:/dev/video0?width=1280&height=720&fps=30&format=MJPG"
+    file = tmp_path / "robot.toml"
+    file.write_text(f'[cameras]\nusb = "{source}"\n')
+    assert load(file, {}).cameras == {"/usb": source}
 
 
 def test_address_of_a_camera_is_not_told(tmp_path: Path) -> None:

@@ -77,7 +77,9 @@ class Desk(Protocol):
     async def cameras(self, principal: Principal, robot: str) -> list[dict[str, Any]]:
         """The cameras the principal may view."""
 
-    async def may_view(self, principal: Principal, robot: str, camera: str, address: str) -> None:
+    async def may_view(
+        self, principal: Principal, robot: str, camera: str, transport: str, address: str
+    ) -> None:
         """Whether it may view this one."""
 
     async def viewing(
@@ -196,7 +198,8 @@ class Video(Resource):
         wanted = asked(_query(request), "stream")
         principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
         if request.method == b"HEAD":
-            await self._desk.may_view(principal, robot, wanted.camera, _address(request))
+            transport = wanted.settings.transport
+            await self._desk.may_view(principal, robot, wanted.camera, transport, _address(request))
             request.setHeader(b"content-type", CONTENT_TYPE)
             return b""
         screen = Multipart(self._clock, self._rounds, self._turns, self._parts, request)
@@ -248,7 +251,8 @@ class Video(Resource):
         wanted = asked(_query(request), "snapshot")
         principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
         if request.method == b"HEAD":
-            await self._desk.may_view(principal, robot, wanted.camera, _address(request))
+            transport = wanted.settings.transport
+            await self._desk.may_view(principal, robot, wanted.camera, transport, _address(request))
             request.setHeader(b"content-type", CONTENT_TYPES[wanted.settings.codec])
             return b""
         screen = Snapshot(self._clock.seconds)

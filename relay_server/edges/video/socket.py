@@ -15,7 +15,7 @@ import msgspec
 from autobahn.websocket.types import ConnectionRequest
 
 from relay_protocol import jsontext, link
-from relay_protocol.errors import MalformedMessage, SwitchboardError
+from relay_protocol.errors import MalformedMessage, Refused, SwitchboardError
 from relay_protocol.message import Message
 from relay_server import closing, wsframe
 from relay_server.access import Principal
@@ -58,6 +58,16 @@ class VideoGate(Gate, Protocol):
         """Have a camera shown to somebody who was admitted, which uses the admission up."""
 
 
+class VideoTransport(ClientTransport, Protocol):
+    """The websocket under a viewer."""
+
+    def cut(self, reason: str) -> None:
+        """End the connection at once; what was not taken yet goes no more.
+
+        :param reason: for the log
+        """
+
+
 def framed(picture: Picture) -> bytes:
     """Both messages of a picture as websocket frames. What is reduced ``playing`` tells."""
     head = {
@@ -93,7 +103,7 @@ class VideoClient:
     def __init__(
         self,
         shared: VideoFactory,
-        transport: ClientTransport,
+        transport: VideoTransport,
         admission: Admission,
         wanted: Asked,
         progress: Progress,
@@ -202,7 +212,12 @@ class VideoClient:
 
     def ended(self, error: SwitchboardError) -> None:
         """There is nothing to see, or no more."""
-        self.close(code_of(error), str(error))
+        if isinstance(error, Refused) and not self.outbox.passing and not self._ended:
+            # A right that is gone is gone for the rest of a picture too, and the code would come behind that.
+            self._transport.cut(str(error))
+            self.end()
+        else:
+            self.close(code_of(error), str(error))
 
     # --- what goes ----------------------------------------------------------------------------------------
 
@@ -229,7 +244,9 @@ class VideoClient:
 
     def _look(self) -> None:
         """A slow viewer may take his time for a picture, as long as something of it arrives."""
-        if self._progress.stands() >= STALL_SECONDS and self._under_way is not None:
+        # He may say 'took' of what he has not read.
+        waits = self._under_way is not None or not self.outbox.passing
+        if self._progress.stands() >= STALL_SECONDS and waits:
             self.close(
                 closing.TOO_SLOW,
                 f"for {STALL_SECONDS:g} s nothing was taken, and no 'took' came",
@@ -260,11 +277,15 @@ class VideoProtocol(ClientProtocol):
     async def _admit(self, principal: Principal) -> Admission:
         admission = await super()._admit(principal)
         try:
-            check_view(admission.permit, self._wanted.camera)
+            check_view(admission.permit, self._wanted.camera, self._wanted.settings.transport)
         except SwitchboardError:
             self.factory.gate.turn_away(admission)
             raise
         return admission
+
+    def cut(self, reason: str) -> None:
+        """End the connection at once."""
+        self._drop(reason)
 
     def _occupant(self, admission: Admission) -> VideoClient:
         return VideoClient(self.factory, self, admission, self._wanted, self._progress, self._opened_ns)

@@ -11,6 +11,7 @@ import socket
 import struct
 import sys
 import termios
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlencode
@@ -31,6 +32,15 @@ LOOK_SECONDS = 1.0
 
 WAITING_BYTES = MIB
 """Pictures of H.264 need those before them, so that several wait; more than this and it begins anew."""
+
+LAG_SECONDS = 0.5
+"""Pictures of H.264 that would take longer on their way to a viewer are left out; behind them others would grow old."""
+
+PACE_PICTURES = 8
+"""How fast a viewer takes what he is sent is told by so many of the last times."""
+
+APART = 1.5
+"""The most of these must be so many times the least, or the network's wavering would seem to be slowness."""
 
 SOCKET_BYTES = 256 * KIB
 UNSENT_BYTES = 16 * KIB
@@ -54,13 +64,14 @@ class Waiting:
     :param start_anew: called when a picture of H.264 is left out, without which the following are no use
     """
 
-    __slots__ = ("_bytes", "_pictures", "_seconds", "_start_anew")
+    __slots__ = ("_bytes", "_pace", "_pictures", "_seconds", "_start_anew")
 
     def __init__(self, seconds: Callable[[], float], start_anew: Callable[[], None] = lambda: None) -> None:
         self._seconds = seconds
         self._start_anew = start_anew
         self._pictures: list[Picture] = []
         self._bytes = 0
+        self._pace = Pace()
 
     def __bool__(self) -> bool:
         return bool(self._pictures)
@@ -76,16 +87,67 @@ class Waiting:
             self._leave_out()
 
     def take(self) -> list[Picture]:
-        """What goes to the viewer now; nothing when it is too old."""
-        if self._pictures and self._seconds() > self._pictures[0].good_until:
+        """What goes to the viewer, who has taken what went before; nothing when it is too old.
+
+        Several that he would take too long for are left out, but for one that stands alone: a viewer whose link is thin
+        for any of these still sees something.
+        """
+        now = self._seconds()
+        self._pace.taken(now)
+        pictures = self._pictures
+        if pictures and now > pictures[0].good_until:
+            pictures = []
             self._leave_out()
-        pictures, self._pictures, self._bytes = self._pictures, [], 0
+        elif len(pictures) > 1 and self._pace.needs(self._bytes) > LAG_SECONDS:
+            pictures = [each for each in pictures[:1] if each.key]
+            self._leave_out()
+        self._pictures, self._bytes = [], 0
+        if pictures:
+            self._pace.sent(sum(len(each.body) for each in pictures), now)
         return pictures
 
     def _leave_out(self) -> None:
-        self._pictures.clear()
+        self._pictures = []
         self._bytes = 0
         self._start_anew()
+
+
+class Pace:
+    """How long a viewer needs for what he is sent.
+
+    What is the same for little and for much, as the time on the way, is not counted: it is the difference between the
+    least and the most of late that tells. Before there is one nothing is known; where there is none any more it is as
+    it was, or better.
+    """
+
+    __slots__ = ("_bytes", "_last", "_per_byte", "_since")
+
+    def __init__(self) -> None:
+        self._last: deque[tuple[int, float]] = deque(maxlen=PACE_PICTURES)
+        """Bytes, and seconds until they were taken."""
+        self._per_byte = 0.0
+        self._bytes = 0
+        self._since = 0.0
+
+    def sent(self, size: int, now: float) -> None:
+        """So many bytes went to him."""
+        self._bytes, self._since = size, now
+
+    def taken(self, now: float) -> None:
+        """He has taken them."""
+        if not self._bytes:
+            return
+        took = now - self._since
+        self._last.append((self._bytes, took))
+        (least, quick), (most, slow) = min(self._last), max(self._last)
+        if most >= APART * least:
+            self._per_byte = max(slow - quick, 0.0) / (most - least)
+        self._per_byte = min(self._per_byte, took / self._bytes)
+        self._bytes = 0
+
+    def needs(self, size: int) -> float:
+        """Seconds he takes for so many bytes; 0: it is not known."""
+        return size * self._per_byte
 
 
 class Progress:

@@ -505,6 +505,22 @@ def test_that_others_pictures_are_recorded_is_told(world: World) -> None:
     assert desk.entry.problems == [problem]
 
 
+def test_that_pictures_are_reduced_is_told(world: World) -> None:
+    """Once for a camera, however often it happens."""
+    video.robot_comes(world)
+    desk = Desk(world, (), (CAMERA,))
+    desk.starts()
+    video.robot_joins(world)
+    (stream,) = world.videos.of(world.robot)
+    stream.message(link.Playing(width=640, height=480, quality=80))
+    assert desk.entry.problems == []
+    for reduced in (0.5, 0.0, 0.25):
+        world.clock.advance(1)
+        stream.message(link.Playing(width=32, height=24, quality=40, reduced=reduced))
+    (problem,) = desk.entry.problems
+    assert problem.startswith(f"{CAMERA}: the robot's uplink is thin")
+
+
 def test_a_camera_that_is_not_to_be_had_is_asked_for_again(world: World) -> None:
     """As long as the recording runs; why it was not is kept."""
     video.robot_comes(world)

@@ -6,8 +6,9 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol import link
-from relay_server.video.keys import KEY_SECONDS, MOST_KEY_SECONDS, STEADY_SECONDS, Keys
-from tests.relay_server.memory import World
+from relay_server.video.keys import ALONE_KEY_SECONDS, KEY_SECONDS, MOST_KEY_SECONDS, STEADY_SECONDS, Keys
+from relay_server.video.stream import Stream
+from tests.relay_server.memory import MemoryLink, World
 from tests.relay_server.video.watching import DELTA, KEY, Watcher, robot_comes, robot_joins, shows
 
 H264 = link.VideoSettings(codec="h264")
@@ -20,8 +21,10 @@ class Robot:
 
     def __init__(self) -> None:
         self.clock = Clock()
-        self.keys = Keys(self.clock, self._asked)
+        self.keys = Keys(self.clock, self._asked, lambda: self.shared)
         self.asked: list[float] = []
+        self.shared = True
+        """Whether others watch too."""
         self.slow: list[Watcher] = []
         """Leave out a picture a moment after each key frame."""
 
@@ -59,6 +62,32 @@ def test_who_is_too_slow_again_and_again_has_it_asked_ever_more_rarely(robot: Ro
     robot.runs(32)
     assert robot.asked[0] == 0
     assert robot.pauses == [KEY_SECONDS, 1, 2, 4, MOST_KEY_SECONDS, MOST_KEY_SECONDS, MOST_KEY_SECONDS]
+
+
+def test_who_watches_alone_is_asked_for_once_a_second(robot: Robot) -> None:
+    """However slow he is; when somebody else comes it is as rare as ever."""
+    robot.shared = False
+    robot.slow = [Watcher()]
+    robot.keys.left_out(robot.slow[0])
+    robot.runs(8)
+    assert robot.pauses[0] == KEY_SECONDS
+    assert set(robot.pauses[1:]) == {ALONE_KEY_SECONDS}
+    robot.shared = True
+    robot.asked.clear()
+    robot.runs(3 * MOST_KEY_SECONDS)
+    assert set(robot.pauses) == {MOST_KEY_SECONDS}
+
+
+def test_who_is_left_alone_waits_no_longer_for_the_sake_of_others(robot: Robot) -> None:
+    """His pause is over within a second."""
+    robot.slow = [Watcher()]
+    robot.keys.left_out(robot.slow[0])
+    robot.runs(17)
+    robot.shared = False
+    before, now = len(robot.asked), robot.clock.seconds()
+    robot.runs(ALONE_KEY_SECONDS)
+    assert len(robot.asked) > before
+    assert robot.asked[before] - now <= ALONE_KEY_SECONDS
 
 
 def test_many_who_are_too_slow_are_asked_for_together(robot: Robot) -> None:
@@ -133,15 +162,22 @@ def test_who_left_is_asked_for_no_more(robot: Robot) -> None:
     assert robot.asked == [0, 20]
 
 
-def test_one_slow_viewer_sets_nobodys_rate_of_key_frames(world: World) -> None:
-    """In half a minute the robot is asked seven times for him, and not twice a second."""
+def begun(world: World, viewer: Watcher, *others: Watcher) -> tuple[Stream, MemoryLink]:
+    """A stream of H.264 whose first key frame these viewers have seen, and the robot's end of it."""
     robot_comes(world)
-    slow, fast = Watcher(), Watcher()
-    stream = slow.watch(world, H264)
-    fast.watch(world, H264)
+    stream = viewer.watch(world, H264)
+    for each in others:
+        each.watch(world, H264)
     end = robot_joins(world)
     stream.message(PLAYING)
     shows(world, stream, 0, KEY)
+    return stream, end
+
+
+def test_one_slow_viewer_sets_nobodys_rate_of_key_frames(world: World) -> None:
+    """In half a minute the robot is asked seven times for him, and not twice a second."""
+    slow, fast = Watcher(), Watcher()
+    stream, end = begun(world, slow, fast)
     keys = 0
     for number in range(1, 300):
         asked = len(end.take(link.KeyFrame))
@@ -154,14 +190,22 @@ def test_one_slow_viewer_sets_nobodys_rate_of_key_frames(world: World) -> None:
     assert fast.numbers == list(range(300))
 
 
+def test_a_slow_viewer_who_is_alone_sees_more(world: World) -> None:
+    """In half a minute the robot is asked nearly once a second for him."""
+    slow = Watcher()
+    stream, end = begun(world, slow)
+    for number in range(1, 300):
+        shows(world, stream, number, KEY if end.take(link.KeyFrame) else DELTA)
+        if slow.pictures[-1].number == number:
+            stream.start_anew(slow)
+        world.clock.advance(0.1)
+    assert sum(each.key for each in slow.pictures) > 20
+
+
 def test_what_came_too_late_for_everybody_is_nobodys_slowness(world: World) -> None:
     """When the robot's uplink is in time again a key frame is asked for at once."""
-    robot_comes(world)
     watcher = Watcher()
-    stream = watcher.watch(world, H264)
-    end = robot_joins(world)
-    stream.message(PLAYING)
-    shows(world, stream, 0, KEY)
+    stream, end = begun(world, watcher)
     for number in range(1, 20):
         shows(world, stream, number, KEY if end.take(link.KeyFrame) else DELTA, late=1.0 + number % 5)
         if watcher.pictures[-1].number == number:

@@ -15,7 +15,7 @@ from relay_server.video.patience import (
 )
 from relay_server.video.pictures import STALE_SECONDS
 from tests.relay_server.memory import World
-from tests.relay_server.video.watching import CAMERA, Watcher, jpeg, robot_comes, robot_joins, shows
+from tests.relay_server.video.watching import CAMERA, KEY, Watcher, jpeg, robot_comes, robot_joins, shows
 
 
 def camera_gives(world: World, fps: float) -> None:
@@ -93,6 +93,50 @@ def test_patience_is_for_cameras_not_for_robots_that_are_away(world: World) -> N
     watcher.watch(world, link.VideoSettings(fps=0.05))
     world.clock.advance(FIRST_PICTURE_SECONDS)
     assert str(watcher.error) == "robot rover is offline"
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "h264"])
+@pytest.mark.parametrize("goes", [False, True])
+def test_a_picture_that_comes_too_late_is_none_for_who_waits(
+    world: World, codec: link.Codec, goes: bool
+) -> None:
+    """When it was the only one he is told so, or that the robot is away, as if none had come."""
+    robot_comes(world)
+    settings = link.VideoSettings(codec=codec)
+    body = KEY if codec == "h264" else None
+    served = Watcher(8)
+    stream = served.watch(world, settings)
+    robot_joins(world)
+    stream.message(link.Playing(width=32, height=24, quality=80))
+    shows(world, stream, 1, body)
+    world.clock.advance(1)
+    watcher = Watcher()
+    watcher.watch(world, settings)
+    world.clock.advance(1)
+    shows(world, stream, 2, body, late=5.0)
+    assert watcher.numbers == [2]
+    stream.start_anew(watcher)
+    if goes:
+        world.robot_goes()
+    world.clock.advance(FIRST_PICTURE_SECONDS)
+    assert served.error is None
+    if goes:
+        assert str(watcher.error) == "robot rover is offline"
+    else:
+        assert isinstance(watcher.error, NothingCame)
+
+
+def test_a_recording_takes_what_comes_too_late_to_be_shown(world: World) -> None:
+    """And is not told that nothing came."""
+    stream = slow_stream(world, 15)
+    world.clock.advance(1)
+    recording = Watcher()
+    stream.attach(recording, Wish(stream.settings, first=True))
+    world.clock.advance(1)
+    shows(world, stream, 2, late=5.0)
+    world.clock.advance(FIRST_PICTURE_SECONDS)
+    assert recording.numbers == [2]
+    assert recording.error is None
 
 
 def test_while_parts_of_a_picture_come_it_is_waited_for(world: World) -> None:

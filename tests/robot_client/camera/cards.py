@@ -1,8 +1,9 @@
-"""A test card of known colours, and messages with it in every encoding, made with nothing but numpy and struct."""
+"""A test card of known colours, and messages with it in every encoding, made with numpy, struct and zlib alone."""
 
 from __future__ import annotations
 
 import struct
+import zlib
 from typing import NamedTuple
 
 import numpy as np
@@ -162,6 +163,51 @@ def compressed_cdr(file: bytes, format_: str = "jpeg", *, order: str = "<") -> b
     body = _aligned(_header("camera", order))
     body = _aligned(body + _text(format_, order)) + struct.pack(order + "I", len(file))
     return _encapsulation(order) + body + file
+
+
+INVERSE = (100.0 * 101.0, 1 - 100.0 * 101.0 / 16.5)
+"""By which compressed_depth_image_transport quantises metres by default, but that it may be told how far: to 16.5 m."""
+
+
+def quantised(metres: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
+    """Metres as :data:`INVERSE` has them; 0 where nothing was measured."""
+    numerator, offset = INVERSE
+    values = np.divide(numerator, metres, out=np.full(metres.shape, -offset), where=metres > 0) + offset
+    return np.floor(values).astype(np.uint16)
+
+
+def png_of(values: npt.NDArray[np.uint16]) -> bytes:
+    """A PNG that is grey of sixteen bits, by hand."""
+    height, width = values.shape
+    rows = _padded(values.astype(">u2"), 0)
+    lines = np.pad(rows, ((0, 0), (1, 0))).tobytes()
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(lines)),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        for name, body in chunks
+    )
+
+
+def depth_files(width: int = 320, height: int = 240) -> dict[str, bytes]:
+    """The depths as image_transport publishes them in PNG: CompressedImage by its ``format``."""
+    metres = depths(width, height)
+    millimetres = png_of(np.rint(metres * 1000).astype(np.uint16))
+    inverse = png_of(quantised(metres))
+    return {
+        "16UC1; png compressed ": millimetres,
+        "16UC1; compressedDepth": depth_head() + millimetres,
+        "16UC1; compressedDepth png": depth_head() + millimetres,
+        "32FC1; compressedDepth png": depth_head(*INVERSE) + inverse,
+    }
+
+
+def depth_head(numerator: float = 0.0, offset: float = 0.0) -> bytes:
+    """What compressed_depth_image_transport writes before the file."""
+    return struct.pack("<iff", 0, numerator, offset)
 
 
 def _encapsulation(order: str) -> bytes:

@@ -4,7 +4,7 @@
 
 ``make stills`` does just that.
 
-Bars: white, yellow, cyan, green, magenta, red, blue, grey, over a ramp. Depth: red to blue over black.
+Bars: white, yellow, cyan, green, magenta, red, blue, grey, over a ramp. Depth: red to blue over black, in every form.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from relay_protocol.link import VideoSettings
 from robot_client.camera.editing import plan
 from robot_client.camera.encoding import Jpeg, Png, make_encoder
-from robot_client.camera.formats import ENCODINGS, compressed, decoded, image
-from tests.robot_client.camera.cards import Pixels, card, coded, compressed_cdr, image_cdr
+from robot_client.camera.formats import ENCODINGS, Raw, compressed, decoded, image, unpacked
+from tests.robot_client.camera.cards import Pixels, card, coded, compressed_cdr, depth_files, image_cdr
 
 WIDTH, HEIGHT, COLUMNS, TITLE = 240, 180, 6, 24
 NOON = 1_763_726_400.789
@@ -28,16 +28,15 @@ NOON = 1_763_726_400.789
 
 def stills() -> dict[str, Pixels]:
     """Titles and BGR pictures: each went through the JPEG that a viewer gets."""
-    settings = VideoSettings(width=WIDTH, height=HEIGHT, stamp=True)
     shown = {}
     for encoding in ENCODINGS:
         for title, cdr in {
             encoding: image_cdr(coded(encoding, big_endian=False, padding=24)),
             f"{encoding}, big endian": image_cdr(coded(encoding, big_endian=True), order=">"),
         }.items():
-            raw = image(cdr)
-            edited = plan(settings, raw.width, raw.height).apply(raw.pixels, NOON)
-            shown[title] = decoded(Jpeg().encode(edited, 80, True)[0]).pixels
+            shown[title] = _edited(image(cdr))
+    for format_, file in depth_files().items():
+        shown[format_.strip()] = _edited(unpacked(compressed(compressed_cdr(file, format_))))
     bgr = np.ascontiguousarray(card(WIDTH, HEIGHT)[:, :, ::-1])
     for kind, encoder in (("jpeg", Jpeg()), ("png", Png())):
         shown[f"{kind}, passed through"] = decoded(
@@ -54,6 +53,12 @@ def stills() -> dict[str, Pixels]:
     picture, _ = make_encoder("h264", WIDTH, HEIGHT, 15).encode(bgr, 80, True)
     shown["h264, key frame"] = h264_decoded([picture])[0]
     return shown
+
+
+def _edited(raw: Raw) -> Pixels:
+    settings = VideoSettings(width=WIDTH, height=HEIGHT, stamp=True)
+    edited = plan(settings, raw.width, raw.height).apply(raw.pixels, NOON)
+    return decoded(Jpeg().encode(edited, 80, True)[0]).pixels
 
 
 def h264_decoded(pictures: list[bytes]) -> list[Pixels]:

@@ -153,7 +153,12 @@ def test_wrong_login_is_told_without_it(
 
 
 @pytest.mark.parametrize(
-    ("device", "why"), [("/dev/no-camera", "there is no /dev/no-camera"), ("/dev/null", "gives no pictures")]
+    ("device", "why"),
+    [
+        ("/dev/no-camera", "there is no /dev/no-camera"),
+        ("/dev/no-camera?width=640&height=480&format=MJPG", "there is no /dev/no-camera;"),
+        ("/dev/null", "gives no pictures"),
+    ],
 )
 def test_device_that_is_missing_or_no_camera_is_told(device: str, why: str) -> None:
     """By its path, which is no secret."""
@@ -170,6 +175,60 @@ def test_device_is_opened_by_its_driver_alone(tmp_path: Path) -> None:
     with closing(seen.capture):
         assert seen.hears()[1].startswith("can't be opened")
     assert seen.pictures.empty()
+
+
+class Device:
+    """A device of the kernel, as OpenCV has it."""
+
+    opened: list[tuple[object, ...]]
+    asked: list[tuple[int, float]]
+
+    def __init__(self, *how: object) -> None:
+        Device.opened, Device.asked = [how], []
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, what: int, value: float) -> bool:
+        Device.asked.append((what, value))
+        return True
+
+    def grab(self) -> bool:
+        return True
+
+    def retrieve(self) -> tuple[bool, Pixels]:
+        return True, np.zeros((48, 64, 3), np.uint8)
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("source", "asked"),
+    [
+        ("v4l2:/dev/video9", []),
+        (
+            "v4l2:/dev/video9?width=1280&height=720&fps=30&format=MJPG",
+            [
+                (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
+                (cv2.CAP_PROP_FRAME_WIDTH, 1280),
+                (cv2.CAP_PROP_FRAME_HEIGHT, 720),
+                (cv2.CAP_PROP_FPS, 30),
+            ],
+        ),
+        ("v4l2:/dev/video9?fps=5", [(cv2.CAP_PROP_FPS, 5)]),
+    ],
+)
+def test_device_is_asked_for_what_is_wanted_of_it(
+    monkeypatch: pytest.MonkeyPatch, source: str, asked: list[tuple[int, float]]
+) -> None:
+    """The format first, on which sizes and rates depend; and for no more pictures than one in advance."""
+    monkeypatch.setattr(cv2, "VideoCapture", Device)
+    seen = Seen(source)
+    with closing(seen.capture):
+        seen.grey()
+        assert Device.opened == [("/dev/video9", cv2.CAP_V4L2)]
+        assert Device.asked == [*asked, (cv2.CAP_PROP_BUFFERSIZE, 1)]
 
 
 def test_closed_capture_reads_no_more(tmp_path: Path) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from robot_client.camera.formats import ENCODINGS
+from tests.robot_client.camera.cards import depth_files
 from tests.robot_client.camera.contact_sheet import sheet, stills
 
 
 def test_every_encoding_is_on_the_sheet() -> None:
-    """Both byte orders of it, the files, edits and H.264; drawn to the last."""
+    """Both byte orders of it, the files, depth in PNG, edits and H.264; drawn to the last."""
     shown = stills()
     titles = [title.partition(",")[0] for title in shown]
     assert {*ENCODINGS, "jpeg", "png", "invert", "h264"} <= set(titles)
+    assert {each.strip() for each in depth_files()} <= set(shown)
     assert all(picture.any() for picture in shown.values())
     assert sheet(shown)[-100].max() == 255

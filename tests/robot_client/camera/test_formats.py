@@ -15,16 +15,32 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from relay_protocol.errors import Invalid
 from robot_client.camera import formats
-from robot_client.camera.formats import ENCODINGS, PIXELS, compressed, decoded, image, looked_at
+from robot_client.camera.formats import (
+    ENCODINGS,
+    PIXELS,
+    Raw,
+    compressed,
+    decoded,
+    image,
+    looked_at,
+    unpacked,
+)
+from robot_client.camera.messages import Damaged
 from tests.robot_client.camera.cards import (
+    INVERSE,
     PATCHES,
     Coded,
     card,
     coded,
     compressed_cdr,
+    depth_files,
+    depth_head,
+    depths,
     grey_of,
     image_cdr,
     middle_of,
+    png_of,
+    quantised,
 )
 
 DEPTH = ("16UC1", "32FC1")
@@ -246,13 +262,16 @@ def test_damaged_images_are_invalid_or_pictures_no_larger_than_they(data: st.Dat
 @given(st.data())
 def test_damaged_files_are_invalid_or_pictures_of_the_size_they_say(data: st.DataObject) -> None:
     """Whatever a publisher puts into a CompressedImage."""
-    cdr = data.draw(damaged(compressed_cdr(data.draw(st.sampled_from([JPEG, PNG])))))
+    whole = st.sampled_from([compressed_cdr(JPEG), compressed_cdr(PNG), INVERSE_CDR])
+    cdr = data.draw(damaged(data.draw(whole)))
     try:
-        size = looked_at(cdr, True)[1:]
-        raw = decoded(compressed(cdr)[1])
+        look = looked_at(cdr, True)
+        raw = unpacked(compressed(cdr))
     except Invalid:
         return
-    assert (raw.width, raw.height) == size == raw.pixels.shape[1::-1]
+    assert (raw.encoding, raw.width, raw.height) == look
+    assert raw.pixels.shape[1::-1] == look[1:]
+    assert raw.pixels.dtype == np.uint8
 
 
 @given(st.binary(max_size=200))
@@ -273,7 +292,7 @@ def test_any_bytes_are_no_more_than_invalid(cdr: bytes) -> None:
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_files_go_through_untouched(file: bytes, kind: str, order: str) -> None:
     """The kind is what the bytes are, whatever the format says."""
-    assert compressed(compressed_cdr(file, "bgr8; tiff compressed", order=order)) == (kind, file)
+    assert compressed(compressed_cdr(file, "bgr8; tiff compressed", order=order))[:2] == (kind, file)
     assert looked_at(compressed_cdr(file, order=order), True) == (kind, 64, 48)
 
 
@@ -281,7 +300,7 @@ def test_compressed_messages_of_rclpy_are_read() -> None:
     """ROS makes the same of a CompressedImage as these tests."""
     message = stamped(CompressedImage(format="jpeg", data=JPEG))
     assert deserialize_message(compressed_cdr(JPEG), CompressedImage) == message
-    assert compressed(serialize_message(message)) == ("jpeg", JPEG)
+    assert compressed(serialize_message(message)) == ("jpeg", JPEG, "", (0.0, 0.0))
 
 
 @pytest.mark.parametrize("file", [JPEG, PNG])
@@ -305,10 +324,115 @@ def test_what_is_no_whole_file_is_refused(file: bytes, words: str) -> None:
         compressed(compressed_cdr(file))
 
 
-def test_compressed_depth_is_refused_with_advice() -> None:
-    """Its PNG has another head before it, and sixteen bits."""
-    with pytest.raises(Invalid, match="take the topic with the raw depth"):
-        compressed(compressed_cdr(b"\0" * 12 + PNG, "16UC1; compressedDepth png"))
+def shown(file: bytes, format_: str) -> Raw:
+    """What viewers get of a CompressedImage."""
+    cdr = compressed_cdr(file, format_)
+    raw = unpacked(compressed(cdr))
+    assert looked_at(cdr, True) == (raw.encoding, raw.width, raw.height)
+    return raw
+
+
+@pytest.mark.parametrize("format_", [each for each in depth_files() if each.startswith("16UC1")])
+def test_depth_in_a_png_has_the_colours_of_the_raw_topic(format_: str) -> None:
+    """Whatever of image_transport made it; its encoding is told, and not what it was packed in."""
+    raw = shown(depth_files()[format_], format_)
+    assert raw.encoding == "16UC1"
+    assert np.array_equal(raw.pixels, image(image_cdr(coded("16UC1"))).pixels)
+
+
+def test_depth_that_was_quantised_by_its_inverse_has_the_colours_of_its_metres() -> None:
+    """Those that are left of it: steps of 6 cm at 16 m; what was not measured stays black."""
+    format_ = "32FC1; compressedDepth png"
+    raw = shown(depth_files()[format_], format_)
+    values = quantised(depths())
+    assert set(np.unique(values[-60:])) == {0}
+    metres = np.where(values > 0, INVERSE[0] / (np.maximum(values, 1) - INVERSE[1]), np.nan)
+    left = Coded("32FC1", 320, 240, False, 4 * 320, metres.astype("<f4").tobytes())
+    assert raw.encoding == "32FC1"
+    assert np.abs(raw.pixels.astype(int) - image(image_cdr(left)).pixels).max() <= 3
+    assert not raw.pixels[-60:].any()
+
+
+@pytest.mark.parametrize("scale", [(0.0, 0.0), (-5.0, 0.0), (3e38, -3e38), (1e-38, 65535.0), (1.0, 3e38)])
+def test_scale_that_makes_no_sense_shows_nothing_worse_than_a_picture(scale: tuple[float, float]) -> None:
+    """Nothing overflows, and what is no distance is black."""
+    raw = shown(depth_head(*scale) + png_of(quantised(depths(12, 8))), "32FC1; compressedDepth png")
+    assert raw.pixels.shape == (8, 12, 3)
+
+
+def test_mono16_in_a_png_is_as_grey_as_on_the_raw_topic() -> None:
+    """Rounded by 255 / 65535, not cut to its upper eight bits."""
+    values = np.array([[0, 128, 129, 257, 4095, 65535]], np.uint16)
+    for format_, head in (("mono16; png compressed ", b""), ("mono16; compressedDepth png", depth_head())):
+        raw = shown(head + png_of(values), format_)
+        assert (raw.encoding, raw.pixels.tolist()) == ("mono16", [[0, 0, 1, 1, 16, 255]])
+
+
+@pytest.mark.parametrize("format_", ["png", "", "bgr16; png compressed bgr16", "rgb8; png compressed bgr8"])
+def test_sixteen_bits_nobody_called_depth_are_grey(format_: str) -> None:
+    """Brighter is more; the file's kind is told."""
+    raw = shown(png_of(np.full((4, 6), 0x8000, np.uint16)), format_)
+    assert (raw.encoding, raw.pixels.tolist()) == ("png", np.full((4, 6), 128).tolist())
+
+
+@pytest.mark.parametrize("file", [JPEG, PNG])
+def test_what_is_called_depth_but_has_eight_bits_is_shown_as_it_is(file: bytes) -> None:
+    """A file says best what it is."""
+    raw = shown(file, "16UC1; jpeg compressed ")
+    assert np.array_equal(raw.pixels, decoded(file).pixels)
+
+
+@pytest.mark.parametrize(
+    ("file", "format_", "words"),
+    [
+        (bytes(400), "16UC1; compressedDepth rvl", "RVL.*format of its publisher to png.*raw depth"),
+        (png_of(quantised(depths(4, 4))), "bgr8; compressedDepth png", "'bgr8'.*16UC1, mono16, 32FC1"),
+        (JPEG, "16UC1; compressedDepth png", "another kind than PNG"),
+        (PNG, "16UC1; compressedDepth png", "grey of sixteen bits"),
+    ],
+)
+def test_depth_in_other_forms_is_refused_in_words(file: bytes, format_: str, words: str) -> None:
+    """At once, and with what can be done where something can."""
+    with pytest.raises(Invalid, match=words) as caught:
+        compressed(compressed_cdr(depth_head() + file, format_))
+    assert not isinstance(caught.value, Damaged)
+
+
+DEPTH_PNG = png_of(quantised(depths(64, 48)))
+INVERSE_CDR = compressed_cdr(depth_head(*INVERSE) + DEPTH_PNG, "32FC1; compressedDepth png")
+
+
+@pytest.mark.parametrize(
+    "cdr",
+    [
+        compressed_cdr(JPEG[:-2]),
+        compressed_cdr(PNG[:-12], "png"),
+        compressed_cdr(b"", "whatever"),
+        compressed_cdr(b"\0" * 100 + JPEG, "rgb8; jpeg compressed bgr8"),
+        compressed_cdr(PNG[:40] + b"\0" * 30 + PNG[70:]),
+        compressed_cdr(b"\xff\xd8\xff\xdb" + bytes(60) + b"\xff\xd9"),
+        compressed_cdr(depth_head(), "16UC1; compressedDepth png"),
+        compressed_cdr(depth_head() + DEPTH_PNG[:-12], "16UC1; compressedDepth png"),
+        compressed_cdr(
+            depth_head() + DEPTH_PNG[:60] + bytes(20) + DEPTH_PNG[80:], "16UC1; compressedDepth png"
+        ),
+        compressed_cdr(depth_head(math.nan, 1.0) + DEPTH_PNG, "32FC1; compressedDepth png"),
+        INVERSE_CDR[:-5],
+    ],
+)
+def test_what_is_damaged_is_told_from_what_can_not_be_shown(cdr: bytes) -> None:
+    """A stream goes on after it: the next picture may be whole."""
+    with pytest.raises(Damaged):
+        unpacked(compressed(cdr))
+
+
+def test_image_that_ends_early_is_damaged() -> None:
+    """As first ones of some drivers do; an encoding nobody knows comes again."""
+    with pytest.raises(Damaged):
+        image(image_cdr(small(data=small().data[:-1])))
+    with pytest.raises(Invalid) as caught:
+        image(image_cdr(small(encoding="yuv999")))
+    assert not isinstance(caught.value, Damaged)
 
 
 @pytest.mark.parametrize("file", [JPEG, PNG])
@@ -379,6 +503,10 @@ def test_a_file_that_would_unfold_to_gigabytes_is_not_decoded(monkeypatch: pytes
     bomb = PNG[:16] + struct.pack(">II", side, side) + PNG[24:]
     with pytest.raises(Invalid, match="too large to be decoded"):
         decoded(bomb)
+    deep = DEPTH_PNG[:16] + struct.pack(">II", side, side) + DEPTH_PNG[24:]
+    for format_, head in (("16UC1; png compressed ", b""), ("32FC1; compressedDepth png", depth_head(1, 0))):
+        with pytest.raises(Invalid, match="too large to be decoded"):
+            unpacked(compressed(compressed_cdr(head + deep, format_)))
     huge = PNG[:16] + struct.pack(">II", 2**31, 2**31) + PNG[24:]
     with pytest.raises(Invalid, match="each side may have"):
         looked_at(compressed_cdr(huge), True)

@@ -14,8 +14,10 @@ from relay_protocol.limits import PICTURE_FRAME
 from relay_protocol.link import VideoSettings
 from relay_protocol.pictures import look_at
 from robot_client.camera import formats
-from robot_client.camera.making import Maker, pixels_shot
+from robot_client.camera.making import Maker, message_shot, pixels_shot
+from robot_client.camera.messages import Damaged
 from robot_client.camera.shot import Look, Shot, Wish
+from tests.robot_client.camera.cards import coded, compressed_cdr, depth_files, image_cdr
 
 ASKED = Wish(80, 1.0, False, True, 15.0)
 PIXELS = np.random.default_rng(3).integers(0, 255, (48, 64, 3), np.uint8)
@@ -125,6 +127,29 @@ def test_pixels_become_what_was_asked_for() -> None:
     made = Maker(VideoSettings(codec="png")).make(pixels_shot(5, 1.0, PIXELS), ASKED)
     assert (made.width, made.height, made.encoding) == (64, 48, "bgr8")
     assert np.array_equal(formats.decoded(made.body).pixels, PIXELS)
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "png"])
+@pytest.mark.parametrize("format_", depth_files())
+def test_depth_in_a_png_goes_out_in_colours(format_: str, codec: str) -> None:
+    """Of the raw topic, by either codec, and never as it came: a viewer would see black."""
+    encoding = format_.partition(";")[0]
+    file = compressed_cdr(depth_files()[format_], format_)
+    wanted = message_shot(5, 1.0, image_cdr(coded(encoding)), False).raw().pixels
+    shot = message_shot(5, 1.0, file, True)
+    assert shot.jpeg() is None
+    assert shot.look() == (encoding, 320, 240)
+    made = Maker(VideoSettings(codec=codec)).make(shot, ASKED)
+    assert made.encoding == encoding
+    off = np.abs(formats.decoded(made.body).pixels.astype(int) - wanted).mean()
+    assert off < (3 if codec == "jpeg" or encoding == "32FC1" else 1e-9)
+
+
+def test_jpeg_that_breaks_off_is_called_damaged() -> None:
+    """Also where it would go out as it came."""
+    for settings in (VideoSettings(), VideoSettings(width=32)):
+        with pytest.raises(Damaged, match="ends in the middle"):
+            Maker(settings).make(message_shot(5, 1.0, compressed_cdr(jpeg()[:-300]), True), ASKED)
 
 
 def test_picture_too_large_for_a_frame_is_refused() -> None:

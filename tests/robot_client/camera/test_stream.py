@@ -15,8 +15,9 @@ from relay_protocol import frames, link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError
 from robot_client.camera.leaving import PART
 from robot_client.camera.lines import Open
+from robot_client.camera.messages import Damaged
 from robot_client.camera.shot import Look, Made, Shot, Wish
-from robot_client.camera.stream import FAULTS, TELL_EVERY, Busy, Stream
+from robot_client.camera.stream import BEARS, FAULTS, TELL_EVERY, Busy, Stream
 from robot_client.camera.trip import DOUBT, RoundTrip
 from robot_client.link import VideoLink
 from robot_client.transport import LinkProtocol
@@ -350,6 +351,64 @@ def test_first_picture_that_can_not_be_made_ends_the_stream() -> None:
     (said,) = scene.heard()
     assert (said["op"], said["reason"]) == ("not_playing", "no such encoding")
     assert scene.view.closed == 1
+
+
+def spoil(scene: Scene, error: SwitchboardError) -> None:
+    """Another picture comes, of which nothing can be made."""
+    scene.shot(1)
+    scene.view.making[-1][1].errback(error)
+
+
+def test_damaged_pictures_at_the_beginning_are_left_out() -> None:
+    """Cameras often begin with some; then it goes on as if nothing had been."""
+    scene = Scene().joined()
+    scene.heard()
+    for _ in range(FAULTS - 1):
+        spoil(scene, Damaged("the JPEG ends in the middle"))
+    assert scene.heard() == []
+    scene.shot(7)
+    scene.make()
+    assert scene.pictures() == [7]
+    assert scene.view.wishes[-1].key
+    for _ in range(round(2 * BEARS / TELL_EVERY)):
+        scene.clock.advance(TELL_EVERY)
+        scene.say(link.Took(number=1))
+    assert scene.transport.connected
+
+
+def test_stream_of_nothing_but_damaged_pictures_ends_with_what_is_wrong() -> None:
+    """After as many as in between."""
+    scene = Scene().joined()
+    scene.heard()
+    for _ in range(FAULTS):
+        assert scene.transport.connected
+        spoil(scene, Damaged("the JPEG ends in the middle"))
+    (said,) = scene.heard()
+    assert (said["op"], said["reason"]) == ("not_playing", "the JPEG ends in the middle")
+    assert scene.view.closed == 1
+
+
+def test_damaged_picture_after_which_none_comes_is_told() -> None:
+    """A kept one may be all there is: who waits learns why before he is told that nothing came."""
+    scene = Scene().joined()
+    scene.heard()
+    spoil(scene, Damaged("the PNG is broken"))
+    scene.clock.pump([TELL_EVERY] * round(BEARS / TELL_EVERY - 1))
+    assert scene.heard() == []
+    scene.clock.pump([TELL_EVERY] * 2)
+    (said,) = scene.heard()
+    assert (said["op"], said["reason"]) == ("not_playing", "the PNG is broken")
+    assert not scene.transport.connected
+    assert scene.view.closed == 1
+
+
+def test_what_can_not_be_shown_ends_the_stream_also_behind_a_damaged_picture() -> None:
+    """At once: it would come again."""
+    scene = Scene().joined()
+    scene.heard()
+    spoil(scene, Damaged("cut off"))
+    spoil(scene, Invalid("no such encoding"))
+    assert [each["reason"] for each in scene.heard()] == ["no such encoding"]
 
 
 def test_broken_picture_in_between_is_left_out() -> None:

@@ -293,6 +293,17 @@ async def test_the_topic_shown_in_a_cameras_stead_may_have_to_be_viewed_too(
     await until(lambda: not show.access._permits)
 
 
+@pytest.mark.parametrize("address", [STREAM, SNAPSHOT])
+@pytest_twisted.ensureDeferred
+async def test_head_judges_the_topic_shown_in_a_cameras_stead_too(show: Show, address: str) -> None:
+    """Its answer is that of GET."""
+    await show.deny(f"{CAMERA}/compressed")
+    path = f"{address}&default_transport=compressed"
+    assert (await show.looks(path).problem())[0] == 404
+    assert (await show.looks(path, "HEAD").head())[0] == 404
+    assert (await show.looks(address, "HEAD").head())[0] == 200
+
+
 @pytest_twisted.ensureDeferred
 async def test_a_viewer_who_leaves_before_the_first_picture_leaves_nothing(show: Show) -> None:
     """Neither at the stream nor with the judge."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import pytest_twisted
+from twisted.internet.task import LoopingCall
 from twisted.internet.threads import deferToThread
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -18,8 +19,16 @@ from relay_server import closing, wsframe
 from relay_server.auth import Opening
 from relay_server.edges.video import socket as module
 from relay_server.video import Stream, hub
-from tests.relay_server.edges.video.show import CAMERA, SECRET, STREAM, Show, jpeg, until
+from tests.relay_server.edges.video.show import CAMERA, SECRET, STREAM, Looker, Show, jpeg, until
 from tests.relay_server.video.watching import DELTA, KEY
+
+HANDSHAKE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec_WebSocket_Version": "13",
+    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}
+"""Of a client of the test's own making."""
 
 
 class Eye:
@@ -213,13 +222,7 @@ async def test_who_takes_a_picture_slowly_is_not_cut(show: Show, monkeypatch: py
     monkeypatch.setattr(module, "STALL_SECONDS", 1.0)
     monkeypatch.setattr(module, "LOOK_SECONDS", 0.1)
     control = show.robot_comes()
-    handshake = {
-        "Connection": "Upgrade",
-        "Upgrade": "websocket",
-        "Sec_WebSocket_Version": "13",
-        "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
-    }
-    looker = show.looks(f"/robots/rover/video/ws?topic={CAMERA}", window=4096, **handshake)
+    looker = show.looks(f"/robots/rover/video/ws?topic={CAMERA}", window=4096, **HANDSHAKE)
     stream = await show.joined(control)
     await looker.head()
     show.shows(stream, jpeg(60_000))
@@ -227,6 +230,60 @@ async def test_who_takes_a_picture_slowly_is_not_cut(show: Show, monkeypatch: py
     assert stream.viewers
     await until(lambda: not stream.viewers)
     looker.leave()
+
+
+async def stuffed(show: Show) -> tuple[Looker, Stream, int]:
+    """A viewer who reads nothing, and the number of a picture that is more than the kernel takes."""
+    control = show.robot_comes()
+    looker = show.looks(f"/robots/rover/video/ws?topic={CAMERA}", window=4096, **HANDSHAKE)
+    stream = await show.joined(control)
+    await looker.head()
+    return looker, stream, show.shows(stream, jpeg(3_900_000))
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_says_that_he_took_what_he_does_not_read_is_cut(
+    show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However much he says meanwhile, as long as the connection takes nothing more."""
+    monkeypatch.setattr(module, "STALL_SECONDS", 0.5)
+    monkeypatch.setattr(module, "LOOK_SECONDS", 0.1)
+    looker, stream, number = await stuffed(show)
+    took = json.dumps({"op": "took", "number": number}).encode()
+    talking = LoopingCall(looker.socket.sendall, b"\x81" + bytes([0x80 + len(took)]) + bytes(4) + took)
+    talking.start(0.2).addErrback(lambda failure: failure.trap(OSError))
+    await until(lambda: not stream.viewers)
+    if talking.running:
+        talking.stop()
+    looker.leave()
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_revoked_right_ends_a_picture_that_is_under_way(show: Show) -> None:
+    """At once: nothing of it that the viewer has not taken goes any more, nor is there a code behind it."""
+    looker, stream, _ = await stuffed(show)
+    await show.deny(CAMERA)
+    assert not stream.viewers
+    assert await deferToThread(_bytes_until_reset, looker) < 1_000_000
+    looker.leave()
+
+
+def _bytes_until_reset(looker: Looker) -> int:
+    """What still comes before the connection is reset."""
+    count = 0
+    with pytest.raises(ConnectionResetError):
+        while data := looker.socket.recv(65536):
+            count += len(data)
+    return count
+
+
+@pytest_twisted.ensureDeferred
+async def test_the_topic_shown_in_a_cameras_stead_is_judged_before_the_handshake(show: Show) -> None:
+    """As the camera itself."""
+    await show.deny(f"{CAMERA}/compressed")
+    with pytest.raises(InvalidStatus) as refused:
+        await opens(show, "&default_transport=compressed")
+    assert refused.value.response.status_code == 403
 
 
 @pytest_twisted.ensureDeferred

@@ -97,6 +97,73 @@ def test_where_one_of_h264_is_left_out_a_new_beginning_is_asked_for(line: Line, 
     assert (line.taken, line.asked) == ([], 2)
 
 
+class ThinLine(Line):
+    """H.264, 30 pictures a second, over a link that takes its time.
+
+    :param per_kilobyte: seconds
+    :param way: seconds there and back
+    """
+
+    def __init__(self, time: Time, per_kilobyte: float, way: float = 0.0) -> None:
+        super().__init__(time)
+        self._per_kilobyte = per_kilobyte
+        self._way = way
+        self._free = time()
+        self.ages: list[float] = []
+        """Of the oldest picture of each batch when all of it was there, seconds."""
+        self.keys = 0
+
+    def runs(self, seconds: float, delta: int, key: int) -> None:
+        """Each key frame that is asked for is the next picture."""
+        began, asked = self.time(), -1
+        for number in range(round(seconds * 30)):
+            self._until(began + number / 30)
+            wanted, asked = self.asked > asked, self.asked
+            self.put(number, "h264", key=wanted, size=key if wanted else delta)
+            self._until(self.time())
+
+    def _until(self, moment: float) -> None:
+        """What the link has taken by then lets the next go."""
+        while self._free <= moment:
+            self.time.now = max(self._free, self.time.now)
+            taken = self.waiting.take()
+            if not taken:
+                break
+            size = sum(len(each.body) for each in taken)
+            self._free = self.time.now + self._way + size / 1000 * self._per_kilobyte
+            self.keys += taken[0].key
+            self.ages.append(self._free - (taken[0].good_until - STALE_SECONDS))
+        self.time.now = moment
+
+
+def test_over_a_thin_link_no_picture_of_h264_is_older_than_a_second(time: Time) -> None:
+    """What came meanwhile goes only as far as it is there soon; else one that stands alone is waited for."""
+    line = ThinLine(time, per_kilobyte=1 / 100)
+    line.runs(30, delta=8000, key=37_000)
+    # The first key frame alone does not tell how fast the link is.
+    assert max(line.ages[2:]) < 1.05
+    assert line.keys > 10
+
+
+def test_a_key_frame_goes_over_the_thinnest_link(line: Line, time: Time) -> None:
+    """Alone; what followed it is left out, and the next one asked for."""
+    for number, size in ((1, 10_000), (2, 40_000)):
+        line.put(number, "h264", size=size)
+        assert line.taken == [number]
+        time.now += size / 20_000
+    assert line.taken == []
+    line.put(3, "h264", size=40_000)
+    line.put(4, "h264", key=False)
+    assert (line.taken, line.asked) == ([3], 1)
+
+
+def test_a_long_way_is_no_thin_link(time: Time) -> None:
+    """What takes the same time for little and much is left out of account."""
+    line = ThinLine(time, per_kilobyte=1 / 5000, way=0.4)
+    line.runs(30, delta=2000, key=30_000)
+    assert (line.asked, line.keys) == (0, 1)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere not all of it is known")
 def test_a_viewer_who_vanished_is_noticed_while_nothing_is_written() -> None:
     """In a minute, not in the two hours that are usual."""
