@@ -6,7 +6,7 @@ to people has the wall clock's time, which may be set; how long something lasts 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from math import inf
 from typing import NamedTuple
@@ -99,17 +99,18 @@ class Book:
             yield from robot.over.values()
 
     def load(self, records: list[AlertRecord], now: Moment) -> None:
-        """Take up what an earlier relay kept. Of what is the same that which lasts counts, as when it was told."""
+        """Take up what an earlier relay kept. Of what is the same that which lasts counts, as when it was told.
+
+        What is without news nobody was told of: it is told when it is told here again, or stays (:meth:`sweep`).
+        """
         for each in sorted(records, key=lambda record: (record.over is None, record.last)):
             robot = self._robots.setdefault(each.robot_id, _Robot(filled=now.tick))
             key = (each.kind, each.about)
             (robot.open if each.over is None else robot.over)[key] = each
-            robot.marks[key] = _Marks(
-                now.ago(each.last if each.over is None else each.over),
-                now.ago(each.last),
-                kinds.severity(each.level),
-                each.over is None,
-            )
+            marks = robot.marks[key] = _Marks(now.ago(each.last if each.over is None else each.over))
+            if each.news:
+                marks.news, marks.severity = now.ago(each.last), kinds.severity(each.level)
+                marks.told = each.over is None
             if each.over is None:
                 robot.over.pop(key, None)
 
@@ -135,6 +136,14 @@ class Book:
     def find(self, alert_id: str) -> AlertRecord | None:
         """An alert by its name."""
         return next((each for each in self if each.id == alert_id), None)
+
+    def untell(self, alert_ids: Collection[str]) -> None:
+        """Nobody has heard of these after all: those that last are kept without news."""
+        for robot in self._robots.values():
+            for key, each in robot.open.items():
+                if each.id in alert_ids:
+                    robot.marks[key] = _Marks(robot.marks[key].since)
+                    self._keep(robot, each._replace(news=0))
 
     def forget(self, robot_id: int) -> None:
         """The robot was removed."""
@@ -237,8 +246,8 @@ class Book:
             text=text, level=level if worse else before.level, last=now.wall, times=before.times + 1
         )
         if not worse:
-            self._keep(robot, now_it_is)
-            return []
+            same = self._keep(robot, now_it_is)
+            return [] if marks.told else self._come_back(robot, same, now)
         self.states += 1
         fresh = self._keep(robot, now_it_is._replace(ack_by=None, ack_at=None))
         if not marks.told:

@@ -127,6 +127,9 @@ class Delivery:
         self._worst = -1
         """How bad the worst was that the latest message told."""
         self._extra = TokenBucket(1 / URGENT_SECONDS, URGENT_BURST, office.clock.seconds)
+        self._under_way: list[Notice] = []
+        """The message that is being sent, or tried again."""
+        self._hushed = False
         self._failing = False
         self._judging: Deferred[None] | None = None
         self._working: Deferred[None] | None = None
@@ -143,16 +146,36 @@ class Delivery:
             return
         # What gives way here is not counted: nobody knows whether its number may be told.
         self._inbox.put(Notice(change.alert, change.event.value), self._office.clock.seconds())
-        if self._judging is None:
+        if self._judging is None and not self._hushed:
             # Judged when a coroutine can be: mostly before this returns.
             self._judging = judging = Deferred.fromCoroutine(self._judge())
             judging.addErrback(self._broken)
             judging.addBoth(self._judged)
 
+    @property
+    def owed(self) -> set[str]:
+        """Alerts that have begun or become worse and of which this has yet to tell, by their ids.
+
+        Also by the message under way: whether it arrives nobody knows before there is an answer.
+        """
+        heaps = self._inbox, self._pending, self._held
+        waiting = [*self._under_way, *(each.notice for heap in heaps for each in heap)]
+        return {each.alert.id for each in waiting if not each.ends}
+
+    @property
+    def told(self) -> set[str]:
+        """Alerts of which their user knows that they have begun, by their ids; the latest."""
+        return set(self._told)
+
     def close(self) -> None:
-        """Tell nothing any more."""
+        """Tell nothing any more, and forget what waits."""
+        self.hush()
         for heap in (self._inbox, self._pending, self._held):
             heap.clear()
+
+    def hush(self) -> None:
+        """Send nothing any more: what waits, and what is offered from now on, stays :attr:`owed`."""
+        self._hushed = True
         for each in (self._judging, self._working):
             if each is not None:
                 each.cancel()
@@ -208,7 +231,9 @@ class Delivery:
                 if self._office.clock.seconds() < self._next:
                     self._extra.take()
                 left_out, self._left_out = self._left_out, 0
-                await self._deliver(self._pending.take(), left_out)
+                self._under_way = self._pending.take()
+                await self._deliver(self._under_way, left_out)
+                self._under_way = []
 
     def _pause(self) -> float:
         """Seconds until there is something to do."""

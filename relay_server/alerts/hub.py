@@ -129,13 +129,14 @@ class Alerts:
         self._looking.start(LOOK_SECONDS, now=False)
 
     def hush(self) -> None:
-        """Look no more, and tell nobody."""
+        """Look no more, and send nothing: of what happens from now on the next relay tells."""
         if self._looking.running:
             self._looking.stop()
-        self.tellers.close()
+        self.tellers.hush()
 
     async def keep(self) -> None:
-        """Keep what there is, if the database takes it soon."""
+        """Keep what there is, if the database takes it soon; what nobody was told of as that."""
+        self.book.untell(self.tellers.unheard())
         late = f"the database has not taken them within {KEEP_SECONDS:g} s"
         try:
             await within(self._clock, KEEP_SECONDS, self.flush(), late)
@@ -156,7 +157,7 @@ class Alerts:
         there = {each.id for each in await self._store.read(queries.list_robots)}
         for gone in {each.robot_id for each in self.book} - there:
             self.book.forget(gone)
-        for kept in (self._came, self._daemons, self._untold):
+        for kept in (self._came, self._daemons, self._untold, self._absent):
             for gone in kept.keys() - there:
                 del kept[gone]
         self._steered &= there

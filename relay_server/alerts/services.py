@@ -51,6 +51,12 @@ PARAMETERS: Mapping[str, frozenset[str]] = {
 SERVERS = frozenset(scheme for scheme, names in PARAMETERS.items() if "port" in names)
 """Those that speak to a server of the user's choice; the others have servers of their own."""
 
+CLOUDS: Mapping[str, str] = {"ntfy": "cloud", "ntfys": "cloud"}
+"""The mode, by apprise's name, in which one of these speaks to the service's own server all the same.
+
+What stands in the place of the host is something else then, as a topic in ``ntfy://topic``.
+"""
+
 _SIGNS = ("+", "-", ":")
 """Begin parameters that become headers, parts of a query or of a message."""
 
@@ -91,6 +97,9 @@ def server(scheme: str, service: Any) -> tuple[str, int] | None:
     :param service: apprise's
     """
     if scheme not in SERVERS:
+        return None
+    # What apprise itself goes by when it sends, not how the URL looks.
+    if scheme in CLOUDS and getattr(service, "mode", None) == CLOUDS[scheme]:
         return None
     host = getattr(service, "smtp_host", None) or getattr(service, "host", None) or ""
     return str(host), getattr(service, "port", None) or 0

@@ -25,9 +25,12 @@ class Tellers:
         self._portal: dict[int, list[AlertRuleRecord]] = {}
         self._deliveries: dict[int, Delivery] = {}
         self._places: dict[int, DeferredSemaphore] = {}
+        self._hushed = False
 
     def take(self, records: Iterable[AlertRuleRecord]) -> None:
-        """These are the rules from now on; what waits by those that stay goes on."""
+        """These are the rules from now on; what waits by those that stay goes on. Once hushed, nothing changes."""
+        if self._hushed:
+            return
         fresh = {each.id: each for each in records}
         for number in [each for each in self._deliveries if fresh.get(each) != self._rules.get(each)]:
             self._deliveries.pop(number).close()
@@ -69,11 +72,16 @@ class Tellers:
             return kinds.severity(alert.level) >= kinds.severity("warning")
         return any(rules.wants(each, alert, event) and rules.passes(each, alert, now) for each in mine)
 
-    def close(self) -> None:
-        """Tell nobody any more."""
+    def hush(self) -> None:
+        """Send nothing any more; what is offered is remembered."""
+        self._hushed = True
         for each in self._deliveries.values():
-            each.close()
-        self._deliveries.clear()
+            each.hush()
+
+    def unheard(self) -> set[str]:
+        """Alerts that rules were to tell of, by their ids, and none has."""
+        ways = self._deliveries.values()
+        return set().union(*(each.owed for each in ways)).difference(*(each.told for each in ways))
 
     def _places_of(self, user: int) -> DeferredSemaphore:
         return self._places.setdefault(user, DeferredSemaphore(PLACES))

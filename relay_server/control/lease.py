@@ -90,6 +90,10 @@ class Client(Hashable, Protocol):
     def commanding_since(self) -> float:
         """The same for its latest command, were it a zero or one that did not pass."""
 
+    def heard_driving(self) -> float:
+        """The relay's clock when it last proved that it is there; endless once it has let go: its latest commands that
+        passed, one on each topic, were zero."""
+
     def control_changed(self) -> None:
         """Who moves the robot has changed: what waited for it goes, or never will."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -57,6 +58,8 @@ class Steering:
         self.pushing = Pushing(clock)
         self.standing = Standing(FREE, {}, None)
         self._idling = Idling(clock, rules.idle, self._latest_command, self._idle_over)
+        self._moved = -inf
+        """The clock's time at which the robot was last known to move, since somebody has control."""
         self._due = 0.0
         """The monotonic moment from which an owner who asks again takes over."""
         self._lapsing: Timer | None = None
@@ -82,6 +85,8 @@ class Steering:
         if message.stopped is not None and self.stopping.stopped is None:
             # Of what comes from here it has been told, and that is known.
             self.stopping.anew()
+        if self.robot.safety.moving:
+            self._moved = self._clock.seconds()
         self.robot.safety = message
         self.stopping.heard()
         self._stand()
@@ -138,7 +143,14 @@ class Steering:
     def _note_lost(self, tenure: Tenure, why: str) -> None:
         """Somebody has control no more, without having given it back."""
         self._bereft[tenure.client] = self._clock.seconds()
-        self._note("control.lost", tenure.client, why, moving=self.robot.safety.moving)
+        self._note("control.lost", tenure.client, why, moving=self._driven_by(tenure.client))
+
+    def _driven_by(self, client: Client) -> bool:
+        """Whether the robot moves, or did when who drives it was heard last.
+
+        Whom a link swallows is known to be gone seconds after the robot has stopped itself.
+        """
+        return self.robot.safety.moving or self._moved >= client.heard_driving()
 
     def _tell_lost(self, tenure: Tenure, why: str) -> None:
         """Tell him, once all has changed: whoever is told may be cut for reading too slowly, and leave by that."""
@@ -249,6 +261,7 @@ class Steering:
             self._idling.begin()
         elif lease.holder is None:
             self._idling.end()
+            self._moved = -inf
         if lease.request is not before.request:
             cancel(self._lapsing)
             asked = lease.request is not None

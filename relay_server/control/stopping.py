@@ -45,17 +45,30 @@ AT_ONCE = 64
 """Orders to stop one robot that are under way at a time; whoever comes then is stopping it already."""
 
 
+class Again(NamedTuple):
+    """That a stopped robot was stopped once more.
+
+    :param since: Unix time, seconds
+    """
+
+    by: str
+    why: str
+    since: float
+
+
 class Stopped(NamedTuple):
     """That a robot is stopped.
 
     :param since: Unix time, seconds
     :param told: whether the robot has confirmed it
+    :param again: the latest of those who have stopped it since: whoever lets it move goes over his head too
     """
 
     by: str
     why: str
     since: float
     told: bool
+    again: Again | None = None
 
 
 class StoppedSince(Refused):
@@ -93,7 +106,9 @@ class Stopping:
         self._clock_ns = clock_ns
         self._latest = 0
         """When the robot was stopped the last time, as far as this relay knows; its monotonic nanoseconds."""
-        self._again = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, clock.seconds)
+        self._repeats = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, clock.seconds)
+        self._again: Again | None = None
+        """Who stopped it last while it was stopped."""
         self._pending: StopRecord | None = None
         self._known: deque[float] = deque(maxlen=KNOWN)
         """The moments that name the orders seen here, whatever has become of them. They are compared for being the
@@ -112,11 +127,15 @@ class Stopping:
     @property
     def stopped(self) -> Stopped | None:
         """By whom and why the robot is stopped, as it says itself, or is going to be; ``None`` when it may move."""
-        told = self._robot.safety.stopped
+        told, pending, again = self._robot.safety.stopped, self._pending, self._again
         if told is not None:
-            return Stopped(told.by, told.why, told.since, True)
-        pending = self._pending
-        return None if pending is None else Stopped(pending.by, pending.why, pending.at, False)
+            return Stopped(told.by, told.why, told.since, True, again)
+        if pending is None:
+            return None
+        # What the robot was not told of gives way to the latest order, which is not told twice.
+        if again is not None and again.since == pending.at:
+            again = None
+        return Stopped(pending.by, pending.why, pending.at, False, again)
 
     def stop(self, actor: Actor, why: str) -> Deferred[bool]:
         """Stop the robot, and keep it stopped. The order is on its way when this returns.
@@ -127,8 +146,10 @@ class Stopping:
         """
         order = StopRecord(self._robot.robot_id, actor.name, why[:WHY], self._wall())
         self._known.append(order.at)
+        first = self.stopped is None
         self.anew()
-        audit = self.stopped is None or self._again.take(actor.source)
+        self._again = None if first else Again(order.by, order.why, order.at)
+        audit = first or self._repeats.take(actor.source)
         if self._pending is None or len(self._keeping) < KEEPING:
             # Else those stand that are being written.
             self._pending = order
@@ -237,6 +258,7 @@ class Stopping:
     def anew(self) -> None:
         """The robot is stopped now: nothing that was asked for before lets it move again."""
         self._latest = self._clock_ns()
+        self._again = None
 
     def resume(self, actor: Actor, why: str, sent: int) -> Deferred[None]:
         """Let the robot move again. A stop it was not told of is taken back.
@@ -273,6 +295,7 @@ class Stopping:
             await self._record.told(robot, pending.at)
         if told:
             # What the robot has done is done, whatever the database says.
+            self._again = None
             self._believe(None)
         if pending is not None:
             self._over(pending)

@@ -75,7 +75,9 @@ def holder(standing: Standing) -> str | None:
 def stopped(standing: Standing) -> dict[str, Any] | None:
     """Why the robot stands, if it was stopped."""
     found = standing.stopped
-    return None if found is None else found._asdict()
+    if found is None:
+        return None
+    return {**found._asdict(), "again": None if found.again is None else found.again._asdict()}
 
 
 def hands(robot: Presence, rules: Rules | None = None) -> dict[str, list[dict[str, Any]]]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from relay_protocol.errors import Invalid
 from relay_server.local.arguments import name, text
-from relay_server.local.view import view
+from relay_server.local.view import view, work_of
 from relay_server.session import Session, normal_type
 
 
@@ -91,12 +91,9 @@ async def nodes(session: Session, args: Any) -> Any:
 
 async def node_details(session: Session, args: Any) -> Any:
     """``/rosapi/node_details``"""
-    node, seen = name(args, "node"), view(session)
-    return {
-        "subscribing": [each for each, topic in seen.topics.items() if node in topic.subscribers],
-        "publishing": [each for each, topic in seen.topics.items() if node in topic.publishers],
-        "services": [each for each, service in seen.services.items() if node in service.providers],
-    }
+    node = name(args, "node")
+    work = work_of([node], view(session))[node]
+    return {"subscribing": work.subscribes, "publishing": work.publishes, "services": work.services}
 
 
 async def action_servers(session: Session, args: Any) -> Any:

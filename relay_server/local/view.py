@@ -6,7 +6,7 @@ Nodes are no resources: their names are shown to everyone with a right on the ro
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -30,6 +30,14 @@ class View(NamedTuple):
     services: dict[str, Service]
     actions: dict[str, Service]
     nodes: list[str]
+
+
+class Work(NamedTuple):
+    """What a node does: names of topics and services, in order."""
+
+    publishes: list[str]
+    subscribes: list[str]
+    services: list[str]
 
 
 class _Kept(NamedTuple):
@@ -66,6 +74,20 @@ def seen(robot: Presence, ends: Ends, rules: Rules) -> View:
     while len(views) > KEPT:
         views.popitem(last=False)
     return found.view
+
+
+def work_of(nodes: Collection[str], seen: View) -> dict[str, Work]:
+    """What each of some nodes does, as far as it is seen; what is no node does nothing."""
+    found = {node: Work([], [], []) for node in nodes}
+    for name, topic in seen.topics.items():
+        for node in found.keys() & topic.publishers:
+            found[node].publishes.append(name)
+        for node in found.keys() & topic.subscribers:
+            found[node].subscribes.append(name)
+    for name, service in seen.services.items():
+        for node in found.keys() & service.providers:
+            found[node].services.append(name)
+    return found
 
 
 def _made(robot: Presence, ends: Ends, rules: Rules) -> View:

@@ -6,6 +6,7 @@ Bytes come in as whole websocket messages and go out as frames; every message is
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from twisted.logger import Logger
 
@@ -112,7 +113,9 @@ class Session:
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
         self._rounds = rounds
         self._pinging = Pinging(self, clock, transport, freshness, timing)
-        self.incoming = Incoming(clock, lambda: freshness.not_before, self._joined, self._given_up)
+        self.incoming = Incoming(
+            clock, lambda: freshness.not_before, self._joined, partial(self.tell, "error")
+        )
         self.listening = Listening(self, clock, local, rounds)
         self.publishing = Publishing(self, freshness)
         self.calling = Calling(self, local)
@@ -267,10 +270,8 @@ class Session:
         if request is not None:
             answer_failed(self, request, error)
         if self._malformed >= MALFORMED:
-            self.close(
-                closing.TOO_MANY_ERRORS,
-                f"{MALFORMED} messages in a row were not rosbridge: {error}"[:120],
-            )
+            words = f"{MALFORMED} messages in a row were not rosbridge: {error}"
+            self.close(closing.TOO_MANY_ERRORS, words[:120])
 
     def pong(self, payload: bytes) -> None:
         """The client answered a ping."""
@@ -289,12 +290,10 @@ class Session:
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """Queue a message of a topic, opened when its turn comes."""
         outbox = self.outbox
-        if outbox.passing:
-            frames = parcel.open(listener)
-            if frames is not None:
-                outbox.write(frames)
-        else:
+        if not outbox.passing:
             outbox.data(listener, parcel, listener.depth or DATA_PER_TOPIC)
+        elif (frames := parcel.open(listener)) is not None:
+            outbox.write(frames)
 
     def dropped(self, listener: Listener) -> None:
         """Count a sample that gave way before it was queued here."""
@@ -356,6 +355,11 @@ class Session:
         """The same for its latest command, were it a zero or one that did not pass."""
         return self._ago(self.publishing.silent_ns)
 
+    def heard_driving(self) -> float:
+        """The clock's time at which it last answered a ping; endless if it let go of all it commanded."""
+        silence = self._freshness.silence() / 1e9 if self.publishing.holds_on else -float("inf")
+        return self._clock.seconds() - silence
+
     def _ago(self, nanoseconds: int) -> float:
         return self._clock.seconds() - (0 if self.pursuing.moving else nanoseconds / 1e9)
 
@@ -379,9 +383,6 @@ class Session:
         if ask.level not in LEVELS:
             raise Refused(f"level '{ask.level[:20]}' is none of {', '.join(LEVELS)}")
         self._level = LEVELS[ask.level]
-
-    def _given_up(self, reason: str, id: rosbridge.Id) -> None:
-        self.tell("error", reason, id)
 
     def _overflow(self) -> None:
         self.close(closing.TOO_SLOW, "replies pile up; read faster")

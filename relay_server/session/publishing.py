@@ -29,6 +29,10 @@ ROUTES = 256
 DROVE_NS = 250_000_000
 """Nanoseconds after a command that moves in which no other is looked at for whether it does: that takes time."""
 
+LATEST_BYTES = 4 * KIB
+LONG = b"long"
+"""A command with more bytes than that is not kept, and counts as one that moves."""
+
 WAITING_TOPICS = 16
 WAITING_BYTES = 64 * KIB
 """Commands of one client that wait for control: the newest to each of so many topics, none larger than this."""
@@ -43,7 +47,17 @@ class Route:
     :param passes: whether this client does, there
     """
 
-    __slots__ = ("deadline", "description", "holders", "passes", "publication", "rules", "standing", "type")
+    __slots__ = (
+        "deadline",
+        "description",
+        "holders",
+        "latest",
+        "passes",
+        "publication",
+        "rules",
+        "standing",
+        "type",
+    )
 
     def __init__(
         self,
@@ -64,6 +78,8 @@ class Route:
         self.passes = passes
         self.deadline = description.motion.deadline_ms * 1_000_000 if motion else None
         """Nanoseconds; the greatest age a command may have."""
+        self.latest: bytes | None = None
+        """The latest command that passed, :data:`LONG` for a long one."""
 
 
 class _Waiting(NamedTuple):
@@ -166,6 +182,8 @@ class Publishing:
                 self._drives(route, ask)
         publication = route.publication
         send, body, stamp = publication.send, bytes(ask.msg), freshness.not_before
+        if deadline is not None:
+            route.latest = body if len(body) <= LATEST_BYTES else LONG
         if send is None:
             session.channel.publications.publish(session, publication, body, stamp, ask.id, left / 1e9)
             return
@@ -344,6 +362,14 @@ class Publishing:
     def idle_ns(self) -> int:
         """Nanoseconds since the latest command that moves."""
         return self._now() - self.drove
+
+    @property
+    def holds_on(self) -> bool:
+        """Whether the latest command on any topic that passed was no zero."""
+        routes = self._routes.values()
+        return any(
+            each.latest is not None and not is_still(each.publication.type, each.latest) for each in routes
+        )
 
     def _stale(self, route: Route, age: int, id: rosbridge.Id) -> None:
         self.stale_commands += 1

@@ -111,6 +111,14 @@ def drive(house: House, page: Page) -> int:
     return since
 
 
+def stop_by(page: Page) -> None:
+    """Press STOP; it is done when the robot has confirmed it."""
+    with page.expect_response(re.compile("/robots/rover/stop$")) as told:
+        seen(page, "stop").click()
+    assert told.value.ok
+    expect(seen(page, "stopped")).to_contain_text("The robot is stopped.")
+
+
 # --- handing over -----------------------------------------------------------------------------------------
 
 
@@ -243,6 +251,35 @@ def test_a_viewer_stops_who_drives(house: House, open_page: OpenPage) -> None:
     drive(house, ann)
     ann.keyboard.up("a")
     house.stands()
+
+
+@pytest.mark.parametrize("button", ["resume", "order-resume"])
+def test_a_second_stop_ends_a_press_to_resume(house: House, open_page: OpenPage, button: str) -> None:
+    """Somebody stops the stopped robot once more while another holds the button: it stays stopped, and he is named."""
+    vera = open_page("vera")
+    olga = open_page("olga", COCKPIT if button == "resume" else "/fleet")
+    if button == "order-resume":
+        seen(olga, "fleet-order").click()
+        seen(olga, "order-pattern").fill("rover")
+        seen(olga, "order-do").select_option("resume")
+    # Where the second stop took longer than the finger, the press was not ended by it.
+    for _ in range(5):
+        stop_by(vera)
+        expect(seen(olga, "stopped" if button == "resume" else "robot-stopped")).to_be_visible()
+        seen(olga, button).focus()
+        olga.keyboard.down("Enter")
+        stop_by(vera)
+        olga.wait_for_timeout(2500)  # proves absence
+        olga.keyboard.up("Enter")
+        if "Again by vera" in seen(vera, "stopped").inner_text():
+            break
+        seen(olga, button).blur()
+    else:
+        pytest.fail("each time the robot was resumed")
+    seen(olga, button).focus()
+    olga.keyboard.down("Enter")
+    expect(seen(vera, "stopped")).to_have_count(0)
+    olga.keyboard.up("Enter")
 
 
 def test_stop_goes_without_a_websocket(house: House, open_page: OpenPage) -> None:

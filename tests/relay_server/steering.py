@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from math import inf
 from typing import Any, TypeVar
 
 import msgspec
@@ -73,6 +74,8 @@ class Connection:
         self.address = "192.0.2.7"
         self.told: list[str] = []
         self.commanded = 0.0
+        self.alive = inf
+        """When it was heard last, as long as it has not let go."""
         self.changes = 0
         self.when_told: Callable[[], object] = lambda: None
         """Called whenever it is told something."""
@@ -100,6 +103,10 @@ class Connection:
     def commanding_since(self) -> float:
         """The same."""
         return self.commanded
+
+    def heard_driving(self) -> float:
+        """As the test says."""
+        return self.alive
 
     def control_changed(self) -> None:
         """Count it."""

@@ -110,8 +110,16 @@ class Control:
 
     def stop(self, client: Any, why: str) -> tuple[bool, str]:
         """For everybody."""
-        self.stopped = {"by": client.user, "why": why, "since": time.time(), "told": not self.away}
+        self.halt(client.user, why, told=not self.away)
         return True, ""
+
+    def halt(self, by: str, why: str = "", *, told: bool = True) -> None:
+        """It is stopped, or stopped once more."""
+        order = {"by": by, "why": why, "since": time.time()}
+        if self.stopped is None:
+            self.stopped = {**order, "told": told, "again": None}
+        else:
+            self.stopped = {**self.stopped, "told": self.stopped["told"] or told, "again": order}
 
     def be(self, away: bool) -> None:
         """The robot goes, or comes: then it hears what it missed."""

@@ -316,8 +316,7 @@ class Relay:
             control.inhibited = order.get("inhibited", control.inhibited)
             control.changed()
             if "stopped" in order:
-                told = order.get("told", True)
-                control.stopped = {"by": order["stopped"], "why": "", "since": time.time(), "told": told}
+                control.halt(order["stopped"], told=order.get("told", True))
                 control.changed()
             if order.get("resumed"):
                 control.stopped = None
@@ -780,7 +779,8 @@ class Connection:
                 protocol.receive_data(data)
                 self.flush(protocol)
                 for frame in protocol.events_received():
-                    if getattr(frame, "opcode", None) is Opcode.TEXT:
+                    # Like the relay, it takes nothing from a connection that it has ended.
+                    if getattr(frame, "opcode", None) is Opcode.TEXT and protocol.state is State.OPEN:
                         socket.take(json.loads(frame.data))  # type: ignore[union-attr]
         finally:
             self.relay.sockets.discard(socket)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+from switchboard_diagnostics import reporting
 from switchboard_drive import LET_GO_SECONDS
 from switchboard_processes import Process, ros_environment, running
 from switchboard_robot import Robot
@@ -58,23 +59,25 @@ def test_what_is_well_again_by_the_time_relay_and_robot_begin_anew_is_over(house
     assert told == ["arm begun", "arm over", "leg begun"]
 
 
-def test_control_that_was_lost_with_a_killed_relay_is_told_by_the_next(house: House) -> None:
-    """The robot says whom it lost as it moved, for that relay knows nothing of it; the next driver ends it."""
-    house.rule(robots="driven", kinds=["control"])
-    robot = Robot(house.relay, "driven")
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_control_that_was_lost_with_the_relay_is_told_by_the_next(house: House, how: str) -> None:
+    """A killed one knew nothing of it, but the robot says so; the other could tell nobody. The next driver ends it."""
+    name = f"driven-{how}"
+    house.rule(robots=name, kinds=["control"])
+    robot = Robot(house.relay, name)
     with running(robot):
-        drive(house, robot, house.relay.kill)
+        drive(house, robot, house.relay.kill if how == "killed" else house.relay.stop)
         house.relay.start()
         wait_for("it is told", lambda: house.hook.told == ["control begun"])
         (alert,) = [
-            each for each in house.alerts(query="?robot=driven&open=true") if each["kind"] == "control"
+            each for each in house.alerts(query=f"?robot={name}&open=true") if each["kind"] == "control"
         ]
         assert (alert["level"], alert["text"].partition(" while ")[0]) == ("error", "boss lost control")
         drive(house, robot, lambda: None, pause=LET_GO_SECONDS)
         wait_for("its end is told", lambda: house.hook.told == ["control begun", "control over"])
 
 
-def drive(house: House, robot: Robot, then: Callable[[], None], *, pause: float = 0.0) -> None:
+def drive(house: House, robot: Robot, then: Callable[[], object], *, pause: float = 0.0) -> None:
     """Somebody drives the robot until something happens.
 
     :param pause: of so many seconds after the first command, by which he lets go
@@ -88,24 +91,16 @@ def drive(house: House, robot: Robot, then: Callable[[], None], *, pause: float 
             then()
 
 
-FAULT = """
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-rclpy.init()
-node = rclpy.create_node("fault")
-publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-fault = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="arm", message="the motor is hot")
-node.create_timer(1.0, lambda: publisher.publish(DiagnosticArray(status=[fault])))
-print("READY", flush=True)
-rclpy.spin(node)
-"""
-
-
 def test_a_daemon_that_begins_anew_while_a_part_is_in_error_tells_nothing_twice(house: House) -> None:
     """The part goes on saying so once a second, the new daemon hears it; nobody is told that it was over."""
     house.rule(kinds=["diagnostics"], robots="sick")
     robot = Robot(house.relay, "sick")
-    fault = Process([sys.executable, "-c", FAULT], robot.folder, "fault", ros_environment(robot.domain))
+    fault = Process(
+        reporting("arm", "ERROR", "the motor is hot", 1.0),
+        robot.folder,
+        "fault",
+        ros_environment(robot.domain),
+    )
 
     def arm() -> dict[str, Any]:
         seen = house.alerts(query="?robot=sick&open=true")

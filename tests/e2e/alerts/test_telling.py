@@ -98,6 +98,23 @@ def only_delivery(house: House) -> Delivery:
     return delivery
 
 
+def test_a_driver_whom_the_network_swallows_has_lost_control(house: House) -> None:
+    """It is told once he is given up, though the robot has stood for seconds then."""
+    house.rule(kinds=["control"], robots="adrift")
+    proxy = ChaosProxy(house.relay.http_port)
+    robot = Robot(house.relay, "adrift")
+    with closing(proxy), running(robot), house.relay.connect_by(proxy.port, "adrift", house.admin) as client:
+        driver = Driver(client)
+        with running(driver):
+            driver.start()
+            wait_for("it moves", robot.moving)
+            proxy.black_hole()
+            wait_for("it stands", lambda: not robot.moving())
+            assert house.hook.got == []
+            wait_for("it is told", lambda: house.hook.told == ["control begun"])
+        proxy.heal()
+
+
 def test_a_battery_and_a_module_are_told_and_acknowledged(house: House) -> None:
     """A robot tells of its charge and of a part; operators acknowledge, viewers see it."""
     house.rule(robots="mule", kinds=["battery", "module"])

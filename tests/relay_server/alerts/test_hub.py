@@ -523,6 +523,85 @@ async def test_a_robot_that_was_removed_is_not_remembered(scene: Scene) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_a_robot_that_is_removed_before_it_is_missed_does_not_come_back(scene: Scene) -> None:
+    """Neither in the registry nor with an alert."""
+    await scene.alerts.start()
+    scene.alerts._absent = {scene.number: ("rover", "default")}
+    await scene.store.write(queries.remove_robot, scene.number)
+    scene.world.registry.forget(scene.number)
+    await scene.alerts.refresh()
+    scene.world.clock.pump([0.25] * int(4 * ABSENT_SECONDS + 8))
+    assert scene.world.registry.find(scene.number) is None
+    assert list(scene.alerts.book) == []
+    scene.alerts.hush()
+    await scene.alerts.keep()
+
+
+@pytest.mark.parametrize("by_robot", [True, False])
+@pytest_twisted.ensureDeferred
+async def test_control_lost_as_a_relay_ends_is_told_by_the_next_once(scene: Scene, by_robot: bool) -> None:
+    """By the robot's word, or when it has lasted for a moment."""
+    await scene.desk.add_rule(
+        scene.people["ann"], Ask("webhook", url="https://example.org/hook"), "192.0.2.9"
+    )
+    scene.says("control.taken")
+    scene.alerts.hush()
+    scene.says("control.lost", user="ann", why="the relay is going down", moving=True)
+    scene.world.clock.advance(5)
+    await scene.alerts.keep()
+    assert scene.sent == []
+    scene.alerts = later = scene.begin()
+    await later.start()
+    if by_robot:
+        scene.says("robot.alert", level="error", text="x", alert_kind="control", about="", over=False)
+    else:
+        scene.world.clock.pump([0.25] * TIDY_EVERY)
+    await until(lambda: later.tellers.unheard() != set())
+    scene.world.clock.advance(1)
+    await until(lambda: bool(scene.sent))
+    scene.world.clock.pump([0.25] * TIDY_EVERY)
+    told = [(each.alert.kind, each.event) for message in scene.sent for each in message.notices]
+    assert told == [("control", "begun")]
+    later.hush()
+    await later.keep()
+
+
+@pytest.mark.parametrize("arrived", [True, False])
+@pytest_twisted.ensureDeferred
+async def test_what_waited_when_a_relay_ended_is_told_by_the_next_if_it_lasts(
+    scene: Scene, arrived: bool
+) -> None:
+    """Once, and not what had arrived."""
+    await scene.desk.add_rule(
+        scene.people["ann"], Ask("webhook", url="https://example.org/hook"), "192.0.2.9"
+    )
+    scene.alerts.tell(scene.robot, "module", "arm", "warning", "x")
+    scene.alerts.tell(scene.robot, "module", "leg", "warning", "x")
+    await until(lambda: scene.alerts.tellers.unheard() != set())
+    if arrived:
+
+        def all_sent() -> bool:
+            scene.world.clock.advance(1)
+            return scene.alerts.tellers.unheard() == set()
+
+        await until(all_sent)
+        scene.sent.clear()
+    scene.alerts.hush()
+    await scene.alerts.keep()
+    scene.alerts = later = scene.begin()
+    await later.start()
+    later.over(scene.robot, "module", "leg")
+    scene.world.clock.pump([0.25] * TIDY_EVERY)
+    await until(lambda: later.tellers.unheard() != set() or arrived)
+    scene.world.clock.advance(61)
+    await until(lambda: bool(scene.sent))
+    told = [(each.alert.about, each.event) for message in scene.sent for each in message.notices]
+    assert told == ([("leg", "over")] if arrived else [("arm", "begun")])
+    later.hush()
+    await later.keep()
+
+
+@pytest_twisted.ensureDeferred
 async def test_a_relay_that_goes_waits_a_moment_for_its_database(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
+import orjson
 import pytest
 import pytest_twisted
+from twisted.protocols.portforward import ProxyFactory, ProxyServer
 
 from relay_protocol.errors import Invalid
 from relay_server.alerts.addresses import Fence, networks
 from relay_server.alerts.mailing import Mailing
 from relay_server.alerts.message import Undelivered
 from relay_server.alerts.names import Names
-from relay_server.alerts.services import PARAMETERS, SERVERS
+from relay_server.alerts.services import CLOUDS, PARAMETERS, SERVERS
 from tests.relay_server.alerts.made_up import message, rule
-from tests.relay_server.alerts.receiver import REACTOR, Hook, serve
+from tests.relay_server.alerts.receiver import REACTOR, Hook, certificate, serve
 
 SLACK = "slack://T1JJ3T3L2/A1BRTD4JD/TIiajkdnlazkcOXrIdevi7FQ"
 DISCORD = f"discord://{'1' * 18}/{'a' * 64}"
@@ -140,6 +144,8 @@ async def test_nothing_is_fetched_for_a_rule_that_is_refused(scene: Scene) -> No
         TEAMS,
         f"{MAIL}?smtp=mail.example.org&port=465&from=relay@example.org&to=ann@example.org&mode=ssl",
         "ntfys://ntfy.example.org/topic?priority=high",
+        "ntfy://mytopic",
+        "ntfys://mytopic?priority=high",
         "gotifys://gotify.example.org/abcdefghijklmno?priority=high",
         "mmosts://chat.example.org/3ccdd113474722377935511fc85d3dd4?channel=robots",
         "jsons://ann:password@example.org:8443/a/b?verify=no",
@@ -190,6 +196,63 @@ def test_each_service_is_one_of_apprise_and_a_server_of_the_users_choice_is_know
     assert {each: found[each] for each in PARAMETERS} == {each: each in SERVERS for each in PARAMETERS}
 
 
+def test_a_service_with_a_server_of_its_own_and_others_of_the_users_choice_is_known_as_one() -> None:
+    """Apprise tells by its templates: some have a host, and others have something else in its place."""
+    import apprise
+
+    both = set()
+    for entry in apprise.Apprise().details()["schemas"]:
+        templates = entry["details"]["templates"]
+        hosts = [each for each in templates if "{host}" in each]
+        if hosts and len(hosts) < len(templates):
+            both.update((*(entry["protocols"] or ()), *(entry["secure_protocols"] or ())))
+    assert both & set(PARAMETERS) == set(CLOUDS)
+
+
+class Proxy(ProxyServer):
+    """Takes HTTPS anywhere to one server of this machine, and remembers where it was to go."""
+
+    reactor = REACTOR
+
+    def connectionMade(self) -> None:
+        """Who comes says first where to."""
+
+    def dataReceived(self, data: bytes) -> None:
+        """The first words say where to; what follows is passed on."""
+        if self.peer is not None:
+            super().dataReceived(data)
+            return
+        self.factory.asked.append(data.split()[1].decode())
+        self.transport.write(b"HTTP/1.1 200 OK\r\n\r\n")
+        super().connectionMade()
+
+
+@pytest.mark.parametrize("url", ["ntfy://mytopic", "ntfys://mytopic?priority=high"])
+@pytest_twisted.ensureDeferred
+async def test_a_message_to_a_topic_of_ntfy_sh_arrives_there(
+    scene: Scene, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The topic is no host: nobody asks for its address."""
+    shown, trusted = certificate(tmp_path, "ntfy.sh")
+    (tmp_path / "ca.pem").write_bytes(trusted.dumpPEM())
+    hook = Hook(200)
+    server = serve(hook, tls=shown)
+    factory: Any = ProxyFactory("127.0.0.1", server.getHost().port)
+    factory.protocol, factory.asked, factory.noisy = Proxy, [], False
+    proxy = REACTOR.listenTCP(0, factory, interface="127.0.0.1")
+    monkeypatch.setenv("https_proxy", f"http://127.0.0.1:{proxy.getHost().port}")
+    monkeypatch.setenv("no_proxy", "")
+    monkeypatch.setenv("REQUESTS_CA_BUNDLE", str(tmp_path / "ca.pem"))
+    try:
+        await scene.mailing.send(rule(channel="apprise", url=url, secret=""), message())
+    finally:
+        await proxy.stopListening()
+        await server.stopListening()
+    assert factory.asked == ["ntfy.sh:443"]
+    ((_, body),) = hook.got
+    assert orjson.loads(body)["topic"] == "mytopic"
+
+
 @pytest.mark.parametrize(
     "form",
     [
@@ -199,6 +262,8 @@ def test_each_service_is_one_of_apprise_and_a_server_of_the_users_choice_is_know
         "gotify://{}/abcdefghijklmno",
         "mmost://{}/3ccdd113474722377935511fc85d3dd4",
         "ntfy://{}/topic",
+        "ntfy://{}?to=topic",
+        "ntfy://ann:password@{}/topic",
         "mailto://ann:password@example.org?smtp=127.0.0.1&port={port}&mode=insecure",
         f"workflows://{{}}/{'a' * 32}/{'b' * 43}",
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 import pytest
@@ -451,6 +452,33 @@ def test_it_ends_with_the_connection(place: Place) -> None:
         place.link.answers(order)
     assert place.desk.lease.state is State.FREE
     assert place.link.holders[-2:] == [bob.number, 0]
+
+
+@pytest.mark.parametrize(("alive", "moving"), [(1000.0, True), (1000.4, True), (1000.5, False), (inf, False)])
+def test_who_vanished_while_he_drove_lost_control_of_a_robot_that_moved(
+    place: Place, alive: float, moving: bool
+) -> None:
+    """Though it has stopped itself by the time that is known; not who was heard since, or had let go."""
+    ann = place.holding()
+    place.desk.told(link.Safety(holder=ann.number, moving=True))
+    place.clock.advance(0.4)
+    place.desk.told(link.Safety(holder=ann.number))
+    place.clock.advance(5.6)
+    ann.alive = alive
+    place.desk.left(ann)
+    assert place.record.notes[-1] == ("control.lost", "ann", "the connection has ended", {"moving": moving})
+
+
+def test_who_has_not_moved_the_robot_does_not_lose_it_for_his_forerunner(place: Place) -> None:
+    """What moved before he had control was not his."""
+    ann = place.holding("ann")
+    place.desk.told(link.Safety(holder=ann.number, moving=True))
+    place.desk.told(link.Safety(holder=ann.number))
+    place.desk.release(ann, "")
+    bob = place.holding("bob")
+    bob.alive = place.clock.seconds()
+    place.desk.left(bob)
+    assert place.record.notes[-1] == ("control.lost", "bob", "the connection has ended", {"moving": False})
 
 
 def test_it_ends_with_the_right(place: Place) -> None:

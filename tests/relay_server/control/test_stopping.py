@@ -19,6 +19,7 @@ from tests.relay_server.memory import World
 from tests.relay_server.steering import Place, outcome, result
 
 ANN = Actor("ann", "user:ann", 7, "192.0.2.7", 3)
+BOB = Actor("bob", "user:bob", 8, "192.0.2.8", 4)
 LATER = 1 << 62
 """Sent after all there was."""
 
@@ -64,6 +65,36 @@ def test_a_stop_is_the_same_before_and_after_it_is_confirmed() -> None:
     assert place.desk.stopping.stopped == stopped._replace(told=True)
 
 
+def test_a_stop_of_a_stopped_robot_is_told() -> None:
+    """Who would let it move sees the latest who stopped it, until it may; the robot itself tells of the first alone."""
+    place = Place().online()
+    result(place.desk.stopping.stop(ANN, "smoke"))
+    first = place.desk.standing.stopped
+    assert first is not None
+    place.clock.advance(60)
+    result(place.desk.stopping.stop(BOB, "somebody is below"))
+    place.desk.told(link.Safety(stopped=link.Stopped(by="ann", why="smoke", since=first.since)))
+    then = place.desk.standing.stopped
+    assert then is not None
+    assert then.again == ("bob", "somebody is below", first.since + 60)
+    assert then._replace(again=None) == first
+    result(place.desk.stopping.resume(ANN, "", LATER))
+    assert place.desk.standing.stopped is None
+    result(place.desk.stopping.stop(ANN, ""))
+    assert place.desk.standing.stopped.again is None
+
+
+def test_a_stop_that_replaces_one_that_is_still_to_be_told_is_no_second_one() -> None:
+    """A robot that is away is told of the latest; nobody is told of that twice."""
+    place = Place()
+    result(place.desk.stopping.stop(ANN, "smoke"))
+    place.clock.advance(60)
+    result(place.desk.stopping.stop(BOB, ""))
+    stopped = place.desk.standing.stopped
+    assert stopped is not None
+    assert (stopped.by, stopped.again) == ("bob", None)
+
+
 def test_until_the_robot_confirms_it_is_kept() -> None:
     """Everybody sees that it is ordered, and whether the robot says so itself."""
     place = Place().online()
@@ -78,7 +109,7 @@ def test_until_the_robot_confirms_it_is_kept() -> None:
     assert asked == [True]
     assert place.record.stops == {}
     stopped = place.desk.standing.stopped
-    assert stopped == ("ann", "smoke", 5.0, True)
+    assert stopped == ("ann", "smoke", 5.0, True, None)
 
 
 def test_a_robot_that_is_away_is_told_before_anything_else() -> None:
@@ -297,7 +328,7 @@ def test_orders_of_the_database_are_told_once() -> None:
     assert [each.why for each in place.link.orders(link.Stop)] == ["maintenance"]
     assert not stopping.expect(order, 0)
     assert not stopping.expect(None, 0)
-    assert place.desk.standing.stopped == ("root", "maintenance", order.at, True)
+    assert place.desk.standing.stopped == ("root", "maintenance", order.at, True, None)
 
 
 def test_an_order_that_is_given_by_a_clock_that_was_set_back_counts() -> None:

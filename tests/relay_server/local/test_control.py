@@ -200,7 +200,7 @@ def test_what_the_robot_tells_is_told_on(world: World, people: dict[str, Person]
     world.clock.advance(0.2)
     seen = told(olga)
     assert seen["moving"] is True
-    assert seen["stopped"] == {"by": "vic", "why": "smoke", "since": 5.0, "told": True}
+    assert seen["stopped"] == {"by": "vic", "why": "smoke", "since": 5.0, "told": True, "again": None}
     assert seen["suppressed"] == [{"resource": "/cmd_vel", "ms": 80, "sources": [4], "by": "olga"}]
     assert seen["inhibited"] == [{"resource": "/secret", "ms": 900, "hold": True, "by": "olga"}]
     assert seen["limits"]["operator"]["linear"] == 0.5

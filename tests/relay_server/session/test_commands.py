@@ -407,6 +407,37 @@ def test_who_suppresses_a_topic_commands_it(world: World) -> None:
     assert "controlled by ann" in olga.told()[-1]
 
 
+@pytest.mark.parametrize(
+    ("last", "silent", "moving"),
+    [
+        ([GO], 0.0, True),
+        ([GO, STOP], 0.0, False),
+        ([GO], 2.0, False),
+        ([STOP], 0.0, False),
+        ([{"linear": {"x": 0.5}, "pad": [0] * 5000}], 0.0, True),
+    ],
+)
+def test_who_vanishes_while_he_drives_loses_control_of_a_moving_robot(
+    world: World, last: list[Any], silent: float, moving: bool
+) -> None:
+    """Seconds after the robot has stopped itself; not who has said zero, or answered pings since it stands."""
+    at_work(world)
+    ann = driver(world, "ann", 1)
+    ann.says("call_service", service="/relay/take_control")
+    desk = world.desks.of(world.robot)
+    for each in last:
+        drive(ann, each)
+    desk.told(link.Safety(holder=ann.session.number, moving=last[0] is not STOP))
+    world.clock.advance(0.4)
+    desk.told(link.Safety(holder=ann.session.number))
+    if silent:
+        world.wait(silent, ann)
+    world.wait(10.0)
+    assert ann.client.closed is not None
+    assert world.record.notes[-1][0] == "control.lost"
+    assert world.record.notes[-1][3] == {"moving": moving}
+
+
 def test_where_control_is_explicit_commands_are_told_what_to_do(world: World) -> None:
     """None of them takes it."""
     world.desks._rules = ControlRules(explicit=True)

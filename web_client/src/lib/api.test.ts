@@ -1,5 +1,5 @@
 import { afterEach, beforeEach, describe, expect, it, vi } from 'vitest'
-import { currentSession, giveOrder, Refusal, resumeRobot, STOP_PATIENCE_MS, stopRobot, Unreachable } from './api'
+import { currentSession, giveOrder, moment, Refusal, STOP_PATIENCE_MS, stopRobot, Unreachable } from './api'
 
 interface Asked {
   path: string
@@ -119,15 +119,12 @@ describe('an order to many', () => {
 })
 
 describe('what moves a robot, or lets it move again', () => {
-  const ways: [string, () => Promise<void>, string, string][] = [
-    ['one robot', () => resumeRobot('rover'), '/api/v1/robots/rover/control', '/api/v1/robots/rover/resume'],
-    ...(['resume', 'call', 'set'] as const).map((what): [string, () => Promise<void>, string, string] => [
-      what,
-      () => giveOrder({ robots: ['*'], do: what }, () => {}),
-      '/api/v1/fleet/groups',
-      '/api/v1/fleet',
-    ]),
-  ]
+  const ways = (['resume', 'call', 'set'] as const).map((what): [string, () => Promise<void>, string, string] => [
+    what,
+    () => giveOrder({ robots: ['*'], do: what }, () => {}),
+    '/api/v1/fleet/groups',
+    '/api/v1/fleet',
+  ])
 
   it.each(ways)('gives back the moment of an answer that was asked for just before: %s', async (_, act, asks, does) => {
     void outcome(act())
@@ -138,6 +135,16 @@ describe('what moves a robot, or lets it move again', () => {
     expect(asked[1]?.path).toBe(does)
     expect(new Headers(asked[1]?.init.headers).get('switchboard-moment')).toBe('ff.1')
     expect(new Headers(asked[1]?.init.headers).get('content-type')).toBe('application/json')
+  })
+
+  it('gives back the moment at which a press for it began', async () => {
+    const pressed = moment()
+    asked[0]?.answer(new Response('{}', { headers: { 'switchboard-moment': 'ff.1' } }))
+    await vi.advanceTimersByTimeAsync(1_500)
+    void outcome(giveOrder({ robots: ['*'], do: 'resume' }, () => {}, undefined, pressed))
+    await vi.advanceTimersByTimeAsync(0)
+    expect(asked.map(({ init }) => init.method)).toEqual(['GET', 'POST'])
+    expect(new Headers(asked[1]?.init.headers).get('switchboard-moment')).toBe('ff.1')
   })
 
   it.each(ways)('is not asked for when that took long: %s', async (_, act) => {

@@ -63,18 +63,18 @@ async function request(method: string, path: string, body?: unknown, more: More 
   return response
 }
 
-/** What dates the next request: the relay takes none that may be older, however long it was held up (SPEC.md 1.13).
+/** What dates a request that follows: the relay takes none that may be older, however long it was held up (SPEC.md 1.13).
  *
  * @throws Unreachable when the relay takes so long to name a moment that it says nothing of when this was asked for
  */
-async function dated(path: string, signal?: AbortSignal): Promise<Record<string, string>> {
+export async function moment(signal?: AbortSignal): Promise<string> {
   const asked = performance.now()
   const patience = new Patience(MOMENT_PATIENCE_MS, signal)
   try {
-    const answer = await request('GET', path, undefined, { signal: patience.signal })
+    const answer = await request('GET', '/api/v1/fleet/groups', undefined, { signal: patience.signal })
     // A page that was frozen finds the answer before its timer.
     if (performance.now() - asked > MOMENT_PATIENCE_MS) throw new Unreachable()
-    return { [MOMENT]: answer.headers.get(MOMENT) ?? '' }
+    return answer.headers.get(MOMENT) ?? ''
   } finally {
     patience.end()
   }
@@ -144,11 +144,6 @@ export async function stopRobot(name: string, why = ''): Promise<boolean> {
   }
 }
 
-export async function resumeRobot(name: string, why = ''): Promise<void> {
-  const headers = await dated(robotPath(name, '/control'))
-  await request('POST', robotPath(name, '/resume'), { why }, { headers })
-}
-
 /** Alerts of all the user's robots, also those that are long over; the latest first.
  *
  * @param before what an earlier answer gave as `next`: only those that are older than it told
@@ -170,11 +165,13 @@ const DATED = new Set<Order['do']>(['resume', 'call', 'set'])
 /** Gives one order to many robots and hands on each line of the answer as it comes.
  *
  * @param signal ends it: what has not begun is not done; of an order to stop only the listening ends
+ * @param asked when it was asked for, where that was not now: to resume robots, when the press began
  * @throws Unreachable also when the answer breaks off, and when nothing more comes of the answer to a stop
  */
-export async function giveOrder(order: Order, take: (line: object) => void, signal?: AbortSignal): Promise<void> {
+export async function giveOrder(order: Order, take: (line: object) => void, signal?: AbortSignal, asked?: Promise<string>): Promise<void> {
   const stops = order.do === 'stop'
-  const headers = DATED.has(order.do) ? await dated('/api/v1/fleet/groups', signal) : {}
+  const dated = asked ?? (DATED.has(order.do) ? moment(signal) : null)
+  const headers: Record<string, string> = dated === null ? {} : { [MOMENT]: await dated }
   const patience = new Patience(stops ? STOP_PATIENCE_MS : null, signal)
   try {
     // An order to stop goes out even when the page is left in the same moment.

@@ -23,12 +23,22 @@ export interface Request extends Person {
   until: number
 }
 
-export interface Stopped {
+export interface Stop {
   by: string
   why: string
   since: number
+}
+
+export interface Stopped extends Stop {
   /** Whether the robot has confirmed it. */
   told: boolean
+  /** The latest of those who have stopped it since. */
+  again?: Stop | null
+}
+
+/** What a press to let robots move again is about: it is another one when somebody stops any of them meanwhile. */
+export function stops(all: (Stopped | null | undefined)[]): string {
+  return JSON.stringify(all.map((stopped) => stopped && [stopped.since, stopped.by, stopped.again?.since, stopped.again?.by]))
 }
 
 /** A topic that others command than who has control. */

@@ -290,8 +290,8 @@ export class Helm {
   async resume(): Promise<void> {
     this.busy = 'resume'
     try {
-      if (this.bridge.link.isOpen) await this.call<Answer>('/relay/resume', ORDER, { why: '' }, SWITCH_S)
-      else await api.resumeRobot(this.bridge.name)
+      // By the connection that tells of stops alone: whoever is cut off does not know of the latest.
+      await this.call<Answer>('/relay/resume', ORDER, { why: '' }, SWITCH_S)
       this.words = null
       this.ending = null
     } catch (error) {

@@ -1,4 +1,5 @@
 /** Shapes of what the relay and the robots send. Times are named with their unit. */
+import type { Stopped } from './control'
 
 export interface Session {
   user: string
@@ -72,8 +73,7 @@ export interface Robot {
   quality?: Quality | null
   /** Who has control. */
   holder?: string | null
-  /** `told`: whether the robot has confirmed it. */
-  stopped?: { by: string; why: string; since?: number; told: boolean } | null
+  stopped?: Stopped | null
   host: string
   platform: string
   distro: string
