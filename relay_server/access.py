@@ -21,6 +21,7 @@ from relay_protocol.errors import Refused
 from relay_protocol.realms import full_name
 from relay_protocol.rights import Grant, Operation, Rules, Verdict
 from relay_protocol.scopes import Scope
+from relay_server.clock import Turns
 from relay_server.store import Store
 
 K = TypeVar("K")
@@ -135,6 +136,7 @@ class Access:
         self._robots: OrderedDict[tuple[int, str | None], list[tuple[RobotRecord, Rules]]] = OrderedDict()
         """By user and scope; those of the longest unchanged are forgotten first."""
         self._refreshed = 0
+        self._refreshing = Turns(self._refresh)
         self._proved: OrderedDict[str, Principal] = OrderedDict()
         """By the hash of a token, who it proved. Kept in step with the database as permits are."""
         self._admitted: OrderedDict[tuple[int, str | None, int], None] = OrderedDict()
@@ -231,8 +233,13 @@ class Access:
     async def refresh(self) -> None:
         """Judge all open permits anew, after something changed in the database.
 
+        One at a time: what an earlier look has read must not come after what a later one has.
+
         :raises Unavailable: the database can't be asked; what is open goes on under the rights last seen
         """
+        await self._refreshing.ask()
+
+    async def _refresh(self) -> None:
         self._refreshed += 1
         self._robots.clear()
         self._admitted.clear()

@@ -150,6 +150,14 @@ class Authenticator:
         self._limiter.succeeded(user, address)
         return Login(record.id, record.name, record.realm, record.admin, 0, None, password_hash=stored)
 
+    async def new_hash(self, password: str) -> str:
+        """What may be stored of a new password.
+
+        :raises Invalid: it breaks the rules
+        :raises Unavailable: too many are hashed now
+        """
+        return await self._hashing.run(passwords.hash_password, password)
+
     async def token(self, token: str) -> Principal:
         """The principal behind an access token or a portal session.
 

@@ -26,8 +26,12 @@ class TokenBucket:
     @property
     def wait(self) -> float:
         """Seconds until one more may pass; 0 when it may now."""
+        return self.wait_for(1)
+
+    def wait_for(self, cost: float) -> float:
+        """The same for what takes so many tokens."""
         self._fill()
-        return max(0.0, (1 - self._tokens) / self._rate)
+        return max(0.0, (cost - self._tokens) / self._rate)
 
     @property
     def left(self) -> float:
@@ -35,12 +39,15 @@ class TokenBucket:
         self._fill()
         return self._tokens
 
-    def take(self) -> bool:
-        """Whether one more may pass now; if so it is counted."""
+    def take(self, cost: float = 1) -> bool:
+        """Whether one more may pass now; if so it is counted.
+
+        :param cost: tokens that it takes
+        """
         self._fill()
-        if self._tokens < 1:
+        if self._tokens < cost:
             return False
-        self._tokens -= 1
+        self._tokens -= cost
         return True
 
     def _fill(self) -> None:

@@ -84,6 +84,41 @@ async def within(
     return await running
 
 
+class Turns:
+    """Work that many ask for: it is never under way twice, and all who ask while it is share the next time.
+
+    :param work: what is done; were it to ask itself, it would wait for ever
+    """
+
+    def __init__(self, work: Callable[[], Coroutine[Deferred[Any], Any, None]]) -> None:
+        self._work = work
+        self._under_way = False
+        self._asked: list[Deferred[None]] = []
+
+    async def ask(self) -> None:
+        """Have it done once more, from now on; it goes on when who waits gives up. Raises what the work raises."""
+        waiting: Deferred[None] = Deferred()
+        self._asked.append(waiting)
+        if not self._under_way:
+            self._begin()
+        await waiting
+
+    def _begin(self) -> None:
+        asked, self._asked = self._asked, []
+        self._under_way = True
+        Deferred.fromCoroutine(self._work()).addBoth(self._done, asked)
+
+    def _done(self, result: Failure | None, asked: list[Deferred[None]]) -> Failure | None:
+        self._under_way = False
+        if self._asked:
+            self._begin()
+        left = [each for each in asked if not each.called]
+        for each in left:
+            each.callback(result)
+        # An error that nobody waits for any more is left to Twisted, which logs it.
+        return None if left else result
+
+
 def to_the_end(work: Deferred[T]) -> Deferred[T]:
     """What is waited for in place of work that goes on when who waits gives up."""
     waiting: Deferred[T] = Deferred()

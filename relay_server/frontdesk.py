@@ -280,14 +280,16 @@ class FrontDesk:
                 ]
         raise NotFound(NO_ROBOT)
 
-    async def may_view(self, principal: Principal, robot: str, camera: str, address: str) -> None:
+    async def may_view(
+        self, principal: Principal, robot: str, camera: str, transport: str, address: str
+    ) -> None:
         """Whether the principal may view this camera now.
 
         :raises NotFound: no such robot, or no right on it or to view this
         """
         admission = await self.admit(principal, robot, address)
         try:
-            check_view(admission.permit, camera)
+            check_view(admission.permit, camera, transport)
         finally:
             self.turn_away(admission)
 

@@ -19,13 +19,13 @@ from twisted.internet.task import LoopingCall, deferLater
 from twisted.logger import Logger
 from twisted.web.server import Site
 
-import relay_server
 from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, SwitchboardError
-from relay_server import invitation, passwords
+from relay_server import VERSION, invitation, passwords
 from relay_server.access import Access
+from relay_server.administration.desk import RealmDesk
 from relay_server.alerts import AlertHouse
 from relay_server.auth import Authenticator
 from relay_server.channel import Channels
@@ -38,6 +38,7 @@ from relay_server.edges import (
     events,
     fleet,
     presence,
+    realm,
     recordings,
     representing,
     resources,
@@ -65,9 +66,10 @@ from relay_server.oauth import OAuthDesk
 from relay_server.origins import Origins
 from relay_server.recording import FOLDER, Library, RecordingDesk, Recordings, sweep
 from relay_server.registry import Registry
-from relay_server.retiring import Realms, retire
+from relay_server.retiring import Realms
 from relay_server.session import Timing
 from relay_server.store import Store
+from relay_server.taking_up import TakingUp
 from relay_server.tls import ServerTls
 from relay_server.video import Videos
 
@@ -111,9 +113,10 @@ class Relay:
         told = self._journal, self._alerts.alerts
         self._memory = MemoryHouse(reactor, *judged, *told, settings)
         self._directory = DirectoryHouse(reactor, *judged, self._channels, self._memory.note)
-        self._realms = Realms(self._store, self._memory.realms, self._directory.realms)
+        realms = Realms(self._store, self._memory.realms, self._directory.realms)
+        concerned = self._registry, self._desks, self._videos, self._alerts.alerts, self._directory.leases
+        self._taking_up = TakingUp(self._store, self._access, realms, *concerned, self._sweep)
         self._ports: list[Any] = []
-        self._revision = -1
         self._polling = LoopingCall(self._poll)
         self._purging = LoopingCall(self._purge)
         self._database_fine = True
@@ -137,12 +140,10 @@ class Relay:
         for each in (self._store, self._workshop, self._auth):
             each.start()
         self._recordings.open()
-        self._revision = await self._store.read(queries.revision)
-        self._desks.expect(await self._store.read(queries.pending_stops))
+        await self._taking_up.begin()
         await sweep(self._recordings, self._store, self._journal)
         self._recordings.recover()
         name = self.settings.name or self._folder.relay_name()
-        await self._realms.look()
         await self._memory.start()
         await self._directory.leases.start()
         await self._alerts.start(name)
@@ -196,14 +197,15 @@ class Relay:
         self._fleet = FleetDesk(
             self._reactor, desk, self._access, self._registry, self._desks, self._store, self._journal
         )
+        meanings = vocabulary.Meanings(self._access, self._registry, self._workshop)
+        realms = RealmDesk(self._store, self._auth, self._recordings, self.refresh)
         beside = {
             "alerts": partial(alerts.beside, self._alerts.desk),
             "directory": partial(directory_edge.beside, self._reactor, self._directory.desk),
             "events": partial(events.beside, self._reactor, self._memory.desk),
             "fleet": partial(fleet.beside, self._reactor, self._fleet, moments),
-            "vocabulary": partial(
-                vocabulary.beside, vocabulary.Meanings(self._access, self._registry, self._workshop)
-            ),
+            "realm": partial(realm.beside, realms),
+            "vocabulary": partial(vocabulary.beside, meanings),
         }
         told = {"alerts": self._alerts.desk.shown}
         served = desk, origins, metrics, below, beside
@@ -263,23 +265,7 @@ class Relay:
 
     async def refresh(self) -> None:
         """Take up changes somebody made in the database."""
-        looked, revision = time.monotonic(), await self._store.read(queries.revision)
-        if revision != self._revision:
-            await self._take_up(revision)
-        self._access.in_step(looked)
-
-    async def _take_up(self, revision: int) -> None:
-        await self._access.refresh()
-        await self._realms.look()
-        await retire(self._store, self._registry, self._desks, self._videos)
-        self._desks.expect(await self._store.read(queries.pending_stops))
-        await self._alerts.alerts.refresh()
-        self._directory.leases.soon()
-        # Not waited for: rights must be taken up however long a disk takes.
-        self._sweep()
-        # Only now: had anything above failed, the next look would have to do it again.
-        self._revision = revision
-        self._registry.changed()
+        await self._taking_up.look()
 
     def _sweep(self) -> Deferred[None]:
         return Deferred.fromCoroutine(sweep(self._recordings, self._store, self._journal)).addErrback(
@@ -335,7 +321,7 @@ class Relay:
     def status(self) -> dict[str, Any]:
         """What ``switchboard status`` shows."""
         return {
-            "relay": relay_server.VERSION,
+            "relay": VERSION,
             "uptime_s": round(time.monotonic() - self._started, 1),
             "http_port": self.http_port,
             "robots_port": self.robots_port,

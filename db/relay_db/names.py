@@ -7,6 +7,7 @@ import unicodedata
 
 from relay_db.models import LABEL, NAME
 from relay_protocol.errors import Invalid
+from relay_protocol.realms import full_name, parted
 
 _HEX = re.compile(r"[0-9a-f]{1,64}\Z")
 
@@ -38,6 +39,15 @@ def findable(text: str) -> str:
         return normal_name(text)
     except Invalid:
         return ""
+
+
+def known_as(text: str) -> str:
+    """The one name by which the whole relay knows somebody or something, however its realm is written.
+
+    :param text: as ``mobile@Lab2``
+    """
+    name, realm = parted(text)
+    return full_name(name, findable(realm) or realm)
 
 
 def findable_hex(text: str) -> str:

@@ -10,9 +10,11 @@ import enum
 import fnmatch
 import re
 from collections.abc import Iterable
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 from relay_protocol.errors import Invalid
+from relay_protocol.wildcards import see_cheap
 
 
 class Level(str, enum.Enum):
@@ -119,7 +121,8 @@ def parse_level(text: str) -> Level:
 def parse_pattern(text: str) -> str:
     """Check one allow or deny pattern and return it normalised.
 
-    :raises Invalid: not ``operation:resource`` with a known operation (or ``*``) and an absolute name
+    :raises Invalid: not ``operation:resource`` with a known operation (or ``*``) and an absolute name, or a pattern
+        that :func:`relay_protocol.wildcards.see_cheap` refuses
     """
     operation, colon, resource = text.partition(":")
     if not colon or operation not in {_ALL, *(str(each) for each in Operation)}:
@@ -127,6 +130,7 @@ def parse_pattern(text: str) -> str:
         raise Invalid(f"'{text}' is no pattern; write operation:resource with one of {known} or *")
     if not resource.startswith(("/", "*")):
         raise Invalid(f"'{text}': the resource must begin with / (as in publish:/cmd_vel) or be a wildcard")
+    see_cheap(resource)
     return text
 
 
@@ -144,9 +148,16 @@ class Rules:
         self._within = None if self.scope is None else Rules(self.scope)
         self._own = _highest(self.grants)
         self.level: Level | None = _lower(self._own, self.scope)
-        self._allow = [pattern for grant in self.grants for pattern in map(_compile, grant.allow)]
-        self._deny = [pattern for grant in self.grants for pattern in map(_compile, grant.deny)]
         self._verdicts: dict[tuple[Operation, str], Verdict] = {}
+
+    # Rules are made of all robots that somebody has a right on, and asked about few.
+    @cached_property
+    def _allow(self) -> list[_Pattern]:
+        return [_compile(text) for grant in self.grants for text in grant.allow]
+
+    @cached_property
+    def _deny(self) -> list[_Pattern]:
+        return [_compile(text) for grant in self.grants for text in grant.deny]
 
     def __bool__(self) -> bool:
         return self.level is not None
@@ -202,6 +213,8 @@ class Rules:
 
 _VERDICTS_KEPT = 4096
 
+_PATTERNS_KEPT = 4096
+
 
 def _highest(grants: tuple[Grant, ...]) -> Level | None:
     levels = [grant.level for grant in grants if grant.level is not None]
@@ -226,6 +239,7 @@ class _Pattern(NamedTuple):
         return self.operation in (_ALL, operation.value) and self.resource.match(resource) is not None
 
 
+@lru_cache(_PATTERNS_KEPT)
 def _compile(text: str) -> _Pattern:
     operation, _, resource = text.partition(":")
     return _Pattern(operation, re.compile(fnmatch.translate(resource)), text)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import NAME
 from relay_protocol.rights import Grant, Level, Operation, includes, needed, parse_pattern
+from relay_protocol.wildcards import see_cheap
 
 ADMIN = "admin"
 
@@ -112,6 +113,7 @@ def _parse(text: str) -> _Item:
         what, robots = text, "*"
     if not robots:
         raise Invalid(f"'{text}' names no robot after the @")
+    see_cheap(robots)
     if ":" in what:
         parse_pattern(what)
     elif what not in [str(each) for each in Level]:

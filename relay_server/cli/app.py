@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pwd
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
 
     from relay_db.engine import Database
     from relay_db.queries import GroupRecord, RobotRecord, UserRecord
+    from relay_server.cli.changing import LocalChange
 
 _Record = TypeVar("_Record")
 
@@ -63,44 +63,13 @@ class App:
             yield session
 
     @contextmanager
-    def change(self) -> Iterator[Change]:
+    def change(self) -> Iterator[LocalChange]:
         """One change with its audit entry; afterwards a running relay is told to look."""
+        from relay_server.cli.changing import LocalChange
+
         with self.database() as database, database.begin() as session:
-            yield Change(session)
+            yield LocalChange(session)
         knock(self.data)
-
-
-class Change:
-    """A write transaction that says in the audit log what it does."""
-
-    def __init__(self, session: Session) -> None:
-        self.session = session
-
-    def audit(self, action: str, target: str, **data: Any) -> None:
-        """Record what is being done, in the same transaction."""
-        from relay_db import queries
-
-        queries.append_audit(
-            self.session,
-            at=time.time(),
-            actor=f"cli:{os_user()}",
-            action=action,
-            target=target,
-            origin="local",
-            data=data,
-        )
-
-    def user(self, name: str) -> UserRecord:
-        """:raises NotFound: no such user"""
-        return user_of(self.session, name)
-
-    def group(self, name: str) -> GroupRecord:
-        """:raises NotFound: no such group"""
-        return group_of(self.session, name)
-
-    def robot(self, name: str) -> RobotRecord:
-        """:raises NotFound: no such robot"""
-        return robot_of(self.session, name)
 
 
 def user_of(session: Session, name: str) -> UserRecord:

@@ -27,8 +27,7 @@ def group() -> None:
 def add(app: App, name: str, as_json: bool) -> None:
     """Add a group NAME, or NAME@REALM."""
     with app.change() as change:
-        added = queries.add_group(change.session, *new_name(change.session, name))
-        change.audit("group.add", added.full)
+        added = change.add_group(*new_name(change.session, name))
     tell(as_json, _json(added), f"Added group {added.full}.")
 
 
@@ -63,8 +62,7 @@ def join(app: App, group_name: str, user_name: str, as_json: bool) -> None:
     """Put USER into GROUP."""
     with app.change() as change:
         found, member = change.group(group_name), change.user(user_name)
-        queries.add_member(change.session, found.id, member.id)
-        change.audit("group.join", found.full, user=member.full)
+        change.join(found, member)
         found = change.group(group_name)
     tell(as_json, _json(found), f"{member.full} is in group {found.full}.")
 
@@ -78,9 +76,8 @@ def leave(app: App, group_name: str, user_name: str, as_json: bool) -> None:
     """Take USER out of GROUP."""
     with app.change() as change:
         found, member = change.group(group_name), change.user(user_name)
-        if not queries.remove_member(change.session, found.id, member.id):
+        if not change.leave(found, member):
             raise Invalid(f"{member.full} is not in group {found.full}")
-        change.audit("group.leave", found.full, user=member.full)
         found = change.group(group_name)
     tell(as_json, _json(found), f"{member.full} is no longer in group {found.full}.")
 

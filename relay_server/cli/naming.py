@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from relay_db.names import findable, normal_name
 from relay_db.queries.realms import realm_id
 from relay_protocol.errors import Invalid, NotFound
-from relay_protocol.realms import DEFAULT_REALM, full_name, parted
+from relay_protocol.realms import DEFAULT_REALM, parted
 
 _MORE_THAN_A_NAME = frozenset("*?[:")
 """What patterns of names have in them, and groups of robots (``group:cleaners``)."""
@@ -43,12 +43,6 @@ def known_realm(session: Session, realm: str) -> str:
             f"there is no realm '{realm}'; see 'switchboard realm list', or add it with 'switchboard realm add'"
         ) from None
     return findable(realm)
-
-
-def known_as(text: str) -> str:
-    """The name by which a relay knows a robot, however its realm is written."""
-    name, realm = parted(text)
-    return full_name(name, findable(realm) or realm)
 
 
 def new_name(session: Session, text: str) -> tuple[str, str]:

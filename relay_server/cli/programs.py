@@ -9,12 +9,14 @@ from typing import Any
 import click
 
 from relay_db import queries
-from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name
 from relay_protocol.scopes import Scope
 from relay_server import passwords
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of
+from relay_server.cli.changing import LocalChange
 from relay_server.cli.output import show, tell
+from relay_server.cli.removing import revoke_numbered
 from relay_server.cli.text import moment
 
 
@@ -77,11 +79,7 @@ def list_(app: App, user: str | None, as_json: bool) -> None:
 @pass_app
 def revoke(app: App, number: int, as_json: bool) -> None:
     """Make the program of number ID and its secret worthless; its tokens end, and what they opened is cut at once."""
-    with app.change() as change:
-        if not queries.remove_program(change.session, number):
-            raise NotFound(f"there is no program {number}; see 'switchboard program list'")
-        change.audit("program.revoke", str(number))
-    tell(as_json, {"id": number, "revoked": True}, f"Revoked program {number}.")
+    revoke_numbered(app, "program", number, LocalChange.revoke_program, as_json)
 
 
 def _json(record: queries.ProgramRecord) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""How users, groups and robots are removed: found, asked about, taken out with an audit entry, told."""
+"""How users, groups and robots are removed, and tokens and programs revoked: found, asked about, on record, told."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
 
-from relay_db import queries
 from relay_db.queries import GroupRecord, RobotRecord, UserRecord
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import NotFound, Unavailable
 from relay_server.cli.app import App, group_of, robot_of, sure, user_of
+from relay_server.cli.changing import LocalChange
 from relay_server.cli.output import tell
 from relay_server.cli.text import file_size
 
@@ -19,14 +19,13 @@ class _Kind(NamedTuple):
     """:param along: what goes with it, for the question"""
 
     find: Callable[[Session, str], UserRecord | GroupRecord | RobotRecord]
-    delete: Callable[[Session, int], None]
     along: str
 
 
 _KINDS = {
-    "user": _Kind(user_of, queries.remove_user, "all rights and tokens"),
-    "group": _Kind(group_of, queries.remove_group, "its rights"),
-    "robot": _Kind(robot_of, queries.remove_robot, "its keys and all rights on it"),
+    "user": _Kind(user_of, "all rights and tokens"),
+    "group": _Kind(group_of, "its rights"),
+    "robot": _Kind(robot_of, "its keys and all rights on it"),
 }
 
 
@@ -46,16 +45,33 @@ def remove_named(app: App, what: str, name: str, yes: bool, as_json: bool) -> No
     sure(f"Remove {what} {found.full} with {kind.along}{also}?", yes)
     with app.change() as change:
         found = kind.find(change.session, name)
-        kind.delete(change.session, found.id)
-        change.audit(
-            f"{what}.remove", found.full, **({"recordings": recordings.number} if recordings else {})
-        )
+        if isinstance(found, UserRecord):
+            change.remove_user(found)
+        elif isinstance(found, GroupRecord):
+            change.remove_group(found)
+        else:
+            change.remove_robot(found, recordings.number if recordings else 0)
     answer: dict[str, Any] = {what: found.full, "removed": True}
     sentences = [f"Removed {what} {found.full}."]
     if recordings:
         answer["recordings"] = recordings.number
         sentences.append(f"The relay deletes {recordings.words}: now if it runs, else when it starts.")
     tell(as_json, answer, *sentences)
+
+
+def revoke_numbered(
+    app: App, what: str, number: int, revoke: Callable[[LocalChange, int], bool], as_json: bool
+) -> None:
+    """Make worthless what has this number, with an audit entry.
+
+    :param what: ``token`` or ``program``
+    :param revoke: false when there is none
+    :raises NotFound: there is none of this number
+    """
+    with app.change() as change:
+        if not revoke(change, number):
+            raise NotFound(f"there is no {what} {number}; see 'switchboard {what} list'")
+    tell(as_json, {"id": number, "revoked": True}, f"Revoked {what} {number}.")
 
 
 class _Kept(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
@@ -10,23 +10,15 @@ from relay_db import queries
 from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name
 from relay_protocol.rights import Level
-from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, user_of
+from relay_server.administration.change import GROUP_MARK, Holder, holder_text
+from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, user_of
+from relay_server.cli.changing import LocalChange
 from relay_server.cli.output import show, tell
-
-_GROUP_MARK = "@"
 
 
 @click.group()
 def right() -> None:
     """Say who may do what on which robot."""
-
-
-class _Holder(NamedTuple):
-    """Whom a right belongs to, as queries take it and as people write it."""
-
-    user_id: int | None
-    group_id: int | None
-    text: str
 
 
 @right.command(
@@ -61,22 +53,10 @@ def grant(
     """
     with app.change() as change:
         found, whose = change.robot(robot), _holder(change, holder)
-        queries.grant_right(
-            change.session,
-            found.id,
-            level,
-            user_id=whose.user_id,
-            group_id=whose.group_id,
-            allow=allow,
-            deny=deny,
-        )
-        detail = {"level": level, "allow": list(allow), "deny": list(deny)}
-        change.audit("right.grant", f"{whose.text} on {found.full}", **detail)
-    tell(
-        as_json,
-        {"holder": whose.text, "robot": found.full, **detail},
-        f"{whose.text} is {level} on {found.full}.",
-    )
+        change.grant(found, whose, level, allow, deny)
+    text = holder_text(whose)
+    told = {"holder": text, "robot": found.full, "level": level, "allow": list(allow), "deny": list(deny)}
+    tell(as_json, told, f"{text} is {level} on {found.full}.")
 
 
 @right.command(epilog=examples("switchboard right revoke ann rover"))
@@ -88,11 +68,11 @@ def revoke(app: App, holder: str, robot: str, as_json: bool) -> None:
     """Take the right of USER or GROUP on ROBOT away; what is open is cut at once."""
     with app.change() as change:
         found, whose = change.robot(robot), _holder(change, holder)
-        if not queries.revoke_right(change.session, found.id, user_id=whose.user_id, group_id=whose.group_id):
-            raise Invalid(f"{whose.text} has no right of its own on {found.full}")
-        change.audit("right.revoke", f"{whose.text} on {found.full}")
-    answer = {"holder": whose.text, "robot": found.full, "revoked": True}
-    tell(as_json, answer, f"{whose.text} has no right of its own on {found.full} any more.")
+        text = holder_text(whose)
+        if not change.revoke(found, whose):
+            raise Invalid(f"{text} has no right of its own on {found.full}")
+    answer = {"holder": text, "robot": found.full, "revoked": True}
+    tell(as_json, answer, f"{text} has no right of its own on {found.full} any more.")
 
 
 @right.command("list", epilog=examples("switchboard right list", "switchboard right list --user ann --json"))
@@ -116,12 +96,10 @@ def list_(app: App, robot: str | None, user: str | None, as_json: bool) -> None:
     show(as_json, map(_json, full), ("holder", "robot", "level", "allow", "deny"), cells)
 
 
-def _holder(change: Change, text: str) -> _Holder:
-    if text.startswith(_GROUP_MARK):
-        group = change.group(text.removeprefix(_GROUP_MARK))
-        return _Holder(None, group.id, f"{_GROUP_MARK}{group.full}")
-    user = change.user(text)
-    return _Holder(user.id, None, user.full)
+def _holder(change: LocalChange, text: str) -> Holder:
+    if text.startswith(GROUP_MARK):
+        return change.group(text.removeprefix(GROUP_MARK))
+    return change.user(text)
 
 
 def _full(record: queries.RightRecord, realm: str) -> queries.RightRecord:
@@ -134,7 +112,7 @@ def _full(record: queries.RightRecord, realm: str) -> queries.RightRecord:
 
 
 def _text(record: queries.RightRecord) -> str:
-    return f"{_GROUP_MARK}{record.group}" if record.user is None else record.user
+    return f"{GROUP_MARK}{record.group}" if record.user is None else record.user
 
 
 def _json(record: queries.RightRecord) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import socket
-import time
 from typing import Any
 
 import click
@@ -12,8 +11,7 @@ import click
 from relay_db import queries
 from relay_protocol.errors import Unavailable
 from relay_protocol.limits import ENROLMENT_SECONDS
-from relay_server import passwords
-from relay_server.cli.app import App, Change, examples, json_option, pass_app, robot_of, yes_option
+from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, yes_option
 from relay_server.cli.fleet import ORDERS
 from relay_server.cli.naming import listed, new_name, realm_option
 from relay_server.cli.output import show, tell
@@ -46,12 +44,8 @@ for _name, _order in ORDERS.items():
 @pass_app
 def add(app: App, name: str, description: str, as_json: bool) -> None:
     """Add a robot NAME, or NAME@REALM, and print the code with which it enrols."""
-    code = passwords.new_enrolment_code()
     with app.change() as change:
-        bare, realm = new_name(change.session, name)
-        added = queries.add_robot(change.session, bare, description, realm)
-        _issue(change, added, code)
-        change.audit("robot.add", added.full, description=description)
+        added, code = change.add_robot(*new_name(change.session, name), description)
     _tell_code(app, added, code, as_json, f"Added robot {added.full}.")
 
 
@@ -61,11 +55,9 @@ def add(app: App, name: str, description: str, as_json: bool) -> None:
 @pass_app
 def code(app: App, name: str, as_json: bool) -> None:
     """Print a new enrolment code for robot NAME; one that was not used yet is void."""
-    new = passwords.new_enrolment_code()
     with app.change() as change:
         found = change.robot(name)
-        _issue(change, found, new)
-        change.audit("robot.code", found.full)
+        new = change.new_code(found)
     _tell_code(app, found, new, as_json)
 
 
@@ -107,18 +99,11 @@ def keys(app: App, name: str, revoke: str | None, as_json: bool) -> None:
     """List the keys of robot NAME, or retire one."""
     if revoke is not None:
         with app.change() as change:
-            found = change.robot(name)
-            queries.revoke_key(change.session, found.id, revoke, time.time())
-            change.audit("robot.key.revoke", found.full, fingerprint=revoke)
+            change.revoke_key(change.robot(name), revoke)
     with app.reading() as session:
         known = queries.list_keys(session, robot_of(session, name).id)
     cells = ((each.fingerprint, moment(each.created), _state(each), each.agent) for each in known)
     show(as_json, (each._asdict() for each in known), ("fingerprint", "enrolled", "state", "agent"), cells)
-
-
-def _issue(change: Change, found: queries.RobotRecord, new: str) -> None:
-    expires = time.time() + ENROLMENT_SECONDS
-    queries.issue_enrolment_code(change.session, found.id, passwords.code_hash(new), expires)
 
 
 def _tell_code(app: App, found: queries.RobotRecord, new: str, as_json: bool, *before: str) -> None:

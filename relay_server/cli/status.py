@@ -187,8 +187,10 @@ def _named(value: Any, field: str) -> str:
 def _stopped(value: Any) -> str:
     """By whom; of a robot that has not confirmed it, that it is only being stopped."""
     by = _named(value, "by")
-    told = not isinstance(value, dict) or value.get("told", True)
-    return by if told else f"being stopped by {by}"
+    if not isinstance(value, dict):
+        return by
+    again = f", again by {_named(value['again'], 'by')}" if value.get("again") else ""
+    return (by if value.get("told", True) else f"being stopped by {by}") + again
 
 
 def _number(value: Any) -> str:

@@ -10,10 +10,10 @@ from typing import Any
 import click
 
 from relay_db import queries
+from relay_db.names import known_as
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.cli.app import App, examples, json_option, os_user, pass_app, why_option
 from relay_server.cli.failure import REFUSED, UNREACHABLE
-from relay_server.cli.naming import known_as
 from relay_server.cli.output import say_aside, show_json, tell
 from relay_server.cli.relaysocket import NoRelay, order_motion
 

@@ -8,11 +8,12 @@ from typing import Any
 import click
 
 from relay_db import queries
-from relay_protocol.errors import Invalid, NotFound
+from relay_protocol.errors import Invalid
 from relay_protocol.scopes import Scope
-from relay_server import passwords
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of
+from relay_server.cli.changing import LocalChange
 from relay_server.cli.output import show, tell
+from relay_server.cli.removing import revoke_numbered
 from relay_server.cli.text import duration, moment, parse_duration
 
 
@@ -39,22 +40,12 @@ def token() -> None:
 def create(app: App, user: str, ttl: str, scope: str | None, label: str, as_json: bool) -> None:
     """Create a token that acts as USER. It is shown once and not stored."""
     checked = None if scope is None else str(Scope(scope))
-    seconds, secret, now = parse_duration(ttl), passwords.new_token(), time.time()
+    seconds = parse_duration(ttl)
     with app.change() as change:
         found = change.user(user)
         if found.disabled:
             raise Invalid(f"user '{found.full}' is disabled; enable it first")
-        number = queries.create_token(
-            change.session,
-            found.id,
-            passwords.token_hash(secret),
-            kind="access",
-            label=label,
-            expires=now + seconds,
-            now=now,
-            scope=checked,
-        )
-        change.audit("token.create", found.full, id=number, ttl_s=seconds, scope=checked, label=label)
+        number, secret = change.create_token(found, seconds, checked, label)
     answer = {"token": secret, "expires_in": seconds, "id": number, "user": found.full}
     tell(as_json, answer, secret)
     if not as_json:
@@ -95,11 +86,7 @@ def list_(app: App, user: str | None, as_json: bool) -> None:
 @pass_app
 def revoke(app: App, number: int, as_json: bool) -> None:
     """Make the token of number ID worthless; what it opened is cut at once."""
-    with app.change() as change:
-        if not queries.revoke_token(change.session, number):
-            raise NotFound(f"there is no token {number}; see 'switchboard token list'")
-        change.audit("token.revoke", str(number))
-    tell(as_json, {"id": number, "revoked": True}, f"Revoked token {number}.")
+    revoke_numbered(app, "token", number, LocalChange.revoke_token, as_json)
 
 
 def _json(record: queries.TokenRecord) -> dict[str, Any]:

@@ -48,8 +48,7 @@ def add(app: App, name: str, admin: bool, password_stdin: bool, no_password: boo
             raise Invalid(f"there is a user '{full_name(bare, realm)}' already")
     hashed = None if no_password else new_password_hash(password_stdin)
     with app.change() as change:
-        added = queries.add_user(change.session, bare, hashed, admin=admin, realm=realm)
-        change.audit("user.add", added.full, admin=admin)
+        added = change.add_user(bare, realm, hashed, admin=admin)
     tell(as_json, _json(added), f"Added {'administrator' if admin else 'user'} {added.full}.")
 
 
@@ -76,10 +75,8 @@ def passwd(app: App, name: str, password_stdin: bool, as_json: bool) -> None:
         user_of(session, name)
     hashed = new_password_hash(password_stdin)
     with app.change() as change:
-        found = change.user(name)
-        queries.set_password(change.session, found.id, hashed)
-        change.audit("user.password", found.full)
-    tell(as_json, _json(found._replace(password_hash=hashed)), f"Changed the password of {found.full}.")
+        found = change.set_password(change.user(name), hashed)
+    tell(as_json, _json(found), f"Changed the password of {found.full}.")
 
 
 @user.command(epilog=examples("switchboard user disable ann"))
@@ -112,11 +109,9 @@ def remove(app: App, name: str, yes: bool, as_json: bool) -> None:
 
 def _set_disabled(app: App, name: str, disabled: bool, as_json: bool) -> None:
     with app.change() as change:
-        found = change.user(name)
-        queries.set_disabled(change.session, found.id, disabled)
-        change.audit("user.disable" if disabled else "user.enable", found.full)
+        found = change.set_disabled(change.user(name), disabled)
     sentence = f"{'Disabled' if disabled else 'Enabled'} user {found.full}."
-    tell(as_json, _json(found._replace(disabled=disabled)), sentence)
+    tell(as_json, _json(found), sentence)
 
 
 def _json(record: queries.UserRecord) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from relay_db.queries.recalling import OURS
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import ROBOT_NAME
+from relay_protocol.wildcards import see_cheap
 from relay_server.directory.limits import (
     ADDRESS,
     DATA,
@@ -206,6 +207,8 @@ def ask_of(query: Mapping[str, str]) -> Ask:
         raise Invalid(f"there is no parameter '{min(strange)[:40]}'; there are {', '.join(PARAMETERS)}")
     if any(len(text) > (PLACE if name == "after" else TEXT) for name, text in query.items()):
         raise Invalid(f"a parameter may have {TEXT} characters at most")
+    for name in ("robot", "name"):
+        see_cheap(query.get(name, ""))
     limit = query.get("limit", str(PAGE))
     if not (limit.isascii() and limit.isdigit() and len(limit) <= len(str(MOST)) and 1 <= int(limit) <= MOST):
         raise Invalid(f"'limit' must be a number from 1 to {MOST}")

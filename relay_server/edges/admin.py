@@ -10,10 +10,9 @@ from klein import Klein
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.web.server import Request
 
-from relay_db.names import findable
+from relay_db.names import known_as
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
-from relay_protocol.realms import full_name, parted
 from relay_server.clock import to_the_end
 from relay_server.console import Halted
 from relay_server.control import reason_in
@@ -45,10 +44,7 @@ class StopOrder(msgspec.Struct):
     @property
     def full(self) -> str | None:
         """The robot's name for the whole relay, however it was written."""
-        if self.robot is None:
-            return None
-        name, realm = parted(self.robot)
-        return full_name(name, findable(realm))
+        return None if self.robot is None else known_as(self.robot)
 
 
 _order_decoder = msgspec.json.Decoder(StopOrder)

@@ -242,7 +242,7 @@ class Api:
         request.postpath = request.postpath or [b""]
         return self._below[part](self, name)
 
-    @app.route("/api/v1/<any(alerts,directory,events,fleet,vocabulary):part>", branch=True)
+    @app.route("/api/v1/<any(alerts,directory,events,fleet,realm,vocabulary):part>", branch=True)
     def beside(self, request: Request, part: str) -> Any:
         if part not in self._beside:
             raise NothingHere

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable
 from typing import Any, TypedDict
 
 from klein import Klein
@@ -10,26 +9,13 @@ from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
-from relay_server.edges.api import STREAMED, Api
-from relay_server.edges.asked import query_of
-from relay_server.edges.goals import LISTING
-from relay_server.edges.representing import Representing
-from relay_server.openapi import PROBLEM, Answer, Operation, described, header
+from relay_server.edges.api import Api
+from relay_server.edges.collection import Collection
+from relay_server.edges.resource_operations import member_of, members_of
+from relay_server.openapi import described
 from relay_server.openapi.kept import Camera
-from relay_server.openapi.told import Available
-from relay_server.resources import HEADER, Asker, CameraDesk, Listing, Moments, ResourceDesk
-from relay_server.resources.forms import FORMS
-
-PLACE = "/api/v1/robots/{robot}/cameras"
-
-_MEDIA = tuple(each.media for each in FORMS)
-_KNOWN = header("If-None-Match", "entity tags of what is known already")
-_TAGGED = {
-    "ETag": "names this state in this form",
-    HEADER: "when this was answered; what moves the robot gives it back",
-}
-_UNCHANGED = Answer("it is as it is known", headers=_TAGGED)
-_NOT_ACCEPTABLE = {406: Answer("none of these forms is accepted", Available, media=(PROBLEM,))}
+from relay_server.resources import CameraDesk, Moments, ResourceDesk
+from relay_server.resources.describing import camera_graph
 
 
 class CameraPage(TypedDict):
@@ -60,85 +46,30 @@ class AddressedCamera(Camera):
     addresses: CameraAddresses
 
 
-class RobotCameras:
+class RobotCameras(Collection):
     """Cameras of one robot, for one request.
 
     :param cameras: tells of them
-    :param forms: in which they are told
     """
 
     app = Klein()
+    part = "cameras"
 
     def __init__(
-        self, cameras: CameraDesk, moments: Moments, forms: Representing, api: Api, robot: str
+        self, cameras: CameraDesk, moments: Moments, desk: ResourceDesk, api: Api, robot: str
     ) -> None:
+        super().__init__(moments, desk, api, robot)
         self._cameras = cameras
-        self._moments = moments
-        self._forms = forms
-        self._api = api
-        self._robot = robot
 
     @app.route("/", methods=["GET"])
-    @described(
-        Operation(
-            method="GET",
-            path=PLACE,
-            tag="resources",
-            summary="A page of the cameras that the caller may view",
-            parameters=(*LISTING, _KNOWN),
-            answers={200: Answer("a page", CameraPage, media=_MEDIA, headers=_TAGGED), 304: _UNCHANGED},
-            problems=_NOT_ACCEPTABLE,
-        )
-    )
+    @described(members_of("cameras", "A page of the cameras that the caller may view", CameraPage))
     def members(self, request: Request) -> Any:
-        return self._answer(request, self._members(request))
-
-    async def _members(self, request: Request) -> Any:
-        asker, form = await self._asker(request), self._forms.form(request)
-        page = await self._cameras.members(asker, Listing.of(query_of(request)))
-        return await self._forms.members(request, asker, page, form)
+        return self._page(request, self._cameras.members)
 
     @app.route("/<path:name>", methods=["GET"])
-    @described(
-        Operation(
-            method="GET",
-            path=f"{PLACE}/{{name}}",
-            tag="resources",
-            summary="A camera, and where its pictures are",
-            parameters=(_KNOWN,),
-            answers={
-                200: Answer("the camera", AddressedCamera, media=_MEDIA, headers=_TAGGED),
-                304: _UNCHANGED,
-            },
-            problems=_NOT_ACCEPTABLE,
-        )
-    )
+    @described(member_of("cameras", "A camera, and where its pictures are", AddressedCamera))
     def one(self, request: Request, name: str) -> Any:
-        return self._answer(request, self._one(request, name))
-
-    async def _one(self, request: Request, name: str) -> Any:
-        asker, form = await self._asker(request), self._forms.form(request)
-        return await self._forms.camera(request, asker, await self._cameras.camera(asker, name), form)
-
-    # --- requests and answers -----------------------------------------------------------------------------
-
-    def _answer(self, request: Request, work: Awaitable[Any]) -> Any:
-        async def dated() -> Any:
-            try:
-                answer = await work
-            finally:
-                request.setHeader(HEADER, self._moments.now())
-            if not isinstance(answer, bytes):
-                return answer
-            # It is no JSON. All headers are there now.
-            request.write(answer)
-            return STREAMED
-
-        return self._api.answer(request, dated())
-
-    async def _asker(self, request: Request) -> Asker:
-        address = getattr(request.getClientAddress(), "host", "local")
-        return Asker(await self._api.principal(request), self._robot, address)
+        return self._member(request, name, self._cameras.camera, camera_graph)
 
     @app.handle_errors(HTTPException)
     def unrouted(self, request: Request, failure: Any) -> bytes:
@@ -148,6 +79,5 @@ class RobotCameras:
 
 def below(cameras: CameraDesk, moments: Moments, desk: ResourceDesk, api: Api, robot: str) -> IResource:
     """What serves the address of a robot's cameras."""
-    forms = Representing(api, desk, robot, "cameras")
-    resource: IResource = RobotCameras(cameras, moments, forms, api, robot).app.resource()
+    resource: IResource = RobotCameras(cameras, moments, desk, api, robot).app.resource()
     return resource

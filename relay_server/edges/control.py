@@ -20,6 +20,7 @@ from relay_server.access import Principal
 from relay_server.console import Outcome
 from relay_server.control import Answer, NotDone, reason_of
 from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.dated import dated
 from relay_server.edges.problems import problem
 from relay_server.moments import HEADER, Moments
 from relay_server.openapi import PROBLEM, Operation, described, header
@@ -262,13 +263,7 @@ class RobotControl:
     def _answer(self, request: Request, work: Awaitable[Any], *, lasts: bool = False) -> Any:
         """Answer with the moment at which that is done; see :meth:`relay_server.edges.api.Api.answer`."""
 
-        async def dated() -> Any:
-            try:
-                return await work
-            finally:
-                request.setHeader(HEADER, self._moments.now())
-
-        return self._api.answer(request, dated(), lasts=lasts)
+        return self._api.answer(request, dated(request, self._moments, work), lasts=lasts)
 
     def _only(self, *parts: str) -> None:
         if self._part not in parts:

@@ -23,9 +23,11 @@ from relay_server.edges.events import EventPages
 from relay_server.edges.fleet import FleetApi
 from relay_server.edges.goals import RobotGoals
 from relay_server.edges.limiting import RequestLimits, TooManyRequests
+from relay_server.edges.modules import RobotModules
 from relay_server.edges.oauth import OAuth
 from relay_server.edges.presence import RobotPeople
 from relay_server.edges.problems import problem, problem_of
+from relay_server.edges.realm import RealmPages
 from relay_server.edges.recordings import RobotRecordings
 from relay_server.edges.resources import RobotResources
 from relay_server.edges.site import Robots
@@ -40,9 +42,11 @@ SERVED = (
     EventPages,
     FleetApi,
     OAuth,
+    RealmPages,
     RobotCameras,
     RobotControl,
     RobotGoals,
+    RobotModules,
     RobotPeople,
     RobotRecordings,
     RobotResources,

@@ -17,6 +17,7 @@ from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.dated import dated
 from relay_server.fleet import Order, Plan, Result, StopOrder, local_of
 from relay_server.moments import HEADER, Moments
 from relay_server.openapi import Answer, Operation, described, header
@@ -107,13 +108,7 @@ class FleetApi:
         return {"groups": await self._desk.groups(await self._api.principal(request))}
 
     def _answer(self, request: Request, work: Awaitable[Any], *, lasts: bool = False) -> Any:
-        async def dated() -> Any:
-            try:
-                return await work
-            finally:
-                request.setHeader(HEADER, self._moments.now())
-
-        return self._api.answer(request, dated(), lasts=lasts)
+        return self._api.answer(request, dated(request, self._moments, work), lasts=lasts)
 
     @app.handle_errors(HTTPException)
     def unrouted(self, request: Request, failure: Any) -> bytes:

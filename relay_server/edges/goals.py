@@ -18,6 +18,7 @@ from relay_protocol.rights import Operation
 from relay_server.clock import Clock
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.asked import WAIT, known_tags, number_in, query_of, streams, wait_preferred
+from relay_server.edges.dated import dated
 from relay_server.edges.flow import Flow
 from relay_server.edges.once import Once, send
 from relay_server.edges.vanished import notice
@@ -241,13 +242,7 @@ class RobotGoals:
     # --- requests and answers -----------------------------------------------------------------------------
 
     def _answer(self, request: Request, work: Awaitable[Any]) -> Any:
-        async def dated() -> Any:
-            try:
-                return await work
-            finally:
-                request.setHeader(HEADER, self._moments.now())
-
-        return self._api.answer(request, dated())
+        return self._api.answer(request, dated(request, self._moments, work))
 
     async def _asker(self, request: Request) -> Asker:
         address = getattr(request.getClientAddress(), "host", "local")

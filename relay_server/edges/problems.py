@@ -9,6 +9,8 @@ from twisted.web.server import Request
 from relay_db.queries import NoRoom, Taken
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, Refused, SwitchboardError, Unavailable
+from relay_server.administration.desk import TooManyChanges as TooManyOfRealm
+from relay_server.administration.own import Needed
 from relay_server.alerts.desk import TooOften as TooManyRules
 from relay_server.auth import BadCredentials, TooManyTries
 from relay_server.control import NotDone, StoppedSince
@@ -58,6 +60,8 @@ _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (Taken, 409),
     (NoRoom, 409),
     (TooManyChanges, 429),
+    (TooManyOfRealm, 429),
+    (Needed, 409),
     (TooLarge, 413),
     (TooOld, 412),
     (StoppedSince, 412),
@@ -75,6 +79,9 @@ _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (TooManyRules, 429),
     (Unavailable, 503),
 ]
+
+_LATER = (TooManyTries, TooManyRequests, TooOften, TooManyRules, TooManyChanges, TooManyOfRealm, Full)
+"""What may be tried again after some time."""
 
 
 def problem(request: Request, status: int, detail: str, **more: Any) -> bytes:
@@ -95,7 +102,7 @@ def problem_body(status: int, detail: str, **more: Any) -> bytes:
 
 def problem_of(request: Request, error: SwitchboardError) -> bytes:
     """The same for an error of ours, with what its status wants to be said beside."""
-    if isinstance(error, (TooManyTries, TooManyRequests, TooOften, TooManyRules, TooManyChanges, Full)):
+    if isinstance(error, _LATER):
         request.setHeader(b"retry-after", str(int(error.retry_after) + 1).encode())
     if isinstance(error, BadCredentials):
         request.setHeader(b"www-authenticate", b"Bearer")

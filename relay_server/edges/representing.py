@@ -17,7 +17,7 @@ from relay_protocol.errors import Unavailable
 from relay_protocol.limits import NAME
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.resources import Asker, ResourceDesk
-from relay_server.resources.describing import Place, camera_graph, members_graph, param_graph, state_graph
+from relay_server.resources.describing import Place, members_graph, param_graph, state_graph
 from relay_server.resources.forms import FORMS, JSON, Form, sent, tags_of, wanted
 from relay_server.resources.states import Param, State, tag_of
 from relay_server.resources.syntax import read, write
@@ -108,11 +108,28 @@ class Representing:
 
     async def members(self, request: Request, asker: Asker, page: Mapping[str, Any], form: Form) -> Any:
         """A page of the collection."""
-        return await self._told(request, asker, page, partial(members_graph, self._part), form)
+        return await self.told(request, asker, page, partial(members_graph, self._part), form)
 
-    async def camera(self, request: Request, asker: Asker, camera: Mapping[str, Any], form: Form) -> Any:
-        """A camera."""
-        return await self._told(request, asker, camera, camera_graph, form)
+    async def told(
+        self,
+        request: Request,
+        asker: Asker,
+        facts: Mapping[str, Any],
+        graph: Callable[[Mapping[str, Any], Place], Graph],
+        form: Form,
+    ) -> Any:
+        """What is the same as long as its JSON is.
+
+        :param graph: makes a graph of the facts
+        """
+        body = jsontext.encode(facts)
+        etag = tag_of(body)
+        if self._known(request, form.tag(etag)):
+            return STREAMED
+        if form is JSON:
+            return _tagged(request, etag, body)
+        make = partial(graph, facts, self._place(request))
+        return await self._written(request, asker, make, form, etag)
 
     async def message(self, request: Request, asker: Asker, name: str) -> Message:
         """The message in a request's body.
@@ -139,24 +156,6 @@ class Representing:
         address = self._place(request).of(self._part, name)
         body = request.content.read()
         return await self._desk.made(asker, lambda: find(read(body, form, address), urlsplit(address).path))
-
-    async def _told(
-        self,
-        request: Request,
-        asker: Asker,
-        facts: Mapping[str, Any],
-        graph: Callable[[Mapping[str, Any], Place], Graph],
-        form: Form,
-    ) -> Any:
-        """What is the same as long as its JSON is."""
-        body = jsontext.encode(facts)
-        etag = tag_of(body)
-        if self._known(request, form.tag(etag)):
-            return STREAMED
-        if form is JSON:
-            return _tagged(request, etag, body)
-        make = partial(graph, facts, self._place(request))
-        return await self._written(request, asker, make, form, etag)
 
     async def _written(
         self, request: Request, asker: Asker, make: Callable[[], Graph], form: Form, etag: str

@@ -1,4 +1,7 @@
-"""What ``resources`` serves: topics, services, actions and parameters of a robot, with what they take."""
+"""What ``resources`` serves: topics, services, actions and parameters of a robot, with what they take.
+
+And what any collection of a robot is asked for: a page, and one member.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from msgspec import Meta
 from relay_server.edges.asked import WAIT
 from relay_server.edges.goals import GOAL_HEADERS, LISTING, PREFER, Wish
 from relay_server.edges.representing import Message, TypeName, Value
-from relay_server.openapi import PROBLEM, Answer, Operation, header, query, raw
+from relay_server.openapi import PROBLEM, Answer, Operation, Parameter, header, query, raw
 from relay_server.openapi.told import (
     Actions,
     Available,
@@ -43,6 +46,8 @@ _NOT_ACCEPTABLE = {406: Answer("none of these forms is accepted", Available, med
 _NOT_READ = {415: Answer("the body is in another form", Available, media=(PROBLEM,))}
 _MOVING = (409, 412, 422, 428, 504)
 """What can be wrong with what may move a robot, and with a key."""
+_ASKING = (409, 504)
+"""What can be wrong with asking a node of the robot."""
 
 
 class Call(msgspec.Struct, forbid_unknown_fields=True):
@@ -57,15 +62,40 @@ class Call(msgspec.Struct, forbid_unknown_fields=True):
     timeout: Annotated[float, Meta(ge=0.1, le=300.0)] = 10.0
 
 
-def _members(part: str, page: Any) -> Operation:
+def members_of(
+    part: str,
+    summary: str,
+    page: Any,
+    *,
+    listing: tuple[Parameter, ...] = LISTING,
+    errors: tuple[int, ...] = (),
+) -> Operation:
+    """A page of a collection, in every form.
+
+    :param listing: what the page can be asked by
+    """
     return Operation(
         method="GET",
         path=f"{ROBOT}/{part}",
         tag="resources",
-        summary=f"A page of the {'parameters' if part == 'params' else part} that the caller may use",
-        parameters=(*LISTING, _KNOWN),
+        summary=summary,
+        parameters=(*listing, _KNOWN),
         answers={200: Answer("a page", page, media=_MEDIA, headers=_TAGGED), 304: _UNCHANGED},
-        errors=(409, 504) if part == "params" else (),
+        errors=errors,
+        problems=_NOT_ACCEPTABLE,
+    )
+
+
+def member_of(part: str, summary: str, member: Any, *, errors: tuple[int, ...] = ()) -> Operation:
+    """One member of a collection, in every form."""
+    return Operation(
+        method="GET",
+        path=f"{ROBOT}/{part}/{{name}}",
+        tag="resources",
+        summary=summary,
+        parameters=(_KNOWN,),
+        answers={200: Answer("it", member, media=_MEDIA, headers=_TAGGED), 304: _UNCHANGED},
+        errors=errors,
         problems=_NOT_ACCEPTABLE,
     )
 
@@ -87,10 +117,10 @@ def _publish(method: str) -> Operation:
 
 
 MEMBERS = (
-    _members("topics", Topics),
-    _members("services", Services),
-    _members("actions", Actions),
-    _members("params", Params),
+    members_of("topics", "A page of the topics that the caller may use", Topics),
+    members_of("services", "A page of the services that the caller may use", Services),
+    members_of("actions", "A page of the actions that the caller may use", Actions),
+    members_of("params", "A page of the parameters that the caller may use", Params, errors=_ASKING),
 )
 ONE = (
     Operation(
@@ -116,16 +146,7 @@ ONE = (
         errors=(504,),
         problems=_NOT_ACCEPTABLE,
     ),
-    Operation(
-        method="GET",
-        path=f"{ROBOT}/params/{{name}}",
-        tag="resources",
-        summary="A parameter",
-        parameters=(_KNOWN,),
-        answers={200: Answer("it", ParamValue, media=_MEDIA, headers=_TAGGED), 304: _UNCHANGED},
-        errors=(409, 504),
-        problems=_NOT_ACCEPTABLE,
-    ),
+    member_of("params", "A parameter", ParamValue, errors=_ASKING),
 )
 CHANGE = (
     _publish("PUT"),

@@ -19,10 +19,11 @@ from relay_protocol import jsontext
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
 from relay_server.clock import Clock, as_twisted
-from relay_server.edges import cameras, goals
+from relay_server.edges import cameras, goals, modules
 from relay_server.edges import resource_operations as operations
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.asked import WAIT, known_tags, number_in, query_of
+from relay_server.edges.dated import dated_in_form
 from relay_server.edges.flow import Flow
 from relay_server.edges.goals import Giving
 from relay_server.edges.once import Once, send
@@ -39,6 +40,7 @@ from relay_server.resources import (
     GoalDesk,
     Idempotency,
     Listing,
+    ModuleDesk,
     Moments,
     Reply,
     ResourceDesk,
@@ -202,21 +204,14 @@ class RobotResources:
     # --- requests and answers -----------------------------------------------------------------------------
 
     def _answer(self, request: Request, work: Awaitable[Any]) -> Any:
-        async def dated() -> Any:
+        async def done() -> Any:
             try:
-                answer = await work
+                return await work
             except MaybeDone as error:
                 # Nothing is done by reading.
                 raise error.reason if request.method in (b"GET", b"HEAD") else error from None
-            finally:
-                request.setHeader(HEADER, self._moments.now())
-            if not isinstance(answer, bytes):
-                return answer
-            # It is no JSON. All headers are there now.
-            request.write(answer)
-            return STREAMED
 
-        return self._api.answer(request, dated())
+        return self._api.answer(request, dated_in_form(request, self._moments, done()))
 
     async def _asker(self, request: Request, *, passes: bool = False) -> Asker:
         address = getattr(request.getClientAddress(), "host", "local")
@@ -239,7 +234,7 @@ def parts(
     clock_ns: Callable[[], int],
     wall: Callable[[], float],
 ) -> dict[str, Callable[[Api, str], IResource]]:
-    """What serves the addresses below a robot's :data:`PARTS`, its goals and its cameras.
+    """What serves the addresses below a robot's :data:`PARTS`, its goals, cameras and modules.
 
     :param threads: do what takes long
     :param clock_ns: monotonic nanoseconds
@@ -251,8 +246,12 @@ def parts(
     once = Once(Idempotency(clock), desk)
     shared = clock, desk, moments, once, Giving(pursued, once)
     below = {part: partial(_below, *shared, part) for part in PARTS}
-    shown = partial(cameras.below, CameraDesk(front.cameras), moments, desk)
-    return {**below, "goals": partial(goals.below, clock, pursued, moments), "cameras": shown}
+    return {
+        **below,
+        "goals": partial(goals.below, clock, pursued, moments),
+        "cameras": partial(cameras.below, CameraDesk(front.cameras), moments, desk),
+        "modules": partial(modules.below, ModuleDesk(guests), moments, desk),
+    }
 
 
 def _below(

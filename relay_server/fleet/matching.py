@@ -6,6 +6,8 @@ from collections.abc import Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
+from relay_protocol.wildcards import see_cheap
+
 GROUP = "group:"
 """How the name of a group begins in an order. No robot's name can: it has no colon."""
 
@@ -36,6 +38,7 @@ def meant(asked: Iterable[str], robots: Collection[str], groups: Mapping[str, Co
     :param asked: names, patterns with shell wildcards, ``group:<name>``
     :param robots: names of those that may be meant
     :param groups: the names of their robots by their own, which is in lower case
+    :raises Invalid: a pattern that costs too much
     """
     known = set(robots)
     found: set[str] = set()
@@ -47,6 +50,7 @@ def meant(asked: Iterable[str], robots: Collection[str], groups: Mapping[str, Co
             # A thousand names must not each be held against all robots.
             these = known & {each}
         else:
+            see_cheap(each)
             these = {name for name in known if fnmatchcase(name, each)}
         found |= these
         if not these:

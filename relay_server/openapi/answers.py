@@ -44,17 +44,30 @@ class About(TypedDict):
 # --- robots -----------------------------------------------------------------------------------------------
 
 
+class Again(TypedDict):
+    """That a stopped robot was stopped once more.
+
+    :param since: Unix seconds
+    """
+
+    by: str
+    why: str
+    since: float
+
+
 class Stopped(TypedDict):
     """That a robot is stopped.
 
     :param since: Unix seconds
     :param told: whether the robot has confirmed it
+    :param again: the latest of those who have stopped it since
     """
 
     by: str
     why: str
     since: float
     told: bool
+    again: Again | None
 
 
 class ClientHere(TypedDict):

@@ -26,7 +26,7 @@ IN_PATHS = {
 ABOUT = """\
 Robots dial out, people and programs dial in. What happens live is told by websockets (rosbridge v2); all else is here.
 
-Names, units and meanings are those of the protocol's specification (SPEC sections 1.1 to 1.15). Every error is \
+Names, units and meanings are those of the protocol's specification (SPEC sections 1.1 to 1.16). Every error is \
 problem details (RFC 9457); `detail` is for people. A request of more than 64 KiB is 413, one that is not here whole \
 within 10 s 408. `HEAD` works wherever `GET` does. How much a user may ask, or a network from which nobody is known, \
 is told by `RateLimit` and `RateLimit-Policy`; who asks more gets 429 with `Retry-After`. A stop is never held back."""
@@ -43,6 +43,7 @@ TAGS = {
     "events": "The short-term memory",
     "directory": "Services and applications, and where they are",
     "fleet": "Orders to many robots",
+    "realm": "One's own realm, for its administrators",
     "oauth": "Tokens for programs and people",
     "relay": "The relay itself",
 }
@@ -134,9 +135,9 @@ def _operation(each: Operation, schemas: _Schemas) -> dict[str, Any]:
     words = " ".join(filter(None, (each.more, each.lasts)))
     if words:
         told["description"] = words
-    named = [Parameter(name, IN_PATHS[name], str, "path", True) for name in _IN_PATH.findall(each.path)]
     given = {parameter.name for parameter in each.parameters if parameter.place == "path"}
-    parameters = [*(one for one in named if one.name not in given), *each.parameters]
+    named = [name for name in _IN_PATH.findall(each.path) if name not in given]
+    parameters = [*(Parameter(name, IN_PATHS[name], str, "path", True) for name in named), *each.parameters]
     if parameters:
         told["parameters"] = [_parameter(one, schemas) for one in parameters]
     if each.body is not None:

@@ -81,6 +81,30 @@ class Params(TypedDict):
     next: str
 
 
+class Module(TypedDict):
+    """A node in the robot's graph.
+
+    :param publishes: topics
+    :param subscribes: topics
+    """
+
+    name: str
+    publishes: list[str]
+    subscribes: list[str]
+    services: list[str]
+
+
+class Modules(TypedDict):
+    """A page of modules.
+
+    :param next: the name behind which there is more, or empty
+    """
+
+    modules: list[Module]
+    next: str
+    online: bool
+
+
 class TopicState(TypedDict):
     """The newest message of a topic.
 

@@ -1,4 +1,4 @@
-"""A robot's topics, services, actions, parameters and cameras as resources of HTTP (SPEC section 1.13)."""
+"""A robot's topics, services, actions, parameters, cameras and modules as resources of HTTP (SPEC section 1.13)."""
 
 from relay_server.moments import HEADER, MomentNeeded, Moments, TooOld
 from relay_server.resources.cameras import CameraDesk
@@ -16,6 +16,7 @@ from relay_server.resources.idempotency import (
     key_in,
 )
 from relay_server.resources.listing import Listing, see_known
+from relay_server.resources.modules import ModuleDesk
 from relay_server.resources.states import NotAsBefore
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "Idempotency",
     "KeyReused",
     "Listing",
+    "ModuleDesk",
     "MomentNeeded",
     "Moments",
     "NotAcceptable",

@@ -6,11 +6,11 @@ Source: W3C Semantic Sensor Network Ontology. What a sensor says is a ``sosa:Obs
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from rdflib import RDF, RDFS, SOSA, XSD, Graph, URIRef
+from rdflib import RDF, RDFS, SOSA, SSN, XSD, Graph, URIRef
 
 from relay_protocol import jsontext
 from relay_protocol.ros.definition import Definition, Shape
@@ -101,7 +101,9 @@ def members_graph(part: str, page: Mapping[str, Any], place: Place) -> Graph:
         member = URIRef(place.of(part, each["name"]))
         graph.add((collection, RDFS.member, member))
         graph.add((member, RDF.type, words.own[_MEMBERS[part]]))
-        _say(values, member, each)
+        _say(values, member, {name: value for name, value in each.items() if name not in _LINKS})
+        for what, target in _links(each, place):
+            graph.add((member, words.own[what], target))
     return graph
 
 
@@ -123,12 +125,32 @@ def camera_graph(camera: Mapping[str, Any], place: Place) -> Graph:
     return graph
 
 
+def module_graph(module: Mapping[str, Any], place: Place) -> Graph:
+    """A module: a system. That the robot hosts it is not said: a node of its graph may run anywhere.
+
+    :param module: as JSON has it
+    """
+    graph, words = _graph(place)
+    graph.bind("ssn", SSN)
+    subject = URIRef(place.of("modules", module["name"]))
+    for each in (words.own.Module, SSN.System):
+        graph.add((subject, RDF.type, each))
+    _say(ValueGraph(graph, words, {}), subject, {"name": module["name"]})
+    for what, target in _links(module, place):
+        graph.add((subject, words.own[what], target))
+    return graph
+
+
+_LINKS = {"publishes": "topics", "subscribes": "topics", "services": "services"}
+"""What a module has of other resources, and the collections these are in."""
+
 _MEMBERS = {
     "topics": "Topic",
     "services": "Service",
     "actions": "Action",
     "params": "Parameter",
     "cameras": "Camera",
+    "modules": "Module",
 }
 """What a member of a collection is."""
 
@@ -169,6 +191,13 @@ def _simple(definition: Definition | None) -> str | None:
         return None
     kind = definition.fields[0].type
     return "data" if kind.shape is Shape.SCALAR and kind.primitive is not None else None
+
+
+def _links(facts: Mapping[str, Any], place: Place) -> Iterator[tuple[str, URIRef]]:
+    """Facts that are other resources."""
+    for what, part in _LINKS.items():
+        for name in facts.get(what, ()):
+            yield what, URIRef(place.of(part, name))
 
 
 def _say(values: ValueGraph, subject: URIRef, facts: Mapping[str, Any]) -> None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import NAME
+from relay_protocol.wildcards import see_cheap
 
 T = TypeVar("T")
 
@@ -32,18 +33,21 @@ class Listing(NamedTuple):
     limit: int = PAGE
 
     @classmethod
-    def of(cls, query: Mapping[str, str]) -> Listing:
+    def of(cls, query: Mapping[str, str], *, typed: bool = True) -> Listing:
         """From the parameters of a request.
 
+        :param typed: whether the members have types to be asked for by
         :raises Invalid: one that there is not, or with a value that it can't have
         """
-        see_known(query, *cls._fields)
+        see_known(query, *(each for each in cls._fields if typed or each != "type"))
         if any(len(each) > NAME for each in query.values()):
             raise Invalid(f"a parameter may have {NAME} characters at most")
         text = query.get("limit", str(PAGE))
         if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= LONGEST:
             raise Invalid(f"'limit' must be a number from 1 to {LONGEST}")
-        return cls(query.get("name", "*"), query.get("type", ""), query.get("after", ""), int(text))
+        return cls(
+            see_cheap(query.get("name", "*")), query.get("type", ""), query.get("after", ""), int(text)
+        )
 
     def page(self, members: Mapping[str, T], types: Any) -> tuple[list[tuple[str, T]], str]:
         """The members meant, in the order of their names, and the name behind which there are more, or ``""``.

@@ -76,6 +76,7 @@ WORDS: dict[str, Term] = {
     "Action": Term(_CLASS, "An action of a robot."),
     "Parameter": Term(_CLASS, "A parameter of a node of a robot."),
     "Camera": Term(_CLASS, "A camera of a robot."),
+    "Module": Term(_CLASS, "A node in the graph of a robot."),
     "Collection": Term(_CLASS, "A page of what there is of a kind; its members are told by rdfs:member."),
     "Object": Term(_CLASS, "An object of JSON without a type that is known."),
     "name": Term(_PROPERTY, "The name of a resource within its robot.", XSD.string),
@@ -85,6 +86,9 @@ WORDS: dict[str, Term] = {
     "publishers": Term(_PROPERTY, "A node that publishes a topic.", XSD.string),
     "subscribers": Term(_PROPERTY, "A node that subscribes to a topic.", XSD.string),
     "providers": Term(_PROPERTY, "A node that offers a service or an action.", XSD.string),
+    "publishes": Term(_PROPERTY, "The address of a topic that a module publishes."),
+    "subscribes": Term(_PROPERTY, "The address of a topic that a module subscribes to."),
+    "services": Term(_PROPERTY, "The address of a service that a module offers."),
     "moves": Term(
         _PROPERTY, "Whether it moves the robot: whoever uses it has to control the robot.", XSD.boolean
     ),
@@ -136,7 +140,7 @@ def _fixed(name: str, form: Form) -> bytes:
     address = f"{_ANYWHERE}{PATH}{name}"
     if name == OWN:
         terms = {str(words.own[word]): term for word, term in WORDS.items()}
-        said = "What a Switchboard relay says of the resources of robots, beside the words of SOSA."
+        said = "What a Switchboard relay says of the resources of robots, beside the words of SOSA and SSN."
         return _written(Page(address, "Words of a relay", said, OWL.Ontology, terms), form)
     said = (
         "Names of fields in values of which no type is known: what stands behind '#' is the field's name, and means "

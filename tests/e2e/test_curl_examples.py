@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -14,46 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_examples import Came, Example, Shell, examples
+from switchboard_examples import Came, Example, examples
 from switchboard_http import ask
 from switchboard_processes import BIN, Process, ros_environment, running
-from switchboard_relay import Relay
-from switchboard_robot import Robot
+from switchboard_scene import DIRECTORY, DOCUMENTS, ROBOT, Scene, staged
 from switchboard_waiting import wait_for
 
-from tests.robot_client.ros import Peer
-
-ROOT = Path(__file__).parents[2]
-README = list(examples(ROOT / "README.md"))
-SHOWN = [
-    *README,
-    *(each for path in sorted((ROOT / "docs").glob("*.md")) for each in examples(path)),
-    *examples(ROOT / "protocol" / "SPEC.md"),
-]
+SHOWN = [each for path in DOCUMENTS for each in examples(path)]
 ASKING = [each for each in SHOWN if each.asks]
-ROBOT = "/api/v1/robots/robot-one"
-DIRECTORY = "/api/v1/directory"
 MCAP = b"\x89MCAP0\r\n"
 JPEG = b"\xff\xd8"
-
-
-@dataclass
-class Scene:
-    """What the examples meet: the demo's robot-one and its user driver, and what some of them need beside."""
-
-    relay: Relay
-    shell: Shell
-
-    @property
-    def folder(self) -> Path:
-        """Where examples run."""
-        return self.shell.folder
-
-    def ask(self, method: str, path: str, body: Any = None) -> Any:
-        """A request of the driver's, by the examples' own token; what it gave."""
-        answer = ask(self.relay.http_port, method, path, body, token=self.shell.environment["TOKEN"])
-        assert answer.status < 300, answer.body
-        return answer.json if answer.body else None
 
 
 def nothing(scene: Scene) -> dict[str, str]:
@@ -96,11 +65,8 @@ def said_on(topic: str) -> Callable[[Scene], dict[str, str]]:
 
 def seen(scene: Scene) -> dict[str, str]:
     """Wait until the robot shows its camera: on a busy machine what shows it takes its time to begin."""
-    token, picture = (
-        scene.shell.environment["TOKEN"],
-        "/robots/robot-one/video/snapshot?topic=/camera/image_raw",
-    )
-    wait_for("a picture", lambda: ask(scene.relay.http_port, "GET", picture, token=token).status == 200)
+    port, picture = scene.relay.http_port, "/robots/robot-one/video/snapshot?topic=/camera/image_raw"
+    wait_for("a picture", lambda: ask(port, "GET", picture, token=scene.token).status == 200)
     return {}
 
 
@@ -137,7 +103,7 @@ def stopped_by_owner(scene: Scene) -> dict[str, str]:
     """The robot is stopped and driver's own; the moment that the line before tells him stands in this one."""
     scene.relay.cli("right", "grant", "driver", "robot-one", "owner")
     scene.relay.run_cli("stop", "robot-one").check_returncode()
-    answer = ask(scene.relay.http_port, "GET", f"{ROBOT}/control", token=scene.shell.environment["TOKEN"])
+    answer = ask(scene.relay.http_port, "GET", f"{ROBOT}/control", token=scene.token)
     return {"$MOMENT": f"switchboard-moment: {answer.headers['switchboard-moment']}"}
 
 
@@ -163,6 +129,13 @@ def unregistered(scene: Scene) -> None:
     """No application is in the directory."""
     for each in scene.ask("GET", f"{DIRECTORY}?kind=application")["entries"]:
         scene.ask("DELETE", f"{DIRECTORY}/{each['id']}")
+
+
+def administering(scene: Scene) -> dict[str, str]:
+    """The token of an administrator stands in the place of the document's own."""
+    if "root" not in [each["user"] for each in scene.relay.cli("user", "list")]:
+        scene.relay.user("root", admin=True)
+    return {"$ADMIN": scene.relay.token("root")}
 
 
 def film(scene: Scene, printed: str) -> bool:
@@ -242,6 +215,14 @@ EXPECTED = {
         200, lambda _, came: isinstance(told(came)["value"], dict), before=said_on("obstacles/places")
     ),
     r"/topics/say$": Expected(204, lambda _, came: came.output == ""),
+    r"/realm/users$": Expected(
+        201, lambda _, came: (told(came)["user"], told(came)["password"]) == ("luigi", True), administering
+    ),
+    r"/realm/rights/robot-one/driver$": Expected(
+        200,
+        lambda _, came: (told(came)["holder"], told(came)["level"]) == ("driver", "operator"),
+        administering,
+    ),
     r"/alerts/rules$": Expected(
         201, lambda _, came: (told(came)["level"], bool(told(came)["secret"])) == ("error", True)
     ),
@@ -271,46 +252,20 @@ USED = {
 """What the robot has that examples use."""
 
 
-def wait_until_known(scene: Scene, part: str) -> None:
-    """Wait until the relay knows what there is of a kind."""
-
-    def known() -> bool:
-        return USED[part] <= {each["name"] for each in scene.ask("GET", f"{ROBOT}/{part}?limit=1000")[part]}
-
-    wait_for(f"the relay knows the robot's {part}", known)
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     """A relay with the demo's robot and user, an action, two services of a robot, and a robot that is away."""
     assert has_curl(), "there is no curl of 7.82 or newer; scripts/setup.sh says how to get one"
     folder = tmp_path_factory.mktemp("examples")
     with ExitStack() as stack:
-        relay = Relay(folder)
-        stack.enter_context(running(relay))
-        robot = Robot(relay, "robot-one", camera=True)
-        stack.enter_context(running(robot))
-        relay.user("driver")
-        relay.cli("robot", "add", "cleaner-1")
-        for name in ("robot-one", "cleaner-1"):
-            relay.cli("right", "grant", "driver", name, "operator")
-        environment = ros_environment(robot.domain)
+        scene = stack.enter_context(staged(folder, camera=True))
+        scene.relay.cli("robot", "add", "cleaner-1")
+        scene.relay.cli("right", "grant", "driver", "cleaner-1", "operator")
+        environment = ros_environment(scene.robot.domain)
         for service in (["obstacles"], ["speech", "--out", str(folder / "said.wav")]):
             command = [str(BIN / "switchboard-robot-service"), *service]
             stack.enter_context(running(Process(command, folder, service[0], environment)))
-        peer = Peer(environment)
-        stack.callback(peer.close)
-        peer.do("act", "/fibonacci", "ok")
-        place = folder / "shell"
-        place.mkdir()
-        # The documents' own names, in the folder of the checkout.
-        (place / ".venv").symlink_to(BIN.parent)
-        (place / "demo-data").symlink_to(relay.data)
-        shell = Shell(place, os.environ, {"127.0.0.1:9090": f"127.0.0.1:{relay.http_port}"})
-        shell.set([each for each in README if each.sets and not each.asks])
-        scene = Scene(relay, shell)
-        for part in USED:
-            wait_until_known(scene, part)
+        scene.wait_until_known(USED)
         yield scene
 
 

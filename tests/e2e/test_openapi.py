@@ -39,6 +39,14 @@ CHECKS = [content_type_conformance, response_schema_conformance, status_code_con
 KNOWN = ["/mode", "mode", "start", "/start", "relay/status", "base:speed", "nothing of that name"]
 """Names of what the robot has, and of what it has not."""
 
+IN_REALM = {
+    "name": ["bob", "crew", "arm", "nobody", "ann@lab1", "%", "\N{SNOWMAN}"],
+    "user": ["bob", "nobody"],
+    "holder": ["bob", "@crew", "@nobody"],
+    "robot": ["arm", "nobody"],
+}
+"""Names in addresses of the realm."""
+
 MOMENT = "switchboard-moment"
 
 SHORT = 0.2
@@ -78,6 +86,9 @@ def asked() -> dict[str, Any]:
             each["parameters"] = given
             for parameter in given:
                 narrow(parameter)
+                if path.startswith("/api/v1/realm") and parameter["name"] in IN_REALM:
+                    # Not the user who asks, nor the robot that all others ask about.
+                    parameter["schema"] = {"enum": IN_REALM[parameter["name"]]}
         if not methods:
             del told["paths"][path]
     schemas = told["components"]["schemas"]
@@ -203,12 +214,44 @@ def test_what_is_asked_rightly_is_answered_as_described(house: House) -> None:
     assert visit("POST", f"{robot}/services/{{name}}", {}, name="/start")["values"]["success"]
     visit("POST", f"{robot}/topics/{{name}}", {"value": {"data": "dock"}}, name="mode")
     visit("POST", "/api/v1/tickets", {"robot": "rover", "for": "video", "camera": "/front"})
+    base = visit("GET", f"{robot}/modules/{{name}}", name="base")
+    assert base in visit("GET", f"{robot}/modules")["modules"] and base["subscribes"] == ["/mode"]
     with house.relay.connect("rover", house.token):
         assert visit("GET", f"{robot}/people")["people"][0]["user"] == "ann"
+    administer(visit, "/api/v1/realm")
     login = {"grant_type": "password", "username": "ann", "password": "correct horse"}
     token = visit("POST", "/oauth/token", login)["access_token"]
     assert visit("POST", "/oauth/introspect", {"token": token})["active"]
     visit("POST", "/oauth/revoke", {"token": token})
+
+
+def administer(visit: Visit, realm: str) -> None:
+    """Users, groups, robots, rights and tokens of the realm, from their beginning to their end."""
+    assert visit("GET", realm)["realm"] == "default"
+    visit("POST", f"{realm}/users", {"name": "bob", "password": "correct horse"})
+    assert visit("PATCH", f"{realm}/users/{{name}}", {"admin": True}, name="bob")["admin"]
+    visit("POST", f"{realm}/groups", {"name": "crew"})
+    visit("PUT", f"{realm}/groups/{{name}}/members/{{user}}", name="crew", user="bob")
+    assert visit("GET", f"{realm}/groups")["groups"] == [
+        visit("GET", f"{realm}/groups/{{name}}", name="crew")
+    ]
+    assert visit("GET", f"{realm}/users/{{name}}", name="bob")["groups"] == ["crew"]
+    visit("POST", f"{realm}/robots", {"name": "arm"})
+    visit("POST", f"{realm}/robots/{{name}}/code", name="arm")
+    assert visit("GET", f"{realm}/robots/{{name}}", name="arm") in visit("GET", f"{realm}/robots")["robots"]
+    right = f"{realm}/rights/{{name}}/{{holder}}"
+    for level in ("viewer", "operator"):
+        visit("PUT", right, {"level": level, "deny": ["call:/x"]}, name="arm", holder="@crew")
+    assert "@crew" in [each["holder"] for each in visit("GET", f"{realm}/rights")["rights"]]
+    visit("DELETE", right, name="arm", holder="@crew")
+    keys = visit("GET", f"{realm}/robots/{{name}}/keys", name="rover")["keys"]
+    assert [each["retired"] for each in keys] == [None]
+    tokens = visit("GET", f"{realm}/users/{{name}}/tokens", name="ann")["tokens"]
+    assert {"access"} <= {each["kind"] for each in tokens}
+    visit("DELETE", f"{realm}/groups/{{name}}/members/{{user}}", name="crew", user="bob")
+    for what, name in (("users", "bob"), ("groups", "crew"), ("robots", "arm")):
+        visit("DELETE", f"{realm}/{what}/{{name}}", name=name)
+    assert "bob" not in [each["user"] for each in visit("GET", f"{realm}/users")["users"]]
 
 
 @SCHEMA.parametrize()

@@ -1,4 +1,4 @@
-"""Lines of shell that the documents show, and what they come to when they are run."""
+"""Lines of shell and programs that the documents show, and what they come to when they are run."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import subprocess
+import sys
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +16,8 @@ from typing import NamedTuple
 from switchboard_processes import mortal
 from switchboard_waiting import PATIENCE, wait_for
 
-_BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+# Of a language; also one that is part of a list, and stands further right.
+_BLOCK = r"^( *)```{}\b[^\n]*\n(.*?)^\1```$"
 _CURL = re.compile(r"(^|[\s;|&(])curl\s")
 _SETTING = re.compile(r"[A-Z]+=")
 _REMARK = re.compile(r"\s+# .*\Z", re.DOTALL)
@@ -23,7 +26,7 @@ _STATUS = re.compile(r"< HTTP/[0-9.]+ ([0-9]{3})")
 
 
 class Example(NamedTuple):
-    """One command of a document.
+    """One command of a document, or one program.
 
     :param place: the document and the line where it begins
     :param text: as it stands there, over however many lines
@@ -51,8 +54,8 @@ class Example(NamedTuple):
 class Came(NamedTuple):
     """What came of an example.
 
-    :param status: of HTTP; that of the last answer
-    :param words: curl's own
+    :param status: of HTTP; that of the last answer that curl got
+    :param words: curl's own, or what a program says of errors
     """
 
     code: int
@@ -63,18 +66,29 @@ class Came(NamedTuple):
 
 def examples(path: Path) -> Iterator[Example]:
     """The commands in a document's blocks of shell."""
-    text = path.read_text()
-    for block in _BLOCK.finditer(text):
-        line = text.count("\n", 0, block.start(1)) + 1
+    for line, text in _blocks(path, "sh"):
         # A backslash at its end joins a line with the next.
-        for lines in re.findall(r"(?:.*\\\n)*.*\n", block[1]):
+        for lines in re.findall(r"(?:.*\\\n)*.*\n", text):
             if lines.strip():
                 yield Example(f"{path.name}:{line}", lines.rstrip("\n"))
             line += lines.count("\n")
 
 
+def programs(path: Path) -> Iterator[Example]:
+    """The programs in a document's blocks of Python, each a whole block."""
+    for line, text in _blocks(path, r"py\w*"):
+        yield Example(f"{path.name}:{line}", text)
+
+
+def _blocks(path: Path, language: str) -> Iterator[tuple[int, str]]:
+    """Each block of a language, and the line where it begins."""
+    text = path.read_text()
+    for block in re.finditer(_BLOCK.format(language), text, re.DOTALL | re.MULTILINE):
+        yield text.count("\n", 0, block.start(2)) + 1, textwrap.dedent(block[2])
+
+
 class Shell:
-    """Runs examples in a folder, by bash and curl.
+    """Runs examples in a folder, by bash and curl, or by Python.
 
     :param folder: where they leave what they make; with curl's settings for them, which have it tell what it does
     :param environment: variables
@@ -114,10 +128,26 @@ class Shell:
         lines = [self._here(example.text, places)]
         if example.sets:
             lines.append(f'printf %s "${example.text.partition("=")[0]}"')
+        command = ["bash", "-c", "set -euo pipefail\n" + "\n".join(lines)]
+        return self._come(command, None if over is None else (example.place, over))
+
+    def run_program(self, text: str, *arguments: str) -> Came:
+        """Run a program to its end, by the Python that runs this.
+
+        :param arguments: its own
+        """
+        (self.folder / "example.py").write_text(self._here(text, {}))
+        return self._come([sys.executable, "example.py", *arguments], None)
+
+    def _come(self, command: list[str], over: tuple[str, Callable[[str], bool]] | None) -> Came:
+        """Run a command.
+
+        :param over: of one that would go on its place, and what says by what was printed whether to end it
+        """
         out, words = self.folder / "out", self.folder / "words"
         with out.open("wb") as printed, words.open("wb") as told:
             running = subprocess.Popen(
-                mortal(["bash", "-c", "set -euo pipefail\n" + "\n".join(lines)]),
+                mortal(command),
                 cwd=self.folder,
                 env=self.environment,
                 stdin=subprocess.DEVNULL,
@@ -127,9 +157,10 @@ class Shell:
             )
             try:
                 if over is not None:
+                    place, enough = over
                     wait_for(
-                        f"{example.place} has come so far",
-                        lambda: running.poll() is not None or over(out.read_text(errors="replace")),
+                        f"{place} has come so far",
+                        lambda: running.poll() is not None or enough(out.read_text(errors="replace")),
                     )
                     _signal(running.pid, signal.SIGINT)
                 code = running.wait(PATIENCE)

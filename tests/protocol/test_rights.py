@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from relay_protocol import rights
 from relay_protocol.errors import Invalid
 from relay_protocol.rights import Grant, Level, Operation, Rules, parse_level, parse_pattern
 
@@ -133,3 +135,20 @@ def test_levels_are_three() -> None:
     assert [parse_level(text) for text in ("viewer", "operator", "owner")] == RANK
     with pytest.raises(Invalid, match="it is viewer, operator or owner"):
         parse_level("admin")
+
+
+def test_patterns_are_compiled_when_somebody_is_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rules are made for all robots of a list: what a realm has in patterns must not hold up the others."""
+    compile_, compiled = rights._compile, list[str]()
+
+    def noted(text: str) -> Any:
+        compiled.append(text)
+        return compile_(text)
+
+    monkeypatch.setattr(rights, "_compile", noted)
+    rules = Rules([Grant(Level.VIEWER, allow=("call:/a*",), deny=("call:/b*",))], [Grant(Level.OPERATOR)])
+    assert rules and rules.level is Level.VIEWER
+    assert compiled == []
+    assert rules.judge(Operation.CALL, "/a1").allowed and not rules.judge(Operation.CALL, "/b1").allowed
+    rules.judge(Operation.CALL, "/c")
+    assert compiled == ["call:/b*", "call:/a*"]

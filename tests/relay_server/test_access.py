@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import pytest_twisted
@@ -44,6 +44,12 @@ class Hall:
     async def grant(self, level: str, **patterns: Any) -> None:
         """Give ann a right on the robot."""
         await self.store.write(queries.grant_right, self.robot.id, level, user_id=self.user.id, **patterns)
+
+    def slow_down(self) -> SlowStore:
+        """What the access reads from now on comes when the test lets it."""
+        slow = SlowStore(self.store)
+        self.access._store = cast(Store, slow)
+        return slow
 
     async def permit(self) -> Permit:
         """A permit whose holder notes what it is told."""
@@ -155,8 +161,7 @@ async def test_a_released_permit_is_told_nothing(store: Store) -> None:
 async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: Store) -> None:
     """A refresh that goes by between the reading and its result is not missed."""
     hall = await Hall(store).open()
-    slow = SlowStore(store)
-    hall.access._store = slow  # type: ignore[assignment]
+    slow = hall.slow_down()
     asking = Deferred.fromCoroutine(hall.access.permit(hall.principal, hall.robot))
     await slow.read_done
     await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
@@ -170,8 +175,7 @@ async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: Sto
 async def test_no_list_is_kept_of_rights_revoked_while_they_were_read(store: Store) -> None:
     """The next look shows the truth."""
     hall = await Hall(store).open()
-    slow = SlowStore(store)
-    hall.access._store = slow  # type: ignore[assignment]
+    slow = hall.slow_down()
     asking = Deferred.fromCoroutine(hall.access.robots(hall.principal))
     await slow.read_done
     await store.write(queries.revoke_right, hall.robot.id, user_id=hall.user.id)
@@ -272,6 +276,25 @@ async def test_what_is_remembered_is_bounded(store: Store, monkeypatch: pytest.M
         # To be asked for is to be used.
         assert hall.access.remembered("a")
     assert [token_hash for token_hash in "abc" if hall.access.remembered(token_hash)] == ["a", "c"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_an_earlier_look_has_read_does_not_come_after_a_later_one(store: Store) -> None:
+    """A logout and somebody's change ask at once: the rights that hold are those of the last change."""
+    hall = await Hall(store).open()
+    permit = await hall.permit()
+    slow = hall.slow_down()
+    first = Deferred.fromCoroutine(hall.access.refresh())
+    await slow.read_done
+    await hall.grant("operator")
+    second = Deferred.fromCoroutine(hall.access.refresh())
+    # What it reads, if it does not wait for its turn, comes from a thread: all of them have been used once by then.
+    for _ in range(4):
+        await store.read(queries.revision)
+    slow.go.callback(None)
+    await first
+    await second
+    assert permit.rules.level is Level.OPERATOR
 
 
 @pytest_twisted.ensureDeferred

@@ -33,6 +33,14 @@ def test_each_takes_from_a_bucket_of_his_own() -> None:
     assert buckets.take("ann")
 
 
+def test_some_take_more_than_one() -> None:
+    """Or nothing, where there is not as much; then it is told for how long not."""
+    bucket = TokenBucket(0.5, 3, Clock().seconds)
+    taken = [bucket.take(cost) for cost in (2, 2, 0.5, 0, 0.5, 0.1)]
+    assert taken == [True, False, True, True, True, False]
+    assert bucket.wait_for(2) == 4
+
+
 def test_what_is_left_is_told() -> None:
     """Also of the bucket of one of many, who keeps his."""
     clock = Clock()

@@ -4,6 +4,22 @@ Times are Unix seconds given by the caller; hashes are SHA-256 in hex. A mutatio
 what counts the revision up in the same transaction.
 """
 
+from relay_db.queries.administration import (
+    RealmSize,
+    RightPlace,
+    count_live_keys,
+    count_patterns,
+    find_token,
+    group_names,
+    groups_of,
+    members_of,
+    named_tokens,
+    realm_size,
+    right_places,
+    take_turn,
+    user_of_program,
+    user_of_token,
+)
 from relay_db.queries.alerts import (
     acknowledge_alert,
     acknowledgements,
@@ -60,7 +76,7 @@ from relay_db.queries.oauth import (
     remove_program,
     revoke_issued,
 )
-from relay_db.queries.realms import MOST_DAYS, add_realm, keep_events, list_realms, remove_realm
+from relay_db.queries.realms import MOST_DAYS, add_realm, find_realm, keep_events, list_realms, remove_realm
 from relay_db.queries.recalling import count_memories, data_fits, latest_memory, memories_since, recall
 from relay_db.queries.records import (
     AlertRecord,
@@ -87,7 +103,14 @@ from relay_db.queries.records import (
     TokenRecord,
     UserRecord,
 )
-from relay_db.queries.rights import grant_right, grants_for, list_rights, revoke_right, robots_with_grants
+from relay_db.queries.rights import (
+    grant_right,
+    grants_for,
+    list_rights,
+    revoke_right,
+    right_held,
+    robots_with_grants,
+)
 from relay_db.queries.robot_groups import (
     add_robot_group,
     add_to_robot_group,
@@ -168,6 +191,8 @@ __all__ = [
     "PrincipalRecord",
     "ProgramRecord",
     "RealmRecord",
+    "RealmSize",
+    "RightPlace",
     "RightRecord",
     "RobotGroupRecord",
     "RobotKeyRecord",
@@ -193,7 +218,9 @@ __all__ = [
     "bound_leases",
     "change_entry",
     "consume_login",
+    "count_live_keys",
     "count_memories",
+    "count_patterns",
     "count_users",
     "create_token",
     "crowded_sources",
@@ -202,8 +229,10 @@ __all__ = [
     "expire_entries",
     "find_group",
     "find_program",
+    "find_realm",
     "find_robot",
     "find_robot_group",
+    "find_token",
     "find_user",
     "forget_memories",
     "get_alert",
@@ -211,6 +240,8 @@ __all__ = [
     "get_user",
     "grant_right",
     "grants_for",
+    "group_names",
+    "groups_of",
     "issue_enrolment_code",
     "issued",
     "keep_events",
@@ -231,8 +262,10 @@ __all__ = [
     "list_tokens",
     "list_users",
     "live_keys",
+    "members_of",
     "memories_since",
     "memory_sizes",
+    "named_tokens",
     "old_memories",
     "open_family",
     "open_session",
@@ -245,6 +278,7 @@ __all__ = [
     "purge_alerts",
     "purge_events",
     "purge_expired",
+    "realm_size",
     "recall",
     "recent_alerts",
     "record_event",
@@ -269,6 +303,8 @@ __all__ = [
     "revoke_key",
     "revoke_right",
     "revoke_token",
+    "right_held",
+    "right_places",
     "robot_key",
     "robots_with_grants",
     "save_alerts",
@@ -277,8 +313,11 @@ __all__ = [
     "set_password",
     "stop_told",
     "surplus_memories",
+    "take_turn",
     "token_is_live",
     "use_memories",
     "user_is_live",
+    "user_of_program",
+    "user_of_token",
     "verify_audit",
 ]

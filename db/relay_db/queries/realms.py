@@ -62,6 +62,13 @@ def list_realms(s: Session) -> list[RealmRecord]:
     return [RealmRecord(*row) for row in s.execute(query)]
 
 
+def find_realm(s: Session, name: str) -> RealmRecord | None:
+    """The realm of that name."""
+    query = select(Realm.id, Realm.name, Realm.events_days).where(Realm.name == findable(name))
+    row = s.execute(query).one_or_none()
+    return None if row is None else RealmRecord(*row)
+
+
 def realm_id(s: Session, name: str) -> int:
     """:raises NotFound: no such realm"""
     found = s.scalar(select(Realm.id).where(Realm.name == findable(name)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from sqlalchemy import ColumnElement, delete, insert, or_, select
@@ -69,9 +69,17 @@ def revoke_right(
 
 
 def list_rights(
-    s: Session, *, robot_id: int | None = None, user_id: int | None = None, group_id: int | None = None
+    s: Session,
+    *,
+    robot_id: int | None = None,
+    user_id: int | None = None,
+    group_id: int | None = None,
+    ids: Collection[int] | None = None,
 ) -> list[RightRecord]:
-    """Rights as they were given, by robot and holder; with ``user_id`` also those through its groups."""
+    """Rights as they were given, by robot and holder; with ``user_id`` also those through its groups.
+
+    :param ids: only of these numbers
+    """
     query = (
         select(
             Right.id,
@@ -93,7 +101,9 @@ def list_rights(
     if group_id is not None:
         query = query.where(Right.group_id == group_id)
     if user_id is not None:
-        query = query.where(_of_user(user_id))
+        query = query.where(of_user(user_id))
+    if ids is not None:
+        query = query.where(Right.id.in_(ids))
     return [
         RightRecord(
             row.id,
@@ -107,6 +117,18 @@ def list_rights(
         )
         for row in s.execute(query)
     ]
+
+
+def right_held(
+    s: Session, robot_id: int, *, user_id: int | None = None, group_id: int | None = None
+) -> RightRecord | None:
+    """The right that a user or a group itself has on a robot.
+
+    :raises Invalid: not exactly one holder
+    """
+    _one_holder(user_id, group_id)
+    ids = s.scalars(select(Right.id).where(_held(robot_id, user_id, group_id))).all()
+    return next(iter(list_rights(s, ids=ids)), None)
 
 
 def grants_for(s: Session, user_id: int, robot_id: int) -> list[Grant]:
@@ -145,7 +167,7 @@ def _grants(s: Session, user_id: int, robot_id: int | None) -> dict[int, list[Gr
     rights = (
         select(Right.robot_id, Right.level, Right.allow, Right.deny, Group.name.label("group"))
         .outerjoin(Group, Group.id == Right.group_id)
-        .where(_of_user(user_id))
+        .where(of_user(user_id))
         .order_by(Right.id)
     )
     for row in s.execute(rights if robot_id is None else rights.where(Right.robot_id == robot_id)):
@@ -154,7 +176,8 @@ def _grants(s: Session, user_id: int, robot_id: int | None) -> dict[int, list[Gr
     return grants
 
 
-def _of_user(user_id: int) -> ColumnElement[bool]:
+def of_user(user_id: int) -> ColumnElement[bool]:
+    """The rights of a user, also through groups."""
     groups = select(Membership.group_id).where(Membership.user_id == user_id)
     return or_(Right.user_id == user_id, Right.group_id.in_(groups))
 

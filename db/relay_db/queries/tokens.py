@@ -102,10 +102,17 @@ def consume_login(s: Session, token_hash: str, now: float) -> PrincipalRecord | 
 
 
 def revoke_token(s: Session, token_id: int) -> bool:
-    """Make a token worthless at once; false if there is none of that number."""
+    """Make a token worthless at once; false if there is none of that number.
+
+    With it goes the refresh token by which who has it would get another.
+    """
     bump(s)
+    family = s.scalar(select(AccessToken.family_id).where(AccessToken.id == token_id))
     gone = delete(AccessToken).where(AccessToken.id == token_id).returning(AccessToken.id)
-    return s.scalar(gone) is not None
+    found = s.scalar(gone) is not None
+    if family is not None:
+        s.execute(delete(TokenFamily).where(TokenFamily.id == family))
+    return found
 
 
 def list_tokens(s: Session, user_id: int | None = None) -> list[TokenRecord]:

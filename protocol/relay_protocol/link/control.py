@@ -9,12 +9,14 @@ import msgspec
 from msgspec import Meta
 
 from relay_protocol import limits
+from relay_protocol.errors import Invalid
 from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
 from relay_protocol.link.both_ways import Bye, Ping, Pong
 from relay_protocol.link.fields import Ends, Few, Label, Name, cut
 from relay_protocol.link.moving import Control, Done, Inhibit, Resume, Safety, Stop, Suppress
 from relay_protocol.link.video import Cameras, CloseVideo, OpenVideo
 from relay_protocol.message import Message
+from relay_protocol.wildcards import see_cheap
 
 
 class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -34,6 +36,14 @@ class MotionPolicy(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     actions: Few = msgspec.field(default_factory=list)
     deadline_ms: int = COMMAND_DEADLINE_MS
     stop_within_ms: int = STOP_WITHIN_MS
+
+    def __post_init__(self) -> None:
+        try:
+            for each in (*self.topics, *self.services, *self.actions):
+                see_cheap(each)
+        except Invalid as error:
+            # As msgspec tells what is wrong with a message.
+            raise ValueError(str(error)) from None
 
     def moves_by_topic(self, topic: str, type: str) -> bool:
         """Whether what is published there moves the robot."""

@@ -95,6 +95,23 @@ def test_a_refresh_token_is_replaced(database: Database, ann: UserRecord) -> Non
         assert queries.principal_by_token(s, "a" * 64, 50.0) is not None
 
 
+def test_a_token_that_is_revoked_by_its_number_gets_no_successor(database: Database, ann: UserRecord) -> None:
+    """The refresh token it came with ends too; those of other families do not."""
+    number, other = family(database, ann, ONE), family(database, ann, THREE)
+    with database.begin() as s:
+        tokens = [
+            queries.create_token(
+                s, ann.id, each * 64, kind="access", expires=None, now=1.0, family_id=number_of
+            )
+            for each, number_of in (("a", number), ("b", number), ("c", other))
+        ]
+        assert queries.revoke_token(s, tokens[0])
+        assert not queries.revoke_token(s, tokens[0])
+        assert queries.refresh_family(s, ONE, TWO, 2.0) is None
+        assert [each.id for each in queries.list_tokens(s, ann.id)] == [tokens[2]]
+        assert queries.refresh_family(s, THREE, TWO, 2.0) is not None
+
+
 def test_a_copied_refresh_token_ends_its_family(database: Database, ann: UserRecord) -> None:
     """Somebody has a copy of what was replaced: neither he nor the owner goes on."""
     number = family(database, ann, ONE)

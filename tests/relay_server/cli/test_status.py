@@ -95,6 +95,17 @@ def test_status_does_not_say_stopped_of_a_robot_that_has_not_heard_of_it(live: A
         assert dict(zip(_words(columns), _words(row), strict=True))["stopped"] == words
 
 
+def test_status_tells_who_stopped_a_stopped_robot_once_more(live: Any, relay: Any) -> None:
+    """Beside who did so first."""
+    again = {"by": "eve", "why": "", "since": 9.0}
+    answer = _answer(
+        name="rover", stopped={"by": "bob", "why": "", "since": 7.0, "told": True, "again": again}
+    )
+    relay.answer = (200, json.dumps(answer).encode())
+    _, columns, _, row = live.ok("status").splitlines()
+    assert dict(zip(_words(columns), _words(row), strict=True))["stopped"] == "bob, again by eve"
+
+
 def test_status_of_one_robot_tells_who_exactly(live: Any, relay: Any) -> None:
     """Each connection, and each camera that is watched; of others nothing."""
     answer = _rover()

@@ -18,7 +18,7 @@ from tests.relay_server.edges.http_client import ORIGIN, World
 
 HERE = "/api/v1/robots/rover"
 ANN = {"Authorization": "Bearer ann"}
-STOPPED = {"by": "ann", "why": "smoke", "since": 5.0, "told": True}
+STOPPED = {"by": "ann", "why": "smoke", "since": 5.0, "told": True, "again": None}
 
 
 class Console:

@@ -31,6 +31,13 @@ def test_members_are_chosen_by_name_and_type() -> None:
     assert names(name="/b", type="a/msg/C")[0] == []
 
 
+def test_what_has_no_types_is_not_asked_for_by_type() -> None:
+    """That is told, rather than that there is nothing of this type."""
+    assert Listing.of({"name": "/b"}, typed=False).name == "/b"
+    with pytest.raises(Invalid, match="no parameter 'type'; there are name, after, limit"):
+        Listing.of({"type": "a/msg/C"}, typed=False)
+
+
 @pytest.mark.parametrize(
     "query",
     [

@@ -10,7 +10,14 @@ from rdflib import OWL, RDF, RDFS, XSD, Graph, Literal, URIRef
 from relay_protocol import jsontext
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.resources.background import Background
-from relay_server.resources.describing import Place, camera_graph, members_graph, param_graph, state_graph
+from relay_server.resources.describing import (
+    Place,
+    camera_graph,
+    members_graph,
+    module_graph,
+    param_graph,
+    state_graph,
+)
 from relay_server.resources.forms import Form
 from relay_server.resources.states import Param, State
 from relay_server.resources.terms import DOCUMENTS, FIELDS, HTML, OWN, WORDS, fixed, is_fixed, of_type
@@ -68,11 +75,14 @@ def used() -> set[str]:
     shown = {"viewers": 1, "settings": {}}
     camera = {"name": "/c", "type": "x", "encoding": "rgb8", "width": 1, "height": 1, "fps": 1.0, "seen": 1.0}
     addresses = dict.fromkeys(("snapshot", "stream", "viewer", "websocket"), "/")
+    module = {"name": "/n", "publishes": ["/a"], "subscribes": ["/a"], "services": ["/a"]}
     graphs = [
         *(
             members_graph(part, {part: [{**member, "moves": True}], "next": "x", "online": True}, PLACE)
             for part in ("topics", "services", "actions", "params", "cameras")
         ),
+        members_graph("modules", {"modules": [module], "next": "x", "online": True}, PLACE),
+        module_graph(module, PLACE),
         camera_graph({**camera, "streams": [shown], "addresses": addresses}, PLACE),
         param_graph(Param("n:p", b'{"a":"\\u0001"}'), PLACE),
         said(ODD, {"stamp": {"sec": 1, "nanosec": 2}}),
@@ -91,6 +101,7 @@ def test_every_word_that_is_used_has_a_meaning() -> None:
     """Whoever follows its address finds it there."""
     found = used()
     assert {"Topic", "Camera", "value", "dateTime", "doubleList", "base64Text", "snapshot"} <= found
+    assert {"Module", "publishes", "subscribes", "services"} <= found
     assert found <= set(WORDS)
 
 

@@ -1,0 +1,155 @@
+"""The robots of a realm, their keys, and the rights on them: as an administrator sees and changes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from relay_db import queries
+from relay_db.queries import GroupRecord, RightPlace, RightRecord, RobotRecord, Taken
+from relay_protocol.errors import NotFound
+from relay_protocol.limits import ENROLMENT_SECONDS
+from relay_server.administration.change import GROUP_MARK, numbers
+from relay_server.administration.own import OwnChange, no_types, robot_in, user_in
+from relay_server.resources import Listing
+
+# --- robots -----------------------------------------------------------------------------------------------
+
+
+def robots(s: Session, realm: str, listing: Listing) -> dict[str, Any]:
+    """A page of them, enrolled or not."""
+    found, behind = listing.page({each.name: each for each in queries.list_robots(s, realm)}, no_types)
+    keys = queries.count_live_keys(s, [each.id for _, each in found])
+    return {"robots": [_robot(each, keys.get(each.id, 0)) for _, each in found], "next": behind}
+
+
+def robot(s: Session, realm: str, name: str) -> dict[str, Any]:
+    """:raises NotFound: no such robot"""
+    found = robot_in(s, realm, name)
+    return _robot(found, queries.count_live_keys(s, [found.id]).get(found.id, 0))
+
+
+def number(s: Session, realm: str, name: str) -> int:
+    """:raises NotFound: no such robot"""
+    return robot_in(s, realm, name).id
+
+
+def add_robot(change: OwnChange, name: str, description: str) -> dict[str, Any]:
+    """:raises Invalid: name or description can't be
+    :raises Taken: there is one of this name
+    :raises NoRoom: there are too many
+    """
+    if queries.find_robot(change.session, name, change.realm) is not None:
+        raise Taken(f"there is a robot '{name}' already")
+    change.see_room("robots")
+    added, code = change.add_robot(name, change.realm, description)
+    return {**_robot(added, 0), **_enrolment(code)}
+
+
+def new_code(change: OwnChange, name: str) -> dict[str, Any]:
+    """:raises NotFound: no such robot"""
+    found = change.robot(name)
+    return {"robot": found.name, **_enrolment(change.new_code(found))}
+
+
+def remove_robot(change: OwnChange, name: str, recordings: int) -> None:
+    """:param recordings: how many are kept of it
+    :raises NotFound: no such robot
+    """
+    change.remove_robot(change.robot(name), recordings)
+
+
+def _robot(record: RobotRecord, keys: int) -> dict[str, Any]:
+    return {"robot": record.name, "description": record.description, "keys": keys}
+
+
+def _enrolment(code: str) -> dict[str, Any]:
+    return {"enrolment_code": code, "expires_in": ENROLMENT_SECONDS}
+
+
+# --- keys -------------------------------------------------------------------------------------------------
+
+
+def keys(s: Session, realm: str, name: str, listing: Listing) -> dict[str, Any]:
+    """A page of all that a robot ever handed in.
+
+    :raises NotFound: no such robot
+    """
+    known = queries.list_keys(s, robot_in(s, realm, name).id)
+    found, behind = listing.page({each.fingerprint: each for each in known}, no_types)
+    return {"keys": [each._asdict() for _, each in found], "next": behind}
+
+
+def revoke_key(change: OwnChange, name: str, fingerprint: str) -> None:
+    """:raises NotFound: no such robot, or it has no such live key"""
+    change.revoke_key(change.robot(name), fingerprint)
+
+
+# --- rights -----------------------------------------------------------------------------------------------
+
+
+def rights(s: Session, realm: str, listing: Listing, robot: str | None, user: str | None) -> dict[str, Any]:
+    """A page of rights as they were given, in the order of their addresses.
+
+    :param robot: only those on this one
+    :param user: only those of this one, also through groups
+    :raises NotFound: no such robot or user
+    """
+    places = queries.right_places(
+        s,
+        realm,
+        robot_id=None if robot is None else robot_in(s, realm, robot).id,
+        user_id=None if user is None else user_in(s, realm, user).id,
+    )
+    page, behind = listing.page({f"{each.robot}/{_holder(each)}": each.id for each in places}, no_types)
+    found = {each.id: each for each in queries.list_rights(s, ids=[id for _, id in page])}
+    return {"rights": [_told(found[id]) for _, id in page], "next": behind}
+
+
+def grant(
+    change: OwnChange, robot: str, holder: str, level: str, allow: Sequence[str], deny: Sequence[str]
+) -> tuple[dict[str, Any], bool]:
+    """Give a right, and whether the holder had none on the robot. One that it has already is left as it is.
+
+    :raises NotFound: no such robot, user or group
+    :raises Invalid: a pattern that is none
+    :raises NoRoom: there are too many
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    found, whose = change.robot(robot), change.holder(holder)
+    mark = GROUP_MARK if isinstance(whose, GroupRecord) else ""
+    told = _right(found.name, f"{mark}{whose.name}", level, allow, deny)
+    held = queries.right_held(change.session, found.id, **numbers(whose))
+    if held is not None and _told(held) == told:
+        return told, False
+    if held is None:
+        change.see_room("rights")
+    before = 0 if held is None else len(held.allow) + len(held.deny)
+    change.see_room_for_patterns(found, len(allow) + len(deny) - before)
+    change.grant(found, whose, level, allow, deny)
+    return told, held is None
+
+
+def revoke(change: OwnChange, robot: str, holder: str) -> None:
+    """:raises NotFound: no such robot, user or group, or no such right
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    if not change.revoke(change.robot(robot), change.holder(holder)):
+        raise NotFound("there is no such right; what comes by a group, or of administration, is another")
+
+
+def _holder(record: RightRecord | RightPlace) -> str:
+    return f"{GROUP_MARK}{record.group}" if record.user is None else record.user
+
+
+def _told(record: RightRecord) -> dict[str, Any]:
+    return _right(record.robot, _holder(record), str(record.level), record.allow, record.deny)
+
+
+def _right(robot: str, holder: str, level: str, allow: Sequence[str], deny: Sequence[str]) -> dict[str, Any]:
+    told = {"holder": holder, "robot": robot, "level": level}
+    return {**told, "allow": list(allow), "deny": list(deny)}

@@ -1,0 +1,147 @@
+"""What an administrator finds and changes in his own realm; there is no other for him."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from sqlalchemy.orm import Session
+
+from relay_db import queries
+from relay_db.names import normal_name
+from relay_db.queries import GroupRecord, NoRoom, RobotRecord, UserRecord
+from relay_protocol.errors import Invalid, NotFound, Refused
+from relay_server.access import BadCredentials, Principal
+from relay_server.administration.change import GROUP_MARK, Change, Holder
+from relay_server.administration.limits import MOST, MOST_PATTERNS, MOST_PATTERNS_OF_A_ROBOT
+
+_Record = TypeVar("_Record")
+
+
+class Needed(Refused):
+    """The realm would have to do without the administrator who asks."""
+
+
+def see_administrator(principal: Principal) -> None:
+    """:raises Refused: he is none, or his token is for less"""
+    if not principal.admin:
+        raise Refused(
+            "this is for administrators of the realm, by a token without a scope or with 'admin' in it"
+        )
+
+
+def user_in(s: Session, realm: str, name: str) -> UserRecord:
+    """:raises NotFound: no such user in the realm"""
+    return _found(queries.find_user(s, name, realm), "user")
+
+
+def group_in(s: Session, realm: str, name: str) -> GroupRecord:
+    """:raises NotFound: no such group in the realm"""
+    return _found(queries.find_group(s, name, realm), "group")
+
+
+def robot_in(s: Session, realm: str, name: str) -> RobotRecord:
+    """:raises NotFound: no such robot in the realm"""
+    return _found(queries.find_robot(s, name, realm), "robot")
+
+
+def _found(record: _Record | None, what: str) -> _Record:
+    if record is None:
+        raise NotFound(f"there is no such {what} in your realm")
+    return record
+
+
+def no_types(_: object) -> tuple[str, ...]:
+    """Of which types the members of an administrator's lists are: they have none."""
+    return ()
+
+
+def new_name(text: str, what: str) -> str:
+    """The one form of the name of something new, which can stand in an address.
+
+    :raises Invalid: the name can't be
+    """
+    name = normal_name(text, f"name of a {what}")
+    if "/" in name or name in (".", ".."):
+        raise Invalid(f"the name of a {what} stands in addresses: it has no '/' in it, and is not '{name}'")
+    return name
+
+
+class OwnChange(Change):
+    """A change by an administrator of a realm, while he is one: until it is done nobody else changes anything.
+
+    :param origin: his address
+    :raises BadCredentials: he can't be proved any more
+    :raises Refused: he is no administrator any more
+    """
+
+    def __init__(
+        self, session: Session, principal: Principal, origin: str, wall: Callable[[], float]
+    ) -> None:
+        super().__init__(session, f"user:{principal.full}", origin, wall)
+        standing = queries.principals_by_ids(session, [principal.token_id], wall())
+        if not standing:
+            raise BadCredentials("your session was ended; log in again")
+        see_administrator(Principal.of(standing[0]))
+        self.principal = principal
+        self.realm = principal.realm
+
+    def user(self, name: str) -> UserRecord:
+        """:raises NotFound: no such user"""
+        return user_in(self.session, self.realm, name)
+
+    def group(self, name: str) -> GroupRecord:
+        """:raises NotFound: no such group"""
+        return group_in(self.session, self.realm, name)
+
+    def robot(self, name: str) -> RobotRecord:
+        """:raises NotFound: no such robot"""
+        return robot_in(self.session, self.realm, name)
+
+    def holder(self, name: str) -> Holder:
+        """:param name: of a user, or with :data:`GROUP_MARK` before it of a group
+        :raises NotFound: no such user or group
+        """
+        if name.startswith(GROUP_MARK):
+            return self.group(name.removeprefix(GROUP_MARK))
+        return self.user(name)
+
+    def see_another(self, user: UserRecord, what: str) -> None:
+        """See that somebody else is meant than who asks. As he is an administrator, the realm keeps one by that.
+
+        :param what: would be done to the user
+        :raises Needed: it is himself
+        """
+        if user.id == self.principal.user_id:
+            raise Needed(
+                f"you can't {what} yourself, or the realm might have no administrator left: have another one do it, or "
+                "who runs 'switchboard' on the relay's machine"
+            )
+
+    def needs_whole(self) -> None:
+        """See that he asks by a token for all that he may: what may give somebody more is not what a scope narrows.
+
+        :raises Refused: by one for less
+        """
+        self.principal.needs_whole()
+
+    def see_room_for_patterns(self, robot: RobotRecord, more: int) -> None:
+        """:param more: patterns that the rights on a robot are to have beside those there are
+        :raises NoRoom: there would be too many
+        """
+        for where, most in (
+            ({"realm": self.realm}, MOST_PATTERNS),
+            ({"robot_id": robot.id}, MOST_PATTERNS_OF_A_ROBOT),
+        ):
+            if more > 0 and queries.count_patterns(self.session, **where) + more > most:
+                raise NoRoom(
+                    f"the rights in a realm have {MOST_PATTERNS} patterns at most, those on one robot "
+                    f"{MOST_PATTERNS_OF_A_ROBOT}; use wildcards, or remove some first"
+                )
+
+    def see_room(self, what: str) -> None:
+        """:param what: one of :data:`MOST`, of which there is to be one more
+        :raises NoRoom: there are as many as there may be
+        """
+        if getattr(queries.realm_size(self.session, self.realm), what) >= MOST[what]:
+            raise NoRoom(f"a realm has {MOST[what]} {what} at most; remove some first")

@@ -1,0 +1,199 @@
+"""The users of a realm, its groups, and the tokens of its users: as an administrator sees and changes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from relay_db import queries
+from relay_db.queries import GroupRecord, Taken, UserRecord
+from relay_protocol.errors import NotFound
+from relay_server.administration.own import OwnChange, group_in, new_name, no_types, user_in
+from relay_server.resources import Listing
+
+
+def about(s: Session, realm: str) -> dict[str, Any]:
+    """The realm itself."""
+    size, found = queries.realm_size(s, realm), queries.find_realm(s, realm)
+    return {
+        "realm": realm,
+        "users": size.users,
+        "groups": size.groups,
+        "robots": size.robots,
+        "events_days": None if found is None else found.events_days,
+    }
+
+
+# --- users ------------------------------------------------------------------------------------------------
+
+
+def users(s: Session, realm: str, listing: Listing) -> dict[str, Any]:
+    """A page of them."""
+    found, behind = listing.page({each.name: each for each in queries.list_users(s, realm)}, no_types)
+    groups = queries.groups_of(s, [each.id for _, each in found])
+    return {"users": [_user(each, groups.get(each.id, ())) for _, each in found], "next": behind}
+
+
+def user(s: Session, realm: str, name: str) -> dict[str, Any]:
+    """:raises NotFound: no such user"""
+    return _told(s, user_in(s, realm, name))
+
+
+def add_user(change: OwnChange, name: str, password_hash: str | None, admin: bool) -> dict[str, Any]:
+    """:raises Invalid: the name can't be
+    :raises Taken: there is one of this name
+    :raises NoRoom: there are too many
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    name = new_name(name, "user")
+    if queries.find_user(change.session, name, change.realm) is not None:
+        raise Taken(f"there is a user '{name}' already")
+    change.see_room("users")
+    return _user(change.add_user(name, change.realm, password_hash, admin=admin), ())
+
+
+def change_user(
+    change: OwnChange, name: str, password_hash: str | None, disabled: bool | None, admin: bool | None
+) -> dict[str, Any]:
+    """What is ``None`` stays as it is.
+
+    :raises NotFound: no such user
+    :raises Needed: he shuts himself out, or would be no administrator any more
+    :raises Refused: anything but to disable, by a token for less than all
+    """
+    if not disabled or password_hash is not None or admin is not None:
+        change.needs_whole()
+    found = change.user(name)
+    if disabled:
+        change.see_another(found, "disable")
+    if admin is False:
+        change.see_another(found, "take administration from")
+    if password_hash is not None:
+        # The session in which somebody changes his own password goes on.
+        found = change.set_password(found, password_hash, keep_token=change.principal.token_id)
+    if disabled is not None and disabled != found.disabled:
+        found = change.set_disabled(found, disabled)
+    if admin is not None and admin != found.admin:
+        found = change.set_admin(found, admin)
+    return _told(change.session, found)
+
+
+def remove_user(change: OwnChange, name: str) -> None:
+    """:raises NotFound: no such user
+    :raises Needed: it is himself
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    found = change.user(name)
+    change.see_another(found, "remove")
+    change.remove_user(found)
+
+
+def _told(s: Session, record: UserRecord) -> dict[str, Any]:
+    return _user(record, queries.groups_of(s, [record.id]).get(record.id, ()))
+
+
+def _user(record: UserRecord, groups: Sequence[str]) -> dict[str, Any]:
+    return {
+        "user": record.name,
+        "admin": record.admin,
+        "disabled": record.disabled,
+        "password": record.password_hash is not None,
+        "groups": list(groups),
+    }
+
+
+# --- groups -----------------------------------------------------------------------------------------------
+
+
+def groups(s: Session, realm: str, listing: Listing) -> dict[str, Any]:
+    """A page of them, with who is in them."""
+    found, behind = listing.page(queries.group_names(s, realm), no_types)
+    members = queries.members_of(s, [number for _, number in found])
+    return {"groups": [_group(name, members.get(number, ())) for name, number in found], "next": behind}
+
+
+def group(s: Session, realm: str, name: str) -> dict[str, Any]:
+    """:raises NotFound: no such group"""
+    found: GroupRecord = group_in(s, realm, name)
+    return _group(found.name, sorted(found.members))
+
+
+def add_group(change: OwnChange, name: str) -> dict[str, Any]:
+    """:raises Invalid: the name can't be
+    :raises Taken: there is one of this name
+    :raises NoRoom: there are too many
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    name = new_name(name, "group")
+    if queries.find_group(change.session, name, change.realm) is not None:
+        raise Taken(f"there is a group '{name}' already")
+    change.see_room("groups")
+    return _group(change.add_group(name, change.realm).name, ())
+
+
+def remove_group(change: OwnChange, name: str) -> None:
+    """:raises NotFound: no such group
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    change.remove_group(change.group(name))
+
+
+def join(change: OwnChange, name: str, user: str) -> None:
+    """:raises NotFound: no such group or user
+    :raises NoRoom: too many are in groups
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    found, member = change.group(name), change.user(user)
+    if member.name not in found.members:
+        change.see_room("memberships")
+        change.join(found, member)
+
+
+def leave(change: OwnChange, name: str, user: str) -> None:
+    """:raises NotFound: no such group or user, or the user is not in it
+    :raises Refused: the token in use is for less than all
+    """
+    change.needs_whole()
+    if not change.leave(change.group(name), change.user(user)):
+        raise NotFound("the user is not in this group")
+
+
+def _group(name: str, members: Sequence[str]) -> dict[str, Any]:
+    return {"group": name, "members": list(members)}
+
+
+# --- tokens -----------------------------------------------------------------------------------------------
+
+
+def tokens(s: Session, realm: str, name: str, listing: Listing) -> dict[str, Any]:
+    """A page of a user's tokens and browser sessions, without the tokens themselves.
+
+    :raises NotFound: no such user
+    """
+    found, behind = listing.page(queries.named_tokens(s, user_in(s, realm, name).id), no_types)
+    told = [
+        {
+            "id": id,
+            "kind": each.kind,
+            "label": each.label,
+            "created": each.created,
+            "expires": each.expires,
+            "scope": each.scope,
+        }
+        for id, each in found
+    ]
+    return {"tokens": told, "next": behind}
+
+
+def revoke_token(change: OwnChange, id: str) -> None:
+    """:raises NotFound: no user of the realm has such a token"""
+    number = queries.find_token(change.session, id, change.realm)
+    if number is None or not change.revoke_token(number):
+        raise NotFound("nobody in your realm has such a token")

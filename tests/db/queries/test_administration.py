@@ -1,0 +1,63 @@
+"""What administrators are told of their realm, on both databases."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_db import queries
+from relay_db.engine import Database
+from relay_db.queries import RightPlace
+from relay_protocol.errors import Invalid
+
+
+def test_patterns_are_counted_in_a_realm_and_on_a_robot(database: Database) -> None:
+    """Those that allow and those that deny; rights without any count nothing."""
+    with database.begin() as s:
+        for realm in ("lab1", "lab2"):
+            queries.add_realm(s, realm)
+            ann = queries.add_user(s, "ann", None, realm=realm)
+            crew = queries.add_group(s, "crew", realm)
+            rover, arm = (queries.add_robot(s, name, realm=realm) for name in ("rover", "arm"))
+            assert queries.count_patterns(s, realm=realm) == 0
+            queries.grant_right(s, rover.id, "viewer", user_id=ann.id, allow=["call:/a"], deny=["call:/b"])
+            queries.grant_right(s, rover.id, "viewer", group_id=crew.id, deny=["call:/c"])
+            queries.grant_right(s, arm.id, "viewer", user_id=ann.id)
+            queries.grant_right(s, arm.id, "viewer", group_id=crew.id, allow=["call:/d"])
+        assert queries.count_patterns(s, realm="lab1") == 4
+        assert [queries.count_patterns(s, robot_id=each.id) for each in (rover, arm)] == [3, 1]
+        assert queries.count_patterns(s, realm="nowhere") == 0
+
+
+def test_places_of_rights_are_those_of_the_realm(database: Database) -> None:
+    """Of a user also those of its groups; what a holder itself has is found by whom and where."""
+    with database.begin() as s:
+        queries.add_realm(s, "lab")
+        ann, bob = (queries.add_user(s, name, None, realm="lab") for name in ("ann", "bob"))
+        crew, rover = queries.add_group(s, "crew", "lab"), queries.add_robot(s, "rover", realm="lab")
+        other = queries.add_user(s, "ann", None), queries.add_robot(s, "rover")
+        queries.grant_right(s, other[1].id, "owner", user_id=other[0].id)
+        queries.add_member(s, crew.id, ann.id)
+        queries.grant_right(s, rover.id, "viewer", group_id=crew.id)
+        queries.grant_right(s, rover.id, "operator", user_id=bob.id)
+        group, own = sorted(queries.right_places(s, "lab"))
+        assert group == RightPlace(group.id, "rover", None, "crew")
+        assert own == RightPlace(own.id, "rover", "bob", None)
+        assert queries.right_places(s, "lab", user_id=ann.id) == [group]
+        assert queries.right_places(s, "lab", robot_id=other[1].id) == []
+        held = queries.right_held(s, rover.id, user_id=bob.id)
+        assert held is not None and (held.id, held.level) == (own.id, "operator")
+        assert queries.right_held(s, rover.id, user_id=ann.id) is None
+        assert [each.id for each in queries.list_rights(s, ids=[group.id])] == [group.id]
+        with pytest.raises(Invalid):
+            queries.right_held(s, rover.id)
+
+
+def test_whose_a_token_is(database: Database) -> None:
+    """By its full name; nobody's, if there is none of that number."""
+    with database.begin() as s:
+        queries.add_realm(s, "lab")
+        ann = queries.add_user(s, "ann", None, realm="lab")
+        token = queries.create_token(s, ann.id, "a" * 64, kind="access", expires=None, now=1.0)
+        assert queries.user_of_token(s, token) == "ann@lab"
+        assert queries.user_of_token(s, token + 1) is None
+        assert queries.user_of_program(s, 1) is None
