@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, expect
@@ -14,6 +16,9 @@ from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_waiting import wait_for
 from switchboard_watchers import Watcher, bystanders
+
+QUIET_NS = 1_000_000_000
+"""A daemon repeats a zero for a fifth of that."""
 
 
 @dataclass
@@ -31,6 +36,25 @@ class World:
         self.robot.wait_online()
         with self.relay.connect("rover", self.viewer) as client:
             wait_for("its graph is known", lambda: {"/odom", "/scan", "/cmd_vel"} <= topics_of(client))
+
+    def left_alone(self) -> int:
+        """Until what tests before this one did is over: nobody has control, the robot stands, and is told nothing.
+
+        :returns: monotonic nanoseconds; from then on it is told what this test tells it
+        """
+        wait_for("nobody has control", lambda: self._holder() is None)
+        wait_for("the robot is left alone", lambda: not self.robot.moving() and self._untold())
+        return time.monotonic_ns()
+
+    def _holder(self) -> Any:
+        with self.relay.connect("rover", self.viewer) as client:
+            client.send(op="subscribe", topic="/relay/control")
+            return client.until(op="publish", topic="/relay/control")["msg"]["holder"]
+
+    def _untold(self) -> bool:
+        """Whether the last command is so old that a daemon repeats no zero of its any more."""
+        last = max((each["t"] for each in self.robot.events("command")), default=0)
+        return bool(time.monotonic_ns() - last > QUIET_NS)
 
     @contextmanager
     def operating(self) -> Iterator[Client]:

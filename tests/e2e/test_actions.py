@@ -50,7 +50,7 @@ def until_the_end(client: Client) -> list[dict[str, Any]]:
     """All that comes of the goal ``g``, its result last."""
     told = []
     while not told or told[-1]["op"] != "action_result":
-        message = client.receive(20)
+        message = client.receive()
         if message.get("id") == "g" and message["op"] != "status":
             told.append(message)
     return told
@@ -150,7 +150,7 @@ def test_a_client_pursues_a_nodes_goal(world: Any, peer: Peer) -> None:
     with world.operating() as client:
         client.send(op="advertise_action", action="/clients", type=FIBONACCI)
         peer.do("send", "/clients", 7)
-        goal = client.until(20, op="send_action_goal", action="/clients")
+        goal = client.until(op="send_action_goal", action="/clients")
         assert (goal["args"], goal["action_type"], goal["feedback"]) == ({"order": 7}, FIBONACCI, True)
         about = {"action": "/clients", "id": goal["id"]}
         client.send(op="action_feedback", **about, values={"sequence": [0, 1]})
@@ -167,7 +167,7 @@ def test_a_node_cancels_a_goal_at_a_client(world: Any, peer: Peer) -> None:
     with world.operating() as client:
         client.send(op="advertise_action", action="/stoppable", type=FIBONACCI)
         peer.do("send", "/stoppable", 7)
-        goal = client.until(20, op="send_action_goal")
+        goal = client.until(op="send_action_goal")
         peer.until(lambda: peer.told("taken", "/stoppable"))
         peer.do("cancel", "/stoppable")
         assert client.until(op="cancel_action_goal")["id"] == goal["id"]
@@ -184,7 +184,7 @@ def test_a_client_fails_or_vanishes_and_the_node_is_told(world: Any, peer: Peer)
         client.send(op="advertise_action", action="/mortal", type=FIBONACCI)
         for order, said in ((1, {"result": False, "values": "no"}), (2, {"values": {"sum": 1}}), (3, None)):
             peer.do("send", "/mortal", order)
-            goal = client.until(20, op="send_action_goal")
+            goal = client.until(op="send_action_goal")
             peer.until(lambda order=order: len(peer.told("taken", "/mortal")) == order)
             if said is None:
                 client.close()
@@ -207,13 +207,13 @@ def test_a_node_sends_every_kind_of_field_to_a_client(world: Any) -> None:
             env=ros_environment(world.robot.domain),
         )
         try:
-            goal = client.until(40, op="send_action_goal")
+            goal = client.until(op="send_action_goal")
             about, args = {"action": "/reflect", "id": goal["id"]}, goal["args"]
             for step in range(args["steps"]):
                 client.send(op="action_feedback", **about, values={"step": step, "feedback": args["goal"]})
             values = {"result": args["goal"], "path": [0.25]}
             client.send(op="action_result", **about, values=values, result=True)
-            out, _ = node.communicate(timeout=40)
+            out, _ = node.communicate(timeout=60)
         finally:
             node.kill()
             node.communicate()

@@ -140,7 +140,7 @@ def shown(where: Page | Locator) -> Any:
     return decoded(base64.b64decode(data.partition(",")[2]))
 
 
-def goes_on(where: Page | Locator, seconds: float = 20.0) -> None:
+def goes_on(where: Page | Locator, seconds: float = WAIT_SECONDS) -> None:
     """Wait until the picture on a canvas is another one, whose clock has gone on."""
     before = shown(where)
 

@@ -16,6 +16,7 @@ import pytest
 from switchboard_client import Client
 from switchboard_drive import LATE_MS
 from switchboard_http import Answer, ask
+from switchboard_pulse import Pulse
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_waiting import wait_for
@@ -161,13 +162,13 @@ def test_who_never_let_go_moves_nothing_by_taking_control_again(place: Place) ->
 
 def test_a_viewer_stops_who_drives_and_may_not_resume(place: Place) -> None:
     """The robot stands at once and stays so; who holds control lets it move again, once he has let go."""
-    with place.driving("ann") as ann, place.connect("vic") as vic:
+    with place.driving("ann") as ann, place.connect("vic") as vic, Pulse() as pulse:
         place.moves()
         since = time.monotonic_ns()
         assert vic.call("/relay/stop", {"why": "somebody is in the way"})["values"]["success"]
         place.stands()
         took_ms = (place.robot.events("standstill", since)[0]["t"] - since) / 1e6
-        assert took_ms < LATE_MS
+        assert took_ms < LATE_MS + 1000 * pulse.lost()
         refused = vic.call("/relay/resume")
         assert refused["result"] is False
         assert "only who has control" in refused["values"]
@@ -253,16 +254,25 @@ def test_an_owner_suppresses_who_drives(place: Place) -> None:
     """For as long as it is renewed only he moves the robot; then it is the driver's again, once he has let go."""
     with place.driving("ann", 0.2), place.connect("olga") as olga:
         place.moves()
-        since = 0
-        for renewal in range(20):
-            if renewal == 4:
-                since = time.monotonic_ns()
-            olga.send(op="call_service", service="/relay/suppress", args={"resource": "/cmd_vel", "ms": 200})
-            olga.drive(-0.1)
-            time.sleep(0.05)  # the pace of a driver
-        commands = [each["v"] for each in place.robot.events("command", since)]
-        assert min(commands) < 0
-        assert max(commands) <= 0, "the driver's commands came through"
+
+        def suppressed() -> bool:
+            since = 0
+            with Pulse() as pulse:
+                for renewal in range(20):
+                    if renewal == 4:
+                        since = time.monotonic_ns()
+                    order = {"resource": "/cmd_vel", "ms": 200}
+                    olga.send(op="call_service", service="/relay/suppress", args=order)
+                    olga.drive(-0.1)
+                    time.sleep(0.05)  # the pace of a driver
+                commands = [each["v"] for each in place.robot.events("command", since)]
+                if pulse.lost():
+                    return False
+            assert min(commands) < 0
+            assert max(commands) <= 0, "the driver's commands came through"
+            return True
+
+        wait_for("it is renewed without a pause", suppressed)
         assert place.control()["holder"]["user"] == "ann"
     place.stands()
 
@@ -273,9 +283,9 @@ def test_an_inhibited_topic_says_nothing(place: Place) -> None:
         vic.send(op="subscribe", topic="/odom", type="nav_msgs/msg/Odometry")
         vic.until(op="publish", topic="/odom")
         assert place.http("POST", "inhibit", "ann", {"resource": "/odom"}).status == 403
+        begun = time.monotonic()
         assert place.http("POST", "inhibit", "olga", {"resource": "/odom", "ms": 1500}).status == 200
         assert vic.call("/relay/ping", {"robot": True})["result"]
-        begun = time.monotonic()
         vic.until(op="publish", topic="/odom")
-        assert time.monotonic() - begun > 0.5
+        assert time.monotonic() - begun > 1.4
         assert [each["resource"] for each in place.control("vic")["inhibited"]] == []

@@ -12,6 +12,7 @@ from typing import Any
 
 import httpx
 import pytest
+from switchboard_pulse import Pulse
 from switchboard_relay import Relay
 from switchboard_waiting import wait_for
 
@@ -85,11 +86,19 @@ class Stream:
 
 def test_what_clients_do_leaves_events(world: Any, operator: httpx.Client) -> None:
     """To come, to take control, to move the robot once, to call, to leave; whoever sees the robot reads of it."""
-    with world.operating() as client:
-        client.call("/relay/take_control", {"why": "a look around"})
+    world.left_alone()
+    with world.operating() as client, Pulse() as pulse:
+
+        def moves() -> bool:
+            client.drive(0.2)
+            return bool(world.robot.moving())
+
+        assert client.call("/relay/take_control", {"why": "a look around"})["values"]["success"]
+        wait_for("it moves", moves)
         for _ in range(5):
             client.drive(0.2)
         client.call("/relay/release_control")
+        lost = pulse.lost()
         client.call("/nobody/offers/this")
     kinds = ["client.joined", "control.taken", "motion.begun", "control.released", "call.begun", "call.ended"]
 
@@ -102,7 +111,9 @@ def test_what_clients_do_leaves_events(world: Any, operator: httpx.Client) -> No
     assert (taken["source"], taken["user"]) == ("relay:rover", "operator")
     assert taken["data"]["why"] == "a look around" and "address" not in taken["data"]
     begun = asked(operator, kind="motion.begun", **{"data.topic": "/cmd_vel"})
-    assert sum(each["at"] >= taken["at"] for each in begun) == 1
+    times = sum(each["at"] >= taken["at"] for each in begun)
+    # Who is held up lets go by it, and begins once more.
+    assert times == 1 or (times and lost)
     with client_of(world.relay, world.stranger) as stranger:
         assert asked(stranger, source="relay*") == []
         assert stranger.get(EVENTS, params={"robot": "rover", "count": "true"}).json() == {"count": 0}

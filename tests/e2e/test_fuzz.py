@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from switchboard_waiting import PATIENCE
 from switchboard_watchers import Watcher, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -97,6 +98,7 @@ def connected(world: Any, token: str) -> ClientConnection:
         additional_headers={"Authorization": f"Bearer {token}"},
         max_size=None,
         compression=None,
+        open_timeout=PATIENCE,
     )
 
 
@@ -170,6 +172,6 @@ def test_half_a_message_and_then_nothing_holds_nobody_up(world: Any) -> None:
         second.socket.sendall(b"\x01\x85" + mask + bytes(5))
         third.send('{"op":"fragment","id":"f","num":0,"total":2,"data":"{"}')
         another.send('{"op":"call_service","service":"/rosapi/get_time","id":"now"}')
-        assert json.loads(another.recv(timeout=10))["id"] == "now"
+        assert json.loads(another.recv(timeout=PATIENCE))["id"] == "now"
         for client in (first, second):
             client.socket.close()

@@ -64,6 +64,12 @@ def told_by_rosapi(world: Any, token: str) -> dict[str, dict[str, list[str]]]:
 def test_a_node_comes_and_goes(world: Any, viewer: httpx.Client, tmp_path: Path) -> None:
     """With the topic that it publishes; who knows it already is told so, and is not any more when it is gone."""
     address = f"modules{NODE}"
+
+    def nobody_talks() -> bool:
+        return bool(viewer.get("modules", params={"name": "/talks_*"}).json()["modules"] == [])
+
+    # Other tests have nodes of these names.
+    wait_for("earlier ones are gone", nobody_talks)
     assert viewer.get(address).status_code == 404
     command = [sys.executable, str(TALKING), TOPIC, "std_msgs/msg/String", "reliable"]
     talking = Process(command, tmp_path, "talking", ros_environment(world.robot.domain))
@@ -86,7 +92,7 @@ def test_a_node_comes_and_goes(world: Any, viewer: httpx.Client, tmp_path: Path)
         wait_for("nothing more of it is new", known)
         tag = viewer.get(address).headers["etag"]
     wait_for("it is gone", lambda: viewer.get(address, headers={"If-None-Match": tag}).status_code == 404)
-    assert viewer.get("modules", params={"name": "/talks_*"}).json()["modules"] == []
+    assert nobody_talks()
 
 
 def test_http_shows_what_rosapi_shows(world: Any) -> None:

@@ -112,10 +112,15 @@ def test_a_robot_that_is_far_away_is_seen_to_be(relay: Relay, proxy: ChaosProxy)
 
         proxy.seconds_away = FAR
         wait_for("the link is bad", lambda: robot_link(relay)["quality"] == "bad")
-        far = told(client, "relay_robot", "bad")
-        assert far["links"]["client_relay"]["quality"] == "good"
-        assert far["links"]["client_robot"]["quality"] == "bad"
-        assert 2000 * FAR <= far["links"]["relay_robot"]["p95_ms"] < 2000 * FAR + 500
+
+        def seen_far() -> bool:
+            """Once nothing from before is counted any more, nor of a moment in which the machine stood still."""
+            links = heard(client)["links"]
+            near, away = links["client_relay"]["quality"], links["client_robot"]["quality"]
+            p95_ms = links["relay_robot"]["p95_ms"]
+            return (near, away) == ("good", "bad") and 2000 * FAR <= (p95_ms or 0) < 2000 * FAR + 500
+
+        wait_for("it is told how far it is", seen_far)
         (robot,) = ask(relay.http_port, "GET", "/api/v1/robots", token=ann).json["robots"]
         assert (robot["quality"], robot["people"]) == ("bad", 1)
 

@@ -97,7 +97,7 @@ def test_a_robot_with_a_low_battery_drives_to_its_charger(hungry: Hungry) -> Non
             wait_for("it turns", robot.moving)
             assert program.stop() == 0
         wait_for("it stands", hungry.stands)
-        assert hungry.free()
+        wait_for("control is given back", hungry.free)
         program = hungry.program()
         with running(program):
             says(program, "driving to marker 7")

@@ -184,7 +184,7 @@ def test_a_cameras_pictures_are_recorded(operator: Recorder, tmp_path: Path) -> 
 
 def test_it_ends_by_its_limits(operator: Recorder) -> None:
     """Of time here, and says so."""
-    id = operator.start("/odom", seconds=1)
+    id = operator.start("/odom", seconds=5)
     done = wait_for("its end", lambda: (found := operator.look(id))["state"] == "complete" and found)
     assert done["reason"] == "it has taken its time"
     assert done["messages"] > 5

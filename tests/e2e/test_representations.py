@@ -43,7 +43,7 @@ def client(world: Any) -> Iterator[httpx.Client]:
     with httpx.Client(
         base_url=f"http://127.0.0.1:{world.relay.http_port}{ROBOT}",
         headers={"Authorization": f"Bearer {world.operator}"},
-        timeout=30,
+        timeout=90,
     ) as client:
         yield client
 
@@ -70,7 +70,7 @@ def test_a_state_is_the_same_in_all_forms(world: Any, client: httpx.Client) -> N
     topic = {"topic": "/forms/measured", "type": "nav_msgs/msg/Odometry"}
     address = f"topics{topic['topic']}"
     with world.relay.connect("rover", world.operator) as other:
-        odometry = client.get("topics/odom").json()["value"]
+        odometry = client.get("topics/odom", params={"wait": 60}).json()["value"]
         other.send(op="advertise", **topic)
 
         def heard() -> bool:
@@ -99,7 +99,7 @@ def test_a_state_is_the_same_in_all_forms(world: Any, client: httpx.Client) -> N
 @pytest.mark.parametrize("media", RDF_MEDIA)
 def test_odometry_is_an_observation(client: httpx.Client, media: str) -> None:
     """With its sensor, its time, and numbers typed as ROS has them."""
-    graph = graph_of(get(client, "topics/odom", media))
+    graph = graph_of(get(client, "topics/odom?wait=60", media))
     topic, words = URIRef(f"{base_of(client)}{ROBOT}/topics/odom"), f"{base_of(client)}/api/v1/vocabulary/"
     assert (topic, RDF.type, SOSA.Observation) in graph
     assert graph.value(graph.value(topic, SOSA.madeBySensor), RDF.type) == SOSA.Sensor
@@ -118,6 +118,7 @@ def test_a_twist_in_xml_moves_the_robot(world: Any, client: httpx.Client) -> Non
             "topics/cmd_vel", content=body, headers={"Content-Type": "application/rdf+xml", **headers}
         )
 
+    world.left_alone()
     needed = put(0.2)
     assert (needed.status_code, needed.json()["code"]) == (428, "moment_needed")
     moment = needed.headers[HEADER]
@@ -153,8 +154,13 @@ def test_a_message_in_turtle_reaches_who_listens(world: Any, client: httpx.Clien
 
 def test_a_parameter_is_set_in_turtle(client: httpx.Client) -> None:
     """As it was read, in whichever form that was."""
-    names = [each["name"] for each in client.get("params", params={"limit": 1000}).json()["params"]]
-    address = f"params/{next(each for each in names if each.endswith(':use_sim_time')).lstrip('/')}"
+
+    def found() -> str:
+        """A node that does not answer in time is left out."""
+        listed = client.get("params", params={"limit": 1000}).json()["params"]
+        return next((each["name"] for each in listed if each["name"].endswith(":use_sim_time")), "")
+
+    address = f"params/{wait_for('a node tells its parameters', found).lstrip('/')}"
     body = f"{PREFIXES.format(base=base_of(client))}<> own:value %s ."
     headers = {"Content-Type": "text/turtle"}
     for media in RDF_MEDIA:
@@ -177,7 +183,7 @@ def test_a_page_lists_addresses(client: httpx.Client) -> None:
     """Which can be read in turn."""
     answer = get(client, "topics?name=/odom", "text/turtle")
     (odom,) = graph_of(answer).objects(None, RDFS.member)
-    assert graph_of(get(client, str(odom), "text/turtle"))
+    assert graph_of(get(client, f"{odom}?wait=60", "text/turtle"))
     # Reading a topic makes one more subscriber: that page may be another by now.
     services = get(client, "services", "text/turtle")
     known = {"If-None-Match": services.headers["etag"]}
@@ -204,7 +210,8 @@ def test_what_is_not_there_is_told_with_what_is(client: httpx.Client) -> None:
 
 def test_every_word_has_a_meaning_at_its_address(client: httpx.Client) -> None:
     """The relay's own, types and their fields: what is read of a robot can be looked up, word by word."""
-    graphs = [graph_of(get(client, each, "text/turtle")) for each in ("topics/odom", "topics", "cameras")]
+    read = ("topics/odom?wait=60", "topics", "cameras")
+    graphs = [graph_of(get(client, each, "text/turtle")) for each in read]
     here = f"{base_of(client)}/api/v1/vocabulary/"
     words = {
         str(each) for graph in graphs for triple in graph for each in triple if str(each).startswith(here)

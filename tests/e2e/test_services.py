@@ -83,14 +83,14 @@ def test_every_kind_of_field_passes(world: Any) -> None:
             env=ros_environment(world.robot.domain),
         )
         try:
-            call = client.until(40, op="call_service", service="/mirror")
+            call = client.until(op="call_service", service="/mirror")
             assert call["args"]["words"] == ["one", "two"]
             request = call["args"]["request"]
             assert request["primitives"]["text"] == "Grüße 🤖"
             assert request["primitives"]["vast"] == 2**64 - 1
             values = {"response": request, "answers": [True, False, True]}
             client.send(op="service_response", service="/mirror", id=call["id"], values=values)
-            out, _ = node.communicate(timeout=40)
+            out, _ = node.communicate(timeout=60)
         finally:
             node.kill()
             node.communicate()
@@ -201,7 +201,7 @@ def test_an_offer_is_made_again_when_the_robot_is_back(tmp_path: Path) -> None:
             with relay.connect("rover", token) as client:
                 client.send(op="advertise_service", service="/again", type=ADD)
                 peer.do("call", "/again", 1, 2)
-                lost = client.until(30, op="call_service")
+                lost = client.until(op="call_service")
                 robot.daemon.kill()
                 wait_for("the robot is away", lambda: relay.state_of("rover") == "offline")
                 robot.start_daemon()

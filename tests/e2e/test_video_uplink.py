@@ -40,6 +40,8 @@ def behind_a_proxy(world: Any, name: str, *sim_options: str) -> Iterator[Thin]:
     finally:
         robot.stop()
         proxy.close()
+        # Who sees it would see it in all tests that follow.
+        world.relay.cli("robot", "remove", name, "--yes")
 
 
 @pytest.fixture(scope="module")

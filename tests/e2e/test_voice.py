@@ -29,6 +29,7 @@ class Hall:
 
     def __init__(self, folder: Path, world: Any) -> None:
         self.folder = folder
+        self.world = world
         self.relay = world.relay
         self.robot = world.robot
         self.token = world.operator
@@ -74,6 +75,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory, world: Any) -> Hall:
 
 def test_words_move_the_robot_and_noise_does_not(hall: Hall) -> None:
     """For a moment; *stop* is the relay's as long as nobody had to take control."""
+    hall.world.left_alone()
     voice, mouth = hall.listening()
     with hall.relay.connect("rover", hall.token) as client, running(voice, mouth):
         mouth.start()

@@ -17,7 +17,7 @@ from switchboard_waiting import freeze
 from relay_protocol import link
 from robot_client.lasting import GOALS
 from robot_client.platforms.base import CANCELED
-from tests.robot_client.fake_relay import FakeRelay, Peer
+from tests.robot_client.fake_relay import PATIENCE, FakeRelay, Peer
 from tests.robot_client.robot_process import Robot, until
 from tests.robot_client.ros import Peer as Node
 
@@ -103,7 +103,7 @@ def test_goals_of_a_frozen_daemon_are_cancelled(robot: Robot, node: Node) -> Non
     errand.begin("second")
     assert (robot.state / GOALS).exists()
     errand.process.terminate()
-    assert errand.process.wait(5) == 0
+    assert errand.process.wait(PATIENCE) == 0
     until(lambda: errand.cancelled)
     assert not (robot.state / GOALS).exists()
 
@@ -158,13 +158,13 @@ def test_goal_that_does_not_end_with_the_daemon_is_noted(robot: Robot, node: Nod
     errand = Errand(robot, node)
     with node.frozen():
         errand.process.terminate()
-        assert errand.process.wait(10) == 0
+        assert errand.process.wait(PATIENCE) == 0
         assert (robot.state / GOALS).exists()
     process = errand.run()
     until(lambda: errand.cancelled)
     until(lambda: not (robot.state / GOALS).exists())
     process.terminate()
-    assert process.wait(5) == 0
+    assert process.wait(PATIENCE) == 0
 
 
 def test_goals_of_a_silent_relay_are_cancelled(robot: Robot, node: Node) -> None:

@@ -191,7 +191,7 @@ class TestStopAll:
         """A page that can't begin is not blank for long."""
         relay.do(stuck=["session"])
         page = open_page("/fleet", user="admin")
-        expect(page.get_by_text("The relay takes long to answer.")).to_be_visible(timeout=5000)
+        expect(page.get_by_text("The relay takes long to answer.")).to_be_visible()
         self.pressed(page, relay)
         relay.do(stuck=[])
         expect(seen(page, "robot-card")).to_have_count(3)
@@ -474,7 +474,7 @@ class TestDriving:
         hold_joystick(page)
         driving(relay)
         relay.do(dead=True)
-        expect(seen(page, "robot-late")).to_be_visible(timeout=5000)
+        expect(seen(page, "robot-late")).to_be_visible()
         expect(seen(page, "driving")).to_have_count(0)
         expect(seen(page, "latency-badge")).to_have_text("robot late")
         expect(seen(page, "drive-words")).to_contain_text("The robot is late.")

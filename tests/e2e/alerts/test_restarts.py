@@ -112,7 +112,7 @@ def test_a_daemon_that_begins_anew_while_a_part_is_in_error_tells_nothing_twice(
         before = arm()["count"]
         robot.daemon.kill()
         robot.start_daemon()
-        wait_for("the new daemon tells it, too", lambda: arm().get("count") == before + 1)
+        wait_for("the new daemon tells it, too", lambda: arm().get("count", 0) > before)
         time.sleep(AGAIN_SECONDS + 2)  # by then the relay has ended all that the new daemon did not tell
         assert arm()["news"] == 1
     assert house.hook.told == ["diagnostics begun"]

@@ -6,7 +6,7 @@ import { connect, deadline } from "./connecting.mjs";
 const [module, url, token] = process.argv.slice(2);
 const ROSLIB = await import(module);
 const seen = {};
-const inTime = deadline(60, seen);
+const inTime = deadline(110, seen);
 
 const ros = await connect(ROSLIB, url, token);
 
@@ -20,15 +20,23 @@ const odom = new ROSLIB.Topic({ ros, name: "/odom", messageType: "nav_msgs/msg/O
 seen.rays = await new Promise((resolve) => scan.subscribe((message) => resolve(message.ranges.length)));
 seen.scanned = true;
 
+// Who began to drive while another still had control, or was late, moves nothing until he has let go for half a second.
+const STROKE = 2000;
+const PAUSE = 1000;
 let first;
 let moved = false;
 await new Promise((resolve) => {
   const command = new ROSLIB.Topic({ ros, name: "/cmd_vel", messageType: "geometry_msgs/msg/Twist" });
+  const begun = performance.now();
   let driving;
   odom.subscribe((message) => {
     const x = message.pose.pose.position.x;
     first ??= x;
-    driving ??= setInterval(() => command.publish({ linear: { x: 0.3 } }), 100);
+    driving ??= setInterval(() => {
+      if ((performance.now() - begun) % (STROKE + PAUSE) < STROKE) {
+        command.publish({ linear: { x: 0.3 } });
+      }
+    }, 100);
     if (!moved && Math.abs(x - first) > 0.05) {
       moved = true;
       clearInterval(driving);

@@ -10,6 +10,7 @@ import time
 
 import roslibpy
 
+STROKE, PAUSE = 2.0, 1.0
 url, token = sys.argv[1:]
 ros = roslibpy.Ros(host=url, headers={"Authorization": f"Bearer {token}"})
 ros.run(timeout=20)
@@ -41,9 +42,11 @@ seen["scanned"] = scanned.wait(20)
 seen["odom"] = first_odom.wait(20)
 
 command = roslibpy.Topic(ros, "/cmd_vel", "geometry_msgs/Twist")
-until = time.monotonic() + 20
-while not moved.is_set() and time.monotonic() < until:
-    command.publish(roslibpy.Message({"linear": {"x": 0.3}}))
+begun = time.monotonic()
+while not moved.is_set() and time.monotonic() < begun + 60:
+    # Who began to drive while another still had control, or was late, moves nothing until he has let go for a while.
+    if (time.monotonic() - begun) % (STROKE + PAUSE) < STROKE:
+        command.publish(roslibpy.Message({"linear": {"x": 0.3}}))
     moved.wait(0.1)
 command.publish(roslibpy.Message({}))
 seen["moved"] = moved.is_set()

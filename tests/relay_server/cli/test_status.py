@@ -139,7 +139,7 @@ def test_status_is_drawn_anew_while_somebody_watches(relay: Any, short_folder: P
         relay.answer = (500, b"")
         wait_for("what is wrong is shown", lambda: "answered something else" in shown())
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from switchboard_rtsp import RtspCamera, card
 
 from relay_protocol import frames, link
 from robot_client.platforms.ros2_transport import without_shared_memory
-from tests.robot_client.fake_relay import FakeRelay, Peer
+from tests.robot_client.fake_relay import PATIENCE, FakeRelay, Peer
 from tests.robot_client.robot_process import Robot, until
 
 RAW = "/camera/image_raw"
@@ -235,7 +235,7 @@ def test_process_ends_with_its_daemon(scene: Scene, how: str) -> None:
     picture(scene.video(RAW))
     (process,) = scene.cameras()
     getattr(scene.process, how)()
-    scene.process.wait(10)
+    scene.process.wait(PATIENCE)
     until(lambda: not process.is_running())
 
 
@@ -299,7 +299,7 @@ def test_silent_camera_holds_up_nobody(network: tuple[Scene, RtspCamera], robot:
     peer.expect(link.Bye)
     peer.expect_end()
     scene.process.terminate()
-    scene.process.wait(5)
+    scene.process.wait(PATIENCE)
     assert not process.is_running()
     camera.close()
     assert not [text for text in (*shown, robot.log.read_text()) if "s3cret" in text]

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from autobahn.twisted.resource import WebSocketResource
+from switchboard_waiting import PATIENCE
 from twisted.internet import reactor, task
 from twisted.internet.task import LoopingCall
 from twisted.internet.threads import deferToThread
@@ -200,7 +201,7 @@ class Show:
         return [each for each in await self.store.read(queries.list_events) if each.kind == kind]
 
 
-async def until(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
+async def until(condition: Callable[[], Any], seconds: float = PATIENCE) -> Any:
     """What ``condition`` gives once it is true."""
     end = time.monotonic() + seconds
     while not (found := condition()):
@@ -231,7 +232,7 @@ class Looker:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window)
             # On loopback a segment has 64 KiB, and no less is ever asked for.
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 1400)
-        self.socket.settimeout(15)
+        self.socket.settimeout(PATIENCE)
         self.socket.connect(("127.0.0.1", port))
         self._data = b""
         self._request = (path, method, headers)
