@@ -13,11 +13,12 @@ from twisted.internet.defer import Deferred
 from relay_db import queries
 from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Level, Operation
-from relay_server.access import Access, Principal
+from relay_server.access import Access, Permit, Principal
 from relay_server.channel import resolve
 from relay_server.clock import Clock, within
 from relay_server.control import Actor, Answer, Client, Desk, Desks, NotDone, acts_for, view
 from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, FrontDesk
+from relay_server.inside import Guests, take_control
 from relay_server.registry import Presence, Registry
 from relay_server.store import Store
 
@@ -46,6 +47,17 @@ class Outcome(NamedTuple):
     failed: str = ""
 
 
+class Taken(NamedTuple):
+    """What became of taking control.
+
+    :param answer: without success while who has control is asked for it
+    :param control: as :meth:`Console.control` tells
+    """
+
+    answer: Answer
+    control: dict[str, Any]
+
+
 class Halted(NamedTuple):
     """What became of a stop of many.
 
@@ -58,10 +70,20 @@ class Halted(NamedTuple):
 
 
 class Console:
-    """Control of robots for users who may have no connection to them, or several."""
+    """Control of robots for users who may have no connection to them, or several.
+
+    :param guests: who takes control by HTTP has it by the connection that is kept for him there
+    """
 
     def __init__(
-        self, clock: Clock, desk: FrontDesk, access: Access, desks: Desks, registry: Registry, store: Store
+        self,
+        clock: Clock,
+        desk: FrontDesk,
+        access: Access,
+        desks: Desks,
+        registry: Registry,
+        store: Store,
+        guests: Guests,
     ) -> None:
         self._clock = clock
         self._desk = desk
@@ -69,6 +91,7 @@ class Console:
         self._desks = desks
         self._registry = registry
         self._store = store
+        self._guests = guests
 
     # --- by HTTP ------------------------------------------------------------------------------------------
 
@@ -78,11 +101,36 @@ class Console:
         :raises NotFound: no such robot, or no right on it
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
-            asker = view.Asker(admission.permit.rules, lambda client: client.user == principal.user_id)
-            desk = self._of(admission)
-            holder = desk.lease.holder
-            mine = holder is not None and asker.mine(holder.client)
-            return view.control(desk, asker, holder.client.number if holder is not None and mine else None)
+            return _shown(self._of(admission), admission.permit)
+
+    async def take(
+        self, principal: Principal, robot: str, why: str, address: str, seconds: float = 0.0
+    ) -> Taken:
+        """Take control, or ask who has it for it, by the connection that is kept for the principal's token.
+
+        :param seconds: an answer to a request is waited for so long
+        :raises NotFound: as :meth:`control`
+        :raises SwitchboardError: as :func:`relay_server.inside.take_control`, or there is no room for him
+        """
+        async with self._guests.at(principal, robot, address) as guest:
+            answer = await take_control(self._clock, guest, why, seconds)
+            return Taken(answer, _shown(guest.session.desk, guest.session.permit))
+
+    async def let_go(self, principal: Principal, robot: str, address: str) -> None:
+        """Give back what that connection has of control, or asks for. Where it has nothing, nothing is done.
+
+        :raises NotFound: as :meth:`control`
+        :raises Unavailable: nobody can say whether he has a right on the robot
+        """
+        there = self._guests.there(principal, robot)
+        if there is None:
+            await self._stoppable(principal, robot, address)
+            return
+        guest, leave = there
+        try:
+            guest.session.desk.release(guest.session, "")
+        finally:
+            leave()
 
     async def release(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
         """Give control back, or a request for it; an owner takes control from anybody.
@@ -90,7 +138,7 @@ class Console:
         :raises NotFound: as :meth:`control`
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
-            desk, actor = self._of(admission), _actor(principal, address)
+            desk, actor = self._of(admission), _actor(principal, admission.robot, address)
             lease = desk.lease
             held, request = lease.holder or lease.coming, lease.request
             answer = Answer(False, "you have no control of this robot")
@@ -134,8 +182,9 @@ class Console:
         :raises NotFound: as :meth:`control`
         :raises Unavailable: it can't be reached, and the order can't be kept; or nobody can say whether he may
         """
-        desk = self._desks.of(await self._stoppable(principal, robot, address))
-        stopping = desk.stopping.stop(_actor(principal, address), why)
+        there = await self._stoppable(principal, robot, address)
+        desk = self._desks.of(there)
+        stopping = desk.stopping.stop(_actor(principal, there, address), why)
         try:
             done, failed = await within(self._clock, CONFIRM_SECONDS, stopping, NOT_CONFIRMED), ""
         except NotDone as error:
@@ -145,7 +194,7 @@ class Console:
     async def _stoppable(self, principal: Principal, robot: str, address: str) -> Presence:
         """A robot the principal has any right on; the database is asked only where that is not known here."""
         for there in self._registry:
-            named = (there.name, there.realm) == (robot, principal.realm)
+            named = there.name == robot and principal.realm in there.realms
             if named and self._access.knows(principal, there.robot_id):
                 return there
         looked_up = self._desk.admit(principal, robot, address)
@@ -167,7 +216,7 @@ class Console:
             owner = admission.permit.rules.level is Level.OWNER
             if not owner and _own_holder(desk, admission) is None:
                 raise Refused("only who has control of the robot, and its owners, may resume it")
-            await desk.stopping.resume(_actor(principal, address), why, sent)
+            await desk.stopping.resume(_actor(principal, admission.robot, address), why, sent)
 
     async def suppress(self, principal: Principal, robot: str, resource: str, ms: int, address: str) -> None:
         """Have a topic obey all connections of the principal and nobody else, for moments.
@@ -184,7 +233,8 @@ class Console:
                 for session in self._desk.sessions_of(admission.robot.robot_id)
                 if session.user == principal.user_id
             ]
-            await self._of(admission).subsuming.suppress(_actor(principal, address), sources, topic, ms)
+            actor = _actor(principal, admission.robot, address)
+            await self._of(admission).subsuming.suppress(actor, sources, topic, ms)
 
     async def inhibit(
         self, principal: Principal, robot: str, resource: str, ms: int, hold: bool, address: str
@@ -198,7 +248,8 @@ class Console:
         over = partial(self._desk.turn_away, admission)
         try:
             topic = self._judged(admission, Operation.INHIBIT, resource)
-            inhibited = subsuming.inhibit(_actor(principal, address), topic, ms, hold, permit, over)
+            actor = _actor(principal, admission.robot, address)
+            inhibited = subsuming.inhibit(actor, topic, ms, hold, permit, over)
         except SwitchboardError:
             over()
             raise
@@ -291,6 +342,14 @@ class Console:
 _NOT_YOURS = Answer(False, "you have no control of this robot")
 
 
+def _shown(desk: Desk, permit: Permit) -> dict[str, Any]:
+    """Who moves a robot, for all connections of who has this permit."""
+    user, holder = permit.principal.user_id, desk.lease.holder
+    asker = view.Asker(permit.rules, lambda client: client.user == user)
+    mine = holder is not None and asker.mine(holder.client)
+    return view.control(desk, asker, holder.client.number if holder is not None and mine else None)
+
+
 def _own_holder(desk: Desk, admission: Admission) -> Client | None:
     """The connection of the principal that has control, if one has, and its token is for that."""
     holder = desk.lease.holder
@@ -298,8 +357,9 @@ def _own_holder(desk: Desk, admission: Admission) -> Client | None:
     return holder.client if holder is not None and mine else None
 
 
-def _actor(principal: Principal, address: str) -> Actor:
-    return Actor(principal.name, f"user:{principal.name}", principal.user_id, address)
+def _actor(principal: Principal, robot: Presence, address: str) -> Actor:
+    name = robot.name_of(principal.name, principal.realm)
+    return Actor(name, f"user:{name}", principal.user_id, address)
 
 
 def _local(by: str) -> Actor:

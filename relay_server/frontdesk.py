@@ -233,10 +233,10 @@ class FrontDesk:
         self._sessions.setdefault(robot.robot_id, {})[session.number] = session
         robot.users = len(self._sessions[robot.robot_id])
         principal = admission.permit.principal
-        session.notice = partial(self._journal.tell, robot_id=robot.robot_id, source=f"user:{principal.name}")
+        session.notice = partial(self._journal.tell, robot_id=robot.robot_id, source=f"user:{session.name}")
         self._journal.event(
             "client.joined",
-            f"user:{principal.name}",
+            f"user:{session.name}",
             cause=f"user:{principal.full}",
             robot_id=robot.robot_id,
             user_id=principal.user_id,
@@ -253,7 +253,7 @@ class FrontDesk:
         principal = session.permit.principal
         self._journal.event(
             "client.left",
-            f"user:{principal.name}",
+            f"user:{session.name}",
             cause=f"user:{principal.full}",
             robot_id=session.robot.robot_id,
             user_id=principal.user_id,
@@ -344,7 +344,7 @@ class FrontDesk:
         principal = watching.permit.principal
         self._journal.event(
             kind,
-            f"user:{principal.name}",
+            f"user:{watching.name}",
             # Not that of the user's other events: snapshots may come one a second.
             cause=f"video:{principal.full}",
             robot_id=watching.robot.robot_id,

@@ -52,7 +52,8 @@ class Overview:
         for record, rules in await self._access.robots(principal):
             if record.name == robot:
                 there = self._of(record)
-                people, more = self._people.told(there, Asker(principal.name, rules, None))
+                name = there.name_of(principal.name, principal.realm)
+                people, more = self._people.told(there, Asker(name, rules, None))
                 return {
                     "robot": record.name,
                     "state": there.state.value,
@@ -98,6 +99,7 @@ class Overview:
         return {
             "name": robot.full,
             "realm": robot.realm,
+            "shared": sorted(robot.shared),
             "state": robot.state.value,
             "address": robot.address,
             "agent": robot.description.agent,

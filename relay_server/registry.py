@@ -76,6 +76,8 @@ class Presence:
 
     :param registered_at: monotonic seconds of the latest registration
     :param patience: seconds for which that registration is not replaced
+    :param realm: its own
+    :param shared: the realms it is shared with
     :param streams: most streams of cameras it makes at a time; 0 when it did not say
     :param rtt: round trip relay–robot of the latest ping, seconds
     :param last_seen: Unix time of the latest byte, ``None`` when never seen since the start
@@ -85,6 +87,7 @@ class Presence:
     robot_id: int
     name: str
     realm: str
+    shared: frozenset[str] = frozenset()
     control: ControlLink | None = None
     registered_at: float = 0.0
     patience: float = REPLACE_SECONDS
@@ -111,6 +114,15 @@ class Presence:
         return full_name(self.name, self.realm)
 
     @property
+    def realms(self) -> frozenset[str]:
+        """All that it is of."""
+        return self.shared | {self.realm}
+
+    def name_of(self, user: str, realm: str) -> str:
+        """What a user is called at this robot: with the realm where people of several realms may be there."""
+        return f"{user}@{realm}" if self.shared else user
+
+    @property
     def state(self) -> State:
         """Offline, online, or online with somebody who works with it or watches its cameras."""
         if self.control is None:
@@ -135,17 +147,28 @@ class Registry:
     def __init__(self, wall: Callable[[], float]) -> None:
         self._wall = wall
         self._robots: dict[int, Presence] = {}
+        self._shares: dict[int, frozenset[str]] = {}
         self._listeners: list[Callable[[], None]] = []
 
     def __iter__(self) -> Iterator[Presence]:
         return iter(list(self._robots.values()))
 
     def presence(self, robot_id: int, name: str, realm: str) -> Presence:
-        """The entry of a robot, made when it is the first time."""
+        """The entry of a robot, made when it is the first time.
+
+        :param realm: its own
+        """
         found = self._robots.get(robot_id)
         if found is None:
-            found = self._robots[robot_id] = Presence(robot_id, name, realm)
+            shared = self._shares.get(robot_id, frozenset())
+            found = self._robots[robot_id] = Presence(robot_id, name, realm, shared)
         return found
+
+    def share(self, shares: dict[int, frozenset[str]]) -> None:
+        """Which realms robots are shared with, by their numbers, and no others from now on."""
+        self._shares = shares
+        for robot in self:
+            robot.shared = shares.get(robot.robot_id, frozenset())
 
     def find(self, robot_id: int) -> Presence | None:
         """The entry of a robot, if there is one."""

@@ -58,6 +58,7 @@ from relay_server.edges.whole import site_of
 from relay_server.fleet import FleetDesk
 from relay_server.folder import DataFolder
 from relay_server.frontdesk import FrontDesk
+from relay_server.inside import Guests
 from relay_server.journal import Journal
 from relay_server.memory import MemoryHouse
 from relay_server.metrics import RelayCollector, registry_of
@@ -185,11 +186,13 @@ class Relay:
         collector = RelayCollector(self._registry, self._channels, self._videos, lambda: desk)
         metrics = registry_of(collector, self._memory)
         keeper = RecordingDesk(desk, self._recordings, self._store, self._journal, time.time)
-        self._console = Console(self._reactor, desk, self._access, self._desks, self._registry, self._store)
+        guests = Guests(self._reactor, desk, now_ns)
+        offices = self._access, self._desks, self._registry, self._store
+        self._console = Console(self._reactor, desk, *offices, guests)
         below = {
             "recordings": partial(recordings.below, self._reactor, keeper),
             "people": partial(presence.below, desk.overview),
-            **resources.parts(self._reactor, desk, self._workshop, moments, now_ns, time.time),
+            **resources.parts(self._reactor, desk, guests, self._workshop, moments, now_ns, time.time),
             **{
                 part: partial(control_edge.below, self._console, moments, part) for part in control_edge.PARTS
             },

@@ -56,6 +56,7 @@ class TakingUp:
         :raises Unavailable: the database can't be asked
         """
         self._revision = await self._store.read(queries.revision)
+        self._registry.share(await self._store.read(queries.robot_shares))
         self._desks.expect(await self._store.read(queries.pending_stops))
         await self._realms.look()
 
@@ -73,6 +74,8 @@ class TakingUp:
         self._access.in_step(looked)
 
     async def _take_up(self, revision: int) -> None:
+        # Before rights on them are: nobody comes in from another realm unnoticed.
+        self._registry.share(await self._store.read(queries.robot_shares))
         await self._access.refresh()
         await self._realms.look()
         await retire(self._store, self._registry, self._desks, self._videos)

@@ -88,8 +88,8 @@ class Watching:
 
     @property
     def name(self) -> str:
-        """The user's name."""
-        return self.permit.principal.name
+        """What the user is called at this robot."""
+        return self.robot.name_of(self.permit.principal.name, self.permit.principal.realm)
 
     def begin(self, videos: Videos) -> None:
         """Watch.

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, inspect, text
 
 from relay_protocol.errors import Unavailable
 
-HEAD = "0008"
+HEAD = "0009"
 """The newest migration in ``migrations/versions``."""
 
 _LOCK = 0x5357_4244

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from relay_db import queries
-from relay_db.queries import GroupRecord, RobotRecord, UserRecord
+from relay_db.queries import GroupRecord, ProgramRecord, RobotGroupRecord, RobotRecord, UserRecord
+from relay_protocol.errors import Invalid
 from relay_protocol.limits import ENROLMENT_SECONDS
 from relay_server import passwords
 
@@ -18,6 +20,10 @@ GROUP_MARK = "@"
 
 Holder = UserRecord | GroupRecord
 """Whom a right belongs to."""
+
+
+class NotInGroup(Invalid):
+    """A robot is to be taken out of a group that it is not in."""
 
 
 class Change:
@@ -80,8 +86,17 @@ class Change:
         self.audit("user.admin", user.full, admin=admin)
         return user._replace(admin=admin)
 
+    def add_guest(self, user: UserRecord, realm: str) -> UserRecord:
+        """An account of the same person in another realm.
+
+        :raises SwitchboardError: as :func:`relay_db.queries.add_guest`
+        """
+        added = queries.add_guest(self.session, user.id, realm)
+        self.audit("user.join", added.full, home=added.home)
+        return added
+
     def remove_user(self, user: UserRecord) -> None:
-        """With its rights and tokens."""
+        """With its rights and tokens, and its accounts in other realms."""
         queries.remove_user(self.session, user.id)
         self.audit("user.remove", user.full)
 
@@ -145,6 +160,22 @@ class Change:
         queries.remove_robot(self.session, robot.id)
         self.audit("robot.remove", robot.full, **({"recordings": recordings} if recordings else {}))
 
+    def share_robot(self, robot: RobotRecord, realm: str) -> None:
+        """Make it one of another realm too.
+
+        :raises SwitchboardError: as :func:`relay_db.queries.share_robot`
+        """
+        queries.share_robot(self.session, robot.id, realm)
+        self.audit("robot.share", robot.full, realm=realm)
+
+    def unshare_robot(self, robot: RobotRecord, realm: str) -> None:
+        """Take it out of that again, with the rights on it that are held there.
+
+        :raises SwitchboardError: as :func:`relay_db.queries.unshare_robot`
+        """
+        queries.unshare_robot(self.session, robot.id, realm)
+        self.audit("robot.unshare", robot.full, realm=realm)
+
     def revoke_key(self, robot: RobotRecord, fingerprint: str) -> None:
         """Retire a key for good.
 
@@ -152,6 +183,43 @@ class Change:
         """
         queries.revoke_key(self.session, robot.id, fingerprint, self._wall())
         self.audit("robot.key.revoke", robot.full, fingerprint=fingerprint)
+
+    def describe_robot(self, robot: RobotRecord, description: str) -> RobotRecord:
+        """:raises Invalid: the description can't be kept"""
+        queries.describe_robot(self.session, robot.id, description)
+        self.audit("robot.describe", robot.full, description=description)
+        return robot._replace(description=description)
+
+    # --- groups of robots ---------------------------------------------------------------------------------
+
+    def fill_robot_group(self, name: str, realm: str, robots: Sequence[RobotRecord] = ()) -> RobotGroupRecord:
+        """Put robots into the group of that name, which is made when there is none.
+
+        :raises Invalid: the name can't be, or a robot is not of the realm
+        :raises NotFound: no such realm
+        """
+        s = self.session
+        found = queries.find_robot_group(s, name, realm) or queries.add_robot_group(s, name, realm)
+        for each in robots:
+            queries.add_to_robot_group(s, found.id, each.id)
+        self.audit("robot.group.add", found.full, robots=[each.full for each in robots])
+        return found._replace(robots=queries.robots_of_groups(s, [found.id])[found.id])
+
+    def empty_robot_group(self, group: RobotGroupRecord, robots: Sequence[RobotRecord]) -> RobotGroupRecord:
+        """Take robots out of a group.
+
+        :raises NotInGroup: one of them is not in it; then nothing must be kept of the change
+        """
+        for each in robots:
+            if not queries.remove_from_robot_group(self.session, group.id, each.id):
+                raise NotInGroup(f"{each.full} is not in group {group.full}")
+        self.audit("robot.group.remove", group.full, robots=[each.full for each in robots])
+        return group._replace(robots=queries.robots_of_groups(self.session, [group.id])[group.id])
+
+    def remove_robot_group(self, group: RobotGroupRecord) -> None:
+        """Its robots stay."""
+        queries.remove_robot_group(self.session, group.id)
+        self.audit("robot.group.remove", group.full, robots=[])
 
     # --- rights -------------------------------------------------------------------------------------------
 
@@ -201,6 +269,28 @@ class Change:
         )
         self.audit("token.create", user.full, id=number, ttl_s=seconds, scope=scope, label=label)
         return number, secret
+
+    def add_program(self, user: UserRecord, scope: str | None, label: str) -> tuple[ProgramRecord, str]:
+        """A program that acts as a user, and its secret.
+
+        :param scope: checked already; ``None`` for all that the user may
+        :raises Invalid: the user is disabled or has too many, or the label can't be kept
+        """
+        if user.disabled:
+            raise Invalid("the user is disabled; enable it first")
+        key, secret = f"swp_{secrets.token_hex(12)}", passwords.new_token()
+        queries.add_program(
+            self.session,
+            user.id,
+            key,
+            passwords.verifier(key, secret),
+            scope=scope,
+            label=label,
+            now=self._wall(),
+        )
+        added = queries.list_programs(self.session, user.id)[-1]
+        self.audit("program.add", user.full, id=added.id, key=key, scope=scope, label=label)
+        return added, secret
 
     def revoke_token(self, number: int) -> bool:
         """Make a token worthless; false if there is none of that number."""

@@ -19,7 +19,19 @@ NAME_SENT = 255
 PATTERN_SENT = 255
 """Characters in which a pattern may be sent."""
 
-MOST = {"users": 5000, "groups": 1000, "robots": 1000, "memberships": 20_000, "rights": 20_000}
+SCOPE_SENT = 4096
+"""Characters in which the scope of a program may be sent."""
+
+MOST = {
+    "users": 5000,
+    "groups": 1000,
+    "robots": 1000,
+    "memberships": 20_000,
+    "rights": 20_000,
+    "programs": 5000,
+    "robot_groups": 1000,
+    "robot_memberships": 20_000,
+}
 """What a realm may come to have over HTTP; the command line has no such limit."""
 
 MOST_PATTERNS = 2000

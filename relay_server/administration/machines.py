@@ -1,4 +1,4 @@
-"""The robots of a realm, their keys, and the rights on them: as an administrator sees and changes them."""
+"""The robots of a realm, their keys, groups, and the rights on them: as an administrator sees and changes them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from relay_db import queries
 from relay_db.queries import GroupRecord, RightPlace, RightRecord, RobotRecord, Taken
 from relay_protocol.errors import NotFound
 from relay_protocol.limits import ENROLMENT_SECONDS
-from relay_server.administration.change import GROUP_MARK, numbers
-from relay_server.administration.own import OwnChange, no_types, robot_in, user_in
+from relay_server.administration.change import GROUP_MARK, NotInGroup, numbers
+from relay_server.administration.own import OwnChange, new_name, no_types, robot_group_in, robot_in, user_in
 from relay_server.resources import Listing
 
 # --- robots -----------------------------------------------------------------------------------------------
@@ -22,13 +22,13 @@ def robots(s: Session, realm: str, listing: Listing) -> dict[str, Any]:
     """A page of them, enrolled or not."""
     found, behind = listing.page({each.name: each for each in queries.list_robots(s, realm)}, no_types)
     keys = queries.count_live_keys(s, [each.id for _, each in found])
-    return {"robots": [_robot(each, keys.get(each.id, 0)) for _, each in found], "next": behind}
+    return {"robots": [_robot(each, keys.get(each.id, 0), realm) for _, each in found], "next": behind}
 
 
 def robot(s: Session, realm: str, name: str) -> dict[str, Any]:
     """:raises NotFound: no such robot"""
     found = robot_in(s, realm, name)
-    return _robot(found, queries.count_live_keys(s, [found.id]).get(found.id, 0))
+    return _robot(found, queries.count_live_keys(s, [found.id]).get(found.id, 0), realm)
 
 
 def number(s: Session, realm: str, name: str) -> int:
@@ -45,24 +45,41 @@ def add_robot(change: OwnChange, name: str, description: str) -> dict[str, Any]:
         raise Taken(f"there is a robot '{name}' already")
     change.see_room("robots")
     added, code = change.add_robot(name, change.realm, description)
-    return {**_robot(added, 0), **_enrolment(code)}
+    return {**_robot(added, 0, change.realm), **_enrolment(code)}
+
+
+def change_robot(change: OwnChange, name: str, description: str | None) -> dict[str, Any]:
+    """What is ``None`` stays as it is.
+
+    :raises NotFound: no such robot
+    :raises Invalid: the description can't be
+    :raises Refused: it is a robot of another realm
+    """
+    found = change.home_robot(name)
+    if description is not None and description != found.description:
+        found = change.describe_robot(found, description)
+    return _robot(found, queries.count_live_keys(change.session, [found.id]).get(found.id, 0), change.realm)
 
 
 def new_code(change: OwnChange, name: str) -> dict[str, Any]:
-    """:raises NotFound: no such robot"""
-    found = change.robot(name)
+    """:raises NotFound: no such robot
+    :raises Refused: it is a robot of another realm
+    """
+    found = change.home_robot(name)
     return {"robot": found.name, **_enrolment(change.new_code(found))}
 
 
 def remove_robot(change: OwnChange, name: str, recordings: int) -> None:
     """:param recordings: how many are kept of it
     :raises NotFound: no such robot
+    :raises Refused: it is a robot of another realm
     """
-    change.remove_robot(change.robot(name), recordings)
+    change.remove_robot(change.home_robot(name), recordings)
 
 
-def _robot(record: RobotRecord, keys: int) -> dict[str, Any]:
-    return {"robot": record.name, "description": record.description, "keys": keys}
+def _robot(record: RobotRecord, keys: int, realm: str) -> dict[str, Any]:
+    told = {"robot": record.name, "description": record.description}
+    return {**told, "keys": keys, "guest": record.realm != realm}
 
 
 def _enrolment(code: str) -> dict[str, Any]:
@@ -83,8 +100,66 @@ def keys(s: Session, realm: str, name: str, listing: Listing) -> dict[str, Any]:
 
 
 def revoke_key(change: OwnChange, name: str, fingerprint: str) -> None:
-    """:raises NotFound: no such robot, or it has no such live key"""
-    change.revoke_key(change.robot(name), fingerprint)
+    """:raises NotFound: no such robot, or it has no such live key
+    :raises Refused: it is a robot of another realm
+    """
+    change.revoke_key(change.home_robot(name), fingerprint)
+
+
+# --- groups -----------------------------------------------------------------------------------------------
+
+
+def groups(s: Session, realm: str, listing: Listing) -> dict[str, Any]:
+    """A page of groups of robots, with what is in them."""
+    found, behind = listing.page(queries.robot_group_names(s, realm), no_types)
+    members = queries.robots_of_groups(s, [number for _, number in found])
+    return {"robot_groups": [_group(name, members[number]) for name, number in found], "next": behind}
+
+
+def group(s: Session, realm: str, name: str) -> dict[str, Any]:
+    """:raises NotFound: no such group of robots"""
+    found = robot_group_in(s, realm, name)
+    return _group(found.name, found.robots)
+
+
+def add_group(change: OwnChange, name: str) -> dict[str, Any]:
+    """:raises Invalid: the name can't be
+    :raises Taken: there is one of this name
+    :raises NoRoom: there are too many
+    """
+    name = new_name(name, "group")
+    if queries.find_robot_group(change.session, name, change.realm) is not None:
+        raise Taken(f"there is a group of robots '{name}' already")
+    change.see_room("robot_groups")
+    return _group(change.fill_robot_group(name, change.realm).name, ())
+
+
+def remove_group(change: OwnChange, name: str) -> None:
+    """:raises NotFound: no such group of robots"""
+    change.remove_robot_group(change.robot_group(name))
+
+
+def join(change: OwnChange, name: str, robot: str) -> None:
+    """:raises NotFound: no such group of robots, or no such robot
+    :raises NoRoom: too many are in groups
+    """
+    found, member = change.robot_group(name), change.robot(robot)
+    if member.name not in found.robots:
+        change.see_room("robot_memberships")
+        change.fill_robot_group(found.name, change.realm, [member])
+
+
+def leave(change: OwnChange, name: str, robot: str) -> None:
+    """:raises NotFound: no such group of robots, no such robot, or it is not in it"""
+    found, member = change.robot_group(name), change.robot(robot)
+    try:
+        change.empty_robot_group(found, [member])
+    except NotInGroup:
+        raise NotFound("the robot is not in this group") from None
+
+
+def _group(name: str, robots: Sequence[str]) -> dict[str, Any]:
+    return {"group": name, "robots": list(robots)}
 
 
 # --- rights -----------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.names import normal_name
-from relay_db.queries import GroupRecord, NoRoom, RobotRecord, UserRecord
+from relay_db.queries import GroupRecord, NoRoom, RobotGroupRecord, RobotRecord, UserRecord
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_server.access import BadCredentials, Principal
 from relay_server.administration.change import GROUP_MARK, Change, Holder
@@ -43,6 +43,11 @@ def group_in(s: Session, realm: str, name: str) -> GroupRecord:
 def robot_in(s: Session, realm: str, name: str) -> RobotRecord:
     """:raises NotFound: no such robot in the realm"""
     return _found(queries.find_robot(s, name, realm), "robot")
+
+
+def robot_group_in(s: Session, realm: str, name: str) -> RobotGroupRecord:
+    """:raises NotFound: no such group of robots in the realm"""
+    return _found(queries.find_robot_group(s, name, realm), "group of robots")
 
 
 def _found(record: _Record | None, what: str) -> _Record:
@@ -98,6 +103,24 @@ class OwnChange(Change):
         """:raises NotFound: no such robot"""
         return robot_in(self.session, self.realm, name)
 
+    def home_robot(self, name: str) -> RobotRecord:
+        """For what is a matter of the robot's own realm, whatever realms it is shared with.
+
+        :raises NotFound: no such robot
+        :raises Refused: it is shared with the realm and of another
+        """
+        found = self.robot(name)
+        if found.realm != self.realm:
+            raise Refused(
+                "this robot is shared with your realm: its description, its keys, and whether it stays on the relay "
+                "are a matter of its own realm"
+            )
+        return found
+
+    def robot_group(self, name: str) -> RobotGroupRecord:
+        """:raises NotFound: no such group of robots"""
+        return robot_group_in(self.session, self.realm, name)
+
     def holder(self, name: str) -> Holder:
         """:param name: of a user, or with :data:`GROUP_MARK` before it of a group
         :raises NotFound: no such user or group
@@ -130,10 +153,10 @@ class OwnChange(Change):
         :raises NoRoom: there would be too many
         """
         for where, most in (
-            ({"realm": self.realm}, MOST_PATTERNS),
+            ({}, MOST_PATTERNS),
             ({"robot_id": robot.id}, MOST_PATTERNS_OF_A_ROBOT),
         ):
-            if more > 0 and queries.count_patterns(self.session, **where) + more > most:
+            if more > 0 and queries.count_patterns(self.session, realm=self.realm, **where) + more > most:
                 raise NoRoom(
                     f"the rights in a realm have {MOST_PATTERNS} patterns at most, those on one robot "
                     f"{MOST_PATTERNS_OF_A_ROBOT}; use wildcards, or remove some first"
@@ -144,4 +167,5 @@ class OwnChange(Change):
         :raises NoRoom: there are as many as there may be
         """
         if getattr(queries.realm_size(self.session, self.realm), what) >= MOST[what]:
-            raise NoRoom(f"a realm has {MOST[what]} {what} at most; remove some first")
+            words = what.replace("_", " ")
+            raise NoRoom(f"a realm has {MOST[what]} {words} at most; remove some first")

@@ -1,4 +1,4 @@
-"""The users of a realm, its groups, and the tokens of its users: as an administrator sees and changes them."""
+"""The users of a realm, its groups, its users' tokens and programs: as an administrator sees and changes them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from relay_db import queries
-from relay_db.queries import GroupRecord, Taken, UserRecord
-from relay_protocol.errors import NotFound
+from relay_db.queries import GroupRecord, NoRoom, ProgramRecord, Taken, UserRecord
+from relay_db.queries.oauth import PROGRAMS_OF_ONE
+from relay_protocol.errors import NotFound, Refused
+from relay_protocol.scopes import Scope
 from relay_server.administration.own import OwnChange, group_in, new_name, no_types, user_in
 from relay_server.resources import Listing
 
@@ -22,6 +24,8 @@ def about(s: Session, realm: str) -> dict[str, Any]:
         "users": size.users,
         "groups": size.groups,
         "robots": size.robots,
+        "programs": size.programs,
+        "robot_groups": size.robot_groups,
         "events_days": None if found is None else found.events_days,
     }
 
@@ -71,14 +75,18 @@ def change_user(
         change.see_another(found, "disable")
     if admin is False:
         change.see_another(found, "take administration from")
+    if password_hash is not None and found.home is not None:
+        raise Refused(
+            "this is a guest of your realm, whose password is that of an account elsewhere: it is changed there"
+        )
     if password_hash is not None:
         # The session in which somebody changes his own password goes on.
         found = change.set_password(found, password_hash, keep_token=change.principal.token_id)
     if disabled is not None and disabled != found.disabled:
         found = change.set_disabled(found, disabled)
     if admin is not None and admin != found.admin:
-        found = change.set_admin(found, admin)
-    return _told(change.session, found)
+        change.set_admin(found, admin)
+    return _told(change.session, change.user(name))
 
 
 def remove_user(change: OwnChange, name: str) -> None:
@@ -102,6 +110,7 @@ def _user(record: UserRecord, groups: Sequence[str]) -> dict[str, Any]:
         "admin": record.admin,
         "disabled": record.disabled,
         "password": record.password_hash is not None,
+        "guest": record.home is not None,
         "groups": list(groups),
     }
 
@@ -197,3 +206,46 @@ def revoke_token(change: OwnChange, id: str) -> None:
     number = queries.find_token(change.session, id, change.realm)
     if number is None or not change.revoke_token(number):
         raise NotFound("nobody in your realm has such a token")
+
+
+# --- programs ---------------------------------------------------------------------------------------------
+
+
+def programs(s: Session, realm: str, name: str, listing: Listing) -> dict[str, Any]:
+    """A page of a user's programs, without their secrets.
+
+    :raises NotFound: no such user
+    """
+    known = queries.list_programs(s, user_in(s, realm, name).id)
+    found, behind = listing.page({each.key: each for each in known}, no_types)
+    return {"programs": [_program(each) for _, each in found], "next": behind}
+
+
+def add_program(change: OwnChange, name: str, label: str, scope: str | None) -> dict[str, Any]:
+    """:raises NotFound: no such user
+    :raises Invalid: the user is disabled, or label or scope can't be
+    :raises NoRoom: there are too many
+    :raises Refused: the token in use is for less than all, or the user is a guest from another realm
+    """
+    change.needs_whole()
+    found, checked = change.user(name), None if scope is None else str(Scope(scope))
+    if found.home is not None:
+        # By a program one gets tokens of all realms that its user has an account in.
+        raise Refused("this account is a guest's: programs that act as him are a matter of his own realm")
+    change.see_room("programs")
+    known = queries.list_programs(change.session, found.id)
+    if len(known) >= PROGRAMS_OF_ONE:
+        raise NoRoom(f"a user has {PROGRAMS_OF_ONE} programs at most; remove some first")
+    added, secret = change.add_program(found, checked, label)
+    return {**_program(added), "secret": secret}
+
+
+def revoke_program(change: OwnChange, key: str) -> None:
+    """:raises NotFound: no user of the realm has such a program"""
+    number = queries.program_in(change.session, key, change.realm)
+    if number is None or not change.revoke_program(number):
+        raise NotFound("nobody in your realm has such a program")
+
+
+def _program(record: ProgramRecord) -> dict[str, Any]:
+    return {"key": record.key, "label": record.label, "created": record.created, "scope": record.scope}

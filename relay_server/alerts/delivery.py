@@ -90,6 +90,7 @@ class Office:
     :param random: 0 to 1
     :param name: makes a fresh name for a message
     :param lasts: whether the alert of this id is not over
+    :param realms: those that the robot of an alert is of
     """
 
     clock: Clock
@@ -99,6 +100,7 @@ class Office:
     send: Send
     known: Known
     lasts: Callable[[str], bool]
+    realms: Callable[[AlertRecord], Collection[str]]
     room: Room = at_once
 
 
@@ -142,7 +144,7 @@ class Delivery:
 
     def offer(self, change: Change) -> None:
         """There is news; if the rule wants it and its user may know of it, it goes with the next message."""
-        if not rules.wants(self.rule, change.alert, change.event):
+        if not rules.wants(self.rule, change.alert, change.event, self._office.realms(change.alert)):
             return
         # What gives way here is not counted: nobody knows whether its number may be told.
         self._inbox.put(Notice(change.alert, change.event.value), self._office.clock.seconds())

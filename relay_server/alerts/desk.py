@@ -170,12 +170,13 @@ class AlertDesk:
         if not _operates(mine):
             raise Refused(f"to acknowledge alerts of {found.robot} takes the level operator")
         fresh = found.over is None and found.ack_at is None
-        found = self._alerts.acknowledge(alert_id, principal.name, self._wall()) or found
+        name = self._alerts.name_of(principal, found)
+        found = self._alerts.acknowledge(alert_id, name, self._wall()) or found
         if fresh:
             await self._alerts.flush()
             self._journal.event(
                 "alert.acknowledged",
-                f"user:{principal.name}",
+                f"user:{name}",
                 cause=f"user:{principal.full}",
                 robot_id=found.robot_id,
                 user_id=principal.user_id,

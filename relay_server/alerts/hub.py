@@ -75,7 +75,7 @@ class Alerts:
         self.tellers = Tellers(
             Office(
                 clock, wall, secrets.SystemRandom().random, lambda: secrets.token_hex(8), send, self._known,
-                self._lasts, room,
+                self._lasts, self._realms, room,
             )
         )  # fmt: skip
         self._clock = clock
@@ -191,6 +191,11 @@ class Alerts:
     def lasting(self, robot: Presence, kind: str) -> list[str]:
         """What those of a kind that last are about."""
         return [each.about for each in self.book.open_of(robot.robot_id) if each.kind == kind]
+
+    def name_of(self, principal: Principal, alert: AlertRecord) -> str:
+        """What somebody is called at the robot of an alert."""
+        robot = self._registry.presence(alert.robot_id, alert.robot, alert.realm)
+        return robot.name_of(principal.name, principal.realm)
 
     def acknowledge(self, alert_id: str, by: str, at: float) -> AlertRecord | None:
         """Somebody looks after an alert; the alert, if there is one."""
@@ -363,6 +368,9 @@ class Alerts:
             for each in alerts
             if each.robot_id in rights and rules.visible(rights[each.robot_id], each.kind, each.about)
         }
+
+    def _realms(self, alert: AlertRecord) -> frozenset[str]:
+        return self._registry.presence(alert.robot_id, alert.robot, alert.realm).realms
 
     def _lasts(self, alert_id: str) -> bool:
         found = self.book.find(alert_id)

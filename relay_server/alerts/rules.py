@@ -107,11 +107,14 @@ def as_quiet(kept: dict[str, str] | None) -> Quiet | None:
     return None if kept is None else msgspec.convert(kept, Quiet)
 
 
-def wants(rule: AlertRuleRecord, alert: AlertRecord, event: Event) -> bool:
-    """Whether the rule tells of this, now or later."""
+def wants(rule: AlertRuleRecord, alert: AlertRecord, event: Event, realms: Collection[str]) -> bool:
+    """Whether the rule tells of this, now or later.
+
+    :param realms: those that the robot is of
+    """
     return (
         # Before all else: names are those of a realm.
-        alert.realm == rule.realm
+        rule.realm in realms
         and fnmatchcase(alert.robot, rule.robots)
         and (not rule.kinds or alert.kind in rule.kinds)
         and kinds.severity(alert.level) >= kinds.severity(rule.level)

@@ -70,7 +70,10 @@ class Tellers:
         mine = self._portal.get(user)
         if mine is None:
             return kinds.severity(alert.level) >= kinds.severity("warning")
-        return any(rules.wants(each, alert, event) and rules.passes(each, alert, now) for each in mine)
+        realms = self._office.realms(alert)
+        return any(
+            rules.wants(each, alert, event, realms) and rules.passes(each, alert, now) for each in mine
+        )
 
     def hush(self) -> None:
         """Send nothing any more; what is offered is remembered."""

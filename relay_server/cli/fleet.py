@@ -264,13 +264,8 @@ def group() -> None:
 def add(app: App, name: str, robots: tuple[str, ...], as_json: bool) -> None:
     """Put ROBOTS into group NAME of their realm, which is made when there is none."""
     with app.change() as change:
-        s = change.session
-        found = queries.find_robot_group(s, *parted(name)) or queries.add_robot_group(s, *new_name(s, name))
         meant = [change.robot(each) for each in robots]
-        for each in meant:
-            queries.add_to_robot_group(s, found.id, each.id)
-        change.audit("robot.group.add", found.full, robots=[each.full for each in meant])
-        found = _group(s, name)
+        found = change.fill_robot_group(*new_name(change.session, name), meant)
     tell(as_json, _told(found), _words(found))
 
 
@@ -292,13 +287,9 @@ def remove(app: App, name: str, robots: tuple[str, ...], yes: bool, as_json: boo
     with app.change() as change:
         found = _group(change.session, name)
         meant = [change.robot(each) for each in robots]
-        for each in meant:
-            if not queries.remove_from_robot_group(change.session, found.id, each.id):
-                raise Invalid(f"{each.full} is not in group {found.full}")
-        if not robots:
-            queries.remove_robot_group(change.session, found.id)
-        change.audit("robot.group.remove", found.full, robots=[each.full for each in meant])
-        left = _group(change.session, name) if robots else None
+        left = change.empty_robot_group(found, meant) if robots else None
+        if left is None:
+            change.remove_robot_group(found)
     if left is None:
         tell(as_json, {"group": found.full, "removed": True}, f"Removed group of robots {found.full}.")
     else:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import secrets
-import time
 from typing import Any
 
 import click
 
 from relay_db import queries
-from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name
 from relay_protocol.scopes import Scope
-from relay_server import passwords
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of
 from relay_server.cli.changing import LocalChange
 from relay_server.cli.output import show, tell
@@ -41,18 +37,17 @@ def program() -> None:
 def add(app: App, user: str, scope: str | None, label: str, as_json: bool) -> None:
     """Add a program that acts as USER. Its secret is shown once and not stored."""
     checked = None if scope is None else str(Scope(scope))
-    key, secret, now = f"swp_{secrets.token_hex(12)}", passwords.new_token(), time.time()
     with app.change() as change:
         found = change.user(user)
-        if found.disabled:
-            raise Invalid(f"user '{found.full}' is disabled; enable it first")
-        known = passwords.verifier(key, secret)
-        number = queries.add_program(
-            change.session, found.id, key, known, scope=checked, label=label, now=now
-        )
-        change.audit("program.add", found.full, id=number, key=key, scope=checked, label=label)
-    answer = {"key": key, "secret": secret, "id": number, "user": found.full, "scope": checked}
-    tell(as_json, answer, f"key     {key}\nsecret  {secret}")
+        added, secret = change.add_program(found, checked, label)
+    answer = {
+        "key": added.key,
+        "secret": secret,
+        "id": added.id,
+        "user": found.full,
+        "scope": checked,
+    }
+    tell(as_json, answer, f"key     {added.key}\nsecret  {secret}")
     if not as_json:
         click.echo("The secret is not shown again.", err=True)
 

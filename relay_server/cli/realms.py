@@ -42,6 +42,8 @@ def list_(app: App, as_json: bool) -> None:
         realms = queries.list_realms(session)
         users = Counter(each.realm for each in queries.list_users(session))
         robots = Counter(each.realm for each in queries.list_robots(session))
+        for shared in queries.robot_shares(session).values():
+            robots.update(shared)
     rows = (
         {
             "realm": each.name,

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
 
+from relay_db.names import known_as
 from relay_db.queries import GroupRecord, RobotRecord, UserRecord
-from relay_protocol.errors import NotFound, Unavailable
+from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_server.cli.app import App, group_of, robot_of, sure, user_of
 from relay_server.cli.changing import LocalChange
 from relay_server.cli.output import tell
@@ -40,6 +41,11 @@ def remove_named(app: App, what: str, name: str, yes: bool, as_json: bool) -> No
     kind = _KINDS[what]
     with app.reading() as session:
         found = kind.find(session, name)
+    if isinstance(found, RobotRecord) and known_as(name) != found.full:
+        raise Invalid(
+            f"'{name}' is {found.full}, which is shared: 'switchboard robot unshare' takes it out of the realm, "
+            f"'switchboard robot remove {found.full}' removes it"
+        )
     recordings = _recordings(app, found.id) if what == "robot" else None
     also = f", and {recordings.words}" if recordings else ""
     sure(f"Remove {what} {found.full} with {kind.along}{also}?", yes)

@@ -45,7 +45,7 @@ def grant(
     deny: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Give USER or GROUP a right on ROBOT, which is of their realm; it replaces the one they have there.
+    """Give USER or GROUP a right on ROBOT, which is of their realm too; it replaces the one they have there.
 
     A viewer may subscribe, an operator also publish and call, an owner do everything. Patterns are
     operation:resource with subscribe, view, record, publish, call, provide, manage or *, and wildcards in the
@@ -102,12 +102,12 @@ def _holder(change: LocalChange, text: str) -> Holder:
     return change.user(text)
 
 
-def _full(record: queries.RightRecord, realm: str) -> queries.RightRecord:
-    """With names for the whole relay: who holds a right is of the robot's realm."""
+def _full(record: queries.RightRecord, robots_realm: str) -> queries.RightRecord:
+    """With names for the whole relay."""
     return record._replace(
-        robot=full_name(record.robot, realm),
-        user=record.user and full_name(record.user, realm),
-        group=record.group and full_name(record.group, realm),
+        robot=full_name(record.robot, robots_realm),
+        user=record.user and full_name(record.user, record.realm),
+        group=record.group and full_name(record.group, record.realm),
     )
 
 

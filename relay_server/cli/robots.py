@@ -13,7 +13,7 @@ from relay_protocol.errors import Unavailable
 from relay_protocol.limits import ENROLMENT_SECONDS
 from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, yes_option
 from relay_server.cli.fleet import ORDERS
-from relay_server.cli.naming import listed, new_name, realm_option
+from relay_server.cli.naming import known_realm, listed, new_name, realm_option
 from relay_server.cli.output import show, tell
 from relay_server.cli.relaysocket import ask_status
 from relay_server.cli.removing import remove_named
@@ -69,13 +69,72 @@ def list_(app: App, realm: str | None, as_json: bool) -> None:
     """List all robots, or those of one realm; 'switchboard status' tells which are online."""
     with app.reading() as session:
         robots = listed(session, queries.list_robots, realm)
+        shares = {number: " ".join(sorted(of)) for number, of in queries.robot_shares(session).items()}
         live = {each.id: _live_keys(queries.list_keys(session, each.id)) for each in robots}
-    rows = ({"robot": each.full, "description": each.description, "keys": live[each.id]} for each in robots)
-    cells = (
-        (each.full, str(live[each.id]) if live[each.id] else "not enrolled", each.description)
+    rows = (
+        {
+            "robot": each.full,
+            "description": each.description,
+            "keys": live[each.id],
+            "shared": shares.get(each.id, "").split(),
+        }
         for each in robots
     )
-    show(as_json, rows, ("robot", "live keys", "description"), cells)
+    cells = (
+        (
+            each.full,
+            str(live[each.id]) if live[each.id] else "not enrolled",
+            shares.get(each.id, ""),
+            each.description,
+        )
+        for each in robots
+    )
+    show(as_json, rows, ("robot", "live keys", "also of", "description"), cells)
+
+
+@robot.command(epilog=examples('switchboard robot describe rover "Lab 3, by the window"'))
+@click.argument("name")
+@click.argument("description")
+@json_option
+@pass_app
+def describe(app: App, name: str, description: str, as_json: bool) -> None:
+    """Say in one line what robot NAME is, for people."""
+    with app.change() as change:
+        found = change.describe_robot(change.robot(name), description)
+    told = {"robot": found.full, "description": found.description}
+    tell(as_json, told, f"{found.full}: {found.description or 'no description'}")
+
+
+@robot.command(epilog=examples("switchboard robot share mobile@lab1 lab2"))
+@click.argument("name")
+@click.argument("realm")
+@json_option
+@pass_app
+def share(app: App, name: str, realm: str, as_json: bool) -> None:
+    """Make robot NAME one of REALM too, under the same name.
+
+    Rights on it can then be given there, and its administrators own it. Who is at the robot, and what they do with
+    it, is told to all who have a right on it, whatever their realm.
+    """
+    with app.change() as change:
+        found, realm = change.robot(name), known_realm(change.session, realm)
+        change.share_robot(found, realm)
+    told = {"robot": found.full, "realm": realm, "shared": True}
+    tell(as_json, told, f"Robot {found.full} is of the realm {realm} too.")
+
+
+@robot.command(epilog=examples("switchboard robot unshare mobile@lab1 lab2"))
+@click.argument("name")
+@click.argument("realm")
+@json_option
+@pass_app
+def unshare(app: App, name: str, realm: str, as_json: bool) -> None:
+    """Take robot NAME out of REALM; the rights on it that are held there go, and what is open by them is cut."""
+    with app.change() as change:
+        found, realm = change.robot(name), known_realm(change.session, realm)
+        change.unshare_robot(found, realm)
+    told = {"robot": found.full, "realm": realm, "shared": False}
+    tell(as_json, told, f"Robot {found.full} is not of the realm {realm} any more.")
 
 
 @robot.command(epilog=examples("switchboard robot remove rover --yes"))

@@ -11,7 +11,7 @@ from relay_db.names import normal_name
 from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name, parted
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of, yes_option
-from relay_server.cli.naming import listed, new_name, realm_option
+from relay_server.cli.naming import known_realm, listed, new_name, realm_option
 from relay_server.cli.output import show, tell
 from relay_server.cli.removing import remove_named
 from relay_server.cli.secrets_in import new_password_hash, stdin_option
@@ -60,7 +60,7 @@ def list_(app: App, realm: str | None, as_json: bool) -> None:
     """List all users, or those of one realm."""
     with app.reading() as session:
         users = listed(session, queries.list_users, realm)
-    cells = ((each.full, _role(each), "yes" if each.password_hash else "no") for each in users)
+    cells = ((each.full, _role(each), _password(each)) for each in users)
     show(as_json, map(_json, users), ("user", "role", "password"), cells)
 
 
@@ -72,11 +72,30 @@ def list_(app: App, realm: str | None, as_json: bool) -> None:
 def passwd(app: App, name: str, password_stdin: bool, as_json: bool) -> None:
     """Set the password of user NAME; its browser sessions end, its access tokens stay."""
     with app.reading() as session:
-        user_of(session, name)
+        found = user_of(session, name)
+        if found.home is not None:
+            raise Invalid(f"the password of {found.full} is that of {found.home}; change it there")
     hashed = new_password_hash(password_stdin)
     with app.change() as change:
         found = change.set_password(change.user(name), hashed)
     tell(as_json, _json(found), f"Changed the password of {found.full}.")
+
+
+@user.command(
+    epilog=examples("switchboard user join toad@lab1 lab2", "switchboard user remove toad@lab2 --yes")
+)
+@click.argument("name")
+@click.argument("realm")
+@json_option
+@pass_app
+def join(app: App, name: str, realm: str, as_json: bool) -> None:
+    """Give user NAME an account in REALM too, under the same name and with the same password.
+
+    It has no rights there until it is given some. To take it back, remove that account: NAME@REALM.
+    """
+    with app.change() as change:
+        added = change.add_guest(change.user(name), known_realm(change.session, realm))
+    tell(as_json, _json(added), f"{added.home} is of the realm {parted(added.full)[1]} too, as {added.full}.")
 
 
 @user.command(epilog=examples("switchboard user disable ann"))
@@ -120,7 +139,14 @@ def _json(record: queries.UserRecord) -> dict[str, Any]:
         "admin": record.admin,
         "disabled": record.disabled,
         "password": record.password_hash is not None,
+        "guest_of": record.home,
     }
+
+
+def _password(record: queries.UserRecord) -> str:
+    if record.home is not None:
+        return f"that of {record.home}"
+    return "yes" if record.password_hash else "no"
 
 
 def _role(record: queries.UserRecord) -> str:

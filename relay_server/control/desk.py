@@ -84,7 +84,8 @@ class Desk(Steering):
             raise Refused(f"control of robot {name} is just being given back; try again in a moment")
         if self.rules.explicit:
             raise Refused(
-                f"nobody controls robot {name}: take control first, with /relay/take_control or the portal"
+                f"nobody controls robot {name}: take control first, with /relay/take_control, PUT …/control or the "
+                "portal"
             )
         self._count_take(client)
         lost = "the same user commands from another connection"

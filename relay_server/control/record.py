@@ -150,7 +150,7 @@ class DatabaseRecord:
             kind,
             actor.source,
             # Not that of the user's other events: who comes and goes must not hide who stops a robot.
-            cause=f"control:{robot.realm}/{actor.source}",
+            cause=f"control:{_full(actor, robot)}",
             robot_id=robot.robot_id,
             user_id=actor.user,
             robot=robot.name,
@@ -176,8 +176,9 @@ class DatabaseRecord:
 
 
 def _full(actor: Actor, robot: Presence) -> str:
-    """Who it is for the whole relay: users are those of the robot's realm."""
-    return actor.source if actor.user is None else full_name(actor.source, robot.realm)
+    """Who it is for the whole relay: without a realm users are those of the robot's own."""
+    name, at, realm = actor.source.partition("@")
+    return actor.source if actor.user is None else full_name(name, realm if at else robot.realm)
 
 
 def _order(s: Session, order: StopRecord, entry: dict[str, Any] | None) -> None:

@@ -41,6 +41,9 @@ AGAIN_AT_ONCE = 3
 AGAIN_USERS = 256
 """Users remembered for that; the longest quiet are forgotten first."""
 
+SAME_SECONDS = 2.0
+"""Who stops a robot once more for the same reason within so long has pressed once: a page sends that two ways."""
+
 AT_ONCE = 64
 """Orders to stop one robot that are under way at a time; whoever comes then is stopping it already."""
 
@@ -59,7 +62,7 @@ class Again(NamedTuple):
 class Stopped(NamedTuple):
     """That a robot is stopped.
 
-    :param since: Unix time, seconds
+    :param since: Unix time, seconds; of what comes by two ways the later
     :param told: whether the robot has confirmed it
     :param again: the latest of those who have stopped it since: whoever lets it move goes over his head too
     """
@@ -69,6 +72,17 @@ class Stopped(NamedTuple):
     since: float
     told: bool
     again: Again | None = None
+
+
+class _Press(NamedTuple):
+    """What stopped a robot that could move.
+
+    :param at: the clock's seconds
+    """
+
+    who: int | str
+    why: str
+    at: float
 
 
 class StoppedSince(Refused):
@@ -109,6 +123,9 @@ class Stopping:
         self._repeats = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, clock.seconds)
         self._again: Again | None = None
         """Who stopped it last while it was stopped."""
+        self._press: _Press | None = None
+        self._same: float | None = None
+        """When what is one press with that came last; Unix time, seconds."""
         self._pending: StopRecord | None = None
         self._known: deque[float] = deque(maxlen=KNOWN)
         """The moments that name the orders seen here, whatever has become of them. They are compared for being the
@@ -129,13 +146,14 @@ class Stopping:
         """By whom and why the robot is stopped, as it says itself, or is going to be; ``None`` when it may move."""
         told, pending, again = self._robot.safety.stopped, self._pending, self._again
         if told is not None:
-            return Stopped(told.by, told.why, told.since, True, again)
+            since = told.since if self._same is None else self._same
+            return Stopped(told.by, told.why, since, True, again)
         if pending is None:
             return None
         # What the robot was not told of gives way to the latest order, which is not told twice.
         if again is not None and again.since == pending.at:
             again = None
-        return Stopped(pending.by, pending.why, pending.at, False, again)
+        return Stopped(pending.by, pending.why, max(pending.at, self._same or 0.0), False, again)
 
     def stop(self, actor: Actor, why: str) -> Deferred[bool]:
         """Stop the robot, and keep it stopped. The order is on its way when this returns.
@@ -147,14 +165,30 @@ class Stopping:
         order = StopRecord(self._robot.robot_id, actor.name, why[:WHY], self._wall())
         self._known.append(order.at)
         first = self.stopped is None
-        self.anew()
-        self._again = None if first else Again(order.by, order.why, order.at)
+        self._latest = self._clock_ns()
+        self._count(order, actor, first)
         audit = first or self._repeats.take(actor.source)
         if self._pending is None or len(self._keeping) < KEEPING:
             # Else those stand that are being written.
             self._pending = order
         self._changed()
         return detached(self._stop(order, actor, audit))
+
+    def _count(self, order: StopRecord, actor: Actor, first: bool) -> None:
+        """See what whoever would let the robot move is told of an order.
+
+        :param first: whether the robot was not stopped before
+        """
+        who = actor.source if actor.user is None else actor.user
+        press, before = _Press(who, order.why, self._clock.seconds()), self._press
+        if first:
+            self._unpress()
+            self._press = press
+        elif before is not None and before[:2] == press[:2] and press.at - before.at <= SAME_SECONDS:
+            # It is told by another moment: that ends a press to resume.
+            self._same = order.at
+        else:
+            self._again = Again(order.by, order.why, order.at)
 
     async def _stop(self, order: StopRecord, actor: Actor, audit: bool) -> bool:
         # Before anything is written: nothing is as urgent.
@@ -258,7 +292,11 @@ class Stopping:
     def anew(self) -> None:
         """The robot is stopped now: nothing that was asked for before lets it move again."""
         self._latest = self._clock_ns()
-        self._again = None
+        self._unpress()
+
+    def _unpress(self) -> None:
+        """Forget who has stopped it."""
+        self._again = self._press = self._same = None
 
     def resume(self, actor: Actor, why: str, sent: int) -> Deferred[None]:
         """Let the robot move again. A stop it was not told of is taken back.
@@ -295,7 +333,7 @@ class Stopping:
             await self._record.told(robot, pending.at)
         if told:
             # What the robot has done is done, whatever the database says.
-            self._again = None
+            self._unpress()
             self._believe(None)
         if pending is not None:
             self._over(pending)

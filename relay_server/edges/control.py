@@ -14,18 +14,21 @@ from werkzeug.exceptions import HTTPException
 from werkzeug.exceptions import NotFound as NothingHere
 
 from relay_protocol import jsontext
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import Invalid, SwitchboardError
 from relay_protocol.limits import NAME, WORDS
 from relay_server.access import Principal
-from relay_server.console import Outcome
+from relay_server.console import Outcome, Taken
 from relay_server.control import Answer, NotDone, reason_of
 from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.asked import APPLIED, wait_preferred
 from relay_server.edges.dated import dated
 from relay_server.edges.problems import problem
+from relay_server.edges.vanished import notice
+from relay_server.inside import LINGER_SECONDS
 from relay_server.moments import HEADER, Moments
 from relay_server.openapi import PROBLEM, Operation, described, header
 from relay_server.openapi import Answer as Told
-from relay_server.openapi.answers import Control, ControlAnswer, StopAnswer, StopProblem
+from relay_server.openapi.answers import Control, ControlAnswer, ControlTaken, StopAnswer, StopProblem
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -91,6 +94,44 @@ def _change_of(what: str, words: str) -> Operation:
 
 _DATED = {HEADER: "when this was answered; who resumes the robot gives it back"}
 
+_TAKING = {
+    HEADER: "when this was answered; the first command gives it back",
+    APPLIED: "the wait that was preferred",
+}
+
+WHO = Operation(
+    method="GET",
+    path=f"{ROBOT}/control",
+    tag="control",
+    summary="Who moves a robot",
+    answers={200: Told("who does", Control, headers=_DATED)},
+)
+TAKE = Operation(
+    method="PUT",
+    path=f"{ROBOT}/control",
+    tag="control",
+    summary="Take control of a robot, or ask who has it for it",
+    more="By the connection that is kept for the token at this robot: commands that are sent to its topics with the "
+    f"same token are the holder's then. It ends {LINGER_SECONDS:g} s after the latest request that used it, and "
+    "control with it; who stays asks again before. 409 where somebody else asks already, or the request was not "
+    "granted.",
+    parameters=(header("Prefer", "`wait=` seconds for which an answer to the request is waited (RFC 7240)"),),
+    body=Why,
+    optional=True,
+    answers={
+        200: Told("the caller has control", ControlTaken, headers=_TAKING),
+        202: Told("who has control is asked for it", ControlTaken, headers=_TAKING),
+    },
+    errors=(409,),
+)
+LET_GO = Operation(
+    method="DELETE",
+    path=f"{ROBOT}/control",
+    tag="control",
+    summary="Give back the control that was taken here, or withdraw the request for it",
+    more="What other connections of the caller have is left alone. Never held back.",
+    answers={204: Told("that connection neither has control nor asks for it", headers=_DATED)},
+)
 STOP = Operation(
     method="POST",
     path=f"{ROBOT}/stop",
@@ -144,6 +185,12 @@ class Desk(Protocol):
     async def control(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
         """Who moves a robot."""
 
+    async def take(self, principal: Principal, robot: str, why: str, address: str, seconds: float) -> Taken:
+        """Take it, or ask for it."""
+
+    async def let_go(self, principal: Principal, robot: str, address: str) -> None:
+        """Give back what was taken so."""
+
     async def release(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
         """Give control back."""
 
@@ -184,22 +231,44 @@ class RobotControl:
         self._robot = robot
 
     @app.route("/", methods=["GET"])
-    @described(
-        Operation(
-            method="GET",
-            path=f"{ROBOT}/control",
-            tag="control",
-            summary="Who moves a robot",
-            more="Control is taken by a websocket's connection alone.",
-            answers={200: Told("who does", Control, headers=_DATED)},
-        )
-    )
+    @described(WHO)
     def control(self, request: Request) -> Any:
         self._only("control")
         return self._answer(request, self._control(request))
 
     async def _control(self, request: Request) -> Any:
         return await self._desk.control(*await self._asked(request))
+
+    @app.route("/", methods=["PUT"])
+    @described(TAKE)
+    def take(self, request: Request) -> Any:
+        self._only("control")
+        return self._answer(request, self._take(request))
+
+    async def _take(self, request: Request) -> Any:
+        # Nobody is to be given control who has gone while he waits for it.
+        notice(request.channel.transport)
+        principal, robot, address = await self._asked(request)
+        why = _body(request, Why).why
+        # Before it is asked for: what can't be read of a request keeps it from being done.
+        try:
+            seconds = wait_preferred(request)
+        except UnicodeDecodeError as error:
+            raise Invalid(f"'prefer' is not in UTF-8: {error.reason}") from None
+        taken = await self._desk.take(principal, robot, why, address, seconds)
+        if not taken.answer.success:
+            request.setResponseCode(202)
+        return {**taken.answer._asdict(), "kept": LINGER_SECONDS, "control": taken.control}
+
+    @app.route("/", methods=["DELETE"])
+    @described(LET_GO)
+    def let_go(self, request: Request) -> Any:
+        self._only("control")
+        return self._answer(request, self._let_go(request))
+
+    async def _let_go(self, request: Request) -> Any:
+        # Which stops the robot.
+        await self._desk.let_go(*await self._asked(request, stops=True))
 
     @app.route("/<any(release,grant,refuse):what>", methods=["POST"])
     @described(*(_change_of(what, words) for what, words in CHANGES.items()))

@@ -105,6 +105,7 @@ class OAuth:
             password=fields.get("password", ""),
             refresh_token=fields.get("refresh_token", ""),
             scope=fields.get("scope"),
+            realm=fields.get("realm"),
         )
         return (await self._desk.token(ask, program, _address(request))).told()
 

@@ -19,7 +19,17 @@ from relay_server.administration.desk import RealmDesk
 from relay_server.edges import realm_operations as operations
 from relay_server.edges.api import Api, body_of
 from relay_server.edges.asked import query_of
-from relay_server.edges.realm_operations import PAGED, Granted, NewGroup, NewRobot, NewUser, UserChange
+from relay_server.edges.realm_operations import PAGED
+from relay_server.edges.realm_shapes import (
+    Granted,
+    NewGroup,
+    NewProgram,
+    NewRobot,
+    NewRobotGroup,
+    NewUser,
+    RobotChange,
+    UserChange,
+)
 from relay_server.openapi import described
 from relay_server.resources import Listing, see_known
 
@@ -132,6 +142,30 @@ class RealmPages:
     def revoke_token(self, request: Request, id: str) -> Any:
         return self._done(request, people.revoke_token, id)
 
+    # --- programs -----------------------------------------------------------------------------------------
+
+    @app.route("/users/<name>/programs", methods=["GET"])
+    @described(operations.PROGRAMS)
+    def programs(self, request: Request, name: str) -> Any:
+        return self._page(request, people.programs, name)
+
+    @app.route("/users/<name>/programs", methods=["POST"])
+    @described(operations.NEW_PROGRAM)
+    def add_program(self, request: Request, name: str) -> Any:
+        return self._api.answer(request, self._add_program(request, name))
+
+    async def _add_program(self, request: Request, name: str) -> Any:
+        principal = await self._admitted(request, changes=True)
+        new = body_of(request, NewProgram)
+        wanted = name, new.label, None if new.scope is UNSET else new.scope
+        told = await self._desk.change(principal, _address(request), people.add_program, *wanted)
+        return _made(request, told, "programs", told["key"])
+
+    @app.route("/programs/<key>", methods=["DELETE"])
+    @described(operations.REVOKE_PROGRAM)
+    def revoke_program(self, request: Request, key: str) -> Any:
+        return self._done(request, people.revoke_program, key)
+
     # --- groups -------------------------------------------------------------------------------------------
 
     @app.route("/groups", methods=["GET"])
@@ -195,6 +229,17 @@ class RealmPages:
     def robot(self, request: Request, name: str) -> Any:
         return self._told(request, machines.robot, name)
 
+    @app.route("/robots/<name>", methods=["PATCH"])
+    @described(operations.CHANGE_ROBOT)
+    def change_robot(self, request: Request, name: str) -> Any:
+        return self._api.answer(request, self._change_robot(request, name))
+
+    async def _change_robot(self, request: Request, name: str) -> Any:
+        principal = await self._admitted(request, changes=True)
+        new = body_of(request, RobotChange)
+        description = None if new.description is UNSET else new.description
+        return await self._desk.change(principal, _address(request), machines.change_robot, name, description)
+
     @app.route("/robots/<name>", methods=["DELETE"])
     @described(operations.REMOVE_ROBOT)
     def remove_robot(self, request: Request, name: str) -> Any:
@@ -224,6 +269,44 @@ class RealmPages:
     @described(operations.REVOKE_KEY)
     def revoke_key(self, request: Request, name: str, fingerprint: str) -> Any:
         return self._done(request, machines.revoke_key, name, fingerprint)
+
+    # --- groups of robots ---------------------------------------------------------------------------------
+
+    @app.route("/robot-groups", methods=["GET"])
+    @described(operations.ROBOT_GROUPS)
+    def robot_groups(self, request: Request) -> Any:
+        return self._page(request, machines.groups)
+
+    @app.route("/robot-groups", methods=["POST"])
+    @described(operations.NEW_ROBOT_GROUP)
+    def add_robot_group(self, request: Request) -> Any:
+        return self._api.answer(request, self._add_robot_group(request))
+
+    async def _add_robot_group(self, request: Request) -> Any:
+        principal = await self._admitted(request, changes=True)
+        new = body_of(request, NewRobotGroup)
+        told = await self._desk.change(principal, _address(request), machines.add_group, new.name)
+        return _made(request, told, "robot-groups", told["group"])
+
+    @app.route("/robot-groups/<name>", methods=["GET"])
+    @described(operations.ROBOT_GROUP)
+    def robot_group(self, request: Request, name: str) -> Any:
+        return self._told(request, machines.group, name)
+
+    @app.route("/robot-groups/<name>", methods=["DELETE"])
+    @described(operations.REMOVE_ROBOT_GROUP)
+    def remove_robot_group(self, request: Request, name: str) -> Any:
+        return self._done(request, machines.remove_group, name)
+
+    @app.route("/robot-groups/<name>/members/<member>", methods=["PUT"])
+    @described(operations.JOIN_ROBOT)
+    def join_robot(self, request: Request, name: str, member: str) -> Any:
+        return self._done(request, machines.join, name, member)
+
+    @app.route("/robot-groups/<name>/members/<member>", methods=["DELETE"])
+    @described(operations.LEAVE_ROBOT)
+    def leave_robot(self, request: Request, name: str, member: str) -> Any:
+        return self._done(request, machines.leave, name, member)
 
     # --- rights -------------------------------------------------------------------------------------------
 

@@ -1,255 +1,40 @@
-"""What ``realm`` serves, with the shapes of what it takes and answers."""
+"""What ``realm`` serves."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypedDict
+from typing import Any
 
-import msgspec
-from msgspec import UNSET, Meta, UnsetType
-
-from relay_db.models import LABEL
-from relay_db.queries.rights import PATTERNS
-from relay_protocol.rights import Level
-from relay_server.administration.limits import NAME_SENT, PATTERN_SENT
 from relay_server.edges.goals import LISTING
+from relay_server.edges.realm_shapes import (
+    Granted,
+    NewGroup,
+    NewProgram,
+    NewRobot,
+    NewRobotGroup,
+    NewUser,
+    RealmAbout,
+    RealmCode,
+    RealmGroup,
+    RealmGroups,
+    RealmKeys,
+    RealmNewProgram,
+    RealmNewRobot,
+    RealmPrograms,
+    RealmRight,
+    RealmRights,
+    RealmRobot,
+    RealmRobotGroup,
+    RealmRobotGroups,
+    RealmRobots,
+    RealmTokens,
+    RealmUser,
+    RealmUsers,
+    RobotChange,
+    UserChange,
+)
 from relay_server.openapi import Answer, Operation, Parameter, query
-from relay_server.passwords import MAX_BYTES
 
 HERE = "/api/v1/realm"
-
-Name = Annotated[str, Meta(max_length=NAME_SENT)]
-Password = Annotated[str, Meta(max_length=MAX_BYTES)]
-Patterns = Annotated[list[Annotated[str, Meta(max_length=PATTERN_SENT)]], Meta(max_length=PATTERNS)]
-
-
-class NewUser(msgspec.Struct, forbid_unknown_fields=True):
-    """A user.
-
-    :param password: at least 8 characters; without one only access tokens let the user in
-    :param admin: an administrator of the realm
-    """
-
-    name: Name
-    password: Password | UnsetType = UNSET
-    admin: bool = False
-
-
-class UserChange(msgspec.Struct, forbid_unknown_fields=True):
-    """What is to be other than it is.
-
-    :param password: ends the user's browser sessions, but for the one that asks
-    :param disabled: shut out at once, with all rights and tokens kept for later
-    """
-
-    password: Password | UnsetType = UNSET
-    disabled: bool | UnsetType = UNSET
-    admin: bool | UnsetType = UNSET
-
-
-class NewGroup(msgspec.Struct, forbid_unknown_fields=True):
-    """A group of users."""
-
-    name: Name
-
-
-class NewRobot(msgspec.Struct, forbid_unknown_fields=True):
-    """A robot.
-
-    :param description: one line for people
-    """
-
-    name: Name
-    description: Annotated[str, Meta(max_length=LABEL)] = ""
-
-
-class Granted(msgspec.Struct, forbid_unknown_fields=True):
-    """What somebody may do.
-
-    :param allow: `operation:resource`, with wildcards: what is allowed beyond the level
-    :param deny: the same: what is denied in spite of the rest
-    """
-
-    level: Level
-    allow: Patterns = []
-    deny: Patterns = []
-
-
-class RealmAbout(TypedDict):
-    """A realm.
-
-    :param users: how many there are
-    :param groups: how many there are
-    :param robots: how many there are
-    :param events_days: how long its memory keeps events; null: as long as the relay's
-    """
-
-    realm: str
-    users: int
-    groups: int
-    robots: int
-    events_days: float | None
-
-
-class RealmUser(TypedDict):
-    """A user.
-
-    :param password: whether there is one
-    """
-
-    user: str
-    admin: bool
-    disabled: bool
-    password: bool
-    groups: list[str]
-
-
-class RealmUsers(TypedDict):
-    """A page of users.
-
-    :param next: the name behind which there is more, or empty
-    """
-
-    users: list[RealmUser]
-    next: str
-
-
-class RealmGroup(TypedDict):
-    """A group and the users in it."""
-
-    group: str
-    members: list[str]
-
-
-class RealmGroups(TypedDict):
-    """A page of groups.
-
-    :param next: the name behind which there is more, or empty
-    """
-
-    groups: list[RealmGroup]
-    next: str
-
-
-class RealmRobot(TypedDict):
-    """A robot.
-
-    :param keys: how many of its keys are live; 0: it is not enrolled
-    """
-
-    robot: str
-    description: str
-    keys: int
-
-
-class RealmRobots(TypedDict):
-    """A page of robots.
-
-    :param next: the name behind which there is more, or empty
-    """
-
-    robots: list[RealmRobot]
-    next: str
-
-
-class RealmNewRobot(TypedDict):
-    """A robot that was added.
-
-    :param enrolment_code: is told this once
-    :param expires_in: seconds for which the code is good
-    """
-
-    robot: str
-    description: str
-    keys: int
-    enrolment_code: str
-    expires_in: float
-
-
-class RealmCode(TypedDict):
-    """A code with which a robot enrols.
-
-    :param enrolment_code: is told this once
-    :param expires_in: seconds for which the code is good
-    """
-
-    robot: str
-    enrolment_code: str
-    expires_in: float
-
-
-class RealmKey(TypedDict):
-    """A key of a robot.
-
-    :param agent: what the robot said that it runs
-    :param created: Unix seconds
-    :param retired: Unix seconds; null while it is live
-    """
-
-    fingerprint: str
-    agent: str
-    created: float
-    retired: float | None
-
-
-class RealmKeys(TypedDict):
-    """A page of keys.
-
-    :param next: the fingerprint behind which there is more, or empty
-    """
-
-    keys: list[RealmKey]
-    next: str
-
-
-class RealmRight(TypedDict):
-    """A right as it was given.
-
-    :param holder: a user, or `@` and a group
-    """
-
-    holder: str
-    robot: str
-    level: Level
-    allow: list[str]
-    deny: list[str]
-
-
-class RealmRights(TypedDict):
-    """A page of rights.
-
-    :param next: what goes on after these as ``after``, or empty
-    """
-
-    rights: list[RealmRight]
-    next: str
-
-
-class RealmToken(TypedDict):
-    """A token, without what it could be used by.
-
-    :param kind: ``access``, ``session`` or ``login``
-    :param created: Unix seconds
-    :param expires: Unix seconds; null: never
-    :param scope: null: for all that the user may
-    """
-
-    id: str
-    kind: str
-    label: str
-    created: float
-    expires: float | None
-    scope: str | None
-
-
-class RealmTokens(TypedDict):
-    """A page of tokens.
-
-    :param next: the id behind which there is more, or empty
-    """
-
-    tokens: list[RealmToken]
-    next: str
-
 
 PAGED = tuple(each for each in LISTING if each.name != "type")
 _PLACED = {"Location": "its address"}
@@ -259,6 +44,8 @@ _IN_PATH = {
     "robot": "name of a robot",
     "holder": "name of a user, or `@` and that of a group",
     "fingerprint": "of a key",
+    "member": "name of a robot",
+    "key": "of a program",
     "id": "what an earlier answer gave as `id`",
 }
 
@@ -268,7 +55,11 @@ def _operation(
 ) -> Operation:
     """:param named: what ``{name}`` in the address is the name of"""
     inside = {"name": named} if named else {}
-    inside |= {name: name for name in ("user", "holder", "fingerprint", "id") if f"{{{name}}}" in path}
+    inside |= {
+        name: name
+        for name in ("user", "member", "holder", "fingerprint", "key", "id")
+        if f"{{{name}}}" in path
+    }
     placed = tuple(Parameter(name, _IN_PATH[what], str, "path", True) for name, what in inside.items())
     parameters = (*placed, *more.pop("parameters", ()))
     place = f"{HERE}/{path}" if path else HERE
@@ -317,6 +108,17 @@ REMOVE_USER = _gone("users/{name}", "Remove a user with rights and tokens", name
 TOKENS = _page("users/{name}/tokens", "A user's tokens and browser sessions", RealmTokens, named="user")
 REVOKE_TOKEN = _gone("tokens/{id}", "Make a token worthless, and cut what it opened")
 
+PROGRAMS = _page("users/{name}/programs", "A user's programs, which act as him", RealmPrograms, named="user")
+NEW_PROGRAM = _new(
+    "users/{name}/programs",
+    "Add a program that acts as a user",
+    NewProgram,
+    RealmNewProgram,
+    named="user",
+    more="It gets tokens by its key and its secret, which is told this once.",
+)
+REVOKE_PROGRAM = _gone("programs/{key}", "Make a program worthless with its tokens, and cut what they opened")
+
 GROUPS = _page("groups", "Groups of users", RealmGroups)
 NEW_GROUP = _new("groups", "Add a group", NewGroup, RealmGroup)
 GROUP = _operation("GET", "groups/{name}", "One group", {200: Answer("the group", RealmGroup)}, named="group")
@@ -334,6 +136,14 @@ LEAVE = _gone("groups/{name}/members/{user}", "Take a user out of a group", name
 ROBOTS = _page("robots", "Robots, enrolled or not", RealmRobots)
 NEW_ROBOT = _new("robots", "Add a robot", NewRobot, RealmNewRobot)
 ROBOT = _operation("GET", "robots/{name}", "One robot", {200: Answer("the robot", RealmRobot)}, named="robot")
+CHANGE_ROBOT = _operation(
+    "PATCH",
+    "robots/{name}",
+    "Change a robot's description",
+    {200: Answer("the robot", RealmRobot)},
+    named="robot",
+    body=RobotChange,
+)
 REMOVE_ROBOT = _gone(
     "robots/{name}",
     "Remove a robot with its keys, rights and recordings",
@@ -352,6 +162,26 @@ KEYS = _page("robots/{name}/keys", "All keys that a robot ever had", RealmKeys, 
 REVOKE_KEY = _gone(
     "robots/{name}/keys/{fingerprint}", "Retire a key, and cut a link that uses it", named="robot"
 )
+
+ROBOT_GROUPS = _page("robot-groups", "Groups of robots", RealmRobotGroups)
+NEW_ROBOT_GROUP = _new("robot-groups", "Add a group of robots", NewRobotGroup, RealmRobotGroup)
+ROBOT_GROUP = _operation(
+    "GET",
+    "robot-groups/{name}",
+    "One group of robots",
+    {200: Answer("the group", RealmRobotGroup)},
+    named="group",
+)
+REMOVE_ROBOT_GROUP = _gone("robot-groups/{name}", "Remove a group; its robots stay", named="group")
+JOIN_ROBOT = _operation(
+    "PUT",
+    "robot-groups/{name}/members/{member}",
+    "Put a robot into a group",
+    {204: Answer("the robot is in it")},
+    named="group",
+    errors=(409,),
+)
+LEAVE_ROBOT = _gone("robot-groups/{name}/members/{member}", "Take a robot out of a group", named="group")
 
 RIGHTS = _page(
     "rights",

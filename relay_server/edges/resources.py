@@ -229,6 +229,7 @@ class RobotResources:
 def parts(
     clock: Clock,
     front: FrontDesk,
+    guests: Guests,
     threads: Threads,
     moments: Moments,
     clock_ns: Callable[[], int],
@@ -236,11 +237,11 @@ def parts(
 ) -> dict[str, Callable[[Api, str], IResource]]:
     """What serves the addresses below a robot's :data:`PARTS`, its goals, cameras and modules.
 
+    :param guests: those who are there by HTTP, whatever they ask for
     :param threads: do what takes long
     :param clock_ns: monotonic nanoseconds
     :param wall: Unix time in seconds
     """
-    guests = Guests(clock, front, clock_ns)
     desk = ResourceDesk(clock, guests, threads, clock_ns, wall)
     pursued = GoalDesk(clock, guests, desk, wall)
     once = Once(Idempotency(clock), desk)

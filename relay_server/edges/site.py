@@ -334,7 +334,7 @@ class Portal(ReadOnly):
     """The built portal: its files, and its page for every address the portal itself routes."""
 
     isLeaf = True
-    PAGES = frozenset({b"", b"login", b"fleet", b"cockpit", b"alerts"})
+    PAGES = frozenset({b"", b"login", b"fleet", b"cockpit", b"alerts", b"realm"})
 
     def __init__(self, folder: Path) -> None:
         super().__init__()

@@ -34,7 +34,7 @@ from relay_server.fleet.result import Outcome, Result
 from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, FrontDesk, GoingDown
 from relay_server.inside import InsideClient
 from relay_server.journal import Journal
-from relay_server.registry import Registry
+from relay_server.registry import Presence, Registry
 from relay_server.store import Store
 
 ROBOTS = 1000
@@ -94,12 +94,12 @@ class Plan:
         """How old it is."""
         return Dating(self.order, self.sent)
 
-    @property
-    def actor(self) -> Actor:
-        """Who gives it, as the record of control knows him."""
+    def actor(self, robot: Presence) -> Actor:
+        """Who gives it, as the record of control of a robot knows him."""
         if _is_local(self.asker):
             return Actor(LOCAL.name, "cli", address=self.address)
-        return Actor(self.asker.name, f"user:{self.asker.name}", self.asker.user_id, self.address)
+        name = robot.name_of(self.asker.name, self.asker.realm)
+        return Actor(name, f"user:{name}", self.asker.user_id, self.address)
 
     def told(self) -> dict[str, Any]:
         """The first line of the answer."""
@@ -196,7 +196,7 @@ class FleetDesk:
             each.name: RobotRecord(each.robot_id, each.name, each.realm, "")
             for each in self._registry
             if each.control is not None
-            and each.realm == asker.realm
+            and asker.realm in each.realms
             and (_is_local(asker) or self._access.knows(asker, each.robot_id))
         }
         robots = {name: here[name] for name in meant(order.robots, here, {}).robots}
@@ -285,25 +285,25 @@ class FleetDesk:
     async def _done(self, plan: Plan, robot: RobotRecord) -> Outcome:
         order = plan.order
         if order.do == "stop" and self._halting.online(robot):
-            return await self._halting.stop(robot, plan.actor, order.why)
+            return await self._halting.stop(robot, plan.actor(self._there(robot)), order.why)
         if order.do in ("stop", "resume"):
             return await self._halted(plan, robot)
         return await self._errand(plan, robot)
 
     async def _halted(self, plan: Plan, record: RobotRecord) -> Outcome:
         """Stop a robot or let it move again, by the asker's rights as they stand when its turn comes."""
-        order, halting = plan.order, self._halting
+        order, halting, actor = plan.order, self._halting, plan.actor(self._there(record))
         try:
             admission = await self._admit(plan, record)
         except Unavailable:
             if order.do != "stop":
                 raise
             # Nobody can say that he may not, and the plan says that he may.
-            return await halting.stop(record, plan.actor, order.why)
+            return await halting.stop(record, actor, order.why)
         try:
             if order.do == "stop":
-                return await halting.stop(record, plan.actor, order.why)
-            return await halting.resume(record, admission.permit, plan.actor, order.why, plan.dating.since)
+                return await halting.stop(record, actor, order.why)
+            return await halting.resume(record, admission.permit, actor, order.why, plan.dating.since)
         finally:
             self._front.turn_away(admission)
 
@@ -328,8 +328,10 @@ class FleetDesk:
     async def _admit(self, plan: Plan, record: RobotRecord) -> Admission:
         if not _is_local(plan.asker):
             return await self._front.admit(plan.asker, record.name, plan.address)
-        robot = self._registry.presence(record.id, record.name, record.realm)
-        return Admission(Permit(LOCAL, record.id, OWNS), robot, plan.address)
+        return Admission(Permit(LOCAL, record.id, OWNS), self._there(record), plan.address)
+
+    def _there(self, record: RobotRecord) -> Presence:
+        return self._registry.presence(record.id, record.name, record.realm)
 
     async def _mine(self, asker: Principal) -> list[RobotRecord]:
         if _is_local(asker):

@@ -6,8 +6,11 @@ So what they listen to, what they publish and the control they have outlast a re
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+from twisted.internet.defer import CancelledError, Deferred
 
 from relay_protocol.errors import Unavailable
 from relay_server import closing
@@ -17,6 +20,8 @@ from relay_server.frontdesk import Admission, FrontDesk, GoingDown
 from relay_server.inside.client import InsideClient
 from relay_server.inside.feed import Feed
 from relay_server.session import Session
+
+T = TypeVar("T")
 
 LINGER_SECONDS = 10.0
 """A guest who asks for nothing is kept for so long."""
@@ -40,6 +45,7 @@ class Guest:
         self.client = client
         self._clock = clock
         self._feeds: dict[str, Feed] = {}
+        self._doing: set[Deferred[Any]] = set()
 
     def feed(self, topic: str, type_name: str = "") -> Feed:
         """What is said on a topic, from now on.
@@ -58,6 +64,21 @@ class Guest:
         feed.used()
         return feed
 
+    async def while_here(self, work: Coroutine[Deferred[Any], Any, T]) -> T:
+        """Do something that must not go on when the connection is over.
+
+        :raises SwitchboardError: it is over, with the reason; or what the work raises
+        """
+        doing = Deferred.fromCoroutine(work)
+        self._doing.add(doing)
+        try:
+            return await doing
+        except CancelledError:
+            self.client.check()
+            raise
+        finally:
+            self._doing.discard(doing)
+
     def tidy(self) -> None:
         """Listen no longer to what nobody has asked for of late."""
         for topic, feed in list(self._feeds.items()):
@@ -68,6 +89,8 @@ class Guest:
         """The connection is over: nobody need wait for anything."""
         for feed in self._feeds.values():
             feed.end()
+        for doing in list(self._doing):
+            doing.cancel()
 
     def _forget(self, topic: str) -> None:
         self._feeds.pop(topic).end()
@@ -110,6 +133,11 @@ class Guests:
         if stay is None:
             stay = await self._arrive(key, principal, robot, address)
         return stay.guest, stay.enter()
+
+    def there(self, principal: Principal, robot: str) -> tuple[Guest, Callable[[], None]] | None:
+        """What :meth:`keep` gives, where it is kept already: nobody comes in by this, and nothing is looked up."""
+        stay = self._here.get((principal.token_id, principal.realm, robot))
+        return None if stay is None else (stay.guest, stay.enter())
 
     @asynccontextmanager
     async def permit(self, principal: Principal, robot: str, address: str) -> AsyncIterator[Permit]:

@@ -96,7 +96,7 @@ class Noticing:
         self._note(f"alert.{what}", alert.robot_id, None, data)
 
     def note(self, event: NewMemory) -> None:
-        """What another part of this relay has put together."""
+        """What another part of this relay has put together; dropped where there were too many of late."""
         if self._may_pass(event.realm, event.robot_id, event.user):
             self._writer.note(event)
         else:
@@ -111,17 +111,22 @@ class Noticing:
         if robot_id is not None and robot is None:
             # It was removed: nobody may see this any more.
             return
-        realm = data.get(_REALM, DEFAULT_REALM) if robot is None else robot.realm
-        if not realm:
+        if robot is None:
+            realm = data.get(_REALM, DEFAULT_REALM)
+            if realm:
+                self.note(NewMemory(realm, self._wall(), OURS, kind, None, _name(user), _text(data)))
             return
-        if not self._may_pass(realm, robot_id, user):
-            self._writer.drop(realm)
-            return
-        source = OURS if robot is None else f"{OURS}:{robot.name}"
-        text = _text(data)
-        self._writer.note(
-            NewMemory(realm, self._wall(), source, kind, robot_id, user and recorded(user, NAME), text)
-        )
+        # Whom it does not name with his realm is of the robot's own.
+        name, at, of = (user or "").partition("@")
+        for realm in sorted(robot.realms):
+            mine = user is not None and realm == (of if at else robot.realm)
+            told = data if mine or user is None else {**data, "by": user if at else f"{user}@{robot.realm}"}
+            source, who = f"{OURS}:{robot.name}", _name(name) if mine else None
+            self.note(NewMemory(realm, self._wall(), source, kind, robot_id, who, _text(told)))
+
+
+def _name(user: str | None) -> str | None:
+    return user and recorded(user, NAME)
 
 
 def _text(data: Mapping[str, Any]) -> str:

@@ -49,6 +49,7 @@ class TokenAsk:
     """The body of a request for a token.
 
     :param scope: what it is to be used for; ``None`` for all that is possible
+    :param realm: in which a program wants to act, where that is not the one of its user
     """
 
     grant_type: str
@@ -56,6 +57,7 @@ class TokenAsk:
     password: str = ""
     refresh_token: str = ""
     scope: str | None = None
+    realm: str | None = None
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,7 @@ class OAuthDesk:
         if program is None:
             raise BadCredentials("prove the program by its key and secret: Digest, or Basic over TLS")
         granted = _new(_scope(ask.scope, program.scope), None)
-        await self._store.write(_to_program, program, granted, address, self._wall())
+        await self._store.write(_to_program, program, ask.realm, granted, address, self._wall())
         return granted
 
     async def _by_refresh(self, ask: TokenAsk) -> Granted:
@@ -314,12 +316,23 @@ def _begin(s: Session, login: Login, granted: Granted, address: str, now: float)
     _audit(s, login.full, "password", granted, address, now)
 
 
-def _to_program(s: Session, program: ProgramRecord, granted: Granted, address: str, now: float) -> None:
-    """An access token for a program, if it is still there, and the audit entry."""
+def _to_program(
+    s: Session, program: ProgramRecord, realm: str | None, granted: Granted, address: str, now: float
+) -> None:
+    """An access token for a program, if it is still there, and the audit entry.
+
+    :param realm: in which its user has an account too, where it is to be for that one
+    """
     if queries.find_program(s, program.key) is None:
         raise BadCredentials("the key is unknown or the secret is wrong")
-    _keep(s, program.user_id, granted, now, program_id=program.id)
-    _audit(s, full_name(program.user, program.realm), "program", granted, address, now, program=program.key)
+    user_id, full = program.user_id, full_name(program.user, program.realm)
+    if realm is not None:
+        account = queries.account_in(s, program.user_id, realm)
+        if account is None or account.disabled:
+            raise OAuthError("invalid_target", "the program's user has no account in that realm")
+        user_id, full = account.id, account.full
+    _keep(s, user_id, granted, now, program_id=program.id)
+    _audit(s, full, "program", granted, address, now, program=program.key)
 
 
 def _refresh(s: Session, old: str, new: str, wanted: Scope | None, now: float) -> Granted | OAuthError:

@@ -300,6 +300,17 @@ class ControlAnswer(TypedDict):
     message: str
 
 
+class ControlTaken(ControlAnswer):
+    """What became of it; without success who has control is asked for it.
+
+    :param message: for people
+    :param kept: seconds for which it lasts when the caller asks for nothing more
+    """
+
+    kept: float
+    control: Control
+
+
 class StopAnswer(TypedDict):
     """How the robot stands now."""
 

@@ -237,6 +237,7 @@ class TokenForm(TypedDict, total=False):
     password: str
     refresh_token: str
     scope: str
+    realm: str
     client_id: str
     client_secret: str
 

@@ -158,8 +158,8 @@ class RecordingDesk:
                 "cameras": [name for name, reason in cameras.items() if not reason],
                 "denied": reasons[0] if all(reasons) and reasons else "",
                 "megabytes": library.quota / 10**6,
-                "left": library.left(there.realm) / 10**6,
-                "full": await self._recordings.full(there),
+                "left": library.left(principal.realm) / 10**6,
+                "full": await self._recordings.full(there, principal.realm),
             }
 
     async def all(
@@ -277,7 +277,7 @@ class RecordingDesk:
     def _view(self, entry: Entry) -> dict[str, Any]:
         """What its users see of a recording."""
         shown: dict[str, Any] = msgspec.to_builtins(entry)
-        for hidden in ("robot_id", "user_id", "realm", "pictures"):
+        for hidden in ("robot_id", "user_id", "realm", "home", "pictures"):
             del shown[hidden]
         shown["megabytes"] = shown.pop("limit") / 10**6
         # Told by the relay: the clocks of those who look may be wrong.
@@ -301,7 +301,7 @@ class RecordingDesk:
             at=self._wall(),
             actor=f"user:{principal.full}",
             action=action,
-            target=f"{full_name(entry.robot, entry.realm)}/{entry.id}",
+            target=f"{entry.robot_full}/{entry.id}",
             origin=admission.address,
             data={"topics": list(entry.topics), "cameras": list(entry.cameras)},
         )

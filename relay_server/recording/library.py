@@ -13,7 +13,7 @@ import msgspec
 from twisted.logger import Logger
 
 from relay_protocol.errors import Invalid, NotFound, Unavailable
-from relay_protocol.realms import DEFAULT_REALM
+from relay_protocol.realms import DEFAULT_REALM, full_name
 
 KEPT = 10_000
 ROBOT_KEPT = 1000
@@ -58,7 +58,8 @@ class Entry(msgspec.Struct):
     :param bytes: of the file
     :param drops: messages that came and are not in it
     :param problems: what was not recorded as it was wanted, in words
-    :param realm: of the robot and of the user
+    :param realm: of the user: there it is kept, and takes room
+    :param home: the robot's own realm, where that is another
     """
 
     id: str
@@ -80,6 +81,12 @@ class Entry(msgspec.Struct):
     drops: int = 0
     problems: list[str] = []
     realm: str = DEFAULT_REALM
+    home: str = ""
+
+    @property
+    def robot_full(self) -> str:
+        """The robot's name for the whole relay."""
+        return full_name(self.robot, self.home or self.realm)
 
 
 FOLDER = "recordings"

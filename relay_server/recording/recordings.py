@@ -176,7 +176,8 @@ class Recordings:
             seconds=ask.seconds,
             pictures=tuple(topic for topic in topics if carries_pictures(robot, topic)),
             limit=round(ask.megabytes * 10**6),
-            realm=robot.realm,
+            realm=permit.principal.realm,
+            home="" if robot.realm == permit.principal.realm else robot.realm,
         )
 
     async def start(
@@ -252,12 +253,13 @@ class Recordings:
         )
         return recorder
 
-    async def full(self, robot: Presence) -> str:
+    async def full(self, robot: Presence, realm: str) -> str:
         """Why there can't be one more recording of a robot, however small; empty when there can.
 
+        :param realm: whose it would be
         :raises Unavailable: too much is done with recordings to find out
         """
-        full = self.library.full(robot.robot_id, robot.realm)
+        full = self.library.full(robot.robot_id, realm)
         try:
             return full or await self._threads.run(self._why_nearly_full)
         except OSError as error:

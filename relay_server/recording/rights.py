@@ -21,6 +21,8 @@ def why_not(permit: Permit, see: Operation, name: str) -> str:
 
 def why_denied(permit: Permit, entry: Entry) -> str:
     """Why somebody may not have all that a recording holds; empty when he may."""
+    if permit.principal.realm != entry.realm:
+        return "it was recorded in another realm"
     asked = [(Operation.SUBSCRIBE, topic) for topic in entry.topics]
     asked += [(Operation.VIEW, each) for each in (*entry.cameras, *entry.pictures)]
     return next((reason for see, name in asked if (reason := why_not(permit, see, name))), "")

@@ -6,7 +6,6 @@ from twisted.logger import Logger
 
 from relay_db import queries
 from relay_protocol.errors import Unavailable
-from relay_protocol.realms import full_name
 from relay_server.journal import Journal
 from relay_server.recording.recordings import Recordings
 from relay_server.store import Store
@@ -26,11 +25,9 @@ async def sweep(recordings: Recordings, store: Store, journal: Journal) -> None:
     """
     there = {record.id for record in await store.read(queries.list_robots)}
     left = [entry for entry in recordings.library if entry.robot_id not in there]
-    removed = await store.read(
-        queries.removed_robots, {full_name(entry.robot, entry.realm) for entry in left}
-    )
+    removed = await store.read(queries.removed_robots, {entry.robot_full for entry in left})
     for entry in left:
-        robot = full_name(entry.robot, entry.realm)
+        robot = entry.robot_full
         if entry.begun > removed.get(robot, -SLACK_SECONDS) + SLACK_SECONDS:
             continue
         try:

@@ -131,8 +131,8 @@ class Session:
 
     @property
     def name(self) -> str:
-        """The user's name."""
-        return self.permit.principal.name
+        """What the user is called at this robot."""
+        return self.robot.name_of(self.permit.principal.name, self.permit.principal.realm)
 
     @property
     def stale_commands(self) -> int:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Page, WebSocketRoute, expect
@@ -15,83 +14,28 @@ from switchboard_browser import (
     lived_in,
     ready_to_drive,
     seen,
-    sound_pages,
     stands,
     take_control,
     was_told,
 )
-from switchboard_relay import Relay
-from switchboard_robot import Robot
+from switchboard_household import COCKPIT, Household, OpenPage, pages_of
 from switchboard_waiting import wait_for
 
-PASSWORD = "correct horse"
-WAIT_SECONDS = 60.0
 GRACE_SECONDS = 2.0
-COCKPIT = "/cockpit/rover"
 USERS = {"ann": "operator", "bob": "operator", "olga": "owner", "vera": "viewer"}
-
-OpenPage = Callable[..., Page]
-
-
-class House:
-    """A relay, a robot, two operators, an owner and a viewer."""
-
-    def __init__(self, folder: Path) -> None:
-        self.relay = Relay(folder, "--control-grace", str(GRACE_SECONDS))
-        self.robot = Robot(self.relay, "rover")
-        self.tokens = {user: self.relay.user(user) for user in USERS}
-        for user, level in USERS.items():
-            self.relay.cli("right", "grant", user, "rover", level)
-
-    @property
-    def url(self) -> str:
-        """Where the portal is."""
-        return f"http://127.0.0.1:{self.relay.http_port}"
-
-    def commands(self, since: int) -> list[tuple[float, float]]:
-        """What reached the robot since a moment, as (ahead, turn)."""
-        return [(each["v"], each["w"]) for each in self.robot.events("command", since)]
-
-    def movements(self, since: int) -> list[tuple[float, float]]:
-        """The same, without the zeros that are said again and again when a robot is to stand."""
-        return [each for each in self.commands(since) if each != (0, 0)]
-
-    def stands(self) -> None:
-        """Wait until the robot stands, by its own record."""
-        wait_for("the robot stands", lambda: not self.robot.moving())
-
-    def moves(self) -> None:
-        """Wait until the robot moves, by its own record."""
-        wait_for("the robot moves", self.robot.moving)
-
-    def stop(self) -> None:
-        """End everything."""
-        self.robot.stop()
-        self.relay.stop()
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Household]:
     """One house for all; each test leaves the robot free, and able to move."""
-    yield from lived_in(House, tmp_path_factory.mktemp("control"))
+    grace = ("--control-grace", str(GRACE_SECONDS))
+    yield from lived_in(lambda folder: Household(folder, USERS, *grace), tmp_path_factory.mktemp("control"))
 
 
 @pytest.fixture
-def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
+def open_page(browser: Browser, house: Household) -> Iterator[OpenPage]:
     """Opens pages of the portal for a user; an uncaught error or a breach of the CSP in any of them fails the test."""
-    with sound_pages(browser, house.url, WAIT_SECONDS) as new_page:
-
-        def open_page(
-            user: str, path: str = COCKPIT, prepare: Callable[[Page], object] | None = None
-        ) -> Page:
-            page = new_page(1280, 800)
-            answer = page.request.post("/api/v1/session", data={"user": user, "password": PASSWORD})
-            assert answer.ok, answer.text()
-            if prepare is not None:
-                prepare(page)
-            page.goto(path)
-            return page
-
+    with pages_of(browser, house) as open_page:
         yield open_page
 
 
@@ -103,7 +47,7 @@ def ask(page: Page, why: str = "") -> None:
     stands(page, "waiting")
 
 
-def drive(house: House, page: Page) -> int:
+def drive(house: Household, page: Page) -> int:
     """Hold a key until the robot turns; the moment before."""
     since = time.monotonic_ns()
     page.keyboard.down("a")
@@ -122,7 +66,7 @@ def stop_by(page: Page) -> None:
 # --- handing over -----------------------------------------------------------------------------------------
 
 
-def test_control_is_taken_asked_for_and_granted(house: House, open_page: OpenPage) -> None:
+def test_control_is_taken_asked_for_and_granted(house: Household, open_page: OpenPage) -> None:
     """One drives, the other can't; asked and granted it is the other way round, by the robot's own record."""
     ann, bob = open_page("ann"), open_page("bob")
     stands(bob, "free")
@@ -151,7 +95,7 @@ def test_control_is_taken_asked_for_and_granted(house: House, open_page: OpenPag
     house.stands()
 
 
-def test_a_refused_request_leaves_everything_as_it_was(house: House, open_page: OpenPage) -> None:
+def test_a_refused_request_leaves_everything_as_it_was(house: Household, open_page: OpenPage) -> None:
     """The holder goes on, and who asked is told so."""
     ann, bob = open_page("ann"), open_page("bob")
     take_control(ann)
@@ -166,7 +110,7 @@ def test_a_refused_request_leaves_everything_as_it_was(house: House, open_page: 
     house.stands()
 
 
-def test_an_owner_takes_over_who_got_no_answer(house: House, open_page: OpenPage) -> None:
+def test_an_owner_takes_over_who_got_no_answer(house: Household, open_page: OpenPage) -> None:
     """While the holder drives and does not look, the owner gets control after the grace time; the robot stands."""
     ann, olga = open_page("ann"), open_page("olga")
     take_control(ann)
@@ -182,7 +126,7 @@ def test_an_owner_takes_over_who_got_no_answer(house: House, open_page: OpenPage
     ann.keyboard.up("a")
 
 
-def test_of_two_who_take_it_at_once_one_has_it(house: House, open_page: OpenPage) -> None:
+def test_of_two_who_take_it_at_once_one_has_it(house: Household, open_page: OpenPage) -> None:
     """Both press the button in the same moment; one drives, the other sees who."""
     ann, bob = open_page("ann"), open_page("bob")
     for page in (ann, bob):
@@ -197,7 +141,7 @@ def test_of_two_who_take_it_at_once_one_has_it(house: House, open_page: OpenPage
     assert sorted(badge.inner_text() == "You have control" for badge in badges) == [False, True]
 
 
-def test_control_goes_with_the_page_that_had_it(house: House, open_page: OpenPage) -> None:
+def test_control_goes_with_the_page_that_had_it(house: Household, open_page: OpenPage) -> None:
     """Closing the tab while driving stops the robot and frees it for the others."""
     ann, bob = open_page("ann"), open_page("bob")
     take_control(ann)
@@ -208,7 +152,7 @@ def test_control_goes_with_the_page_that_had_it(house: House, open_page: OpenPag
     house.stands()
 
 
-def test_who_is_here_and_who_has_control_is_shown(house: House, open_page: OpenPage) -> None:
+def test_who_is_here_and_who_has_control_is_shown(house: Household, open_page: OpenPage) -> None:
     """Everybody sees everybody, and the mark at who has control; an owner sees addresses too."""
     ann, olga = open_page("ann"), open_page("olga")
     take_control(ann)
@@ -224,7 +168,7 @@ def test_who_is_here_and_who_has_control_is_shown(house: House, open_page: OpenP
 # --- stop -------------------------------------------------------------------------------------------------
 
 
-def test_a_viewer_stops_who_drives(house: House, open_page: OpenPage) -> None:
+def test_a_viewer_stops_who_drives(house: Household, open_page: OpenPage) -> None:
     """STOP on the viewer's screen halts the robot and bars the driver, who alone of the two may resume."""
     ann, vera = open_page("ann"), open_page("vera")
     take_control(ann)
@@ -254,9 +198,9 @@ def test_a_viewer_stops_who_drives(house: House, open_page: OpenPage) -> None:
 
 
 @pytest.mark.parametrize("button", ["resume", "order-resume"])
-def test_a_second_stop_ends_a_press_to_resume(house: House, open_page: OpenPage, button: str) -> None:
+def test_a_second_stop_ends_a_press_to_resume(house: Household, open_page: OpenPage, button: str) -> None:
     """Somebody stops the stopped robot once more while another holds the button: it stays stopped, and he is named."""
-    vera = open_page("vera")
+    vera, ann = open_page("vera"), open_page("ann")
     olga = open_page("olga", COCKPIT if button == "resume" else "/fleet")
     if button == "order-resume":
         seen(olga, "fleet-order").click()
@@ -268,10 +212,10 @@ def test_a_second_stop_ends_a_press_to_resume(house: House, open_page: OpenPage,
         expect(seen(olga, "stopped" if button == "resume" else "robot-stopped")).to_be_visible()
         seen(olga, button).focus()
         olga.keyboard.down("Enter")
-        stop_by(vera)
+        stop_by(ann)
         olga.wait_for_timeout(2500)  # proves absence
         olga.keyboard.up("Enter")
-        if "Again by vera" in seen(vera, "stopped").inner_text():
+        if "Again by ann" in seen(vera, "stopped").inner_text():
             break
         seen(olga, button).blur()
     else:
@@ -282,7 +226,7 @@ def test_a_second_stop_ends_a_press_to_resume(house: House, open_page: OpenPage,
     olga.keyboard.up("Enter")
 
 
-def test_stop_goes_without_a_websocket(house: House, open_page: OpenPage) -> None:
+def test_stop_goes_without_a_websocket(house: Household, open_page: OpenPage) -> None:
     """On a screen whose websockets never open STOP goes by HTTP, and halts who drives elsewhere."""
 
     def cut(route: WebSocketRoute) -> None:
@@ -300,7 +244,7 @@ def test_stop_goes_without_a_websocket(house: House, open_page: OpenPage) -> Non
     hold_resume(ann)
 
 
-def test_all_robots_are_stopped_and_resumed_from_the_list(house: House, open_page: OpenPage) -> None:
+def test_all_robots_are_stopped_and_resumed_from_the_list(house: Household, open_page: OpenPage) -> None:
     """STOP all halts who drives; the order to resume goes to a pattern, with a result for each robot."""
     ann, olga = open_page("ann"), open_page("olga", "/fleet")
     take_control(ann)
@@ -334,7 +278,7 @@ LEAVING = {
 
 
 @pytest.mark.parametrize("way", LEAVING)
-def test_a_page_that_goes_out_of_sight_says_zero(house: House, open_page: OpenPage, way: str) -> None:
+def test_a_page_that_goes_out_of_sight_says_zero(house: Household, open_page: OpenPage, way: str) -> None:
     """A tab that is hidden, frozen by the browser or loses the focus sends zero, and nothing after it."""
     page = open_page("ann")
     ready_to_drive(page)
@@ -356,7 +300,7 @@ PAD = """
 
 
 @pytest.mark.parametrize("way", ["pad.buttons[4].pressed = false", "window.pad = null"])
-def test_a_gamepad_that_is_let_go_or_gone_stops(house: House, open_page: OpenPage, way: str) -> None:
+def test_a_gamepad_that_is_let_go_or_gone_stops(house: Household, open_page: OpenPage, way: str) -> None:
     """It drives while its shoulder button is held, and no longer."""
     page = open_page("ann", prepare=lambda page: page.add_init_script(PAD))
     ready_to_drive(page)
@@ -372,7 +316,7 @@ def test_a_gamepad_that_is_let_go_or_gone_stops(house: House, open_page: OpenPag
 # --- alerts -----------------------------------------------------------------------------------------------
 
 
-def test_who_looks_elsewhere_is_told_that_a_robot_is_gone(house: House, open_page: OpenPage) -> None:
+def test_who_looks_elsewhere_is_told_that_a_robot_is_gone(house: Household, open_page: OpenPage) -> None:
     """A toast and a count in the top bar; on the page of alerts it is acknowledged, and over when it is back."""
     ann, vera = open_page("ann", "/fleet"), open_page("vera", "/alerts")
     expect(seen(ann, "robot-card")).to_have_count(1)

@@ -99,6 +99,17 @@ def resumed(scene: Scene) -> None:
     scene.relay.run_cli("resume", "robot-one").check_returncode()
 
 
+def taken(scene: Scene) -> dict[str, str]:
+    """The driver has control."""
+    assert scene.ask("PUT", f"{ROBOT}/control")["success"]
+    return {}
+
+
+def released(scene: Scene) -> None:
+    """Nobody has."""
+    scene.ask("DELETE", f"{ROBOT}/control")
+
+
 def stopped_by_owner(scene: Scene) -> dict[str, str]:
     """The robot is stopped and driver's own; the moment that the line before tells him stands in this one."""
     scene.relay.cli("right", "grant", "driver", "robot-one", "owner")
@@ -136,6 +147,31 @@ def administering(scene: Scene) -> dict[str, str]:
     if "root" not in [each["user"] for each in scene.relay.cli("user", "list")]:
         scene.relay.user("root", admin=True)
     return {"$ADMIN": scene.relay.token("root")}
+
+
+def with_a_group(scene: Scene) -> dict[str, str]:
+    """An administrator, and a group of robots."""
+    scene.relay.cli("robot", "group", "add", "upstairs")
+    return administering(scene)
+
+
+def without_a_group(scene: Scene) -> None:
+    """It is gone."""
+    scene.relay.cli("robot", "group", "remove", "upstairs", "--yes")
+
+
+def in_two_realms(scene: Scene) -> dict[str, str]:
+    """The driver has an account in another realm, and a program."""
+    scene.relay.cli("realm", "add", "lab2")
+    scene.relay.cli("user", "join", "driver", "lab2")
+    program = scene.relay.cli("program", "add", "driver", "--label", "reader")
+    return {"$KEY": program["key"], "$SECRET": program["secret"]}
+
+
+def in_one_realm(scene: Scene) -> None:
+    """There is no other any more."""
+    scene.relay.cli("user", "remove", "driver@lab2", "--yes")
+    scene.relay.cli("realm", "remove", "lab2", "--yes")
 
 
 def film(scene: Scene, printed: str) -> bool:
@@ -193,6 +229,10 @@ EXPECTED = {
     r"/robot-one/resume$": Expected(
         200, lambda _, came: told(came) == {"stopped": None}, before=stopped_by_owner, after=operating
     ),
+    r"-X PUT .*/robot-one/control$": Expected(
+        200, lambda _, came: told(came)["control"]["holder"]["user"] == "driver", after=released
+    ),
+    r"-X DELETE .*/robot-one/control$": Expected(204, lambda _, came: came.output == "", before=taken),
     r"/robot-one/stop$": Expected(200, stopped, after=resumed),
     r"--json .* \$DIRECTORY$": Expected(201, lambda _, came: told(came)["name"] == "map", after=unregistered),
     r"\?kind=application\"$": Expected(
@@ -215,6 +255,9 @@ EXPECTED = {
         200, lambda _, came: isinstance(told(came)["value"], dict), before=said_on("obstacles/places")
     ),
     r"/topics/say$": Expected(204, lambda _, came: came.output == ""),
+    r"-d realm=lab2 ": Expected(
+        200, lambda _, came: told(came)["token_type"] == "Bearer", before=in_two_realms, after=in_one_realm
+    ),
     r"/realm/users$": Expected(
         201, lambda _, came: (told(came)["user"], told(came)["password"]) == ("luigi", True), administering
     ),
@@ -222,6 +265,20 @@ EXPECTED = {
         200,
         lambda _, came: (told(came)["holder"], told(came)["level"]) == ("driver", "operator"),
         administering,
+    ),
+    r"/realm/users/driver/programs$": Expected(
+        201,
+        lambda _, came: (told(came)["scope"], bool(told(came)["secret"])) == ("viewer", True),
+        administering,
+    ),
+    r"/realm/robot-groups$": Expected(
+        201,
+        lambda _, came: told(came) == {"group": "upstairs", "robots": []},
+        administering,
+        after=without_a_group,
+    ),
+    r"/realm/robot-groups/upstairs/members/robot-one$": Expected(
+        204, lambda _, came: came.output == "", with_a_group, after=without_a_group
     ),
     r"/alerts/rules$": Expected(
         201, lambda _, came: (told(came)["level"], bool(told(came)["secret"])) == ("error", True)

@@ -43,6 +43,8 @@ IN_REALM = {
     "name": ["bob", "crew", "arm", "nobody", "ann@lab1", "%", "\N{SNOWMAN}"],
     "user": ["bob", "nobody"],
     "holder": ["bob", "@crew", "@nobody"],
+    "member": ["arm", "nobody"],
+    "key": ["swp_nobody", "%"],
     "robot": ["arm", "nobody"],
 }
 """Names in addresses of the realm."""
@@ -226,7 +228,7 @@ def test_what_is_asked_rightly_is_answered_as_described(house: House) -> None:
 
 
 def administer(visit: Visit, realm: str) -> None:
-    """Users, groups, robots, rights and tokens of the realm, from their beginning to their end."""
+    """All that there is in a realm, from its beginning to its end."""
     assert visit("GET", realm)["realm"] == "default"
     visit("POST", f"{realm}/users", {"name": "bob", "password": "correct horse"})
     assert visit("PATCH", f"{realm}/users/{{name}}", {"admin": True}, name="bob")["admin"]
@@ -248,6 +250,19 @@ def administer(visit: Visit, realm: str) -> None:
     assert [each["retired"] for each in keys] == [None]
     tokens = visit("GET", f"{realm}/users/{{name}}/tokens", name="ann")["tokens"]
     assert {"access"} <= {each["kind"] for each in tokens}
+    told = visit("PATCH", f"{realm}/robots/{{name}}", {"description": "on the bench"}, name="arm")
+    assert told["description"] == "on the bench"
+    programs = f"{realm}/users/{{name}}/programs"
+    program = visit("POST", programs, {"label": "reader", "scope": "viewer"}, name="bob")
+    assert program.pop("secret") and visit("GET", programs, name="bob")["programs"] == [program]
+    visit("DELETE", f"{realm}/programs/{{key}}", key=program["key"])
+    visit("POST", f"{realm}/robot-groups", {"name": "upstairs"})
+    place = f"{realm}/robot-groups/{{name}}/members/{{member}}"
+    visit("PUT", place, name="upstairs", member="arm")
+    group = visit("GET", f"{realm}/robot-groups/{{name}}", name="upstairs")
+    assert group in visit("GET", f"{realm}/robot-groups")["robot_groups"] and group["robots"] == ["arm"]
+    visit("DELETE", place, name="upstairs", member="arm")
+    visit("DELETE", f"{realm}/robot-groups/{{name}}", name="upstairs")
     visit("DELETE", f"{realm}/groups/{{name}}/members/{{user}}", name="crew", user="bob")
     for what, name in (("users", "bob"), ("groups", "crew"), ("robots", "arm")):
         visit("DELETE", f"{realm}/{what}/{{name}}", name=name)

@@ -21,15 +21,18 @@ PASSWORD = "correct horse"
 BODIES = {
     "users": {"name": "new"},
     "users/{name}": {"disabled": True},
+    "users/{name}/programs": {"label": "new"},
     "groups": {"name": "new"},
     "robots": {"name": "new"},
+    "robots/{name}": {"description": "new"},
+    "robot-groups": {"name": "new"},
     "rights/{name}/{holder}": {"level": "viewer"},
 }
 
 
 class Labs:
     """A relay with two realms, and an administrator ``root`` and a robot ``mobile`` in each; ``mole`` is a user,
-    a group and a robot of lab2 and of the default realm.
+    a group, a robot and a group of robots of lab2 and of the default realm.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -45,6 +48,7 @@ class Labs:
             self.tokens[f"mole{end}"] = self.relay.user(f"mole{end}")
             self.relay.cli("group", "add", f"mole{end}")
             self.relay.cli("robot", "add", f"mole{end}")
+            self.relay.cli("robot", "group", "add", f"mole{end}", f"mole{end}")
 
     def ask(self, who: str, method: str, path: str = "", body: Any = None, **headers: str) -> Answer:
         """What somebody is answered about the realm."""
@@ -94,7 +98,8 @@ def test_a_user_is_added_given_a_right_and_cut_when_it_is_taken(labs: Labs) -> N
     """He logs in, sees the robot and works with it; then his websocket ends, and the robot is none for him."""
     made = labs.ask("root@lab1", "POST", "/users", {"name": "Luigi", "password": PASSWORD})
     assert (made.status, made.headers["Location"]) == (201, f"{REALM}/users/luigi")
-    assert made.json == {"user": "luigi", "admin": False, "disabled": False, "password": True, "groups": []}
+    told = {"user": "luigi", "admin": False, "disabled": False, "password": True, "guest": False}
+    assert made.json == {**told, "groups": []}
     assert PASSWORD.encode() not in made.body
     port = labs.relay.http_port
     cookie = {"Cookie": log_in(port, "luigi@lab1", PASSWORD)}
@@ -184,12 +189,13 @@ def test_who_is_no_administrator_is_refused(labs: Labs, method: str, path: str) 
 
 @pytest.mark.parametrize(("method", "path"), [each for each in of_a_realm() if "{" in each[1]])
 def test_what_is_in_another_realm_is_answered_as_what_is_nowhere(labs: Labs, method: str, path: str) -> None:
-    """Users, groups, robots, rights and tokens: the same words, to the administrator of any other realm."""
+    """Users, groups, robots and groups of them, rights, tokens: the same words, to any other realm's administrator."""
     foreign = labs.do("GET", "/users/mole/tokens", who="root@lab2")["tokens"][0]["id"]
     said = []
     for name, id in (("mole", foreign), ("nobody", "0" * 16), ("mole@lab2", foreign)):
         at = path.replace("{name}", name).replace("{id}", id).replace("{fingerprint}", "0" * 16)
-        at = at.replace("{user}", name).replace("{holder}", name)
+        at = at.replace("{user}", name).replace("{holder}", name).replace("{member}", name)
+        at = at.replace("{key}", "swp_0")
         answer = labs.ask("root@lab1", method, at, BODIES.get(path.removeprefix("/")))
         said.append((answer.status, answer.body))
     assert len(set(said)) == 1 and said[0][0] == 404
@@ -198,7 +204,7 @@ def test_what_is_in_another_realm_is_answered_as_what_is_nowhere(labs: Labs, met
 
 def test_lists_hold_nothing_of_other_realms(labs: Labs) -> None:
     """Nor do the numbers of the realm."""
-    for part in ("users", "groups", "robots", "rights"):
+    for part in ("users", "groups", "robots", "robot-groups", "rights"):
         assert b"mole" not in labs.ask("root@lab1", "GET", f"/{part}?limit=1000").body
     before = labs.do("GET", "")
     labs.do("POST", "/users", {"name": "more"}, who="root@lab2")
@@ -233,6 +239,11 @@ def test_the_last_administrator_stays(labs: Labs) -> None:
         ("/users", {"name": "bob", "root": True}, 400, "malformed"),
         ("/groups", {}, 400, "malformed"),
         ("/robots", {"name": "stream"}, 400, "invalid"),
+        ("/robot-groups", {"name": "a/b"}, 400, "invalid"),
+        ("/users/root/programs", {"scope": "fly"}, 400, "invalid"),
+        ("/users/root/programs", {"scope": "x" * 4097}, 400, "malformed"),
+        ("/users/root/programs", {"label": "x" * 256}, 400, "malformed"),
+        ("/users/root/programs", {"secret": "chosen"}, 400, "malformed"),
     ],
 )
 def test_what_can_not_be_added(labs: Labs, path: str, body: Any, status: int, code: str) -> None:

@@ -307,7 +307,7 @@ def test_rights_do_not_cross_realms(labs: Labs) -> None:
     """A right of one realm's user on another's robot can't be given; the command says why."""
     done = labs.relay.run_cli("right", "grant", "toad@lab1", "secret@lab2", "viewer")
     assert done.returncode != 0
-    assert "different realms" in done.stderr
+    assert "not of the realm of the holder" in done.stderr
 
 
 def test_the_record_tells_whose_it_was(labs: Labs) -> None:

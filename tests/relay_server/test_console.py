@@ -14,6 +14,7 @@ from relay_server.access import Principal
 from relay_server.console import CONFIRM_SECONDS, NOT_ALL_KNOWN, NOT_CONFIRMED, Console
 from relay_server.control import Answer
 from relay_server.frontdesk import LOOKUP_SECONDS
+from relay_server.inside import Guests
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import hangs
 from tests.relay_server.steering import outcome, result
@@ -29,9 +30,9 @@ class Place:
     def __init__(self, front: Desk) -> None:
         self.front = front
         self.world = front.world
-        self.console = Console(
-            self.world.clock, front.desk, front.access, self.world.desks, self.world.registry, front.store
-        )
+        self.guests = Guests(self.world.clock, front.desk, self.world.now_ns)
+        offices = front.desk, front.access, self.world.desks, self.world.registry, front.store
+        self.console = Console(self.world.clock, *offices, self.guests)
         with front.store.database.begin() as s:
             self.users = {}
             for name, level in (("olga", "owner"), ("vic", "viewer"), ("eve", "")):

@@ -11,7 +11,16 @@ from relay_db.models.alerts import Alert, AlertRule
 from relay_db.models.columns import LABEL, NAME, SOURCE
 from relay_db.models.directory import DirectoryEntry
 from relay_db.models.history import AuditEntry, Event, Memory, MemoryCount, Revision
-from relay_db.models.people import AccessToken, Group, Membership, Program, Realm, TokenFamily, User
+from relay_db.models.people import (
+    AccessToken,
+    Group,
+    GuestAccount,
+    Membership,
+    Program,
+    Realm,
+    TokenFamily,
+    User,
+)
 from relay_db.models.robots import (
     EnrolmentCode,
     Right,
@@ -19,6 +28,7 @@ from relay_db.models.robots import (
     RobotGroup,
     RobotKey,
     RobotMembership,
+    RobotRealm,
     StopOrder,
 )
 
@@ -34,6 +44,7 @@ __all__ = [
     "EnrolmentCode",
     "Event",
     "Group",
+    "GuestAccount",
     "Membership",
     "Memory",
     "MemoryCount",
@@ -45,6 +56,7 @@ __all__ = [
     "RobotGroup",
     "RobotKey",
     "RobotMembership",
+    "RobotRealm",
     "StopOrder",
     "TokenFamily",
     "User",

@@ -34,6 +34,17 @@ class User(Base):
     disabled: Mapped[bool]
 
 
+class GuestAccount(Base):
+    """A user is the same person as one of another realm, and logs in by that one's password."""
+
+    __tablename__ = "guest_account"
+
+    user_id: Mapped[int] = mapped_column(
+        ForeignKey("user_account.id", ondelete="CASCADE"), primary_key=True, autoincrement=False
+    )
+    home_id: Mapped[int] = owned_by("user_account.id")
+
+
 class Group(Base):
     """Users that get rights together."""
 

@@ -22,6 +22,21 @@ class Robot(Base):
     description: Mapped[Label]
 
 
+class RobotRealm(Base):
+    """A robot is of a realm, under its one name: of its own, where it was added, and of any it is shared with."""
+
+    __tablename__ = "robot_realm"
+    __table_args__ = (UniqueConstraint("realm_id", "name"),)
+
+    robot_id: Mapped[int] = mapped_column(
+        ForeignKey("robot.id", ondelete="CASCADE"), primary_key=True, autoincrement=False
+    )
+    realm_id: Mapped[int] = mapped_column(
+        ForeignKey("realm.id", ondelete="RESTRICT"), primary_key=True, autoincrement=False
+    )
+    name: Mapped[str] = mapped_column(String(ROBOT_NAME))
+
+
 class RobotGroup(Base):
     """Robots to which one order can be given. It gives nobody a right."""
 

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, func, literal, or_, select
+from sqlalchemy import ColumnElement, func, literal, or_, select, update
 from sqlalchemy.orm import Session
 
 from relay_db.base import JsonText
@@ -19,13 +19,17 @@ from relay_db.models import (
     Revision,
     Right,
     Robot,
+    RobotGroup,
     RobotKey,
+    RobotMembership,
+    RobotRealm,
     User,
 )
-from relay_db.names import findable, findable_hex
+from relay_db.names import findable, findable_hex, label
 from relay_db.queries.records import TokenRecord
-from relay_db.queries.rights import of_user
+from relay_db.queries.rights import holders_realm, of_user
 from relay_db.queries.tokens import list_tokens
+from relay_protocol.errors import NotFound
 from relay_protocol.realms import full_name
 
 _TOKEN_NAME = 16
@@ -40,6 +44,9 @@ class RealmSize(NamedTuple):
     robots: int
     memberships: int
     rights: int
+    programs: int
+    robot_groups: int
+    robot_memberships: int
 
 
 class RightPlace(NamedTuple):
@@ -61,7 +68,7 @@ def realm_size(s: Session, realm: str) -> RealmSize:
     of = Realm.name == findable(realm)
     users = select(func.count(User.id)).join(Realm, Realm.id == User.realm_id)
     groups = select(func.count(Group.id)).join(Realm, Realm.id == Group.realm_id)
-    robots = select(func.count(Robot.id)).join(Realm, Realm.id == Robot.realm_id)
+    robots = select(func.count(RobotRealm.robot_id)).join(Realm, Realm.id == RobotRealm.realm_id)
     memberships = (
         select(func.count(Membership.user_id))
         .join(Group, Group.id == Membership.group_id)
@@ -69,24 +76,35 @@ def realm_size(s: Session, realm: str) -> RealmSize:
     )
     rights = (
         select(func.count(Right.id))
-        .join(Robot, Robot.id == Right.robot_id)
-        .join(Realm, Realm.id == Robot.realm_id)
+        .outerjoin(User, User.id == Right.user_id)
+        .outerjoin(Group, Group.id == Right.group_id)
+        .join(Realm, Realm.id == holders_realm())
     )
-    return RealmSize(
-        *(s.scalar(each.where(of)) or 0 for each in (users, groups, robots, memberships, rights))
+    programs = (
+        select(func.count(Program.id))
+        .join(User, User.id == Program.user_id)
+        .join(Realm, Realm.id == User.realm_id)
     )
+    robot_groups = select(func.count(RobotGroup.id)).join(Realm, Realm.id == RobotGroup.realm_id)
+    in_groups = (
+        select(func.count(RobotMembership.robot_id))
+        .join(RobotGroup, RobotGroup.id == RobotMembership.group_id)
+        .join(Realm, Realm.id == RobotGroup.realm_id)
+    )
+    counted = (users, groups, robots, memberships, rights, programs, robot_groups, in_groups)
+    return RealmSize(*(s.scalar(each.where(of)) or 0 for each in counted))
 
 
-def count_patterns(s: Session, *, realm: str | None = None, robot_id: int | None = None) -> int:
-    """How many patterns all rights have, those in a realm or those on a robot."""
+def count_patterns(s: Session, *, realm: str, robot_id: int | None = None) -> int:
+    """How many patterns the rights that are held in a realm have, or those of them on a robot."""
     none: Any = literal([], JsonText)
     query = (
         select(Right.allow, Right.deny)
-        .join(Robot, Robot.id == Right.robot_id)
-        .where(or_(Right.allow != none, Right.deny != none))
+        .outerjoin(User, User.id == Right.user_id)
+        .outerjoin(Group, Group.id == Right.group_id)
+        .join(Realm, Realm.id == holders_realm())
+        .where(Realm.name == findable(realm), or_(Right.allow != none, Right.deny != none))
     )
-    if realm is not None:
-        query = query.join(Realm, Realm.id == Robot.realm_id).where(Realm.name == findable(realm))
     if robot_id is not None:
         query = query.where(Right.robot_id == robot_id)
     return sum(len(allow) + len(deny) for allow, deny in s.execute(query))
@@ -95,13 +113,13 @@ def count_patterns(s: Session, *, realm: str | None = None, robot_id: int | None
 def right_places(
     s: Session, realm: str, *, robot_id: int | None = None, user_id: int | None = None
 ) -> list[RightPlace]:
-    """Where the rights in a realm stand, without what they hold; of a user also those through its groups."""
+    """Where the rights that are held in a realm stand, without what they say; of a user also those by its groups."""
     query = (
         select(Right.id, Robot.name, User.name, Group.name)
         .join(Robot, Robot.id == Right.robot_id)
-        .join(Realm, Realm.id == Robot.realm_id)
         .outerjoin(User, User.id == Right.user_id)
         .outerjoin(Group, Group.id == Right.group_id)
+        .join(Realm, Realm.id == holders_realm())
         .where(Realm.name == findable(realm))
     )
     if robot_id is not None:
@@ -139,6 +157,18 @@ def group_names(s: Session, realm: str) -> dict[str, int]:
         .where(Realm.name == findable(realm))
     )
     return {row.name: row.id for row in rows}
+
+
+def describe_robot(s: Session, robot_id: int, description: str) -> None:
+    """Change what a robot is said to be.
+
+    :raises Invalid: the description can't be kept
+    :raises NotFound: no such robot
+    """
+    text = label(description, "description of a robot")
+    changed = update(Robot).where(Robot.id == robot_id).values(description=text).returning(Robot.id)
+    if s.scalar(changed) is None:
+        raise NotFound("there is no such robot")
 
 
 def count_live_keys(s: Session, robot_ids: Collection[int]) -> dict[int, int]:

@@ -14,6 +14,7 @@ from relay_db.models import Alert, AlertRule, Realm, Robot, User
 from relay_db.names import label, recorded
 from relay_db.queries.records import AlertRecord, AlertRuleRecord
 from relay_db.queries.state import bump
+from relay_db.queries.users import live_user
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.limits import WORDS
 
@@ -270,7 +271,7 @@ def list_alert_rules(s: Session, user_id: int | None = None) -> list[AlertRuleRe
         .join(Realm, Realm.id == User.realm_id)
         .order_by(AlertRule.created, AlertRule.id)
     )
-    query = query.where(User.disabled.is_(False) if user_id is None else User.id == user_id)
+    query = query.where(live_user() if user_id is None else User.id == user_id)
     rows = (AlertRuleRecord(*row) for row in s.execute(query))
     return [row._replace(kinds=tuple(row.kinds)) for row in rows]
 

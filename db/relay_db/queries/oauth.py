@@ -6,11 +6,11 @@ from sqlalchemy import Select, delete, insert, literal, null, or_, select, updat
 from sqlalchemy.orm import Session
 
 from relay_db.models import AccessToken, Program, Realm, TokenFamily, User
-from relay_db.names import findable_hex
+from relay_db.names import findable, findable_hex
 from relay_db.names import label as checked_label
 from relay_db.queries.records import IssuedRecord, ProgramRecord
 from relay_db.queries.state import bump
-from relay_db.queries.users import check_unchanged
+from relay_db.queries.users import check_unchanged, live_user
 from relay_protocol.errors import Invalid, NotFound
 
 PROGRAMS_OF_ONE = 256
@@ -48,10 +48,18 @@ def add_program(
 
 def find_program(s: Session, key: str) -> ProgramRecord | None:
     """The program of that key, unless its user is disabled."""
-    query = _programs().where(Program.key == key, User.disabled.is_(False))
+    query = _programs().where(Program.key == key, live_user())
     # Text from anyone: what can't be a key must not reach the database.
     row = s.execute(query).one_or_none() if key.isascii() and key.isprintable() else None
     return None if row is None else ProgramRecord(*row)
+
+
+def program_in(s: Session, key: str, realm: str) -> int | None:
+    """The number of the program of that key, if its user is of the realm; also while he is disabled."""
+    if not (key.isascii() and key.isprintable()):
+        return None
+    query = select(Program.id).join(User, User.id == Program.user_id).join(Realm, Realm.id == User.realm_id)
+    return s.scalar(query.where(Program.key == key, Realm.name == findable(realm)))
 
 
 def list_programs(s: Session, user_id: int | None = None) -> list[ProgramRecord]:
@@ -119,7 +127,7 @@ def refresh_family(s: Session, refresh_hash: str, new_hash: str, now: float) -> 
     if copied is not None:
         bump(s)
         return None
-    live = select(User.id).where(User.id == TokenFamily.user_id, User.disabled.is_(False)).exists()
+    live = select(User.id).where(User.id == TokenFamily.user_id, live_user()).exists()
     replaced = (
         update(TokenFamily)
         .where(TokenFamily.refresh_hash == found, TokenFamily.expires > now, live)
@@ -155,7 +163,7 @@ def issued(s: Session, token_hash: str, now: float) -> IssuedRecord | None:
         .where(
             AccessToken.token_hash == found,
             AccessToken.kind == "access",
-            User.disabled.is_(False),
+            live_user(),
             or_(AccessToken.expires.is_(None), AccessToken.expires > now),
         )
     )
@@ -173,7 +181,7 @@ def issued(s: Session, token_hash: str, now: float) -> IssuedRecord | None:
         )
         .join(User, User.id == TokenFamily.user_id)
         .join(Realm, Realm.id == User.realm_id)
-        .where(TokenFamily.refresh_hash == found, TokenFamily.expires > now, User.disabled.is_(False))
+        .where(TokenFamily.refresh_hash == found, TokenFamily.expires > now, live_user())
     )
     row = s.execute(access).one_or_none() or s.execute(refresh).one_or_none()
     return None if row is None else IssuedRecord(*row)

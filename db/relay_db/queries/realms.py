@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import delete, exists, insert, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import DirectoryEntry, Group, Memory, MemoryCount, Realm, Robot, RobotGroup, User
+from relay_db.models import DirectoryEntry, Group, Memory, MemoryCount, Realm, RobotGroup, RobotRealm, User
 from relay_db.names import findable, normal_name
 from relay_db.queries.records import RealmRecord
 from relay_db.queries.state import bump
@@ -44,7 +44,7 @@ def remove_realm(s: Session, name: str) -> None:
         for what, kind in (
             ("users", User),
             ("groups", Group),
-            ("robots", Robot),
+            ("robots", RobotRealm),
             ("groups of robots", RobotGroup),
         )
         if s.scalar(select(exists().where(kind.realm_id == gone)))

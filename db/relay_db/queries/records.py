@@ -20,7 +20,10 @@ class RealmRecord(NamedTuple):
 
 
 class UserRecord(NamedTuple):
-    """A user; ``password_hash`` is None for one that only tokens let in."""
+    """A user; ``password_hash`` is None for one that only tokens let in.
+
+    :param home: the full name of the account it is a guest of: the password is that one's
+    """
 
     id: int
     name: str
@@ -28,6 +31,7 @@ class UserRecord(NamedTuple):
     admin: bool
     disabled: bool
     password_hash: str | None
+    home: str | None = None
 
     @property
     def full(self) -> str:
@@ -50,7 +54,7 @@ class GroupRecord(NamedTuple):
 
 
 class RobotRecord(NamedTuple):
-    """A robot."""
+    """A robot, with its own realm, whatever realms it is shared with."""
 
     id: int
     name: str
@@ -96,11 +100,12 @@ class KeyRecord(NamedTuple):
 
 
 class RightRecord(NamedTuple):
-    """A right: exactly one of ``user`` and ``group`` is a name."""
+    """A right: exactly one of ``user`` and ``group`` is a name, in the realm ``realm``."""
 
     id: int
     robot_id: int
     robot: str
+    realm: str
     user: str | None
     group: str | None
     level: Level

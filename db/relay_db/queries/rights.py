@@ -6,12 +6,13 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable
 from typing import Any
 
-from sqlalchemy import ColumnElement, delete, insert, or_, select
+from sqlalchemy import ColumnElement, delete, exists, func, insert, or_, select
 from sqlalchemy.orm import Session
 
-from relay_db.models import Group, Membership, Realm, Right, Robot, User
+from relay_db.models import Group, Membership, Realm, Right, Robot, RobotRealm, User
 from relay_db.queries.records import RightRecord, RobotRecord
 from relay_db.queries.state import bump
+from relay_db.queries.users import live_user
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.rights import Grant, Level, parse_level, parse_pattern
 
@@ -35,13 +36,14 @@ def grant_right(
 
     :param allow: patterns ``operation:resource`` allowed beyond the level
     :param deny: patterns denied in spite of everything
-    :raises Invalid: not exactly one holder, a pattern that is none, or a holder of another realm
+    :raises Invalid: not exactly one holder, a pattern that is none, or a holder of a realm that the robot is not of
     :raises NotFound: no such robot, user or group
     """
     level = parse_level(str(level))
     patterns = _patterns(allow), _patterns(deny)
-    _check_realms(s, robot_id, user_id, group_id)
+    # First: from here on nobody takes the robot out of the realm.
     bump(s)
+    _check_realms(s, robot_id, user_id, group_id)
     s.execute(delete(Right).where(_held(robot_id, user_id, group_id)))
     s.execute(
         insert(Right).values(
@@ -85,6 +87,7 @@ def list_rights(
             Right.id,
             Right.robot_id,
             Robot.name.label("robot"),
+            Realm.name.label("realm"),
             User.name.label("user"),
             Group.name.label("group"),
             Right.level,
@@ -94,6 +97,7 @@ def list_rights(
         .join(Robot, Robot.id == Right.robot_id)
         .outerjoin(User, User.id == Right.user_id)
         .outerjoin(Group, Group.id == Right.group_id)
+        .join(Realm, Realm.id == holders_realm())
         .order_by(Robot.name, User.name, Group.name)
     )
     if robot_id is not None:
@@ -109,6 +113,7 @@ def list_rights(
             row.id,
             row.robot_id,
             row.robot,
+            row.realm,
             row.user,
             row.group,
             Level(row.level),
@@ -134,7 +139,7 @@ def right_held(
 def grants_for(s: Session, user_id: int, robot_id: int) -> list[Grant]:
     """All a user has on a robot: its own right, those of its groups, and an administrator's.
 
-    A disabled user, or one of another realm, has none.
+    A disabled user, or one of a realm that the robot is not of, has none.
     """
     return _grants(s, user_id, robot_id).get(robot_id, [])
 
@@ -145,7 +150,8 @@ def robots_with_grants(s: Session, user_id: int) -> list[tuple[RobotRecord, list
     robots = s.execute(
         select(Robot.id, Robot.name, Realm.name, Robot.description)
         .join(Realm, Realm.id == Robot.realm_id)
-        .join(User, User.realm_id == Robot.realm_id)
+        .join(RobotRealm, RobotRealm.robot_id == Robot.id)
+        .join(User, User.realm_id == RobotRealm.realm_id)
         .where(User.id == user_id)
         .order_by(Robot.name)
     )
@@ -155,17 +161,18 @@ def robots_with_grants(s: Session, user_id: int) -> list[tuple[RobotRecord, list
 def _grants(s: Session, user_id: int, robot_id: int | None) -> dict[int, list[Grant]]:
     """Grants of a live user by robot, of one robot or of all."""
     user = s.execute(
-        select(User.name, User.admin, User.realm_id).where(User.id == user_id, User.disabled.is_(False))
+        select(User.name, User.admin, User.realm_id).where(User.id == user_id, live_user())
     ).one_or_none()
     grants: dict[int, list[Grant]] = defaultdict(list)
     if user is None:
         return grants
     if user.admin:
-        robots = select(Robot.id).where(Robot.realm_id == user.realm_id)
-        for each in s.scalars(robots if robot_id is None else robots.where(Robot.id == robot_id)):
+        robots = select(RobotRealm.robot_id).where(RobotRealm.realm_id == user.realm_id)
+        for each in s.scalars(robots if robot_id is None else robots.where(RobotRealm.robot_id == robot_id)):
             grants[each].append(Grant(Level.OWNER, source=f"admin {user.name}"))
     rights = (
         select(Right.robot_id, Right.level, Right.allow, Right.deny, Group.name.label("group"))
+        .join(RobotRealm, (RobotRealm.robot_id == Right.robot_id) & (RobotRealm.realm_id == user.realm_id))
         .outerjoin(Group, Group.id == Right.group_id)
         .where(of_user(user_id))
         .order_by(Right.id)
@@ -182,6 +189,11 @@ def of_user(user_id: int) -> ColumnElement[bool]:
     return or_(Right.user_id == user_id, Right.group_id.in_(groups))
 
 
+def holders_realm() -> ColumnElement[int]:
+    """The number of the realm of who holds a right, where both tables of holders are joined."""
+    return func.coalesce(User.realm_id, Group.realm_id)
+
+
 def _held(robot_id: int, user_id: int | None, group_id: int | None) -> Any:
     holder = Right.user_id == user_id if user_id is not None else Right.group_id == group_id
     return (Right.robot_id == robot_id) & holder
@@ -194,8 +206,7 @@ def _one_holder(user_id: int | None, group_id: int | None) -> None:
 
 def _check_realms(s: Session, robot_id: int, user_id: int | None, group_id: int | None) -> None:
     _one_holder(user_id, group_id)
-    robot_realm = s.scalar(select(Robot.realm_id).where(Robot.id == robot_id))
-    if robot_realm is None:
+    if s.scalar(select(Robot.id).where(Robot.id == robot_id)) is None:
         raise NotFound("there is no such robot")
     if user_id is not None:
         holder_realm = s.scalar(select(User.realm_id).where(User.id == user_id))
@@ -203,8 +214,9 @@ def _check_realms(s: Session, robot_id: int, user_id: int | None, group_id: int 
         holder_realm = s.scalar(select(Group.realm_id).where(Group.id == group_id))
     if holder_realm is None:
         raise NotFound("there is no such user or group")
-    if holder_realm != robot_realm:
-        raise Invalid("the robot and the holder of the right are of different realms")
+    of = (RobotRealm.robot_id == robot_id) & (RobotRealm.realm_id == holder_realm)
+    if not s.scalar(select(exists().where(of))):
+        raise Invalid("the robot is not of the realm of the holder of the right")
 
 
 def _patterns(texts: Iterable[str]) -> list[str]:

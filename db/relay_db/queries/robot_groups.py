@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Collection
 
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
-from relay_db.models import Realm, Robot, RobotGroup, RobotMembership
+from relay_db.models import Realm, Robot, RobotGroup, RobotMembership, RobotRealm
 from relay_db.names import findable, normal_name
 from relay_db.queries.realms import realm_id
 from relay_db.queries.records import RobotGroupRecord
@@ -22,7 +23,11 @@ def find_robot_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> Robot
         .join(Realm, Realm.id == RobotGroup.realm_id)
         .where(RobotGroup.name == findable(name), Realm.name == findable(realm))
     ).one_or_none()
-    return None if row is None else RobotGroupRecord(row[0], row[1], row[2], _robots(s, row[0])[row[0]])
+    return (
+        None
+        if row is None
+        else RobotGroupRecord(row[0], row[1], row[2], robots_of_groups(s, [row[0]])[row[0]])
+    )
 
 
 def list_robot_groups(s: Session, realm: str | None = None) -> list[RobotGroupRecord]:
@@ -34,8 +39,18 @@ def list_robot_groups(s: Session, realm: str | None = None) -> list[RobotGroupRe
     )
     if realm is not None:
         query = query.where(Realm.name == findable(realm))
-    robots = _robots(s)
+    robots = robots_of_groups(s)
     return [RobotGroupRecord(id, name, where, robots[id]) for id, name, where in s.execute(query).all()]
+
+
+def robot_group_names(s: Session, realm: str) -> dict[str, int]:
+    """The groups of robots of a realm: numbers by name."""
+    rows = s.execute(
+        select(RobotGroup.name, RobotGroup.id)
+        .join(Realm, Realm.id == RobotGroup.realm_id)
+        .where(Realm.name == findable(realm))
+    )
+    return {row.name: row.id for row in rows}
 
 
 def add_robot_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> RobotGroupRecord:
@@ -67,11 +82,11 @@ def add_to_robot_group(s: Session, group_id: int, robot_id: int) -> None:
     :raises Invalid: they are of different realms
     """
     group_realm = s.scalar(select(RobotGroup.realm_id).where(RobotGroup.id == group_id))
-    robot_realm = s.scalar(select(Robot.realm_id).where(Robot.id == robot_id))
-    if group_realm is None or robot_realm is None:
+    robot_realms = s.scalars(select(RobotRealm.realm_id).where(RobotRealm.robot_id == robot_id)).all()
+    if group_realm is None or not robot_realms:
         raise NotFound("there is no such group or robot")
-    if group_realm != robot_realm:
-        raise Invalid("the group and the robot are of different realms")
+    if group_realm not in robot_realms:
+        raise Invalid("the robot is not of the realm of the group")
     pair = (RobotMembership.group_id == group_id) & (RobotMembership.robot_id == robot_id)
     if s.scalar(select(RobotMembership.robot_id).where(pair)) is None:
         s.execute(insert(RobotMembership).values(group_id=group_id, robot_id=robot_id))
@@ -83,15 +98,17 @@ def remove_from_robot_group(s: Session, group_id: int, robot_id: int) -> bool:
     return s.scalar(delete(RobotMembership).where(pair).returning(RobotMembership.robot_id)) is not None
 
 
-def _robots(s: Session, group_id: int | None = None) -> defaultdict[int, tuple[str, ...]]:
-    """The names of the robots of each group, or of one."""
+def robots_of_groups(
+    s: Session, group_ids: Collection[int] | None = None
+) -> defaultdict[int, tuple[str, ...]]:
+    """The names of the robots of each group, or of some, by the number of the group."""
     query = (
         select(RobotMembership.group_id, Robot.name)
         .join(Robot, Robot.id == RobotMembership.robot_id)
         .order_by(Robot.name)
     )
-    if group_id is not None:
-        query = query.where(RobotMembership.group_id == group_id)
+    if group_ids is not None:
+        query = query.where(RobotMembership.group_id.in_(group_ids))
     found: defaultdict[int, tuple[str, ...]] = defaultdict(tuple)
     for id, name in s.execute(query):
         found[id] += (name,)

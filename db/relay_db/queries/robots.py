@@ -8,7 +8,7 @@ from typing import NamedTuple
 from sqlalchemy import Select, delete, insert, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import EnrolmentCode, Realm, Robot, RobotKey
+from relay_db.models import EnrolmentCode, Realm, Robot, RobotKey, RobotRealm
 from relay_db.names import findable, findable_hex, label, recorded
 from relay_db.queries.realms import realm_id
 from relay_db.queries.records import KeyRecord, RobotKeyRecord, RobotRecord
@@ -32,19 +32,17 @@ _REFUSED = (
 
 
 def find_robot(s: Session, name: str, realm: str = DEFAULT_REALM) -> RobotRecord | None:
-    """The robot of that name."""
+    """The robot of that name in a realm, its own or one that it is shared with."""
     if not _possible(name):
         return None
-    row = s.execute(_robots().where(Robot.name == name, Realm.name == findable(realm))).one_or_none()
+    row = s.execute(_robots_in(realm).where(RobotRealm.name == name)).one_or_none()
     return None if row is None else RobotRecord(*row)
 
 
 def list_robots(s: Session, realm: str | None = None) -> list[RobotRecord]:
-    """All robots, of one realm or of all, by name."""
-    query = _robots().order_by(Robot.name)
-    if realm is not None:
-        query = query.where(Realm.name == findable(realm))
-    return [RobotRecord(*row) for row in s.execute(query)]
+    """All robots, or those of one realm with those that are shared with it, by name."""
+    query = _robots() if realm is None else _robots_in(realm)
+    return [RobotRecord(*row) for row in s.execute(query.order_by(Robot.name, Realm.name))]
 
 
 def enrolled_robots(s: Session) -> list[RobotRecord]:
@@ -66,11 +64,11 @@ def add_robot(s: Session, name: str, description: str = "", realm: str = DEFAULT
     if find_robot(s, name, realm) is not None:
         raise Invalid(f"there is a robot '{full_name(name, realm)}' already")
     bump(s)
+    number = realm_id(s, realm)
     robot_id = s.scalars(
-        insert(Robot)
-        .values(realm_id=realm_id(s, realm), name=name, description=description)
-        .returning(Robot.id)
+        insert(Robot).values(realm_id=number, name=name, description=description).returning(Robot.id)
     ).one()
+    s.execute(insert(RobotRealm).values(robot_id=robot_id, realm_id=number, name=name))
     return RobotRecord(robot_id, name, realm, description)
 
 
@@ -122,6 +120,9 @@ def redeem_enrolment_code(
     if len(public_key) != PUBLIC_KEY_BYTES:
         raise Invalid(f"the public key must have {PUBLIC_KEY_BYTES} bytes (Ed25519)")
     robot = find_robot(s, robot_name, realm)
+    if robot is not None and robot.realm != findable(realm):
+        # Keys are handed in under the name of its own realm.
+        robot = None
     spent = s.scalar(
         update(EnrolmentCode)
         .where(
@@ -224,6 +225,12 @@ def _make_live(s: Session, robot: RobotRecord, key: _Enrolment, now: float) -> N
 
 def _robots() -> Select[int, str, str, str]:
     return select(Robot.id, Robot.name, Realm.name, Robot.description).join(Realm, Realm.id == Robot.realm_id)
+
+
+def _robots_in(realm: str) -> Select[int, str, str, str]:
+    """Those of a realm, and those that are shared with it."""
+    number = select(Realm.id).where(Realm.name == findable(realm)).scalar_subquery()
+    return _robots().join(RobotRealm, RobotRealm.robot_id == Robot.id).where(RobotRealm.realm_id == number)
 
 
 def _possible(name: str) -> bool:

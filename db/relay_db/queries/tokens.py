@@ -13,7 +13,7 @@ from relay_db.names import findable_hex
 from relay_db.names import label as checked_label
 from relay_db.queries.records import PrincipalRecord, TokenRecord
 from relay_db.queries.state import bump
-from relay_db.queries.users import check_unchanged
+from relay_db.queries.users import check_unchanged, live_user
 from relay_protocol.errors import NotFound
 
 TokenKind = Literal["access", "session", "login"]
@@ -141,7 +141,7 @@ def token_is_live(s: Session, token_id: int, now: float) -> bool:
     live = (
         select(AccessToken.id)
         .join(User, User.id == AccessToken.user_id)
-        .where(AccessToken.id == token_id, User.disabled.is_(False), _unexpired(now))
+        .where(AccessToken.id == token_id, live_user(), _unexpired(now))
     )
     return s.scalar(live) is not None
 
@@ -175,7 +175,7 @@ def _principals(now: float) -> Select[int, str, str, bool, int, float | None, st
         )
         .join(User, User.id == AccessToken.user_id)
         .join(Realm, Realm.id == User.realm_id)
-        .where(User.disabled.is_(False), _unexpired(now))
+        .where(live_user(), _unexpired(now))
     )
 
 

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-from sqlalchemy import ColumnElement, Row, Select, delete, exists, func, insert, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy import (
+    ColumnElement,
+    Row,
+    Select,
+    case,
+    delete,
+    exists,
+    false,
+    func,
+    insert,
+    or_,
+    select,
+    update,
+)
+from sqlalchemy.orm import Session, aliased
 
-from relay_db.models import AccessToken, Group, Membership, Realm, TokenFamily, User
+from relay_db.models import AccessToken, Group, GuestAccount, Membership, Realm, TokenFamily, User
 from relay_db.names import findable, normal_name
 from relay_db.queries.realms import realm_id
 from relay_db.queries.records import GroupRecord, UserRecord
@@ -13,25 +26,30 @@ from relay_db.queries.state import bump
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.realms import DEFAULT_REALM, full_name
 
+_Home = aliased(User)
+"""The account that a guest has in another realm."""
+
+_HomeRealm = aliased(Realm)
+
 
 def find_user(s: Session, name: str, realm: str = DEFAULT_REALM) -> UserRecord | None:
     """The user of that name, in whatever case it is written; also a disabled one."""
     row = s.execute(_users().where(User.name == findable(name), Realm.name == findable(realm))).one_or_none()
-    return None if row is None else UserRecord(*row)
+    return None if row is None else _record(row)
 
 
 def get_user(s: Session, user_id: int) -> UserRecord | None:
     """The user of that number."""
     row = s.execute(_users().where(User.id == user_id)).one_or_none()
-    return None if row is None else UserRecord(*row)
+    return None if row is None else _record(row)
 
 
 def list_users(s: Session, realm: str | None = None) -> list[UserRecord]:
     """All users, of one realm or of all, by name."""
-    query = _users().order_by(User.name)
+    query = _users().order_by(User.name, Realm.name)
     if realm is not None:
         query = query.where(Realm.name == findable(realm))
-    return [UserRecord(*row) for row in s.execute(query)]
+    return [_record(row) for row in s.execute(query)]
 
 
 def count_users(s: Session) -> int:
@@ -63,25 +81,31 @@ def add_user(
 def set_password(
     s: Session, user_id: int, password_hash: str | None, *, keep_token: int | None = None
 ) -> None:
-    """Change the password and end all browser sessions and refreshed tokens opened with the old one.
+    """Change the password and end all browser sessions and refreshed tokens opened with the old one, in all realms.
 
     :param keep_token: number of the session that asks for the change and goes on
     :raises NotFound: no such user
+    :raises Refused: the user is a guest, whose password is that of another account
     """
+    user = get_user(s, user_id)
+    if user is not None and user.home is not None:
+        raise Refused(f"the password of {user.full} is that of {user.home}; change it there")
     bump(s)
     _change_user(s, user_id, password_hash=password_hash)
+    guests = select(GuestAccount.user_id).where(GuestAccount.home_id == user_id)
+    accounts = [user_id, *s.scalars(guests)]
     s.execute(
         delete(AccessToken).where(
-            AccessToken.user_id == user_id,
+            AccessToken.user_id.in_(accounts),
             AccessToken.kind.in_(("session", "login")),
             AccessToken.id != (-1 if keep_token is None else keep_token),
         )
     )
-    s.execute(delete(TokenFamily).where(TokenFamily.user_id == user_id))
+    s.execute(delete(TokenFamily).where(TokenFamily.user_id.in_(accounts)))
 
 
 def set_disabled(s: Session, user_id: int, disabled: bool) -> None:
-    """Shut a user out, or let it in again; its rights and tokens stay.
+    """Shut a user out, or let it in again; its rights and tokens stay. With it all accounts that are its guests.
 
     :raises NotFound: no such user
     """
@@ -96,18 +120,30 @@ def set_admin(s: Session, user_id: int, admin: bool) -> None:
 
 
 def remove_user(s: Session, user_id: int) -> None:
-    """Remove a user with its rights, memberships and tokens.
+    """Remove a user with its rights, memberships and tokens, and its accounts in other realms.
 
     :raises NotFound: no such user
     """
     bump(s)
+    guests = select(GuestAccount.user_id).where(GuestAccount.home_id == user_id)
+    s.execute(delete(User).where(User.id.in_(list(s.scalars(guests)))))
     if s.scalar(delete(User).where(User.id == user_id).returning(User.id)) is None:
         raise NotFound("there is no such user")
 
 
 def user_is_live(s: Session, user_id: int) -> bool:
     """Whether the user is there and not disabled."""
-    return _holds(s, (User.id == user_id) & User.disabled.is_(False))
+    return _holds(s, (User.id == user_id) & live_user())
+
+
+def live_user() -> ColumnElement[bool]:
+    """Whether a user is not disabled, nor the account that it is a guest of."""
+    shut_out = (
+        select(GuestAccount.user_id)
+        .join(_Home, _Home.id == GuestAccount.home_id)
+        .where(GuestAccount.user_id == User.id, _Home.disabled)
+    )
+    return User.disabled.is_(False) & ~shut_out.exists()
 
 
 def check_unchanged(s: Session, user_id: int, password_hash: str | None) -> None:
@@ -116,9 +152,16 @@ def check_unchanged(s: Session, user_id: int, password_hash: str | None) -> None
     :param password_hash: what was stored when the user was proved
     :raises Refused: another is stored now, or the user was disabled or removed
     """
-    standing = select(User.password_hash, User.disabled).where(User.id == user_id).with_for_update()
-    user = s.execute(standing).one_or_none()
-    if user is None or user.disabled or user.password_hash != password_hash:
+    home = s.scalar(select(GuestAccount.home_id).where(GuestAccount.user_id == user_id)) or user_id
+    standing = (
+        select(User.id, User.password_hash, User.disabled)
+        .where(User.id.in_({user_id, home}))
+        .order_by(User.id)
+        .with_for_update()
+    )
+    users = {row.id: row for row in s.execute(standing)}
+    shut_out = not {user_id, home} <= users.keys() or any(row.disabled for row in users.values())
+    if shut_out or users[home].password_hash != password_hash:
         raise Refused("the account was changed while you logged in; log in again")
 
 
@@ -190,10 +233,23 @@ def remove_member(s: Session, group_id: int, user_id: int) -> bool:
     return s.scalar(gone.returning(Membership.user_id)) is not None
 
 
-def _users() -> Select[int, str, str, bool, bool, str | None]:
-    return select(User.id, User.name, Realm.name, User.admin, User.disabled, User.password_hash).join(
-        Realm, Realm.id == User.realm_id
+def _users() -> Select[int, str, str, bool, bool, str | None, str | None, str | None]:
+    """Users, with the account they are guests of."""
+    password = case((_Home.id.is_not(None), _Home.password_hash), else_=User.password_hash)
+    disabled = or_(User.disabled, func.coalesce(_Home.disabled, false()))
+    return (
+        select(User.id, User.name, Realm.name, User.admin, disabled, password, _Home.name, _HomeRealm.name)
+        .join(Realm, Realm.id == User.realm_id)
+        .outerjoin(GuestAccount, GuestAccount.user_id == User.id)
+        .outerjoin(_Home, _Home.id == GuestAccount.home_id)
+        .outerjoin(_HomeRealm, _HomeRealm.id == _Home.realm_id)
     )
+
+
+def _record(row: Row[int, str, str, bool, bool, str | None, str | None, str | None]) -> UserRecord:
+    name, realm = row[6], row[7]
+    home = None if name is None or realm is None else full_name(name, realm)
+    return UserRecord(row[0], row[1], row[2], row[3], bool(row[4]), row[5], home)
 
 
 def _change_user(s: Session, user_id: int, **values: str | bool | None) -> None:

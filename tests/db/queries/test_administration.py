@@ -7,7 +7,7 @@ import pytest
 from relay_db import queries
 from relay_db.engine import Database
 from relay_db.queries import RightPlace
-from relay_protocol.errors import Invalid
+from relay_protocol.errors import Invalid, NotFound
 
 
 def test_patterns_are_counted_in_a_realm_and_on_a_robot(database: Database) -> None:
@@ -24,7 +24,7 @@ def test_patterns_are_counted_in_a_realm_and_on_a_robot(database: Database) -> N
             queries.grant_right(s, arm.id, "viewer", user_id=ann.id)
             queries.grant_right(s, arm.id, "viewer", group_id=crew.id, allow=["call:/d"])
         assert queries.count_patterns(s, realm="lab1") == 4
-        assert [queries.count_patterns(s, robot_id=each.id) for each in (rover, arm)] == [3, 1]
+        assert [queries.count_patterns(s, realm="lab2", robot_id=each.id) for each in (rover, arm)] == [3, 1]
         assert queries.count_patterns(s, realm="nowhere") == 0
 
 
@@ -50,6 +50,36 @@ def test_places_of_rights_are_those_of_the_realm(database: Database) -> None:
         assert [each.id for each in queries.list_rights(s, ids=[group.id])] == [group.id]
         with pytest.raises(Invalid):
             queries.right_held(s, rover.id)
+
+
+def test_how_much_is_in_a_realm(database: Database) -> None:
+    """All that is counted of it, and nothing of another."""
+    with database.begin() as s:
+        for realm, names in (("lab1", ("ann",)), ("lab2", ("ann", "bob"))):
+            queries.add_realm(s, realm)
+            users = [queries.add_user(s, name, None, realm=realm) for name in names]
+            group, robots = queries.add_group(s, "crew", realm), queries.add_robot_group(s, "all", realm)
+            for user in users:
+                robot = queries.add_robot(s, user.name, realm=realm)
+                queries.add_member(s, group.id, user.id)
+                queries.grant_right(s, robot.id, "viewer", user_id=user.id)
+                queries.add_to_robot_group(s, robots.id, robot.id)
+                queries.add_program(s, user.id, user.full, "f" * 64, scope=None, label="", now=1.0)
+        assert queries.realm_size(s, "lab1") == (1,) * 8
+        assert queries.realm_size(s, "lab2") == (2, 1, 2, 2, 2, 2, 1, 2)
+        assert queries.realm_size(s, "nowhere") == (0,) * 8
+
+
+def test_a_robot_is_described_anew(database: Database) -> None:
+    """By one line that can be printed; one that is not there is not described."""
+    with database.begin() as s:
+        rover = queries.add_robot(s, "rover", "old")
+        queries.describe_robot(s, rover.id, "new")
+        with pytest.raises(Invalid, match="description of a robot"):
+            queries.describe_robot(s, rover.id, "a\nb")
+        with pytest.raises(NotFound):
+            queries.describe_robot(s, rover.id + 1, "other")
+        assert queries.find_robot(s, "rover") == rover._replace(description="new")
 
 
 def test_whose_a_token_is(database: Database) -> None:

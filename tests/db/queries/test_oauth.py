@@ -64,6 +64,18 @@ def test_a_user_has_a_bounded_number_of_programs(
             queries.add_program(s, ann.id, "two", VERIFIER, scope=None, label="", now=1.0)
 
 
+def test_a_program_is_found_in_the_realm_of_its_user(database: Database, ann: UserRecord) -> None:
+    """Also while the user is disabled; in no other, and by nothing that can't be a key."""
+    with database.begin() as s:
+        queries.add_realm(s, "lab")
+        number = queries.add_program(s, ann.id, "key", VERIFIER, scope=None, label="", now=1.0)
+        queries.set_disabled(s, ann.id, True)
+        assert queries.find_program(s, "key") is None
+        assert queries.program_in(s, "key", "Default") == number
+        for key, realm in (("key", "lab"), ("key", "nowhere"), ("other", "default"), ("k\0", "default")):
+            assert queries.program_in(s, key, realm) is None
+
+
 def test_tokens_end_with_their_program(database: Database, ann: UserRecord) -> None:
     """Once it is removed, which counts as a change of rights."""
     with database.begin() as s:

@@ -65,7 +65,9 @@ def test_a_right_replaces_the_one_before(database: Database) -> None:
         queries.grant_right(s, rover.id, "owner", user_id=ann.id, allow=["*:*"])
         queries.grant_right(s, rover.id, "viewer", user_id=ann.id)
         [right] = queries.list_rights(s)
-    assert right == queries.RightRecord(right.id, rover.id, "rover", "ann", None, Level.VIEWER, (), ())
+    assert right == queries.RightRecord(
+        right.id, rover.id, "rover", "default", "ann", None, Level.VIEWER, (), ()
+    )
 
 
 def test_a_right_is_revoked_from_its_holder_only(database: Database) -> None:

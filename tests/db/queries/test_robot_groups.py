@@ -24,6 +24,9 @@ def test_a_group_has_its_robots_by_name(database: Database) -> None:
         empty = queries.add_robot_group(s, "all-others")
         assert queries.list_robot_groups(s) == [empty, found]
         assert queries.list_robot_groups(s, "elsewhere") == []
+        assert queries.robot_group_names(s, "Default") == {"cleaners": group.id, "all-others": empty.id}
+        assert queries.robot_group_names(s, "elsewhere") == {}
+        assert queries.robots_of_groups(s, [group.id]) == {group.id: ("cleaner-1", "cleaner-2")}
 
 
 def test_robots_leave_and_groups_go(database: Database) -> None:
@@ -58,7 +61,7 @@ def test_what_can_not_be_is_refused(database: Database) -> None:
             queries.add_robot_group(s, "more", "nowhere")
         queries.add_realm(s, "plant")
         far = queries.add_robot(s, "far", realm="plant")
-        with pytest.raises(Invalid, match="realms"):
+        with pytest.raises(Invalid, match="not of the realm"):
             queries.add_to_robot_group(s, group.id, far.id)
         for pair in ((group.id, -1), (-1, far.id)):
             with pytest.raises(NotFound):

@@ -22,8 +22,8 @@ ALL = Listing()
 
 
 class Office:
-    """Two realms with a user ``toad``, a group ``crew`` and a robot ``mobile`` each, and administrators: ``root`` and
-    ``boss`` of lab1, ``root`` of lab2.
+    """Two realms with a user ``toad``, a group ``crew``, a robot ``mobile`` and a group of robots ``cleaners`` each,
+    and administrators: ``root`` and ``boss`` of lab1, ``root`` of lab2.
     """
 
     def __init__(self, store: Store) -> None:
@@ -48,6 +48,7 @@ class Office:
                 queries.add_realm(s, lab)
                 queries.add_group(s, "crew", lab)
                 queries.add_robot(s, "mobile", realm=lab)
+                queries.add_robot_group(s, "cleaners", lab)
                 for name in ("toad", "root", *(["boss"] if lab == "lab1" else [])):
                     user = queries.add_user(s, name, None, admin=name != "toad", realm=lab)
                     self.people[f"{name}@{lab}"] = self._principal(s, user, None)

@@ -23,6 +23,7 @@ from tests.relay_server.administration.office import ALL, Office
         (people.add_user, "toad", (None, False)),
         (people.add_group, "crew", ()),
         (machines.add_robot, "mobile", ("",)),
+        (machines.add_group, "cleaners", ()),
     ],
 )
 @pytest_twisted.ensureDeferred
@@ -142,6 +143,7 @@ async def test_the_same_right_again_changes_nothing(office: Office) -> None:
         (people.leave, ("crew", "toad")),
         (machines.grant, ("mobile", "toad", "viewer", [], [])),
         (machines.revoke, ("mobile", "toad")),
+        (people.add_program, ("toad", "", None)),
     ],
 )
 @pytest_twisted.ensureDeferred
@@ -164,11 +166,20 @@ async def test_a_token_for_administration_shuts_out_and_sees_to_robots(office: O
     await office.do(people.change_user, "toad", None, True, None, who="narrow")
     await office.do(machines.add_robot, "arm", "", who="narrow")
     await office.do(machines.new_code, "arm", who="narrow")
+    await office.do(machines.change_robot, "arm", "on the bench", who="narrow")
+    await office.do(machines.join, "cleaners", "arm", who="narrow")
     await office.do(machines.remove_robot, "arm", 0, who="narrow")
     (token,) = (await office.see(people.tokens, "toad", ALL, who="narrow"))["tokens"]
     await office.do(people.revoke_token, token["id"], who="narrow")
-    actions = ["user.disable", "robot.add", "robot.code", "robot.remove", "token.revoke"]
-    assert [each[2] for each in office.record()] == actions
+    assert [each[2] for each in office.record()] == [
+        "user.disable",
+        "robot.add",
+        "robot.code",
+        "robot.describe",
+        "robot.group.add",
+        "robot.remove",
+        "token.revoke",
+    ]
 
 
 @pytest_twisted.ensureDeferred

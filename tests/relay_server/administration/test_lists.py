@@ -17,7 +17,9 @@ from tests.relay_server.administration.office import ALL, Office
 LOOKS: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
     (people.user, ("{}",)),
     (people.tokens, ("{}", ALL)),
+    (people.programs, ("{}", ALL)),
     (people.group, ("{}",)),
+    (machines.group, ("{}",)),
     (machines.robot, ("{}",)),
     (machines.keys, ("{}", ALL)),
     (machines.rights, (ALL, "{}", None)),
@@ -30,6 +32,14 @@ CHANGES: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
     (people.join, ("{}", "toad")),
     (people.join, ("crew", "{}")),
     (people.leave, ("crew", "{}")),
+    (people.add_program, ("{}", "", None)),
+    (people.revoke_program, ("{}",)),
+    (machines.change_robot, ("{}", "x")),
+    (machines.remove_group, ("{}",)),
+    (machines.join, ("{}", "mobile")),
+    (machines.join, ("cleaners", "{}")),
+    (machines.leave, ("{}", "mobile")),
+    (machines.leave, ("cleaners", "{}")),
     (machines.new_code, ("{}",)),
     (machines.remove_robot, ("{}", 0)),
     (machines.revoke_key, ("{}", "0" * 16)),
@@ -48,6 +58,7 @@ async def test_what_is_of_another_realm_is_not_there(office: Office, work: Any, 
         queries.add_user(s, "mole", None, realm="lab2")
         queries.add_group(s, "mole", realm="lab2")
         queries.add_robot(s, "mole", realm="lab2")
+        queries.add_robot_group(s, "mole", realm="lab2")
     said = set()
     for name in ("mole", "mole@lab2", "nobody", "toad@lab2", "\0", "", "mobile@lab2"):
         given = [each.format(name) if isinstance(each, str) else each for each in args]
@@ -79,6 +90,8 @@ async def test_lists_are_of_the_own_realm(office: Office) -> None:
         "users": 3,
         "groups": 1,
         "robots": 1,
+        "programs": 0,
+        "robot_groups": 1,
         "events_days": None,
     }
     told = await office.see(people.users, ALL)
@@ -92,7 +105,7 @@ async def test_lists_are_of_the_own_realm(office: Office) -> None:
     assert await office.see(people.users, Listing(after="root")) == {"users": told["users"][2:], "next": ""}
     assert (await office.see(people.groups, ALL))["groups"] == [{"group": "crew", "members": ["toad"]}]
     assert (await office.see(machines.robots, ALL))["robots"] == [
-        {"robot": "mobile", "description": "", "keys": 2}
+        {"robot": "mobile", "description": "", "keys": 2, "guest": False}
     ]
     rights = (await office.see(machines.rights, ALL, None, None))["rights"]
     assert [(each["holder"], each["level"]) for each in rights] == [("@crew", "viewer"), ("toad", "viewer")]

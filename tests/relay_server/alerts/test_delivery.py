@@ -32,6 +32,11 @@ from tests.relay_server.alerts.made_up import alert, rule
 NIGHT = {"from": "22:00", "to": "07:00", "zone": "UTC", "least": "error"}
 
 
+def its_own(alert: AlertRecord) -> frozenset[str]:
+    """No robot is shared here."""
+    return frozenset({alert.realm})
+
+
 class Scene:
     """One rule's way out, its time, and a receiver that fails when the test says so."""
 
@@ -49,7 +54,15 @@ class Scene:
         self.asks = 0
         self._names = 0
         self.office = Office(
-            self.clock, self.wall, lambda: 0.0, self._name, self._send, self._known, self._lasts, self._room
+            self.clock,
+            self.wall,
+            lambda: 0.0,
+            self._name,
+            self._send,
+            self._known,
+            self._lasts,
+            its_own,
+            self._room,
         )
         self.places = DeferredSemaphore(2)
         self.rooms = DeferredSemaphore(4)
@@ -205,7 +218,9 @@ def test_a_database_that_does_not_answer_is_asked_again(
             raise answers.pop()
         return {each.id for each in alerts}
 
-    office = Office(scene.clock, scene.wall, lambda: 0.0, lambda: "d1", scene._send, known, scene._lasts)
+    office = Office(
+        scene.clock, scene.wall, lambda: 0.0, lambda: "d1", scene._send, known, scene._lasts, its_own
+    )
     way = Delivery(office, rule(), scene.places)
     way.offer(begun())
     scene.wait(1)

@@ -49,14 +49,14 @@ def at(text: str, zone: str = "Europe/Rome") -> float:
 )
 def test_a_rule_tells_what_it_is_for(change: dict[str, object], event: Event, wanted: bool) -> None:
     """By robot, kind, level, and whether it is over."""
-    assert rules.wants(RULE._replace(**change), ALERT, event) is wanted  # type: ignore[arg-type]  # its fields
+    assert rules.wants(RULE._replace(**change), ALERT, event, {ALERT.realm}) is wanted  # type: ignore[arg-type]  # its fields
 
 
 def test_a_rule_tells_nothing_of_another_realms_robots() -> None:
-    """Their names may be the same."""
+    """Their names may be the same; one that is shared with its realm is one of it."""
     theirs = RULE._replace(realm="lab1", robots="cleaner-7")
-    assert not rules.wants(theirs, ALERT, Event.BEGUN)
-    assert rules.wants(theirs, ALERT._replace(realm="lab1"), Event.BEGUN)
+    assert not rules.wants(theirs, ALERT, Event.BEGUN, {ALERT.realm})
+    assert rules.wants(theirs, ALERT, Event.BEGUN, {ALERT.realm, "lab1"})
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,8 @@ def test_robots_are_listed_with_their_live_keys(cli: Any) -> None:
     code = cli.json("robot", "add", "arm")["enrolment_code"]
     _enrol(cli, "arm", code)
     assert cli.json("robot", "list") == [
-        {"robot": "arm", "description": "", "keys": 1},
-        {"robot": "rover", "description": "[red]x[/red] :boom:", "keys": 0},
+        {"robot": "arm", "description": "", "keys": 1, "shared": []},
+        {"robot": "rover", "description": "[red]x[/red] :boom:", "keys": 0, "shared": []},
     ]
     table = cli.ok("robot", "list")
     assert "[red]x[/red] :boom:" in table

@@ -25,7 +25,7 @@ def _stored_hash(cli: Any, name: str) -> str | None:
 def test_a_user_is_added_with_a_password_from_stdin(cli: Any) -> None:
     """The first line counts, without its end, and what is stored verifies it."""
     answer = cli.json("user", "add", "Ann", "--admin", "--password-stdin", stdin=f"{PASSWORD}\r\nsecond line")
-    assert answer == {"user": "ann", "admin": True, "disabled": False, "password": True}
+    assert answer == {"user": "ann", "admin": True, "disabled": False, "password": True, "guest_of": None}
     assert verify_password(PASSWORD, _stored_hash(cli, "ann"))
 
 
@@ -34,7 +34,10 @@ def test_a_password_is_asked_for_twice_and_not_shown(cli: Any) -> None:
     typed = f"{PASSWORD}\nsomething else\n{PASSWORD}\n{PASSWORD}\n"
     result = cli("user", "add", "ann", "--json", stdin=typed)
     assert result.exit_code == 0
-    assert result.stdout == '{"user": "ann", "admin": false, "disabled": false, "password": true}\n'
+    assert (
+        result.stdout
+        == '{"user": "ann", "admin": false, "disabled": false, "password": true, "guest_of": null}\n'
+    )
     assert PASSWORD not in result.output
     assert result.stderr.count("Password") >= 2
     assert verify_password(PASSWORD, _stored_hash(cli, "ann"))

@@ -11,7 +11,7 @@ from relay_server.cli import relaysocket
 from relay_server.console import CONFIRM_SECONDS
 from relay_server.control import Actor, NotDone, StoppedSince
 from relay_server.control import stopping as module
-from relay_server.control.stopping import STOP_SECONDS
+from relay_server.control.stopping import SAME_SECONDS, STOP_SECONDS
 from relay_server.fleet import desk
 from relay_server.frontdesk import LOOKUP_SECONDS
 from robot_client.hardware import DYING, PATIENCE
@@ -82,6 +82,63 @@ def test_a_stop_of_a_stopped_robot_is_told() -> None:
     assert place.desk.standing.stopped is None
     result(place.desk.stopping.stop(ANN, ""))
     assert place.desk.standing.stopped.again is None
+
+
+def test_one_press_that_comes_two_ways_is_told_once() -> None:
+    """The robot gets both; that it is told by another moment ends a press to resume, as does what was asked before."""
+    place = Place().online()
+    stopping, by_http = place.desk.stopping, ANN._replace(address="192.0.2.9", connection=0)
+    place.link.silent = True
+    ways = [outcome(stopping.stop(ANN, "smoke"))]
+    first = place.desk.standing.stopped
+    before = place.now_ns()
+    place.clock.advance(SAME_SECONDS)
+    ways.append(outcome(stopping.stop(by_http, "smoke")))
+    second = place.desk.standing.stopped
+    assert first is not None and second is not None
+    assert (second.by, second.why, second.again) == ("ann", "smoke", None)
+    assert second.since == first.since + SAME_SECONDS
+    for order in place.link.orders(link.Stop):
+        place.link.answers(order)
+        place.desk.told(link.Safety(stopped=link.Stopped(by="ann", why="smoke", since=first.since)))
+        assert place.desk.standing.stopped == second._replace(told=True)
+    assert ways == [[True], [True]]
+    place.link.silent = False
+    with pytest.raises(StoppedSince):
+        result(stopping.resume(BOB, "", before))
+    result(stopping.resume(BOB, "", LATER))
+    result(stopping.stop(ANN, "smoke"))
+    assert place.desk.standing.stopped._replace(since=first.since, told=False) == first
+
+
+@pytest.mark.parametrize(
+    ("actor", "why", "later"),
+    [(BOB, "smoke", 0.0), (ANN, "fire", 0.0), (ANN, "smoke", SAME_SECONDS + 0.1)],
+    ids=["by another", "for another reason", "later"],
+)
+def test_another_press_is_told(actor: Actor, why: str, later: float) -> None:
+    """As what it is."""
+    place = Place().online()
+    result(place.desk.stopping.stop(ANN, "smoke"))
+    place.clock.advance(later)
+    result(place.desk.stopping.stop(actor, why))
+    stopped = place.desk.standing.stopped
+    assert stopped is not None and stopped.again is not None
+    assert stopped.again[:2] == (actor.name, why)
+
+
+def test_who_comes_between_the_two_ways_of_a_press_stays_named() -> None:
+    """Though the later of them is the latest; it ends a press to resume as well."""
+    place = Place().online()
+    for actor in (ANN, BOB):
+        result(place.desk.stopping.stop(actor, "smoke"))
+        place.clock.advance(0.5)
+    before = place.desk.standing.stopped
+    result(place.desk.stopping.stop(ANN, "smoke"))
+    stopped = place.desk.standing.stopped
+    assert before is not None and stopped is not None
+    assert stopped.since > before.since
+    assert stopped._replace(since=before.since) == before
 
 
 def test_a_stop_that_replaces_one_that_is_still_to_be_told_is_no_second_one() -> None:

@@ -10,9 +10,10 @@ import pytest
 
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Principal
-from relay_server.console import Outcome
+from relay_server.console import Outcome, Taken
 from relay_server.control import Answer, NotDone, StoppedSince
 from relay_server.edges import control as module
+from relay_server.inside import LINGER_SECONDS
 from relay_server.moments import HEADER, Moments
 from tests.relay_server.edges.http_client import ORIGIN, World
 
@@ -43,6 +44,15 @@ class Console:
         if robot != "rover":
             raise NotFound("there is no such robot, or you have no right on it")
         return {"robot": robot, "stopped": STOPPED}
+
+    async def take(self, principal: Principal, robot: str, why: str, address: str, seconds: float) -> Taken:
+        """Keep it."""
+        self._keep("take", principal, robot, why, address, seconds)
+        return Taken(Answer(self.done, "you have control"), {"robot": robot})
+
+    async def let_go(self, principal: Principal, robot: str, address: str) -> None:
+        """Keep it."""
+        self._keep("let go", principal, robot, address)
 
     async def release(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
         """Keep it."""
@@ -84,8 +94,8 @@ class Console:
 class Site(World):
     """A relay's site with control behind it."""
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
+    def __init__(self, folder: Path, rate: float = 0.0) -> None:
+        super().__init__(folder, rate=rate)
         self.console = Console()
         self.now = 1000
         self.moments = Moments(lambda: self.now)
@@ -115,7 +125,7 @@ def test_who_moves_a_robot_is_told(site: Site) -> None:
 
 
 def test_control_is_given_back_handed_over_and_kept(site: Site) -> None:
-    """With a reason or without any body; but not taken, which a connection does."""
+    """With a reason or without any body."""
     assert site.post("control/release", {"why": "done"}).json == {
         "success": True,
         "message": "control is given back",
@@ -131,6 +141,47 @@ def test_control_is_given_back_handed_over_and_kept(site: Site) -> None:
     assert site.post("control/grant", {"client": "bob"}).status == 400
     assert site.post("control/take").status == 404
     assert site.post("control").status == 404
+
+
+def test_control_is_taken_or_asked_for(site: Site) -> None:
+    """With a reason and a wait, or without; the answer says which, until when, and gives a first command's moment."""
+    taken = site.ask("PUT", f"{HERE}/control", {"why": "delivery"}, **ANN, Prefer="wait=7")
+    assert (taken.status, taken.headers["preference-applied"]) == (200, "wait=7")
+    assert taken.json == {
+        "success": True,
+        "message": "you have control",
+        "kept": LINGER_SECONDS,
+        "control": {"robot": "rover"},
+    }
+    assert taken.headers[HEADER] == site.moments.now()
+    site.console.done = False
+    asked = site.ask("PUT", f"{HERE}/control", **ANN)
+    assert (asked.status, asked.json["success"]) == (202, False)
+    assert site.console.asked == [
+        ("take", "rover", "delivery", "192.0.2.9", 7.0),
+        ("take", "rover", "", "192.0.2.9", 0.0),
+    ]
+    assert site.ask("PUT", f"{HERE}/control", {"why": 7}, **ANN).status == 400
+    assert site.ask("PUT", f"{HERE}/control", raw=b"{", **ANN).status == 400
+    assert len(site.console.asked) == 2
+
+
+def test_control_that_was_taken_is_let_go(site: Site) -> None:
+    """Though the database is gone: that stops a robot."""
+    site.desk.up = False
+    for _ in range(3):
+        answer = site.ask("DELETE", f"{HERE}/control", **ANN)
+        assert (answer.status, answer.body) == (204, b"")
+        assert answer.headers[HEADER] == site.moments.now()
+    assert site.console.asked == [("let go", "rover", "192.0.2.9")] * 3
+    assert site.ask("PUT", f"{HERE}/control", **ANN).status == 503
+
+
+def test_what_was_taken_is_let_go_however_much_was_asked(tmp_path: Path) -> None:
+    """Taking counts as other requests do."""
+    site = Site(tmp_path, rate=0.1)
+    assert [site.ask("PUT", f"{HERE}/control", **ANN).status for _ in range(2)] == [200, 429]
+    assert [site.ask("DELETE", f"{HERE}/control", **ANN).status for _ in range(3)] == [204] * 3
 
 
 def test_a_stop_says_whether_it_is_done(site: Site) -> None:
@@ -182,6 +233,9 @@ def test_what_goes_wrong_is_told_in_words(site: Site, error: Exception, status: 
         answer = site.post(part, {"resource": "/cmd_vel"})
         assert (answer.status, answer.json["detail"]) == (status, str(error)), part
         assert answer.headers["content-type"] == "application/problem+json"
+    for method in ("PUT", "DELETE"):
+        answer = site.ask(method, f"{HERE}/control", **ANN)
+        assert (answer.status, answer.json["detail"]) == (status, str(error)), method
     if status == 409:
         assert site.post("stop").json["stopped"] == STOPPED
 
@@ -253,6 +307,8 @@ def test_a_cookie_counts_only_with_a_listed_origin(site: Site) -> None:
         body = {"resource": "/x"} if part in ("suppress", "inhibit") else {}
         assert site.ask("POST", f"{HERE}/{part}", body, **cookie).status == 403
         assert site.ask("POST", f"{HERE}/{part}", body, **cookie, Origin="https://evil.example").status == 403
+    for method in ("PUT", "DELETE"):
+        assert site.ask(method, f"{HERE}/control", **cookie).status == 403
     assert site.console.asked == []
     assert site.ask("POST", f"{HERE}/stop", {}, **cookie, Origin=ORIGIN).status == 200
 
@@ -260,5 +316,8 @@ def test_a_cookie_counts_only_with_a_listed_origin(site: Site) -> None:
 def test_addresses_take_their_own_methods(site: Site) -> None:
     """And there is nothing below them."""
     assert site.ask("GET", f"{HERE}/stop", **ANN).status == 404
-    assert site.ask("DELETE", f"{HERE}/control", **ANN).status == 405
+    assert site.ask("PATCH", f"{HERE}/control", **ANN).status == 405
+    for method in ("PUT", "DELETE"):
+        assert site.ask(method, f"{HERE}/stop", **ANN).status == 404
+    assert site.console.asked == []
     assert site.post("stop/now").status == 404

@@ -10,7 +10,8 @@ import pytest
 from twisted.internet.defer import CancelledError, Deferred
 
 from relay_server.access import Principal
-from relay_server.console import Outcome
+from relay_server.console import Outcome, Taken
+from relay_server.control import Answer
 from relay_server.edges import control
 from relay_server.moments import HEADER, Moments
 from tests.relay_server.edges.http_client import HOST, World
@@ -31,6 +32,12 @@ class Console:
         self.asked.append((robot, why))
         await self._wait()
         return Outcome(True, {"by": principal.name})
+
+    async def take(self, principal: Principal, robot: str, why: str, address: str, seconds: float) -> Taken:
+        """Wait, then take control."""
+        self.asked.append((robot, why))
+        await self._wait()
+        return Taken(Answer(True, "you have control"), {})
 
     async def resume(self, principal: Principal, robot: str, why: str, address: str, sent: int) -> None:
         """Wait, then resume it."""
@@ -60,10 +67,10 @@ def world(tmp_path: Path, console: Any) -> World:
     return made
 
 
-def leaves(world: World, part: str) -> None:
+def leaves(world: World, part: str, method: str = "POST") -> None:
     """Somebody gives an order, and is gone."""
     body = '{"why": "smoke"}'
-    head = f"POST /api/v1/robots/rover/{part} HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\n"
+    head = f"{method} /api/v1/robots/rover/{part} HTTP/1.1\r\nHost: {HOST}\r\nAuthorization: Bearer ann\r\n"
     head += (
         f"{HEADER}: {MOMENTS.now()}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
     )
@@ -95,7 +102,9 @@ def test_a_stop_begins_though_nobody_waits_for_it(
     assert console.done == ["done"]
 
 
-def test_anything_else_is_given_up(world: World, console: Console) -> None:
-    """Nothing moves again for who does not see it."""
-    leaves(world, "resume")
+@pytest.mark.parametrize(("method", "part"), [("POST", "resume"), ("PUT", "control")])
+def test_anything_else_is_given_up(world: World, console: Console, method: str, part: str) -> None:
+    """Nothing moves again for who does not see it, and who has gone waits for control no more."""
+    leaves(world, part, method)
+    assert console.asked == [("rover", "smoke")]
     assert console.done == ["given up"]

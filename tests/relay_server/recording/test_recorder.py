@@ -75,7 +75,8 @@ class Desk:
         self, world: World, topics: tuple[str, ...] = (HERE,), cameras: tuple[str, ...] = ()
     ) -> None:
         self.world = world
-        self.entry = Entry("id", 1, "rover", 7, "ann", topics, cameras, begun=1.0, limit=10**6, seconds=600.0)
+        what = "id", 1, "rover", 7, "ann", topics, cameras
+        self.entry = Entry(*what, begun=1.0, limit=10**6, seconds=600.0, realm="main")
         principal = Principal(7, "ann", "main", False, 1, None)
         self.permit = Permit(principal, 1, Rules([Grant(Level.OPERATOR)]))
         self.over: list[Recorder] = []
@@ -270,6 +271,13 @@ def test_what_a_viewer_may_is_not_enough(world: World) -> None:
     for denied in (f"view:{CAMERA}", f"record:{CAMERA}", "subscribe:/chatter"):
         desk.rights(denied)
         assert denied in why_denied(desk.permit, desk.entry)
+
+
+def test_what_another_realm_has_recorded_is_not_had(world: World) -> None:
+    """Of a robot that both are at, whatever one may see of it."""
+    desk = Desk(world, (HERE,))
+    desk.entry.realm = "lab2"
+    assert why_denied(desk.permit, desk.entry) == "it was recorded in another realm"
 
 
 def test_pictures_of_a_topic_take_the_right_to_view_them(world: World) -> None:

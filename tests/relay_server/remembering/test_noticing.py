@@ -60,6 +60,27 @@ def test_an_event_of_a_robot_is_in_its_name_and_says_who_did_it(notes: Notes, no
     assert json.loads(event.data) == {"why": "x" * 254 + "…"}
 
 
+def test_an_event_of_a_shared_robot_is_told_in_all_its_realms(time: Time, notes: Notes) -> None:
+    """Who did it is a user in his own realm, in the others a full name; what nobody did is the same."""
+    registry = Registry(time)
+    registry.share({1: frozenset({"lab2"})})
+    assert registry.presence(1, "rover", "lab").realms == {"lab", "lab2"}
+    noticing = Noticing(notes, registry, time, time)
+    noticing.happened("control.taken", "user:ann@lab2", 1, {"why": "why not"})
+    noticing.happened("control.released", "user:bob", 1, {})
+    noticing.happened("robot.offline", "relay", 1, {})
+    told = [(each.realm, each.kind, each.user, json.loads(each.data)) for each in notes.events]
+    assert told == [
+        ("lab", "control.taken", None, {"why": "why not", "by": "ann@lab2"}),
+        ("lab2", "control.taken", "ann", {"why": "why not"}),
+        ("lab", "control.released", "bob", {}),
+        ("lab2", "control.released", None, {"by": "bob@lab"}),
+        ("lab", "robot.offline", None, {}),
+        ("lab2", "robot.offline", None, {}),
+    ]
+    assert {each.source for each in notes.events} == {"relay:rover"}
+
+
 def test_a_refused_login_is_told_in_full(notes: Notes, noticing: Noticing) -> None:
     """Only administrators read it."""
     data = {"user": "ann", "address": "192.0.2.1", "reason": "bad_credentials"}

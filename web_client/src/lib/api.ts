@@ -44,7 +44,11 @@ const HEADERS = { Accept: 'application/json', 'X-Requested-With': 'switchboard' 
 
 type More = RequestInit & { headers?: Record<string, string> }
 
-async function request(method: string, path: string, body?: unknown, more: More = {}): Promise<Response> {
+/** Asks the relay, with what the session's cookie needs beside it.
+ *
+ * @throws Refusal, Unreachable
+ */
+export async function request(method: string, path: string, body?: unknown, more: More = {}): Promise<Response> {
   const headers: Record<string, string> = { ...HEADERS }
   if (body !== undefined) headers['Content-Type'] = 'application/json'
   let response: Response

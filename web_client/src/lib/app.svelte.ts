@@ -108,7 +108,7 @@ class App {
     this.session = null
     this.known = true
     this.notice = notice
-    const wanted = ['cockpit', 'alerts'].includes(parse(location.pathname).page)
+    const wanted = ['cockpit', 'alerts', 'realm'].includes(parse(location.pathname).page)
     const here = wanted ? `?next=${encodeURIComponent(location.pathname)}` : ''
     history.replaceState(null, '', `/login${here}`)
     this.route = { page: 'login' }

@@ -1,5 +1,5 @@
 import { expect, it } from 'vitest'
-import { afterLogin, cockpitPath, loginCode, parse } from './route'
+import { afterLogin, cockpitPath, loginCode, parse, REALM_PARTS, realmPath } from './route'
 
 it('reads the pages out of the address', () => {
   expect(parse('/')).toEqual({ page: 'fleet' })
@@ -11,6 +11,14 @@ it('reads the pages out of the address', () => {
   expect(parse('/elsewhere')).toEqual({ page: 'unknown' })
 })
 
+it('knows the parts of a realm', () => {
+  expect(parse('/realm')).toEqual({ page: 'realm', part: 'robots' })
+  for (const part of REALM_PARTS) expect(parse(realmPath(part))).toEqual({ page: 'realm', part })
+  expect(parse('/realm/tokens')).toEqual({ page: 'unknown' })
+  expect(parse('/realm/rights/rover')).toEqual({ page: 'unknown' })
+  expect(realmPath('rights', { who: '@crew', robot: '' })).toBe('/realm/rights?who=%40crew')
+})
+
 it('writes robot names so that they can be read back', () => {
   for (const name of ['rover-1', 'a b', 'ä/ö', '%41']) {
     expect(parse(cockpitPath(name))).toEqual({ page: 'cockpit', robot: name })
@@ -20,6 +28,7 @@ it('writes robot names so that they can be read back', () => {
 it('goes to a page of the portal after the login, nowhere else', () => {
   expect(afterLogin('?next=%2Fcockpit%2Frover-1')).toBe('/cockpit/rover-1')
   expect(afterLogin('?next=%2Falerts')).toBe('/alerts')
+  expect(afterLogin('?next=%2Frealm%2Frights')).toBe('/realm/rights')
   for (const next of ['https://evil.example/', '//evil.example/x', 'javascript:alert(1)', '/api/v1/session', '']) {
     expect(afterLogin(`?next=${encodeURIComponent(next)}`)).toBe('/fleet')
   }

@@ -1,0 +1,57 @@
+"""Robots and users that are of several realms.
+
+Revision ID: 0009
+Revises: 0008
+"""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0009"
+down_revision = "0008"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    op.create_table(
+        "robot_realm",
+        sa.Column("robot_id", sa.Integer(), nullable=False),
+        sa.Column("realm_id", sa.Integer(), nullable=False),
+        sa.Column("name", sa.String(length=63), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["robot_id"], ["robot.id"], name=op.f("fk_robot_realm_robot_id_robot"), ondelete="CASCADE"
+        ),
+        sa.ForeignKeyConstraint(
+            ["realm_id"], ["realm.id"], name=op.f("fk_robot_realm_realm_id_realm"), ondelete="RESTRICT"
+        ),
+        sa.PrimaryKeyConstraint("robot_id", "realm_id", name=op.f("pk_robot_realm")),
+        sa.UniqueConstraint("realm_id", "name", name=op.f("uq_robot_realm_realm_id_name")),
+    )
+    op.execute("INSERT INTO robot_realm (robot_id, realm_id, name) SELECT id, realm_id, name FROM robot")
+    op.create_table(
+        "guest_account",
+        sa.Column("user_id", sa.Integer(), nullable=False),
+        sa.Column("home_id", sa.Integer(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["user_id"],
+            ["user_account.id"],
+            name=op.f("fk_guest_account_user_id_user_account"),
+            ondelete="CASCADE",
+        ),
+        sa.ForeignKeyConstraint(
+            ["home_id"],
+            ["user_account.id"],
+            name=op.f("fk_guest_account_home_id_user_account"),
+            ondelete="CASCADE",
+        ),
+        sa.PrimaryKeyConstraint("user_id", name=op.f("pk_guest_account")),
+    )
+    op.create_index(op.f("ix_guest_account_home_id"), "guest_account", ["home_id"])
+
+
+def downgrade() -> None:
+    op.drop_table("guest_account")
+    op.drop_table("robot_realm")

@@ -1,0 +1,331 @@
+"""An administrator sees to his realm in the portal, in a real browser with the real relay behind it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+from switchboard_browser import lived_in, seen, sound_pages, was_told
+from switchboard_forks import run_command
+from switchboard_relay import Relay
+
+PASSWORD = "correct horse"
+WAIT_SECONDS = 60.0
+
+GROUPS = re.compile(r"/api/v1/realm/groups$")
+"""Where groups are added; lists of them are asked for with a query."""
+
+OpenPage = Callable[..., Page]
+
+
+class House:
+    """A relay with an administrator ``root``, a user ``guest``, and a robot ``mower`` that has not enrolled."""
+
+    def __init__(self, folder: Path) -> None:
+        self.relay = Relay(folder)
+        self.relay.user("root", admin=True)
+        self.relay.user("guest")
+        self.relay.cli("robot", "add", "mower", "--description", "Cuts the lawn")
+
+    def stop(self) -> None:
+        """End everything."""
+        self.relay.stop()
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    """One house for all; each test has robots and people of its own."""
+    yield from lived_in(House, tmp_path_factory.mktemp("realm"))
+
+
+@pytest.fixture
+def open_page(browser: Browser, house: House) -> Iterator[OpenPage]:
+    """Opens pages of somebody who has logged in; an uncaught error or a breach of the CSP fails the test."""
+    url = f"http://127.0.0.1:{house.relay.http_port}"
+    with sound_pages(browser, url, WAIT_SECONDS) as new_page:
+
+        def open_page(
+            path: str, user: str = "root", password: str = PASSWORD, width: int = 1280, height: int = 800
+        ) -> Page:
+            page = new_page(width, height)
+            log_in(page, user, password)
+            seen(page, "user-menu").wait_for()
+            page.goto(path)
+            return page
+
+        yield open_page
+
+
+def log_in(page: Page, user: str, password: str = PASSWORD) -> None:
+    """Fill in the form."""
+    page.goto("/login")
+    seen(page, "login-user").fill(user)
+    seen(page, "login-password").fill(password)
+    seen(page, "login-submit").click()
+
+
+def row(page: Page, what: str, name: str) -> Locator:
+    """The row of a robot, person or group."""
+    key = "user" if what == "person" else what
+    return page.locator(f"[data-testid=realm-{what}][data-{key}='{name}']")
+
+
+def right(page: Page, robot: str, holder: str) -> Locator:
+    """The row of a right."""
+    of_robot = page.locator(f"[data-testid=rights-of][data-robot='{robot}']")
+    return of_robot.locator(f"[data-testid=right][data-holder='{holder}']")
+
+
+def inside(place: Locator, testid: str) -> Locator:
+    """A part of a row."""
+    return place.get_by_test_id(testid)
+
+
+def add_person(page: Page, name: str, password: str) -> None:
+    """On the page of people."""
+    seen(page, "person-add").click()
+    seen(page, "person-name").fill(name)
+    seen(page, "person-password").fill(password)
+    seen(page, "person-add-sure").click()
+    expect(row(page, "person", name)).to_be_visible()
+
+
+def give(page: Page, robot: str, holder: str, level: str) -> None:
+    """A right, on the page of rights."""
+    here = page.locator(f"[data-testid=rights-of][data-robot='{robot}']")
+    inside(here, "right-add-here").click()
+    inside(here, "grant-who").fill(holder)
+    inside(inside(here, "grant-form"), f"level-{level}").click()
+    inside(here, "grant-sure").click()
+    expect(right(page, robot, holder)).to_have_attribute("data-level", level)
+
+
+def test_a_robot_is_added_and_enrols_by_the_command_that_is_shown(
+    house: House, open_page: OpenPage, tmp_path: Path
+) -> None:
+    """What is wrong with a name is told beside it; the code lets the robot in, and its key is seen and retired."""
+    page = open_page("/fleet")
+    seen(page, "realm-link").click()
+    seen(page, "robot-add").click()
+    seen(page, "robot-name").fill("Rover One")
+    seen(page, "robot-description").fill("In the hall")
+    seen(page, "robot-add-sure").click()
+    expect(seen(page, "realm-problem")).to_contain_text("lower-case letters")
+    expect(seen(page, "robot-description")).to_have_value("In the hall")
+    seen(page, "robot-name").fill("mower")
+    seen(page, "robot-add-sure").click()
+    expect(seen(page, "realm-problem")).to_contain_text("There is a robot 'mower' already")
+    seen(page, "robot-name").fill("rover-one")
+    seen(page, "robot-add-sure").click()
+
+    expect(seen(page, "realm-code-until")).to_contain_text(re.compile(r"Good until .+, for 15 minutes"))
+    expect(row(page, "robot", "rover-one")).to_contain_text("Not enrolled yet")
+    command = shlex.split(seen(page, "realm-command").inner_text())
+    # Another port than is assumed, and a folder of this test.
+    command[command.index("--relay") + 1] = f"127.0.0.1:{house.relay.robots_port}"
+    command[command.index("--state") + 1] = str(tmp_path / "state")
+    done = run_command(command, stdin=seen(page, "realm-code-text").inner_text() + "\n")
+    assert done.returncode == 0, done.stderr
+    expect(seen(page, "realm-code-until")).to_contain_text("has enrolled")
+
+    robot = row(page, "robot", "rover-one")
+    expect(robot).to_contain_text("1 live key")
+    inside(robot, "robot-show-keys").click()
+    inside(robot, "key-retire").click()
+    inside(robot, "realm-sure").click()
+    expect(inside(robot, "realm-key")).to_contain_text("retired")
+    expect(inside(robot, "robot-keys")).to_have_text("Not enrolled yet")
+
+
+def test_a_robot_is_removed_after_it_was_said_what_goes_with_it(house: House, open_page: OpenPage) -> None:
+    """To keep it is one press; a new code is shown for it until then."""
+    house.relay.cli("robot", "add", "old-one")
+    page = open_page("/realm/robots")
+    robot = row(page, "robot", "old-one")
+    inside(robot, "robot-code").click()
+    expect(inside(robot, "realm-code-text")).to_have_text(re.compile(r"\S{8,}"))
+    inside(robot, "robot-remove").click()
+    expect(robot).to_contain_text("All rights on it and its recordings go with it")
+    inside(robot, "realm-keep").click()
+    expect(robot).to_be_visible()
+    inside(robot, "robot-remove").click()
+    inside(robot, "realm-sure").click()
+    expect(robot).to_have_count(0)
+    expect(row(page, "robot", "mower")).to_be_visible()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_person_gets_a_right_and_loses_it(house: House, open_page: OpenPage, width: int) -> None:
+    """Who was added with a password sees the robot while he has the right, and not after; nothing needs a wide page."""
+    name = f"luigi-{width}"
+    page = open_page("/realm/people", width=width)
+    add_person(page, name, "it is me again")
+    seen(page, "realm-rights").click()
+    give(page, "mower", name, "operator")
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+
+    other = open_page("/fleet", name, "it is me again")
+    card = other.locator("[data-testid=robot-card][data-robot=mower]")
+    expect(card).to_contain_text(re.compile("operator", re.IGNORECASE))
+    inside(right(page, "mower", name), "right-revoke").click()
+    inside(right(page, "mower", name), "realm-sure").click()
+    expect(right(page, "mower", name)).to_have_count(0)
+    expect(card).to_have_count(0)
+    expect(seen(other, "fleet-empty")).to_be_visible()
+
+
+def test_a_right_is_changed_in_place_and_not_lost_by_accident(house: House, open_page: OpenPage) -> None:
+    """Another level keeps the patterns; a second right is asked about, and a pattern that is none is told in words."""
+    for name in ("ann", "bob"):
+        house.relay.user(name)
+    house.relay.cli("right", "grant", "ann", "mower", "viewer", "--deny", "call:/blade")
+    house.relay.cli("right", "grant", "bob", "mower", "viewer")
+    page = open_page("/realm/rights?who=ann")
+    ann = right(page, "mower", "ann")
+    expect(ann).to_have_attribute("data-level", "viewer")
+    expect(right(page, "mower", "bob")).to_have_count(0)
+    inside(ann, "level-owner").click()
+    expect(ann).to_have_attribute("data-level", "owner")
+    expect(inside(ann, "right-denied")).to_contain_text("call:/blade")
+
+    inside(ann, "right-edit").click()
+    inside(ann, "right-allow").fill("mow:/lawn")
+    inside(ann, "right-save").click()
+    expect(inside(ann, "realm-problem")).to_contain_text("'mow:/lawn' is no pattern")
+    expect(inside(ann, "right-allow")).to_have_value("mow:/lawn")
+    inside(ann, "right-allow").fill("call:/mow")
+    inside(ann, "right-save").click()
+    expect(inside(ann, "right-allowed")).to_contain_text("call:/mow")
+
+    seen(page, "right-add").click()
+    form = page.locator("form[data-testid=grant-form]")
+    expect(inside(form, "grant-who")).to_have_value("ann")
+    inside(form, "grant-robot").fill("mower")
+    inside(form, "grant-sure").click()
+    expect(seen(page, "grant-before")).to_contain_text("owner; call:/mow allowed; call:/blade denied")
+    expect(ann).to_have_attribute("data-level", "owner")
+    inside(form, "grant-sure").click()
+    expect(ann).to_have_attribute("data-level", "viewer")
+    expect(inside(ann, "right-denied")).to_have_count(0)
+
+
+def test_what_a_group_may_do_is_seen_with_who_is_in_it(house: House, open_page: OpenPage) -> None:
+    """A group is added, filled, given a right and removed; the right goes with it."""
+    house.relay.user("mario")
+    page = open_page("/realm/groups")
+    seen(page, "group-add").click()
+    seen(page, "group-name").fill("crew")
+    seen(page, "group-add-sure").click()
+    group = row(page, "group", "crew")
+    inside(group, "group-who").fill("nobody-of-this-name")
+    inside(group, "group-join").click()
+    expect(inside(group, "realm-problem")).to_contain_text("no such user")
+    expect(inside(group, "group-who")).to_have_value("nobody-of-this-name")
+    for name in ("mario", "guest"):
+        inside(group, "group-who").fill(name)
+        inside(group, "group-join").click()
+        expect(group.locator(f"[data-testid=group-member][data-user={name}]")).to_be_visible()
+    inside(group.locator("[data-user=guest]"), "group-leave").click()
+    expect(inside(group, "group-member")).to_have_text(["mario"])
+
+    seen(page, "realm-rights").click()
+    give(page, "mower", "@crew", "viewer")
+    expect(right(page, "mower", "@crew")).to_contain_text("mario")
+    page.goto("/realm/rights?who=mario")
+    expect(right(page, "mower", "@crew")).to_be_visible()
+    page.goto("/realm/groups")
+    inside(group, "group-remove").click()
+    inside(group, "realm-sure").click()
+    expect(group).to_have_count(0)
+    page.goto("/realm/rights")
+    expect(page.locator("[data-testid=rights-of][data-robot=mower]")).to_be_visible()
+    expect(right(page, "mower", "@crew")).to_have_count(0)
+
+
+def test_people_are_shut_out_let_in_and_made_administrators(house: House, open_page: OpenPage) -> None:
+    """A new password and a revoked session are for somebody else to notice at once; oneself nobody can remove."""
+    house.relay.user("peach")
+    other = open_page("/fleet", "peach")
+    page = open_page("/realm/people")
+    peach = row(page, "person", "peach")
+    inside(peach, "person-manage").click()
+    session = peach.locator("[data-testid=realm-token][data-kind=session]")
+    inside(session, "token-revoke").click()
+    expect(session).to_have_count(0)
+    expect(seen(other, "login-submit")).to_be_visible()
+
+    inside(peach, "person-new-password").fill("short")
+    inside(peach, "person-set-password").click()
+    expect(inside(peach, "realm-problem")).to_contain_text("8 characters")
+    inside(peach, "person-new-password").fill("another castle")
+    inside(peach, "person-set-password").click()
+    was_told(page, "peach has a new password")
+    inside(peach, "person-disable").click()
+    expect(peach).to_contain_text("Disabled")
+    log_in(other, "peach", "another castle")
+    expect(seen(other, "login-error")).to_be_visible()
+    inside(peach, "person-enable").click()
+    inside(peach, "person-make-admin").click()
+    expect(peach).to_contain_text("Administrator")
+
+    log_in(other, "peach", "another castle")
+    expect(seen(other, "realm-link")).to_be_visible()
+    other.goto("/realm/people")
+    own = row(other, "person", "peach")
+    inside(own, "person-manage").click()
+    for each in ("person-no-admin", "person-disable", "person-remove"):
+        expect(inside(own, each)).to_be_disabled()
+
+    inside(peach, "person-remove").click()
+    inside(peach, "realm-sure").click()
+    expect(peach).to_have_count(0)
+    expect(seen(other, "login-submit")).to_be_visible()
+
+
+def test_a_long_list_is_shown_in_parts_and_filtered_by_name(house: House, open_page: OpenPage) -> None:
+    """The filter finds what the part that is shown does not have."""
+    for number in range(101):
+        house.relay.cli("group", "add", f"many-{number:03d}")
+    page = open_page("/realm/groups")
+    expect(seen(page, "realm-group")).to_have_count(100)
+    seen(page, "realm-more").click()
+    expect(row(page, "group", "many-100")).to_be_visible()
+    expect(seen(page, "realm-more")).to_have_count(0)
+    seen(page, "realm-search").fill("Y-07")
+    expect(seen(page, "realm-group")).to_have_count(10)
+    seen(page, "realm-search").fill("many-0?0")
+    expect(seen(page, "realm-group")).to_have_count(10)
+    seen(page, "realm-search").fill("nothing of this")
+    expect(seen(page, "realm-empty")).to_contain_text("Nothing matches")
+
+
+def test_who_changes_too_much_is_told_how_long_to_wait(open_page: OpenPage) -> None:
+    """What he typed stays, and a second press does it."""
+    page = open_page("/realm/groups")
+    problem = {"title": "Too Many Requests", "status": 429, "detail": "this realm is changed too often"}
+    refused = {"status": 429, "headers": {"Retry-After": "2"}, "json": problem}
+    page.route(GROUPS, lambda route: route.fulfill(**refused), times=1)
+    seen(page, "group-add").click()
+    seen(page, "group-name").fill("hasty")
+    seen(page, "group-add-sure").click()
+    expect(seen(page, "realm-problem")).to_have_text("This realm is changed too often. Wait 2 seconds.")
+    expect(seen(page, "group-name")).to_have_value("hasty")
+    seen(page, "group-add-sure").click()
+    expect(row(page, "group", "hasty")).to_be_visible()
+
+
+def test_others_are_told_that_it_is_not_for_them(open_page: OpenPage) -> None:
+    """No link leads there, neither in the bar nor in the menu; the address says in words why there is nothing."""
+    page = open_page("/fleet", "guest")
+    expect(seen(page, "alerts-link")).to_be_visible()
+    expect(seen(page, "realm-link")).to_have_count(0)
+    seen(page, "user-menu").click()
+    expect(seen(page, "logout")).to_be_visible()
+    expect(seen(page, "realm-menu-link")).to_have_count(0)
+    page.goto("/realm/rights")
+    expect(page.get_by_text("You are not an administrator of this realm")).to_be_visible()
+    expect(seen(page, "right-add")).to_have_count(0)
