@@ -110,6 +110,11 @@ def seen(page: Page, testid: str) -> Locator:
     return page.get_by_test_id(testid)
 
 
+def picture(page: Page, canvas: str) -> str:
+    """What a canvas shows, as data."""
+    return str(seen(page, canvas).evaluate("canvas => canvas.toDataURL()"))
+
+
 def was_told(page: Page, words: str) -> None:
     """Wait until a toast with these words has been shown, were it for a moment."""
     wait_for(f"a toast with '{words}'", lambda: any(words in each for each in page.evaluate("toastsTold")))

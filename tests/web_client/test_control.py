@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from playwright.sync_api import Page, expect
 from switchboard_browser import hold_joystick, hold_resume, ready_to_drive, seen, stands, take_control
+from switchboard_touch import Phone
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -617,40 +618,18 @@ class TestTilt:
         page = open_page(COCKPIT, user="driver", width=390, height=844, has_touch=True, is_mobile=True)
         ready_to_drive(page)
         seen(page, "input-tilt").click()
-        session = page.context.new_cdp_session(page)
-
-        def tilt(beta: float) -> None:
-            session.send(
-                "DeviceOrientation.setDeviceOrientationOverride", {"alpha": 0, "beta": beta, "gamma": 0}
-            )
-
         seen(page, "tilt-ask").click()
-        page.evaluate(
-            "addEventListener('deviceorientation', told => { document.body.dataset.beta = Math.round(told.beta) })"
-        )
-        button = seen(page, "tilt-hold")
-        button.scroll_into_view_if_needed()
-        box = button.bounding_box()
-        assert box is not None
-        at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+        phone = Phone(page)
         for leave in ("lift", "silence"):
             before = len(relay.commands())
-            for _ in range(8):
-                tilt(40)
-                # How it is held when it is touched is what counts as level.
-                expect(page.locator("body[data-beta='40']")).to_be_attached()
-                session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
-                for i in range(10):
-                    tilt(10 + i / 2)
-                    page.wait_for_timeout(50)  # a phone tells its angles all the time
-                if len(relay.commands()) > before + 3:
-                    break
-                # Again: the machine was so busy that the phone seemed to have fallen silent.
-                session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-            relay.until(lambda before=before: len(relay.commands()) > before + 3, "no commands came")
+
+            def driven(before: int = before) -> bool:
+                return len(relay.commands()) > before + 3
+
+            phone.hold_tilted(seen(page, "tilt-hold"), "commands come", driven, 12)
             assert max(ahead for ahead, _ in relay.commands()[before:]) == 0.5
             if leave == "lift":
-                session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+                phone.lift()
             ends_with_one_zero(page, relay)
-        session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        phone.lift()
         expect(seen(page, "drive-words")).to_contain_text("no longer tells how it is held")
