@@ -29,7 +29,7 @@ MEASUREMENTS = {
     "control": "twenty clients race for control; how long it takes to hand over",
     "stopping": "from anybody's stop to standstill, under full load",
     "alerts": "from a robot's unplugging to the webhook",
-    "apps": "from a word, a stick and a scan to what the robot does",
+    "apps": "from a word, a stick, a tilt and a scan to what the robot does",
     "memory": "a million events: asked, written by the thousand, killed",
 }
 

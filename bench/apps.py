@@ -1,8 +1,9 @@
-"""The applications: how long words, a stick, a scan and a face take until the robot does what they mean.
+"""The applications: how long words, a stick, a tilt, a scan and a face take until the robot does what they mean.
 
 Words are spoken by eSpeak NG into the standard input of ``voice``, as a microphone's samples come. The gamepad of
 ``joystick`` is SDL's virtual one. What counts is the simulated robot's own record, on the same clock. The bars are what
-SOM4R's authors measured of such applications: 500 ms for words, 300 ms for a joystick's answer, 83 ms for a scan.
+SOM4R's authors measured of such applications: 500 ms for words, 300 ms for a joystick's answer, 83 ms for a scan. Their
+joystick was a phone that is tilted: so one is measured too, in the portal.
 
 Whom ``greeting`` greets the measurement itself puts on the topic of the service ``faces``; what a look at a picture
 takes that service is measured apart. ``recharge`` drives the simulated robot to its charger with the service
@@ -12,7 +13,6 @@ takes that service is measured apart. ``recharge`` drives the simulated robot to
 from __future__ import annotations
 
 import json
-import math
 import os
 import statistics
 import sys
@@ -29,17 +29,17 @@ from switchboard_processes import Process, ros_environment, running
 from switchboard_robot import Robot
 from switchboard_speech import Mouth, silence, speech
 from switchboard_threads import Listener
+from switchboard_touch import OBEYED_SECONDS
 from switchboard_waiting import wait_for
 
-from bench import ROOT
+from bench import ROOT, scanning, tilting
+from bench.driving import first_move
 from bench.relay import Relay
-from bench.report import Options, Row
-from robot_client.apps.line import Line
-from robot_client.apps.runaway import Link, Manners, Runaway
+from bench.report import Options, Row, Unavailable
 
 HAND = ROOT / "tests" / "e2e" / "clients" / "joystick_in_hand.py"
 HOLD, LEFT_Y = 10, 1
-RAYS = 360
+USER, PASSWORD = "driver", "correct horse"
 WORD_BAR_MS, STICK_BAR_MS, SCAN_BAR_MS = 500, 300, 83
 FAILED = 180.0
 """Seconds after which a robot has not reached its charger."""
@@ -94,41 +94,6 @@ class Said(Listener):
         self.client.send(op="publish", topic="/faces/seen", msg={"data": json.dumps(seen)})
 
 
-class _Scans:
-    """A websocket by which the same scan comes for ever."""
-
-    def __init__(self) -> None:
-        ranges = [1.4 + 0.1 * math.sin(number) for number in range(RAYS)]
-        scan = {"ranges": ranges, "angle_min": -math.pi, "angle_increment": math.tau / RAYS}
-        self._text = json.dumps({"op": "publish", "topic": "/scan", "msg": scan})
-
-    def send(self, text: str) -> None:
-        """Nobody listens."""
-
-    def recv(self, timeout: float) -> str:
-        """The scan."""
-        return self._text
-
-
-def scans(runs: int) -> list[float]:
-    """Milliseconds to read a scan and to decide."""
-    link, runaway = Link(Line(_Scans()), "/scan", "/cmd_vel"), Runaway(Manners())
-    took = []
-    for _ in range(runs):
-        began = time.perf_counter()
-        scan = link.scan(1.0)
-        assert scan is not None
-        runaway.see(scan)
-        took.append((time.perf_counter() - began) * 1000)
-    return took
-
-
-def _moving(robot: Robot, since: int) -> int:
-    """When the first command to move came, monotonic nanoseconds; 0 before."""
-    events = robot.events("command", since)
-    return next((int(each["t"]) for each in events if each["v"] or each["w"]), 0)
-
-
 def _rest(robot: Robot) -> None:
     wait_for("the robot stands", lambda: not robot.moving())
     time.sleep(REST)
@@ -157,7 +122,9 @@ def words(relay: Relay, robot: Robot, environment: dict[str, str], runs: int, fi
         mouth.say(silence(REST))  # what is silence here is heard before the first word
         for number in range(first, runs + 1):
             ended = mouth.say(speech(("ahead", "right", "left")[number % 3]))
-            came = wait_for("the word is obeyed", lambda ended=ended: _moving(robot, ended))
+            came = wait_for(
+                "the word is obeyed", lambda ended=ended: first_move(robot.events("command", ended))
+            )
             if number:  # with number 0 control was taken, and the robot's guard got ready
                 took.append((came - ended) / 1e6)
             _rest(robot)
@@ -187,7 +154,9 @@ def sticks(
             odometry.forget()
             pushed = time.monotonic_ns()
             pad.tell(f"axis {LEFT_Y} -1")
-            came = wait_for("the stick is obeyed", lambda pushed=pushed: _moving(robot, pushed))
+            came = wait_for(
+                "the stick is obeyed", lambda pushed=pushed: first_move(robot.events("command", pushed))
+            )
             if number:  # until number 0 the robot's guard got ready
                 commands.append((came - pushed) / 1e6)
                 seen.append((odometry.moved_at() - pushed) / 1e6)
@@ -247,7 +216,7 @@ def looks(runs: int) -> list[float]:
 def recharges(relay: Relay, environment: dict[str, str], runs: int) -> list[float]:
     """Seconds from control over a robot with a low battery until it charges, of those runs in which it does."""
     robot = Robot(relay, "hungry", camera=True, sim_options=("--charge", "15"))
-    relay.cli("right", "grant", "driver", "hungry", "operator")
+    relay.cli("right", "grant", USER, "hungry", "operator")
     see = [sys.executable, "-m", "robot_client.services.main", "markers", "--view", "75", "--size", "0.4"]
     markers = Process(see, relay.folder, "markers", ros_environment(robot.domain))
     client = relay.connect("hungry", environment["SWITCHBOARD_TOKEN"])
@@ -283,31 +252,65 @@ def _recharge(relay: Relay, client: Client, environment: dict[str, str], number:
     return []
 
 
-def _pair(what: str, took: list[float], bar: float | None = None) -> list[Row]:
+def _pair(what: str, took: list[float], bar: float | None = None, note: str = "") -> list[Row]:
     return [
-        Row("apps", f"{what}, median", "ms", statistics.median(took), bar=bar),
+        Row("apps", f"{what}, median", "ms", statistics.median(took), bar=bar, note=note),
         Row("apps", f"{what}, longest of {len(took)}", "ms", max(took)),
+    ]
+
+
+def _scanned(took: list[float]) -> list[Row]:
+    what = f"runaway: a robot's scan of {scanning.RAYS} rays, from its stamp until decided upon"
+    note = (
+        f"of {len(took)} scans of a simulated robot, by ROS 2, daemon, relay and websocket; the stamp is of before it "
+        "looks"
+    )
+    return [
+        Row("apps", f"{what}, median", "ms", statistics.median(took), bar=SCAN_BAR_MS, note=note),
+        Row("apps", f"{what}, p95", "ms", sorted(took)[int(0.95 * (len(took) - 1))]),
+    ]
+
+
+def _tilted(relay: Relay, robot: Robot, environment: dict[str, str], runs: int, first: int) -> list[Row]:
+    """A phone that is tilted. Without a browser or portal there are no rows."""
+    with relay.connect(robot.name, environment["SWITCHBOARD_TOKEN"]) as client:
+        client.call("/reset")  # room ahead, after all that was driven before
+    try:
+        found = tilting.tilts(relay, robot, USER, PASSWORD, runs, first)
+    except Unavailable as reason:
+        print(f"    not measured: tilt: {reason}", flush=True)
+        return []
+    note = f"tilt: {found.anew} were not obeyed within {OBEYED_SECONDS:g} s and done anew"
+    return [
+        *_pair("tilt: phone tilted → command carried out", found.commands, STICK_BAR_MS, note),
+        *_pair("tilt: phone tilted → odometry of it is on its page", found.shown, STICK_BAR_MS),
     ]
 
 
 def run(options: Options) -> list[Row]:
     """All of them."""
     runs, first = options.runs or int(options.pick(1, 60)), int(options.pick(1, 0))
-    rows = _pair("runaway: a scan of 360 rays read and decided upon", scans(runs * 20), SCAN_BAR_MS)
+    at_once = scanning.constant(runs * 20)
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         relay = Relay(Path(folder))
         with running(relay):
             robot = Robot(relay, "rover")
             with running(robot):
-                environment = {**os.environ, "SWITCHBOARD_TOKEN": relay.user("driver")}
-                relay.cli("right", "grant", "driver", "rover", "operator")
+                token = relay.user(USER, PASSWORD)
+                environment = {**os.environ, "SWITCHBOARD_TOKEN": token}
+                relay.cli("right", "grant", USER, "rover", "operator")
+                scanned = scanning.of_a_robot(relay, "rover", token, runs * 5)
                 commands, seen = sticks(relay, robot, environment, runs, first)
+                tilted = _tilted(relay, robot, environment, runs, first)
                 heard = words(relay, robot, environment, runs, first)
                 greeted = greetings(relay, environment, runs)
             drives = int(options.pick(1, 10))
             charged = recharges(relay, environment, drives)
+    rows = _pair(f"runaway: a scan of {scanning.RAYS} rays read and decided upon", at_once, SCAN_BAR_MS)
+    rows += _scanned(scanned)
     rows += _pair("joystick: stick pushed → command carried out", commands, STICK_BAR_MS)
     rows += _pair("joystick: stick pushed → odometry of it is back", seen, STICK_BAR_MS)
+    rows += tilted
     rows += _pair("voice: end of the word → command carried out", heard, WORD_BAR_MS)
     rows += _pair("faces: a picture of 640×480 looked at", looks(runs))
     rows += _pair("greeting: second picture of somebody → what the robot is to say", greeted)

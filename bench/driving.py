@@ -74,6 +74,12 @@ def sent_before(moment: int, events: Iterable[dict[str, Any]]) -> bool:
     return any(age_ms(each["w"], each["t"]) - (each["t"] - moment) / 1e6 > EXACT_MS for each in moving)
 
 
+def first_move(events: Iterable[dict[str, Any]]) -> int:
+    """When the first command to move among some events of a record came, monotonic nanoseconds; 0 without one."""
+    commands = (each for each in events if each["event"] == "command")
+    return next((int(each["t"]) for each in commands if each["v"] or each["w"]), 0)
+
+
 def connected(port: int, robot: str, token: str) -> Client:
     """A client that does not wait long for an answer to its goodbye."""
     headers = {"Authorization": f"Bearer {token}"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.driving import ages_ms, sent_before, stamped_turn
+from bench.driving import ages_ms, first_move, sent_before, stamped_turn
 
 MS = 1_000_000
 
@@ -30,6 +30,15 @@ def test_a_command_from_before_a_moment_is_known(sent: int, before: bool) -> Non
         {"event": "moving", "t": moment + 401 * MS},
     ]
     assert sent_before(moment, record) is before
+
+
+@pytest.mark.parametrize(("v", "w"), [(0.2, 0.0), (-0.2, 0.0), (0.0, 0.6)])
+def test_the_first_command_to_move_is_found(v: float, w: float) -> None:
+    """Behind zeros, ahead, back or round; where there are only zeros, there is none."""
+    zeros = [{"event": "command", "t": 1, "v": 0.0, "w": 0.0}, {"event": "standstill", "t": 2}]
+    moves = [{"event": "command", "t": at, "v": v, "w": w} for at in (3, 4)]
+    assert first_move(zeros + moves) == 3
+    assert first_move(zeros) == 0
 
 
 def test_what_is_written_into_a_command_moves_nothing_else() -> None:

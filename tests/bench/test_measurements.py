@@ -28,7 +28,7 @@ LEAST_ROWS = {
     "control": 6,
     "stopping": 4,
     "alerts": 5,
-    "apps": 8,
+    "apps": 15,
     "memory": 10,
 }
 

@@ -1,0 +1,41 @@
+"""The program's own parts read scans through what keeps their time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from switchboard_socket import Socket
+
+from bench.scanning import SCAN, Kept, program
+from robot_client.apps.runaway import Scan
+
+
+def scan(sec: int, nanosec: int, distance: float) -> dict[str, Any]:
+    """A message with one ray, in metres."""
+    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "laser"}
+    rays = {"ranges": [distance], "angle_min": 0.0, "angle_increment": 0.1}
+    return {"op": "publish", "topic": SCAN, "msg": {"header": header, **rays}}
+
+
+def test_the_stamp_is_of_the_scan_that_was_read_last() -> None:
+    """To the nanosecond, also while another waits; what the program says goes on to the relay."""
+    socket = Socket()
+    kept = Kept(socket)
+    link, _ = program(kept)
+    assert {"op": "subscribe", "topic": SCAN}.items() <= socket.sent[-1].items()
+    socket.coming += [scan(1_800_000_000, 123_456_789, 1.0), scan(1_800_000_001, 1, 2.0)]
+    assert link.scan(1.0) == Scan([1.0], 0.0, 0.1)
+    assert kept.stamp() == 1_800_000_000_123_456_789
+    assert link.scan(1.0) == Scan([2.0], 0.0, 0.1)
+    assert kept.stamp() == 1_800_000_001_000_000_001
+
+
+def test_a_stamp_is_kept_while_nothing_comes() -> None:
+    """A scan that does not come within the time is none, and takes nothing away."""
+    socket = Socket()
+    kept = Kept(socket)
+    link, _ = program(kept)
+    socket.coming.append(scan(5, 6, 1.0))
+    link.scan(1.0)
+    assert link.scan(0.01) is None
+    assert kept.stamp() == 5_000_000_006
