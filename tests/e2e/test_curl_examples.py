@@ -6,14 +6,15 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 from switchboard_examples import Came, Example, examples
+from switchboard_expected import Expected, said_on, told
+from switchboard_guide import EXPECTED_OF_GUIDE
 from switchboard_http import ask
 from switchboard_processes import BIN, Process, ros_environment, running
 from switchboard_scene import DIRECTORY, DOCUMENTS, ROBOT, Scene, staged
@@ -23,44 +24,6 @@ SHOWN = [each for path in DOCUMENTS for each in examples(path)]
 ASKING = [each for each in SHOWN if each.asks]
 MCAP = b"\x89MCAP0\r\n"
 JPEG = b"\xff\xd8"
-
-
-def nothing(scene: Scene) -> dict[str, str]:
-    """Nothing has to be done before, or after."""
-    return {}
-
-
-@dataclass(frozen=True)
-class Expected:
-    """What has to come of an example.
-
-    :param status: of HTTP
-    :param check: looks at what came
-    :param before: makes what the example needs; what stands for what in its text
-    :param over: says of one that goes on until it is ended that enough has come
-    :param after: takes back what it did
-    """
-
-    status: int
-    check: Callable[[Scene, Came], bool]
-    before: Callable[[Scene], dict[str, str]] = nothing
-    over: Callable[[Scene, str], bool] | None = None
-    after: Callable[[Scene], object] = nothing
-
-
-def told(came: Came) -> Any:
-    """The JSON that was printed."""
-    return json.loads(came.output)
-
-
-def said_on(topic: str) -> Callable[[Scene], dict[str, str]]:
-    """Wait until something has been said on a topic, which is kept for who asks soon."""
-
-    def before(scene: Scene) -> dict[str, str]:
-        scene.ask("GET", f"{ROBOT}/topics/{topic}?wait=60")
-        return {}
-
-    return before
 
 
 def seen(scene: Scene) -> dict[str, str]:
@@ -283,6 +246,7 @@ EXPECTED = {
     r"/alerts/rules$": Expected(
         201, lambda _, came: (told(came)["level"], bool(told(came)["secret"])) == ("error", True)
     ),
+    **EXPECTED_OF_GUIDE,
 }
 """By what the command looks like: each of those the documents show is one of these, and each of these is shown."""
 

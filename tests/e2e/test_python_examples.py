@@ -122,6 +122,20 @@ def directory(scene: Scene, example: Example) -> None:
     assert scene.ask("GET", f"{DIRECTORY}?kind=service&name=obstacles")["entries"] == []
 
 
+def goal(scene: Scene, example: Example) -> None:
+    """It is begun, followed to its end, and its result is read."""
+    begun, *events, result = output_of(scene, example.text)
+    assert begun.startswith("202 ")
+    assert "event: ended" in events
+    assert ast.literal_eval(result) == {"sequence": [0, 1, 1, 2, 3]}
+
+
+def greeting(scene: Scene, example: Example) -> None:
+    """Somebody is greeted once, though it is started anew."""
+    assert output_of(scene, example.text) == ["Hello, bob."]
+    assert output_of(scene, example.text) == []
+
+
 def webhook(scene: Scene, example: Example) -> None:
     """A message of the relay's is genuine; it is not with another secret or body, nor five minutes later."""
     program, secret = scene.folder / "receiver.py", scene.folder / "secret"
@@ -175,6 +189,8 @@ RUN: dict[str, Callable[[Scene, Example], None]] = {
     r"ActionClient\(": services_and_actions,
     r"/relay/take_control": control,
     r"/api/v1/directory": directory,
+    r"/actions/fibonacci": goal,
+    r'"kind": "greeted"': greeting,
     r"Switchboard-Signature": webhook,
     r"^@case\(": conformance,
 }

@@ -21,6 +21,7 @@ from tests.robot_client.ros import Peer
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
+GUIDE = ROOT / "docs" / "http.md"
 DOCUMENTS = [README, *sorted((ROOT / "docs").glob("*.md")), ROOT / "protocol" / "SPEC.md"]
 """Whose examples are run."""
 
@@ -30,7 +31,7 @@ DIRECTORY = "/api/v1/directory"
 
 @dataclass
 class Scene:
-    """A relay, its robot, and where examples run, with the variables that README.md sets."""
+    """A relay, its robot, and where examples run, with the variables that README.md and docs/http.md set."""
 
     relay: Relay
     robot: Robot
@@ -88,5 +89,6 @@ def staged(folder: Path, *options: str, camera: bool = False) -> Iterator[Scene]
         (place / ".venv").symlink_to(BIN.parent)
         (place / "demo-data").symlink_to(relay.data)
         shell = Shell(place, os.environ, {"127.0.0.1:9090": f"127.0.0.1:{relay.http_port}"})
-        shell.set([each for each in examples(README) if each.sets and not each.asks])
+        settings = (each for path in (README, GUIDE) for each in examples(path))
+        shell.set([each for each in settings if each.sets and not each.asks])
         yield Scene(relay, robot, shell)
