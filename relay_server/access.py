@@ -36,6 +36,9 @@ IN_STEP_SECONDS = 1.0
 ADMITTED = 4096
 """Users on robots that are remembered, in the same way."""
 
+NO_ROBOT = -1
+"""The number of none."""
+
 LISTED = 1024
 """Users, with the scopes of their tokens, whose robots are remembered."""
 
@@ -190,21 +193,40 @@ class Access:
 
         :raises BadCredentials: the token has ended or the account was disabled since it was proved
         """
-        key = (principal.user_id, principal.token_id, robot.id)
+        found = await self._permitted(principal, lambda session: robot)
+        return None if found is None else found[1]
+
+    async def permit_by_name(self, principal: Principal, robot: str) -> tuple[RobotRecord, Permit] | None:
+        """The same for a robot of the principal's realm.
+
+        The same questions are put to the database whether or not there is such a robot: the time that they take does
+        not tell.
+
+        :raises BadCredentials: as :meth:`permit`
+        """
+        return await self._permitted(
+            principal, lambda session: queries.find_robot(session, robot, principal.realm)
+        )
+
+    async def _permitted(
+        self, principal: Principal, find: Callable[[Session], RobotRecord | None]
+    ) -> tuple[RobotRecord, Permit] | None:
         # What was read while a refresh went by may be what the refresh was about.
         seen = -1
         while seen != self._refreshed:
             seen = self._refreshed
-            now = (await self._store.read(_standing, {key}, self._wall()))[key]
+            robot, now = await self._store.read(_standing_on, principal, find, self._wall())
         if isinstance(now.ended, BadCredentials):
             raise now.ended
+        if robot is None:
+            return None
         rules = principal.rules(robot.name, now.grants)
         if now.ended is not None or not rules:
             return None
         permit = Permit(principal, robot.id, rules)
         self._permits.add(permit)
         _keep(self._admitted, (*_who(principal), robot.id), None, ADMITTED)
-        return permit
+        return robot, permit
 
     async def robots(self, principal: Principal) -> list[tuple[RobotRecord, Rules]]:
         """The robots a principal has any right on, kept until something changes in the database."""
@@ -313,3 +335,12 @@ def _standing(
                 None if grants else Refused("your right on this robot was revoked"), grants
             )
     return found
+
+
+def _standing_on(
+    session: Session, principal: Principal, find: Callable[[Session], RobotRecord | None], now: float
+) -> tuple[RobotRecord | None, _Standing]:
+    """A robot, and how the principal stands to it; of none as much is asked."""
+    robot = find(session)
+    key = principal.user_id, principal.token_id, NO_ROBOT if robot is None else robot.id
+    return robot, _standing(session, {key}, now)[key]

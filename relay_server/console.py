@@ -128,6 +128,7 @@ class Console:
             return
         guest, leave = there
         try:
+            guest.gave_back += 1
             guest.session.desk.release(guest.session, "")
         finally:
             leave()

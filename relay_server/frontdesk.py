@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -51,11 +51,12 @@ class GoingDown(Unavailable):
 
 @dataclass(frozen=True)
 class Admission:
-    """Somebody who may come in to a robot."""
+    """Somebody who may come in to a robot; ``snapshot``: for one picture."""
 
     permit: Permit
     robot: Presence
     address: str
+    snapshot: bool = False
 
 
 class FrontDesk:
@@ -189,9 +190,8 @@ class FrontDesk:
 
         :raises NotFound: no such robot, or no right on it: one and the same answer
         """
-        record = await self._store.read(queries.find_robot, robot, principal.realm)
-        permit = None if record is None else await self._access.permit(principal, record)
-        if record is None or permit is None:
+        found = await self._access.permit_by_name(principal, robot)
+        if found is None:
             self._journal.event(
                 "client.refused",
                 "relay",
@@ -201,6 +201,7 @@ class FrontDesk:
                 address=address,
             )
             raise NotFound(NO_ROBOT)
+        record, permit = found
         return Admission(permit, self._registry.presence(record.id, record.name, record.realm), address)
 
     def turn_away(self, admission: Admission) -> None:
@@ -301,13 +302,16 @@ class FrontDesk:
         settings: link.VideoSettings,
         screen: Screen,
         address: str,
+        snapshot: bool = False,
     ) -> Watching:
         """Have a camera shown, until :meth:`Watching.leave` or until the screen is told that it has ended.
 
+        :param snapshot: for one picture
         :raises NotFound: no such robot, or no right on it or to view this
         :raises Unavailable: too many watch, or the relay is going down
         """
-        return self.watch(await self.admit(principal, robot, address), camera, settings, screen)
+        admission = await self.admit(principal, robot, address)
+        return self.watch(replace(admission, snapshot=snapshot), camera, settings, screen)
 
     def watch(
         self, admission: Admission, camera: str, settings: link.VideoSettings, screen: Screen
@@ -321,6 +325,7 @@ class FrontDesk:
             screen,
             address=admission.address,
             over=self._left,
+            snapshot=admission.snapshot,
         )
         try:
             if not self.accepting:
@@ -349,7 +354,7 @@ class FrontDesk:
             cause=f"video:{principal.full}",
             robot_id=watching.robot.robot_id,
             user_id=principal.user_id,
-            camera=watching.camera,
+            **watching.about,
             **data,
         )
 

@@ -38,6 +38,8 @@ class GraphMirror:
     def __init__(self) -> None:
         self.version = 0
         """Another one after every change."""
+        self.told = False
+        """Whether the robot has told anything since it was last forgotten."""
         self.topics: dict[str, Topic] = {}
         self.services: dict[str, Service] = {}
         self.actions: dict[str, Service] = {}
@@ -63,6 +65,7 @@ class GraphMirror:
             elif name not in self.nodes and len(self.nodes) < NAMES:
                 self._count(_size(name))
                 self.nodes.add(name)
+        self.told = True
 
     def _take(self, target: dict[str, Entry], changes: Mapping[str, Entry | None]) -> None:
         for name, value in changes.items():
@@ -87,6 +90,7 @@ class GraphMirror:
     def clear(self) -> None:
         """Nothing is known any more."""
         self.version += 1
+        self.told = False
         self.topics.clear()
         self.services.clear()
         self.actions.clear()

@@ -13,6 +13,9 @@ from relay_protocol.ros_types import TypeRegistry
 from relay_server.graph import GraphMirror
 from relay_server.linkmeter import NO_LINK, Reading
 
+SETTLING_SECONDS = 10.0
+"""After it has registered a robot finds the nodes that were there before, one by one: those are no news."""
+
 REPLACE_SECONDS = 3.0
 """A registration younger than this is not replaced."""
 
@@ -70,6 +73,10 @@ class Onlooker(Protocol):
         """Where he is, for people."""
 
 
+Modules = Callable[["Presence", list[str], list[str]], None]
+"""Is told of a robot whose nodes were others a moment ago: which have come, and which have gone."""
+
+
 @dataclass
 class Presence:
     """One robot as the relay sees it now.
@@ -79,6 +86,7 @@ class Presence:
     :param realm: its own
     :param shared: the realms it is shared with
     :param streams: most streams of cameras it makes at a time; 0 when it did not say
+    :param came: Unix time of the latest registration
     :param rtt: round trip relay–robot of the latest ping, seconds
     :param last_seen: Unix time of the latest byte, ``None`` when never seen since the start
     :param onlookers: since when each watches, Unix time
@@ -90,6 +98,7 @@ class Presence:
     shared: frozenset[str] = frozenset()
     control: ControlLink | None = None
     registered_at: float = 0.0
+    came: float = 0.0
     patience: float = REPLACE_SECONDS
     session: str = ""
     key: str = ""
@@ -119,8 +128,11 @@ class Presence:
         return self.shared | {self.realm}
 
     def name_of(self, user: str, realm: str) -> str:
-        """What a user is called at this robot: with the realm where people of several realms may be there."""
-        return f"{user}@{realm}" if self.shared else user
+        """What a user is called at this robot: with the realm where people of several realms may be there.
+
+        So also who still is there, or is there already, when it is shared no more, or not yet to the relay's knowledge.
+        """
+        return f"{user}@{realm}" if self.shared or realm != self.realm else user
 
     @property
     def state(self) -> State:
@@ -149,6 +161,7 @@ class Registry:
         self._robots: dict[int, Presence] = {}
         self._shares: dict[int, frozenset[str]] = {}
         self._listeners: list[Callable[[], None]] = []
+        self._modules: list[Modules] = []
 
     def __iter__(self) -> Iterator[Presence]:
         return iter(list(self._robots.values()))
@@ -183,6 +196,7 @@ class Registry:
         robot.graph.clear()
         robot.health = link.Health()
         robot.rtt = None
+        robot.came = self._wall()
         self.seen(robot)
         if older is not None:
             for watcher in list(robot.watchers):
@@ -209,7 +223,13 @@ class Registry:
 
     def graph(self, robot: Presence, graph: link.Graph) -> None:
         """The robot told of its graph, or of changes in it."""
+        told = robot.graph.told and self._wall() - robot.came >= SETTLING_SECONDS
+        before = _nodes(robot, graph)
         robot.graph.apply(graph)
+        after = _nodes(robot, graph)
+        if told and before != after:
+            for listener in self._modules:
+                listener(robot, sorted(after - before), sorted(before - after))
         for watcher in list(robot.watchers):
             watcher.graph_changed()
 
@@ -249,7 +269,17 @@ class Registry:
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
+    def on_modules(self, listener: Modules) -> None:
+        """Have somebody told of nodes that come and go while their robot is online."""
+        self._modules.append(listener)
+
     def changed(self) -> None:
         """Something users can see has changed."""
         for listener in list(self._listeners):
             listener()
+
+
+def _nodes(robot: Presence, graph: link.Graph) -> set[str]:
+    """Those of a robot's nodes that are listed and that a message about its graph may change."""
+    nodes = robot.graph.nodes
+    return {each for each in (nodes if graph.full else nodes & graph.nodes.keys()) if "/_" not in each}

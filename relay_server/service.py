@@ -51,6 +51,7 @@ from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.pages import PageGate
+from relay_server.edges.robot_pages import RobotPages
 from relay_server.edges.robot_roles import Opening, RobotHall
 from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
 from relay_server.edges.site import RelaySite
@@ -67,6 +68,7 @@ from relay_server.oauth import OAuthDesk
 from relay_server.origins import Origins
 from relay_server.recording import FOLDER, Library, RecordingDesk, Recordings, sweep
 from relay_server.registry import Registry
+from relay_server.resources import Idempotency
 from relay_server.retiring import Realms
 from relay_server.session import Timing
 from relay_server.store import Store
@@ -189,8 +191,9 @@ class Relay:
         guests = Guests(self._reactor, desk, now_ns)
         offices = self._access, self._desks, self._registry, self._store
         self._console = Console(self._reactor, desk, *offices, guests)
+        keys = Idempotency(self._reactor)
         below = {
-            "recordings": partial(recordings.below, self._reactor, keeper),
+            "recordings": partial(recordings.below, self._reactor, keeper, keys),
             "people": partial(presence.below, desk.overview),
             **resources.parts(self._reactor, desk, guests, self._workshop, moments, now_ns, time.time),
             **{
@@ -205,13 +208,13 @@ class Relay:
         beside = {
             "alerts": partial(alerts.beside, self._alerts.desk),
             "directory": partial(directory_edge.beside, self._reactor, self._directory.desk),
-            "events": partial(events.beside, self._reactor, self._memory.desk),
+            "events": partial(events.beside, self._reactor, self._memory.desk, keys),
             "fleet": partial(fleet.beside, self._reactor, self._fleet, moments),
             "realm": partial(realm.beside, realms),
             "vocabulary": partial(vocabulary.beside, meanings),
         }
         told = {"alerts": self._alerts.desk.shown}
-        served = desk, origins, metrics, below, beside
+        served = desk, origins, metrics, below, beside, RobotPages(desk, self._workshop)
         limits = RequestLimits(settings.requests, time.monotonic)
         api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, events=told, limits=limits)
         self._pages = PageGate(self._reactor, desk, origins, cookie, {"robots": desk.robots, **told})

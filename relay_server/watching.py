@@ -55,6 +55,7 @@ class Watching:
 
     :param permit: kept till the end, then given to ``over`` with all the rest
     :param over: called once, when nothing is watched any more
+    :param snapshot: for one picture
     """
 
     def __init__(
@@ -67,12 +68,14 @@ class Watching:
         *,
         address: str,
         over: Callable[[Watching], None],
+        snapshot: bool = False,
     ) -> None:
         self.permit = permit
         self.robot = robot
         self.camera = camera
         self.settings = settings
         self.address = address
+        self.snapshot = snapshot
         self.pictures = 0
         """How many there were for this viewer."""
         self._screen = screen
@@ -90,6 +93,11 @@ class Watching:
     def name(self) -> str:
         """What the user is called at this robot."""
         return self.robot.name_of(self.permit.principal.name, self.permit.principal.realm)
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What is told of it in the journal."""
+        return {"camera": self.camera, **({"snapshot": True} if self.snapshot else {})}
 
     def begin(self, videos: Videos) -> None:
         """Watch.

@@ -77,6 +77,11 @@ class Scope:
     def __str__(self) -> str:
         return self._text
 
+    @property
+    def anywhere(self) -> bool:
+        """Whether it means the same in every realm: it names no robots, and covers no administration."""
+        return not self.admin and all(each.robots == "*" for each in self._items)
+
     def on(self, robot: str) -> tuple[Grant, ...]:
         """What it covers on a robot; nothing where the token must not even show that there is one."""
         return tuple(grant for pattern, grant in self._compiled if pattern.match(robot))

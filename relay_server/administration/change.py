@@ -56,6 +56,13 @@ class Change:
             data=data,
         )
 
+    def keep_events(self, realm: str, days: float | None) -> None:
+        """:param days: for which a realm's memory keeps events; ``None``: as long as the relay's
+        :raises SwitchboardError: as :func:`relay_db.queries.keep_events`
+        """
+        queries.keep_events(self.session, realm, days)
+        self.audit("realm.set", realm, events_days=days)
+
     # --- users --------------------------------------------------------------------------------------------
 
     def add_user(self, name: str, realm: str, password_hash: str | None, *, admin: bool) -> UserRecord:

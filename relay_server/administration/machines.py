@@ -12,8 +12,21 @@ from relay_db.queries import GroupRecord, RightPlace, RightRecord, RobotRecord, 
 from relay_protocol.errors import NotFound
 from relay_protocol.limits import ENROLMENT_SECONDS
 from relay_server.administration.change import GROUP_MARK, NotInGroup, numbers
-from relay_server.administration.own import OwnChange, new_name, no_types, robot_group_in, robot_in, user_in
+from relay_server.administration.own import (
+    ANYTHING,
+    OwnChange,
+    Seen,
+    holder_in,
+    home_robot_in,
+    new_name,
+    no_types,
+    robot_group_in,
+    robot_in,
+    user_in,
+)
 from relay_server.resources import Listing
+
+NO_RIGHT = "there is no such right; what comes by a group, or of administration, is another"
 
 # --- robots -----------------------------------------------------------------------------------------------
 
@@ -48,17 +61,22 @@ def add_robot(change: OwnChange, name: str, description: str) -> dict[str, Any]:
     return {**_robot(added, 0, change.realm), **_enrolment(code)}
 
 
-def change_robot(change: OwnChange, name: str, description: str | None) -> dict[str, Any]:
+def change_robot(
+    change: OwnChange, name: str, description: str | None, seen: Seen = ANYTHING
+) -> dict[str, Any]:
     """What is ``None`` stays as it is.
 
     :raises NotFound: no such robot
+    :raises NotAsBefore: it is not as was seen
     :raises Invalid: the description can't be
     :raises Refused: it is a robot of another realm
     """
     found = change.home_robot(name)
+    keys = queries.count_live_keys(change.session, [found.id]).get(found.id, 0)
+    seen.check(_robot(found, keys, change.realm))
     if description is not None and description != found.description:
         found = change.describe_robot(found, description)
-    return _robot(found, queries.count_live_keys(change.session, [found.id]).get(found.id, 0), change.realm)
+    return _robot(found, keys, change.realm)
 
 
 def new_code(change: OwnChange, name: str) -> dict[str, Any]:
@@ -94,7 +112,7 @@ def keys(s: Session, realm: str, name: str, listing: Listing) -> dict[str, Any]:
 
     :raises NotFound: no such robot
     """
-    known = queries.list_keys(s, robot_in(s, realm, name).id)
+    known = queries.list_keys(s, home_robot_in(s, realm, name).id)
     found, behind = listing.page({each.fingerprint: each for each in known}, no_types)
     return {"keys": [each._asdict() for _, each in found], "next": behind}
 
@@ -183,12 +201,31 @@ def rights(s: Session, realm: str, listing: Listing, robot: str | None, user: st
     return {"rights": [_told(found[id]) for _, id in page], "next": behind}
 
 
+def right(s: Session, realm: str, robot: str, holder: str) -> dict[str, Any]:
+    """The right that a holder has on a robot.
+
+    :raises NotFound: no such robot, user or group, or no such right
+    """
+    found = robot_in(s, realm, robot)
+    held = queries.right_held(s, found.id, **numbers(holder_in(s, realm, holder)))
+    if held is None:
+        raise NotFound(NO_RIGHT)
+    return _told(held)
+
+
 def grant(
-    change: OwnChange, robot: str, holder: str, level: str, allow: Sequence[str], deny: Sequence[str]
+    change: OwnChange,
+    robot: str,
+    holder: str,
+    level: str,
+    allow: Sequence[str],
+    deny: Sequence[str],
+    seen: Seen = ANYTHING,
 ) -> tuple[dict[str, Any], bool]:
     """Give a right, and whether the holder had none on the robot. One that it has already is left as it is.
 
     :raises NotFound: no such robot, user or group
+    :raises NotAsBefore: what the holder has there is not as was seen
     :raises Invalid: a pattern that is none
     :raises NoRoom: there are too many
     :raises Refused: the token in use is for less than all
@@ -198,6 +235,7 @@ def grant(
     mark = GROUP_MARK if isinstance(whose, GroupRecord) else ""
     told = _right(found.name, f"{mark}{whose.name}", level, allow, deny)
     held = queries.right_held(change.session, found.id, **numbers(whose))
+    seen.check(None if held is None else _told(held))
     if held is not None and _told(held) == told:
         return told, False
     if held is None:
@@ -214,7 +252,7 @@ def revoke(change: OwnChange, robot: str, holder: str) -> None:
     """
     change.needs_whole()
     if not change.revoke(change.robot(robot), change.holder(holder)):
-        raise NotFound("there is no such right; what comes by a group, or of administration, is another")
+        raise NotFound(NO_RIGHT)
 
 
 def _holder(record: RightRecord | RightPlace) -> str:

@@ -2,24 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 from sqlalchemy.orm import Session
+from werkzeug.http import parse_etags
 
 from relay_db import queries
 from relay_db.names import normal_name
 from relay_db.queries import GroupRecord, NoRoom, RobotGroupRecord, RobotRecord, UserRecord
+from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_server.access import BadCredentials, Principal
 from relay_server.administration.change import GROUP_MARK, Change, Holder
 from relay_server.administration.limits import MOST, MOST_PATTERNS, MOST_PATTERNS_OF_A_ROBOT
+from relay_server.resources.states import NotAsBefore, see_match, tag_of
 
 _Record = TypeVar("_Record")
 
 
 class Needed(Refused):
     """The realm would have to do without the administrator who asks."""
+
+
+class Seen(NamedTuple):
+    """What an administrator has seen of what he changes (RFC 9110 sections 13.1.1 and 13.1.2).
+
+    :param match: ``If-Match``: entity tags of which it has one, or ``*``: that it is there
+    :param none: ``If-None-Match``: those of which it has none, or ``*``: that it is not there
+    """
+
+    match: str | None = None
+    none: str | None = None
+
+    def check(self, told: Mapping[str, Any] | None) -> None:
+        """See that it is still so.
+
+        :param told: as it is told now; ``None``: it is not there
+        :raises NotAsBefore: it is not
+        """
+        etag = "" if told is None else tag_of(jsontext.encode(told))
+        if self.match is not None and told is None:
+            raise NotAsBefore("there is none of it any more; read it again")
+        if self.match is not None:
+            see_match(etag, self.match)
+        if (
+            self.none is not None
+            and told is not None
+            and parse_etags(self.none).contains_weak(etag.strip('"'))
+        ):
+            raise NotAsBefore("there is one by now; read it")
+
+
+ANYTHING = Seen()
+"""However it is, it is to be changed."""
 
 
 def see_administrator(principal: Principal) -> None:
@@ -45,9 +81,33 @@ def robot_in(s: Session, realm: str, name: str) -> RobotRecord:
     return _found(queries.find_robot(s, name, realm), "robot")
 
 
+def holder_in(s: Session, realm: str, name: str) -> Holder:
+    """Who can have a right.
+
+    :param name: of a user, or with :data:`GROUP_MARK` before it of a group
+    :raises NotFound: no such user or group in the realm
+    """
+    if name.startswith(GROUP_MARK):
+        return group_in(s, realm, name.removeprefix(GROUP_MARK))
+    return user_in(s, realm, name)
+
+
 def robot_group_in(s: Session, realm: str, name: str) -> RobotGroupRecord:
     """:raises NotFound: no such group of robots in the realm"""
     return _found(queries.find_robot_group(s, name, realm), "group of robots")
+
+
+def home_robot_in(s: Session, realm: str, name: str) -> RobotRecord:
+    """:raises NotFound: no such robot in the realm
+    :raises Refused: it is shared with the realm and of another
+    """
+    found = robot_in(s, realm, name)
+    if found.realm != realm:
+        raise Refused(
+            "this robot is shared with your realm: its description, its keys, and whether it stays on the relay "
+            "are a matter of its own realm"
+        )
+    return found
 
 
 def _found(record: _Record | None, what: str) -> _Record:
@@ -109,13 +169,7 @@ class OwnChange(Change):
         :raises NotFound: no such robot
         :raises Refused: it is shared with the realm and of another
         """
-        found = self.robot(name)
-        if found.realm != self.realm:
-            raise Refused(
-                "this robot is shared with your realm: its description, its keys, and whether it stays on the relay "
-                "are a matter of its own realm"
-            )
-        return found
+        return home_robot_in(self.session, self.realm, name)
 
     def robot_group(self, name: str) -> RobotGroupRecord:
         """:raises NotFound: no such group of robots"""
@@ -125,9 +179,7 @@ class OwnChange(Change):
         """:param name: of a user, or with :data:`GROUP_MARK` before it of a group
         :raises NotFound: no such user or group
         """
-        if name.startswith(GROUP_MARK):
-            return self.group(name.removeprefix(GROUP_MARK))
-        return self.user(name)
+        return holder_in(self.session, self.realm, name)
 
     def see_another(self, user: UserRecord, what: str) -> None:
         """See that somebody else is meant than who asks. As he is an administrator, the realm keeps one by that.

@@ -12,7 +12,7 @@ from relay_db.queries import GroupRecord, NoRoom, ProgramRecord, Taken, UserReco
 from relay_db.queries.oauth import PROGRAMS_OF_ONE
 from relay_protocol.errors import NotFound, Refused
 from relay_protocol.scopes import Scope
-from relay_server.administration.own import OwnChange, group_in, new_name, no_types, user_in
+from relay_server.administration.own import ANYTHING, OwnChange, Seen, group_in, new_name, no_types, user_in
 from relay_server.resources import Listing
 
 
@@ -28,6 +28,17 @@ def about(s: Session, realm: str) -> dict[str, Any]:
         "robot_groups": size.robot_groups,
         "events_days": None if found is None else found.events_days,
     }
+
+
+def keep_events(change: OwnChange, days: float | None) -> dict[str, Any]:
+    """Say how long the realm's memory keeps events; ``None``: as long as the relay's.
+
+    :raises Refused: by a token for less than all
+    :raises Invalid: not more than 0 days, or too many
+    """
+    change.needs_whole()
+    change.keep_events(change.realm, days)
+    return about(change.session, change.realm)
 
 
 # --- users ------------------------------------------------------------------------------------------------
@@ -60,17 +71,24 @@ def add_user(change: OwnChange, name: str, password_hash: str | None, admin: boo
 
 
 def change_user(
-    change: OwnChange, name: str, password_hash: str | None, disabled: bool | None, admin: bool | None
+    change: OwnChange,
+    name: str,
+    password_hash: str | None,
+    disabled: bool | None,
+    admin: bool | None,
+    seen: Seen = ANYTHING,
 ) -> dict[str, Any]:
     """What is ``None`` stays as it is.
 
     :raises NotFound: no such user
+    :raises NotAsBefore: he is not as was seen
     :raises Needed: he shuts himself out, or would be no administrator any more
     :raises Refused: anything but to disable, by a token for less than all
     """
     if not disabled or password_hash is not None or admin is not None:
         change.needs_whole()
     found = change.user(name)
+    seen.check(_told(change.session, found))
     if disabled:
         change.see_another(found, "disable")
     if admin is False:
@@ -82,7 +100,8 @@ def change_user(
     if password_hash is not None:
         # The session in which somebody changes his own password goes on.
         found = change.set_password(found, password_hash, keep_token=change.principal.token_id)
-    if disabled is not None and disabled != found.disabled:
+    # A guest may be shut out by another realm as well: that it is already is no reason not to keep this.
+    if disabled is not None and (found.home is not None or disabled != found.disabled):
         found = change.set_disabled(found, disabled)
     if admin is not None and admin != found.admin:
         change.set_admin(found, admin)

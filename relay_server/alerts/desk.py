@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -161,12 +161,13 @@ class AlertDesk:
         :raises Refused: only operators and owners may
         """
         rights = await self._rights(principal)
-        found = self._alerts.book.find(alert_id) or await self._store.read(queries.get_alert, alert_id)
-        if found is None or found.robot_id not in rights:
+        found = self._alerts.book.find(alert_id)
+        if not _concerns(found, rights):
+            # Also one of the book: how long it takes does not tell who has no right on its robot that it is there.
+            found = await self._store.read(queries.get_alert, alert_id)
+        if found is None or not _concerns(found, rights):
             raise NotFound(NO_ALERT)
         mine = rights[found.robot_id][1]
-        if not rules.visible(mine, found.kind, found.about):
-            raise NotFound(NO_ALERT)
         if not _operates(mine):
             raise Refused(f"to acknowledge alerts of {found.robot} takes the level operator")
         fresh = found.over is None and found.ack_at is None
@@ -189,8 +190,9 @@ class AlertDesk:
         return {record.id: (record.name, each) for record, each in await self._access.robots(principal)}
 
     def _view(self, principal: Principal, alert: AlertRecord, rights: Rules) -> dict[str, Any]:
+        told = view(alert._replace(ack_by=_elsewhere(alert, principal.realm)))
         return {
-            **view(alert),
+            **told,
             "may_acknowledge": alert.over is None and alert.ack_at is None and _operates(rights),
             "news": alert.news,
             "notify": self._alerts.tellers.shown(principal.user_id, alert, self._wall()),
@@ -291,6 +293,12 @@ class AlertDesk:
         }
 
 
+def _concerns(alert: AlertRecord | None, rights: Mapping[int, tuple[str, Rules]]) -> bool:
+    """Whether there is an alert that somebody with these rights may know of."""
+    mine = None if alert is None else rights.get(alert.robot_id)
+    return alert is not None and mine is not None and rules.visible(mine[1], alert.kind, alert.about)
+
+
 def _operates(rights: Rules) -> bool:
     return rights.level in (Level.OPERATOR, Level.OWNER)
 
@@ -347,3 +355,9 @@ def _audit(
         origin=address,
         data={"channel": record.channel, "url": rules.shown_url(record), "robots": record.robots},
     )
+
+
+def _elsewhere(alert: AlertRecord, realm: str) -> str | None:
+    """Who looks after an alert, as a realm is told: it may be from before the robot was shared with that."""
+    by = alert.ack_by
+    return by if by is None or "@" in by or realm == alert.realm else f"{by}@{alert.realm}"

@@ -370,7 +370,8 @@ class Alerts:
         }
 
     def _realms(self, alert: AlertRecord) -> frozenset[str]:
-        return self._registry.presence(alert.robot_id, alert.robot, alert.realm).realms
+        robot = self._registry.find(alert.robot_id)
+        return frozenset({alert.realm}) if robot is None else robot.realms
 
     def _lasts(self, alert_id: str) -> bool:
         found = self.book.find(alert_id)

@@ -47,7 +47,7 @@ def add(app: App, user: str, scope: str | None, label: str, as_json: bool) -> No
         "user": found.full,
         "scope": checked,
     }
-    tell(as_json, answer, f"key     {added.key}\nsecret  {secret}")
+    tell(as_json, answer, f"key     {added.key}", f"secret  {secret}")
     if not as_json:
         click.echo("The secret is not shown again.", err=True)
 

@@ -79,8 +79,7 @@ def set_(app: App, name: str, events_days: str, as_json: bool) -> None:
     days = None if events_days == "relay" else _days(events_days)
     with app.change() as change:
         name = known_realm(change.session, name)
-        queries.keep_events(change.session, name, days)
-        change.audit("realm.set", name, events_days=days)
+        change.keep_events(name, days)
     told = {"realm": name, "events_days": days}
     tell(as_json, told, f"The memory of realm {name} keeps events {_kept(days)}.")
 

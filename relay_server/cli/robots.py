@@ -11,7 +11,7 @@ import click
 from relay_db import queries
 from relay_protocol.errors import Unavailable
 from relay_protocol.limits import ENROLMENT_SECONDS
-from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, yes_option
+from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, sure, yes_option
 from relay_server.cli.fleet import ORDERS
 from relay_server.cli.naming import known_realm, listed, new_name, realm_option
 from relay_server.cli.output import show, tell
@@ -123,13 +123,18 @@ def share(app: App, name: str, realm: str, as_json: bool) -> None:
     tell(as_json, told, f"Robot {found.full} is of the realm {realm} too.")
 
 
-@robot.command(epilog=examples("switchboard robot unshare mobile@lab1 lab2"))
+@robot.command(epilog=examples("switchboard robot unshare mobile@lab1 lab2 --yes"))
 @click.argument("name")
 @click.argument("realm")
+@yes_option
 @json_option
 @pass_app
-def unshare(app: App, name: str, realm: str, as_json: bool) -> None:
-    """Take robot NAME out of REALM; the rights on it that are held there go, and what is open by them is cut."""
+def unshare(app: App, name: str, realm: str, yes: bool, as_json: bool) -> None:
+    """Take robot NAME out of REALM; the rights on it that are held there go, and what is open by them is cut.
+
+    What was recorded of it there is deleted: nobody could have it any more.
+    """
+    sure(f"Take {name} out of the realm {realm}, with the rights on it and the recordings of it there?", yes)
     with app.change() as change:
         found, realm = change.robot(name), known_realm(change.session, realm)
         change.unshare_robot(found, realm)

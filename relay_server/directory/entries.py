@@ -34,8 +34,8 @@ from relay_server.directory.limits import (
 
 SERVICE = "service"
 
-OWN = ("action", "camera", "robot", SERVICE, "topic")
-"""Kinds of what robots have."""
+OWN = ("action", "camera", "module", "robot", SERVICE, "topic")
+"""Kinds of what robots have, in the order of their names."""
 
 PARAMETERS = ("kind", "robot", "name", "realm", "limit", "after")
 

@@ -52,8 +52,8 @@ class Robots:
         for each in robots:
             if each.record.name == name and kind in OWN:
                 member = name if kind == "robot" else what
-                there = self.of(each, kind).get(member)
-                return None if there is None else self.entry(each.record, kind, member, there)
+                members = self.of(each, kind)
+                return self.entry(each.record, kind, member, members[member]) if member in members else None
         return None
 
     def of(self, robot: Seen, kind: str) -> dict[str, Any]:
@@ -67,6 +67,8 @@ class Robots:
             return {each.name: each for each in cameras if rules.judge(Operation.VIEW, each.name).allowed}
         channel = self._channels.find(there)
         view: View = seen(there, Ends() if channel is None else channel.ends(), rules)
+        if kind == "module":
+            return dict.fromkeys(view.nodes)
         members: dict[str, Any] = getattr(view, _GRAPH[kind])
         return members
 
@@ -83,6 +85,8 @@ class Robots:
         id = f"{kind}:{record.name}:{name}"
         if kind == "camera":
             return _entry(id, kind, name, record, place.of("cameras", name), {"type": there.type})
+        if kind == "module":
+            return _entry(id, kind, name, record, place.of("modules", name), {})
         ends: Topic | Service = there
         return _entry(id, kind, name, record, place.of(_GRAPH[kind], name), {"types": ends.types})
 

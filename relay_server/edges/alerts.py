@@ -14,6 +14,9 @@ from relay_protocol.errors import Invalid, NotFound
 from relay_server.access import Principal
 from relay_server.alerts import Ask, Position
 from relay_server.edges.api import Api, body_of
+from relay_server.edges.asked import KNOWN
+from relay_server.edges.once import see_no_key
+from relay_server.edges.tagged import answers, told_facts
 from relay_server.openapi import Answer, Operation, described, query
 from relay_server.openapi.kept import Alert, Alerts, Rule, Rules, Tested
 
@@ -72,8 +75,9 @@ class AlertPages:
                     Annotated[int, Meta(ge=1, le=MOST)],
                 ),
                 query("before", "`next` of an earlier answer: what comes behind that"),
+                KNOWN,
             ),
-            answers={200: Answer("alerts", Alerts)},
+            answers=answers("alerts", Alerts),
         )
     )
     def list(self, request: Request) -> Any:
@@ -95,7 +99,8 @@ class AlertPages:
             principal, robot, _ANSWERS[lasts], most + 1, Position.parse(before) if before else None
         )
         told = found[:most]
-        return {"alerts": told, "next": str(_position(told[-1])) if len(found) > most else None}
+        behind = str(_position(told[-1])) if len(found) > most else None
+        return told_facts(request, {"alerts": told, "next": behind})
 
     @app.route("/<id>/acknowledge", methods=["POST"])
     @described(
@@ -146,6 +151,7 @@ class AlertPages:
 
     async def _add(self, request: Request) -> Any:
         principal = await self._api.principal(request)
+        see_no_key(request)
         made = await self._desk.add_rule(principal, body_of(request, Ask), _address(request))
         request.setResponseCode(201)
         return made
@@ -181,7 +187,9 @@ class AlertPages:
         return self._api.answer(request, self._test(request, number))
 
     async def _test(self, request: Request, number: str) -> Any:
-        return await self._desk.test_rule(await self._api.principal(request), _number(number))
+        principal = await self._api.principal(request)
+        see_no_key(request)
+        return await self._desk.test_rule(principal, _number(number))
 
     @app.handle_errors(HTTPException)
     def unrouted(self, request: Request, failure: Any) -> bytes:

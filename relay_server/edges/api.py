@@ -21,7 +21,7 @@ from werkzeug.exceptions import NotFound as NothingHere
 from werkzeug.routing import RequestRedirect
 
 from relay_protocol import jsontext
-from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.errors import Invalid, Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
 from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import Principal
@@ -30,6 +30,7 @@ from relay_server.clock import Clock, to_the_end
 from relay_server.edges import api_operations as operations
 from relay_server.edges.api_operations import Login, TicketFor
 from relay_server.edges.limiting import RequestLimits
+from relay_server.edges.once import see_no_key
 from relay_server.edges.problems import problem, problem_of
 from relay_server.edges.stream import EventStream, Source
 from relay_server.openapi import described
@@ -69,11 +70,22 @@ class Desk(Protocol):
         """Call ``listener`` when something about robots may have changed; returns what ends that."""
 
 
+class Shown(Protocol):
+    """What tells of robots themselves; see :class:`relay_server.edges.robot_pages.RobotPages`."""
+
+    async def page(self, api: Api, request: Request) -> Any:
+        """A page of those that who asks has a right on."""
+
+    async def one(self, api: Api, request: Request, name: str) -> Any:
+        """One of them."""
+
+
 class Api:
     """The HTTP API as a klein application.
 
     :param below: what serves the addresses below those of robots, by their first part
     :param beside: the same for those beside them
+    :param robots: tells of robots themselves
     :param events: what else is told to pages, by the name of the event
     :param cookie: name of the session cookie
     :param secure: cookies only over TLS
@@ -91,6 +103,7 @@ class Api:
         metrics: CollectorRegistry,
         below: Mapping[str, Callable[[Api, str], IResource]],
         beside: Mapping[str, Callable[[Api], IResource]],
+        robots: Shown,
         *,
         cookie: str,
         secure: bool,
@@ -105,6 +118,7 @@ class Api:
         self._metrics = metrics
         self._below = below
         self._beside = beside
+        self._robots = robots
         self._cookie = cookie
         self._secure = secure
 
@@ -207,10 +221,7 @@ class Api:
     @app.route("/api/v1/robots", methods=["GET"])
     @described(operations.ROBOTS)
     def robots(self, request: Request) -> Any:
-        return self.answer(request, self._robots(request))
-
-    async def _robots(self, request: Request) -> Any:
-        return {"robots": await self._desk.robots(await self.principal(request))}
+        return self.answer(request, self._robots.page(self, request))
 
     @app.route("/api/v1/robots/stream", methods=["GET"])
     @described(operations.STREAM)
@@ -226,13 +237,7 @@ class Api:
     @app.route("/api/v1/robots/<name>", methods=["GET"])
     @described(operations.ROBOT)
     def robot(self, request: Request, name: str) -> Any:
-        return self.answer(request, self._robot(request, name))
-
-    async def _robot(self, request: Request, name: str) -> Any:
-        for robot in await self._desk.robots(await self.principal(request)):
-            if robot["name"] == name:
-                return robot
-        raise NotFound("there is no such robot, or you have no right on it")
+        return self.answer(request, self._robots.one(self, request, name))
 
     @app.route("/api/v1/robots/<name>/<part>", branch=True)
     def below(self, request: Request, name: str, part: str) -> Any:
@@ -256,6 +261,7 @@ class Api:
 
     async def _tickets(self, request: Request) -> Any:
         principal = await self.principal(request)
+        see_no_key(request)
         wanted = body_of(request, TicketFor)
         video = wanted.purpose == "video"
         if wanted.camera and not video:

@@ -8,8 +8,11 @@ import msgspec
 from msgspec import Meta
 
 from relay_protocol.limits import NAME
-from relay_server.openapi import Answer, Credential, Operation
+from relay_server.edges.asked import KNOWN, UNTYPED
+from relay_server.openapi import PROBLEM, Answer, Credential, Operation
 from relay_server.openapi.answers import Health, Me, Robot, Robots, Ticket
+from relay_server.openapi.told import Available
+from relay_server.resources.forms import FORMS
 
 
 class Login(msgspec.Struct):
@@ -28,6 +31,8 @@ class TicketFor(msgspec.Struct, rename={"purpose": "for"}):
     camera: Annotated[str, Meta(max_length=NAME)] = ""
 
 
+_TAGGED = {"ETag": "names this state, whatever `rtt_ms` and `last_seen` are"}
+_UNCHANGED = Answer("it is as it is known", headers=_TAGGED)
 _COOKIE = {"Set-Cookie": "the session"}
 
 LOGIN = Operation(
@@ -60,8 +65,9 @@ ROBOTS = Operation(
     method="GET",
     path="/api/v1/robots",
     tag="robots",
-    summary="Robots the caller has a right on",
-    answers={200: Answer("robots", Robots)},
+    summary="A page of the robots the caller has a right on",
+    parameters=(*UNTYPED, KNOWN),
+    answers={200: Answer("a page", Robots, headers=_TAGGED), 304: _UNCHANGED},
 )
 STREAM = Operation(
     method="GET",
@@ -77,7 +83,12 @@ ROBOT = Operation(
     path="/api/v1/robots/{robot}",
     tag="robots",
     summary="One robot",
-    answers={200: Answer("the robot", Robot)},
+    parameters=(KNOWN,),
+    answers={
+        200: Answer("the robot", Robot, media=tuple(each.media for each in FORMS), headers=_TAGGED),
+        304: _UNCHANGED,
+    },
+    problems={406: Answer("none of these forms is accepted", Available, media=(PROBLEM,))},
 )
 TICKETS = Operation(
     method="POST",

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from msgspec import Meta
 from twisted.web.server import Request
 from werkzeug.http import parse_dict_header, parse_etags
 
 from relay_protocol.errors import Invalid
+from relay_server.openapi import header, query
+from relay_server.resources.listing import LONGEST, PAGE
 
 WAIT = 60.0
 """Longest that a request may wait for something, seconds."""
 
 APPLIED = "preference-applied"
 """The header of an answer that names what was preferred, and is so (RFC 7240 section 3)."""
+
+LISTING = (
+    query("name", "a name, with shell wildcards"),
+    query("type", "a type"),
+    query("limit", f"most of an answer; {PAGE} where left out", Annotated[int, Meta(ge=1, le=LONGEST)]),
+    query("after", "the name behind which the page begins"),
+)
+"""What a page is asked for by (:class:`relay_server.resources.Listing`)."""
+
+UNTYPED = tuple(each for each in LISTING if each.name != "type")
+"""The same where the members have no types."""
+
+KNOWN = header("If-None-Match", "entity tags of what is known already")
 
 
 def query_of(request: Request) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Below ``/api/v1/robots/<robot>``: ``control``, ``stop``, ``resume``, ``suppress``, ``inhibit`` (SPEC section 1.7)."""
+"""A robot's ``control``, ``stop``, ``resume``, ``suppress``, ``inhibit`` and ``hold`` (SPEC section 1.7)."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from relay_server.control import Answer, NotDone, reason_of
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.asked import APPLIED, wait_preferred
 from relay_server.edges.dated import dated
+from relay_server.edges.methods import not_taken
 from relay_server.edges.problems import problem
 from relay_server.edges.vanished import notice
 from relay_server.inside import LINGER_SECONDS
@@ -32,7 +33,7 @@ from relay_server.openapi.answers import Control, ControlAnswer, ControlTaken, S
 
 T = TypeVar("T", bound=msgspec.Struct)
 
-PARTS = ("control", "stop", "resume", "suppress", "inhibit")
+PARTS = ("control", "stop", "resume", "suppress", "inhibit", "hold")
 """The addresses below a robot's that are served here."""
 
 ReasonText = Annotated[str, Meta(max_length=WORDS)]
@@ -62,12 +63,11 @@ class Suppress(msgspec.Struct):
     ms: int = 100
 
 
-class Inhibit(msgspec.Struct):
-    """Body of ``POST …/inhibit``; times in milliseconds."""
+class Inhibit(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of ``POST …/inhibit`` and ``…/hold``; times in milliseconds."""
 
     resource: Resource
     ms: int = 1000
-    hold: bool = False
 
 
 ROBOT = "/api/v1/robots/{robot}"
@@ -177,6 +177,16 @@ INHIBIT = Operation(
     answers={200: Told("as it was asked", Inhibit)},
     errors=(409,),
 )
+HOLD = Operation(
+    method="POST",
+    path=f"{ROBOT}/hold",
+    tag="control",
+    summary="Have a topic say its last value for a time",
+    more="What it says meanwhile nobody gets: in its place the last value before comes again.",
+    body=Inhibit,
+    answers={200: Told("as it was asked", Inhibit)},
+    errors=(409,),
+)
 
 
 class Desk(Protocol):
@@ -230,20 +240,28 @@ class RobotControl:
         self._api = api
         self._robot = robot
 
-    @app.route("/", methods=["GET"])
-    @described(WHO)
-    def control(self, request: Request) -> Any:
-        self._only("control")
-        return self._answer(request, self._control(request))
+    @app.route("/", methods=["GET", "PUT", "DELETE", "POST"])
+    @described(WHO, TAKE, LET_GO, STOP, RESUME, SUPPRESS, INHIBIT, HOLD)
+    def order(self, request: Request) -> Any:
+        ways = {
+            ("control", "GET"): self._control,
+            ("control", "PUT"): self._take,
+            ("control", "DELETE"): self._let_go,
+            ("stop", "POST"): self._stop,
+            ("resume", "POST"): self._resume,
+            ("suppress", "POST"): self._suppress,
+            ("inhibit", "POST"): self._inhibit,
+            ("hold", "POST"): self._inhibit,
+        }
+        method = "GET" if request.method == b"HEAD" else request.method.decode()
+        way = ways.get((self._part, method))
+        if way is None:
+            return self.other(request)
+        # Who stops a robot and leaves has it stopped all the same.
+        return self._answer(request, way(request), lasts=self._part == "stop")
 
     async def _control(self, request: Request) -> Any:
         return await self._desk.control(*await self._asked(request))
-
-    @app.route("/", methods=["PUT"])
-    @described(TAKE)
-    def take(self, request: Request) -> Any:
-        self._only("control")
-        return self._answer(request, self._take(request))
 
     async def _take(self, request: Request) -> Any:
         # Nobody is to be given control who has gone while he waits for it.
@@ -260,12 +278,6 @@ class RobotControl:
             request.setResponseCode(202)
         return {**taken.answer._asdict(), "kept": LINGER_SECONDS, "control": taken.control}
 
-    @app.route("/", methods=["DELETE"])
-    @described(LET_GO)
-    def let_go(self, request: Request) -> Any:
-        self._only("control")
-        return self._answer(request, self._let_go(request))
-
     async def _let_go(self, request: Request) -> Any:
         # Which stops the robot.
         await self._desk.let_go(*await self._asked(request, stops=True))
@@ -273,7 +285,8 @@ class RobotControl:
     @app.route("/<any(release,grant,refuse):what>", methods=["POST"])
     @described(*(_change_of(what, words) for what, words in CHANGES.items()))
     def change(self, request: Request, what: str) -> Any:
-        self._only("control")
+        if self._part != "control":
+            raise NothingHere
         return self._api.answer(request, self._change(request, what))
 
     async def _change(self, request: Request, what: str) -> Any:
@@ -286,18 +299,14 @@ class RobotControl:
             done = await do(principal, robot, reply.why, address, reply.client)
         return done._asdict()
 
-    @app.route("/", methods=["POST"])
-    @described(STOP, RESUME, SUPPRESS, INHIBIT)
-    def order(self, request: Request) -> Any:
-        self._only("stop", "resume", "suppress", "inhibit")
-        orders = {
-            "stop": self._stop,
-            "resume": self._resume,
-            "suppress": self._suppress,
-            "inhibit": self._inhibit,
-        }
-        # Who stops a robot and leaves has it stopped all the same.
-        return self._answer(request, orders[self._part](request), lasts=self._part == "stop")
+    @app.route("/")
+    @app.route("/<path:what>")
+    def other(self, request: Request, what: str = "") -> Any:
+        """No method of these addresses."""
+        if what and (self._part != "control" or what not in CHANGES):
+            raise NothingHere
+        takes = ("GET", "PUT", "DELETE") if self._part == "control" and not what else ("POST",)
+        return self._answer(request, not_taken(self._control(request), takes))
 
     async def _stop(self, request: Request) -> Any:
         why = _reason(request)
@@ -326,17 +335,13 @@ class RobotControl:
     async def _inhibit(self, request: Request) -> Any:
         principal, robot, address = await self._asked(request)
         ask = body_of(request, Inhibit)
-        await self._desk.inhibit(principal, robot, ask.resource, ask.ms, ask.hold, address)
+        await self._desk.inhibit(principal, robot, ask.resource, ask.ms, self._part == "hold", address)
         return msgspec.to_builtins(ask)
 
     def _answer(self, request: Request, work: Awaitable[Any], *, lasts: bool = False) -> Any:
         """Answer with the moment at which that is done; see :meth:`relay_server.edges.api.Api.answer`."""
 
         return self._api.answer(request, dated(request, self._moments, work), lasts=lasts)
-
-    def _only(self, *parts: str) -> None:
-        if self._part not in parts:
-            raise NothingHere
 
     async def _asked(self, request: Request, *, stops: bool = False) -> tuple[Principal, str, str]:
         """Who asks, about which robot, from where."""

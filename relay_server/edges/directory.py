@@ -20,9 +20,11 @@ from relay_server.directory.desk import DirectoryDesk, Kept
 from relay_server.directory.entries import Ask, Registration, ask_of, place_text
 from relay_server.edges import directory_operations as operations
 from relay_server.edges.api import STREAMED, Api, body_of
-from relay_server.edges.asked import known_tags, query_of, streams
+from relay_server.edges.asked import query_of, streams
+from relay_server.edges.once import see_no_key
 from relay_server.edges.outflow import Outflow
 from relay_server.edges.sse import news_within, sent
+from relay_server.edges.tagged import told
 from relay_server.openapi import described
 from relay_server.resources.states import tag_of
 
@@ -57,7 +59,7 @@ class DirectoryPages:
             return await self._stream(request, principal, ask)
         entries, behind = await self._desk.page(principal, ask)
         body = jsontext.encode({"entries": entries, "next": None if behind is None else place_text(behind)})
-        return _told(request, body, tag_of(body))
+        return told(request, body, tag_of(body))
 
     @app.route("/", methods=["POST"])
     @described(operations.REGISTER)
@@ -66,6 +68,7 @@ class DirectoryPages:
 
     async def _register(self, request: Request) -> Any:
         principal = await self._api.principal(request)
+        see_no_key(request)
         kept = await self._desk.register(principal, body_of(request, Registration))
         if kept.fresh:
             request.setResponseCode(201)
@@ -79,7 +82,7 @@ class DirectoryPages:
 
     async def _one(self, request: Request, id: str) -> Any:
         kept = await self._desk.one(await self._api.principal(request), id)
-        return _told(request, kept.body, kept.etag)
+        return told(request, kept.body, kept.etag)
 
     @app.route("/<path:id>", methods=["PUT"])
     @described(operations.PUT)
@@ -144,15 +147,6 @@ def beside(clock: Clock, desk: DirectoryDesk, api: Api) -> IResource:
     """What serves ``/api/v1/directory``."""
     resource: IResource = DirectoryPages(clock, desk, api).app.resource()
     return resource
-
-
-def _told(request: Request, body: bytes, etag: str) -> Any:
-    """Something that was asked for, unless who asks has it already."""
-    request.setHeader("etag", etag)
-    if etag in known_tags(request):
-        request.setResponseCode(304)
-        return STREAMED
-    return msgspec.Raw(body)
 
 
 def _kept(request: Request, kept: Kept) -> Any:

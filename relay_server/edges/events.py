@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from klein import Klein
@@ -18,6 +19,7 @@ from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_server.clock import Clock
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.asked import query_of
+from relay_server.edges.once import KEYED, once, send
 from relay_server.edges.outflow import Outflow
 from relay_server.edges.sse import news_within, sent
 from relay_server.memory import Ask, Forms, MemoryDesk, NewEvent, ask_of
@@ -25,6 +27,7 @@ from relay_server.memory.asks import place_text
 from relay_server.memory.limits import LONGEST, SEVERAL
 from relay_server.openapi import JSON, Answer, Operation, described, query
 from relay_server.openapi.told import Event, EventCount, EventPage, EventsKept
+from relay_server.resources import Idempotency, Reply
 
 STREAM = "text/event-stream"
 CSV = "text/csv"
@@ -51,9 +54,10 @@ class EventPages:
 
     app = Klein()
 
-    def __init__(self, clock: Clock, desk: MemoryDesk, api: Api) -> None:
+    def __init__(self, clock: Clock, desk: MemoryDesk, keys: Idempotency, api: Api) -> None:
         self._clock = clock
         self._desk = desk
+        self._keys = keys
         self._api = api
 
     @app.route("/", methods=["POST"])
@@ -64,9 +68,10 @@ class EventPages:
             tag="events",
             summary="Write an event, or up to 100",
             more="All are kept or none; they are safe when this is answered.",
+            parameters=(KEYED,),
             body=BODY,
             answers={201: Answer("as it was kept", (Event, EventsKept))},
-            errors=(404,),
+            errors=(404, 422),
         )
     )
     def write(self, request: Request) -> Any:
@@ -75,9 +80,14 @@ class EventPages:
     async def _write(self, request: Request) -> Any:
         principal, body = await self._api.principal(request), body_of(request, BODY)
         several = isinstance(body, list)
-        kept = await self._desk.write(principal, body if several else [body])
-        request.setResponseCode(201)
-        return {"events": kept} if several else kept[0]
+        events: list[NewEvent] = body if several else [body]
+
+        async def work() -> Reply:
+            kept = await self._desk.write(principal, events)
+            return Reply(201, jsontext.encode({"events": kept} if several else kept[0]))
+
+        may = partial(self._desk.may_write, principal, events)
+        return send(request, await once(self._keys, request, principal, "", work, may))
 
     @app.route("/", methods=["GET"])
     @described(
@@ -193,9 +203,12 @@ class EventPages:
         return answer
 
 
-def beside(clock: Clock, desk: MemoryDesk, api: Api) -> IResource:
-    """What serves ``/api/v1/events``."""
-    resource: IResource = EventPages(clock, desk, api).app.resource()
+def beside(clock: Clock, desk: MemoryDesk, keys: Idempotency, api: Api) -> IResource:
+    """What serves ``/api/v1/events``.
+
+    :param keys: requests that were sent with a key
+    """
+    resource: IResource = EventPages(clock, desk, keys, api).app.resource()
     return resource
 
 

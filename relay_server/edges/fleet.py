@@ -18,6 +18,7 @@ from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.dated import dated
+from relay_server.edges.once import see_no_key
 from relay_server.fleet import Order, Plan, Result, StopOrder, local_of
 from relay_server.moments import HEADER, Moments
 from relay_server.openapi import Answer, Operation, described, header
@@ -83,6 +84,8 @@ class FleetApi:
 
     async def _order(self, request: Request) -> Any:
         order = _order_of(request)
+        if order.do != "stop":
+            see_no_key(request)
         # Whatever is ordered: rights are judged anew when a robot has its turn.
         principal = await self._api.principal(request, urgent=True, passes=order.do == "stop")
         address = getattr(request.getClientAddress(), "host", "local")

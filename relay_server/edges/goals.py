@@ -17,10 +17,20 @@ from relay_protocol.limits import NAME
 from relay_protocol.rights import Operation
 from relay_server.clock import Clock
 from relay_server.edges.api import STREAMED, Api, body_of
-from relay_server.edges.asked import WAIT, known_tags, number_in, query_of, streams, wait_preferred
+from relay_server.edges.asked import (
+    KNOWN,
+    LISTING,
+    WAIT,
+    known_tags,
+    number_in,
+    query_of,
+    streams,
+    wait_preferred,
+)
 from relay_server.edges.dated import dated
 from relay_server.edges.flow import Flow
 from relay_server.edges.once import Once, send
+from relay_server.edges.tagged import answers, told_facts
 from relay_server.edges.vanished import notice
 from relay_server.openapi import JSON, Answer, described, header, query, raw
 from relay_server.openapi import Operation as Described
@@ -36,7 +46,6 @@ from relay_server.resources import (
     Reply,
     see_known,
 )
-from relay_server.resources.listing import LONGEST, PAGE
 
 STREAM_SECONDS = 60.0
 """A stream ends after so long, for its reader to begin it anew: what holds connections open in between, as proxies do,
@@ -51,12 +60,6 @@ AGAIN_MS = 500
 UNWATCHED_SECONDS = 3600.0
 
 
-LISTING = (
-    query("name", "a name, with shell wildcards"),
-    query("type", "a type"),
-    query("limit", f"most of an answer; {PAGE} where left out", Annotated[int, Meta(ge=1, le=LONGEST)]),
-    query("after", "the name behind which the page begins"),
-)
 PREFER = header("Prefer", "`wait=` seconds for which its end is waited (RFC 7240)")
 GOAL_HEADERS = {
     "ETag": "names this status",
@@ -135,8 +138,8 @@ class RobotGoals:
             tag="goals",
             summary="A page of the caller's own goals",
             more="`name` and `type` are those of actions.",
-            parameters=LISTING,
-            answers={200: Answer("a page", GoalPage)},
+            parameters=(*LISTING, KNOWN),
+            answers=answers("a page", GoalPage, _TAGGED),
         )
     )
     def members(self, request: Request) -> Any:
@@ -144,7 +147,7 @@ class RobotGoals:
 
     async def _members(self, request: Request) -> Any:
         asker = await self._asker(request)
-        return await self._desk.members(asker, Listing.of(query_of(request)))
+        return told_facts(request, await self._desk.members(asker, Listing.of(query_of(request))))
 
     @app.route("/<id>", methods=["GET"])
     @described(

@@ -10,15 +10,13 @@ from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
 from relay_server.edges.api import Api
+from relay_server.edges.asked import UNTYPED
 from relay_server.edges.collection import Collection
-from relay_server.edges.goals import LISTING
 from relay_server.edges.resource_operations import member_of, members_of
 from relay_server.openapi import described
 from relay_server.openapi.told import Module, Modules
 from relay_server.resources import ModuleDesk, Moments, ResourceDesk
 from relay_server.resources.describing import module_graph
-
-_LISTING = tuple(each for each in LISTING if each.name != "type")
 
 
 class RobotModules(Collection):
@@ -38,7 +36,7 @@ class RobotModules(Collection):
         self._modules = modules
 
     @app.route("/", methods=["GET"])
-    @described(members_of("modules", "A page of the nodes in the robot's graph", Modules, listing=_LISTING))
+    @described(members_of("modules", "A page of the nodes in the robot's graph", Modules, listing=UNTYPED))
     def members(self, request: Request) -> Any:
         return self._page(request, self._modules.members)
 

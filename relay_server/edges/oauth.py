@@ -54,10 +54,10 @@ class Desk(Protocol):
     async def token(self, ask: TokenAsk, program: ProgramRecord | None, address: str) -> Granted:
         """A token."""
 
-    async def introspect(self, token: str, realm: str) -> dict[str, Any]:
+    async def introspect(self, token: str, realm: str, program: str | None = None) -> dict[str, Any]:
         """What is left of one."""
 
-    async def revoke(self, token: str, realm: str) -> None:
+    async def revoke(self, token: str, realm: str, program: str | None = None) -> None:
         """Its end."""
 
 
@@ -129,8 +129,7 @@ class OAuth:
     async def _introspect(self, request: Request) -> Any:
         self._limits.of_network(request)
         fields = _fields(request)
-        realm = await self._realm(request, fields)
-        return await self._desk.introspect(_token_in(fields), realm)
+        return await self._desk.introspect(_token_in(fields), *await self._asker(request, fields))
 
     @app.route("/oauth/revoke", methods=["POST"])
     @described(
@@ -153,21 +152,22 @@ class OAuth:
     async def _revoke(self, request: Request) -> Any:
         self._limits.of_network(request)
         fields = _fields(request)
-        realm = await self._realm(request, fields)
-        await self._desk.revoke(_token_in(fields), realm)
+        await self._desk.revoke(_token_in(fields), *await self._asker(request, fields))
         return {}
 
     # --- who asks -----------------------------------------------------------------------------------------
 
-    async def _realm(self, request: Request, fields: dict[str, str]) -> str:
-        """Whose tokens may be asked about: those of the realm of who asks, a program or anybody with a token."""
+    async def _asker(self, request: Request, fields: dict[str, str]) -> tuple[str, str | None]:
+        """Whose tokens may be asked about: those of the realm of who asks, a program or anybody with a token; and the
+        key of the program.
+        """
         scheme, _, token = (request.getHeader("authorization") or "").partition(" ")
         if scheme.lower() == "bearer":
-            return (await self._desk.principal(token.strip())).realm
+            return (await self._desk.principal(token.strip())).realm, None
         program = await self._program(request, fields)
         if program is None:
             raise BadCredentials("prove yourself by a token of your own, or a program by its key and secret")
-        return program.realm
+        return program.realm, program.key
 
     async def _program(self, request: Request, fields: dict[str, str]) -> ProgramRecord | None:
         header = request.getHeader("authorization") or ""

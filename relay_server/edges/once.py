@@ -9,8 +9,11 @@ import msgspec
 from twisted.internet.defer import Deferred
 from twisted.web.server import Request
 
+from relay_protocol.errors import Invalid
 from relay_protocol.rights import Operation
+from relay_server.access import Principal
 from relay_server.channel import resolve
+from relay_server.openapi import header
 from relay_server.resources import (
     KEY_HEADER,
     Asker,
@@ -24,6 +27,10 @@ from relay_server.resources import (
 from relay_server.session.calling import URGENT
 
 Work = Callable[[], Coroutine[Deferred[Any], Any, Reply]]
+May = Callable[[], Coroutine[Deferred[Any], Any, None]]
+
+
+KEYED = header(KEY_HEADER, "a key of the sender's: the same again is not done again")
 
 
 class Once:
@@ -44,14 +51,46 @@ class Once:
         if operation is Operation.CALL and resolve(name) in URGENT:
             # Who stops a robot with a key that he has used before means it.
             return await work()
-        key = key_in(request.requestHeaders.getRawHeaders(KEY_HEADER, []))
-        if key is None:
-            return await work()
-        address = request.path.decode("ascii", "replace")
-        request.content.seek(0)
-        body = request.content.read()
-        target = Target(Owner.of(asker.principal), asker.robot, address, key)
-        return await self._memory.once(target, body, work, lambda: self._desk.may(asker, operation, name))
+
+        async def may() -> None:
+            await self._desk.may(asker, operation, name)
+
+        return await once(self._memory, request, asker.principal, asker.robot, work, may)
+
+
+async def once(
+    memory: Idempotency,
+    request: Request,
+    principal: Principal,
+    robot: str,
+    work: Work,
+    may: May,
+) -> Reply:
+    """Do what a request asks for, unless it was done already.
+
+    :param robot: whose address it is sent to, or empty
+    :param may: raises what keeps the asker from being given the answer of an earlier request
+    :raises SwitchboardError: as ``work``, or the key can't be, or stands for something else
+    """
+    key = key_in(request.requestHeaders.getRawHeaders(KEY_HEADER, []))
+    if key is None:
+        return await work()
+    address = request.path.decode("ascii", "replace")
+    request.content.seek(0)
+    body = request.content.read()
+    return await memory.once(Target(Owner.of(principal), robot, address, key), body, work, may)
+
+
+def see_no_key(request: Request) -> None:
+    """See that a request has none, where the same again would be done again.
+
+    :raises Invalid: it has one
+    """
+    if request.requestHeaders.hasHeader(KEY_HEADER):
+        raise Invalid(
+            f"'{KEY_HEADER}' is not understood at this address, and the same again would be done again: leave it "
+            "out, and where no answer came look first whether it was done"
+        )
 
 
 def send(request: Request, reply: Reply) -> Any:

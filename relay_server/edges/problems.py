@@ -17,6 +17,7 @@ from relay_server.control import NotDone, StoppedSince
 from relay_server.directory.desk import MatchNeeded, TooManyChanges
 from relay_server.directory.entries import TooLarge
 from relay_server.edges.limiting import TooManyRequests
+from relay_server.edges.methods import WrongMethod
 from relay_server.inside import MaybeDone
 from relay_server.memory import Full
 from relay_server.resources import (
@@ -55,6 +56,7 @@ _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (TooManyTries, 429),
     (TooManyRequests, 429),
     (NotFound, 404),
+    (WrongMethod, 405),
     (MomentNeeded, 428),
     (MatchNeeded, 428),
     (Taken, 409),
@@ -106,6 +108,8 @@ def problem_of(request: Request, error: SwitchboardError) -> bytes:
         request.setHeader(b"retry-after", str(int(error.retry_after) + 1).encode())
     if isinstance(error, BadCredentials):
         request.setHeader(b"www-authenticate", b"Bearer")
+    if isinstance(error, WrongMethod):
+        request.setHeader(b"allow", error.allow.encode())
     status = next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
     more: dict[str, Any] = {}
     if isinstance(error, (NotAcceptable, UnknownForm)):

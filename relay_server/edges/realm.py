@@ -16,9 +16,11 @@ from relay_protocol.errors import NotFound
 from relay_server.access import Principal
 from relay_server.administration import machines, people
 from relay_server.administration.desk import RealmDesk
+from relay_server.administration.own import Seen
 from relay_server.edges import realm_operations as operations
 from relay_server.edges.api import Api, body_of
 from relay_server.edges.asked import query_of
+from relay_server.edges.once import see_no_key
 from relay_server.edges.realm_operations import PAGED
 from relay_server.edges.realm_shapes import (
     Granted,
@@ -27,9 +29,11 @@ from relay_server.edges.realm_shapes import (
     NewRobot,
     NewRobotGroup,
     NewUser,
+    RealmChange,
     RobotChange,
     UserChange,
 )
+from relay_server.edges.tagged import changed, told_facts
 from relay_server.openapi import described
 from relay_server.resources import Listing, see_known
 
@@ -51,6 +55,8 @@ class RealmPages:
         """The administrator who asks; nothing is looked at before he is known to be one."""
         principal = await self._api.principal(request)
         self._desk.admit(principal, changes=changes)
+        if request.method == b"POST":
+            see_no_key(request)
         if b"%2f" in request.path.lower():
             # Addresses lose slashes (edges/site.py): somebody else could be meant by what is left.
             raise NotFound("names with a '/' are not known here; see to them by the command line")
@@ -58,7 +64,8 @@ class RealmPages:
 
     def _told(self, request: Request, query: Callable[..., Any], *args: Any) -> Any:
         async def work() -> Any:
-            return await self._desk.read(await self._admitted(request), query, *args)
+            told = await self._desk.read(await self._admitted(request), query, *args)
+            return told_facts(request, told)
 
         return self._api.answer(request, work())
 
@@ -70,7 +77,8 @@ class RealmPages:
             see_known(asked, *_PAGED, *filters)
             listing = Listing.of({name: text for name, text in asked.items() if name in _PAGED})
             chosen = [asked.get(name) for name in filters]
-            return await self._desk.read(principal, query, *args, listing, *chosen)
+            page = await self._desk.read(principal, query, *args, listing, *chosen)
+            return told_facts(request, page)
 
         return self._api.answer(request, work())
 
@@ -85,6 +93,16 @@ class RealmPages:
     @described(operations.ABOUT)
     def about(self, request: Request) -> Any:
         return self._told(request, people.about)
+
+    @app.route("/", methods=["PATCH"])
+    @described(operations.CHANGE)
+    def change(self, request: Request) -> Any:
+        return self._api.answer(request, self._change(request))
+
+    async def _change(self, request: Request) -> Any:
+        principal = await self._admitted(request, changes=True)
+        days = body_of(request, RealmChange).events_days
+        return await self._desk.change(principal, _address(request), people.keep_events, days)
 
     # --- users --------------------------------------------------------------------------------------------
 
@@ -122,7 +140,10 @@ class RealmPages:
         new = body_of(request, UserChange)
         disabled, admin = (None if each is UNSET else each for each in (new.disabled, new.admin))
         wanted = await self._hash(principal, new.password), disabled, admin
-        return await self._desk.change(principal, _address(request), people.change_user, name, *wanted)
+        told = await self._desk.change(
+            principal, _address(request), people.change_user, name, *wanted, seen=_seen(request)
+        )
+        return changed(request, told)
 
     async def _hash(self, principal: Principal, password: str | UnsetType) -> str | None:
         return None if password is UNSET else await self._desk.new_hash(principal, password)
@@ -238,7 +259,10 @@ class RealmPages:
         principal = await self._admitted(request, changes=True)
         new = body_of(request, RobotChange)
         description = None if new.description is UNSET else new.description
-        return await self._desk.change(principal, _address(request), machines.change_robot, name, description)
+        told = await self._desk.change(
+            principal, _address(request), machines.change_robot, name, description, seen=_seen(request)
+        )
+        return changed(request, told)
 
     @app.route("/robots/<name>", methods=["DELETE"])
     @described(operations.REMOVE_ROBOT)
@@ -315,6 +339,11 @@ class RealmPages:
     def rights(self, request: Request) -> Any:
         return self._page(request, machines.rights, filters=("robot", "user"))
 
+    @app.route("/rights/<name>/<holder>", methods=["GET"])
+    @described(operations.RIGHT)
+    def right(self, request: Request, name: str, holder: str) -> Any:
+        return self._told(request, machines.right, name, holder)
+
     @app.route("/rights/<name>/<holder>", methods=["PUT"])
     @described(operations.GRANT)
     def grant(self, request: Request, name: str, holder: str) -> Any:
@@ -326,9 +355,11 @@ class RealmPages:
         self._desk.count(principal, len(new.allow) + len(new.deny))
         given = str(new.level), new.allow, new.deny
         told, fresh = await self._desk.change(
-            principal, _address(request), machines.grant, name, holder, *given
+            principal, _address(request), machines.grant, name, holder, *given, seen=_seen(request)
         )
-        return _made(request, told, "rights", told["robot"], told["holder"]) if fresh else told
+        if fresh:
+            _made(request, told, "rights", told["robot"], told["holder"])
+        return changed(request, told)
 
     @app.route("/rights/<name>/<holder>", methods=["DELETE"])
     @described(operations.REVOKE)
@@ -352,6 +383,11 @@ def _made(request: Request, told: Any, *names: str) -> Any:
     request.setResponseCode(201)
     request.setHeader("location", "/".join([operations.HERE, *(quote(each, safe="@") for each in names)]))
     return told
+
+
+def _seen(request: Request) -> Seen:
+    """What who changes something says that he has seen of it."""
+    return Seen(request.getHeader("if-match"), request.getHeader("if-none-match"))
 
 
 def _address(request: Request) -> str:

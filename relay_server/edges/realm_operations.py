@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from relay_server.edges.goals import LISTING
+from relay_server.edges.asked import KNOWN, UNTYPED
 from relay_server.edges.realm_shapes import (
     Granted,
     NewGroup,
@@ -13,6 +13,7 @@ from relay_server.edges.realm_shapes import (
     NewRobotGroup,
     NewUser,
     RealmAbout,
+    RealmChange,
     RealmCode,
     RealmGroup,
     RealmGroups,
@@ -32,11 +33,15 @@ from relay_server.edges.realm_shapes import (
     RobotChange,
     UserChange,
 )
-from relay_server.openapi import Answer, Operation, Parameter, query
+from relay_server.openapi import Answer, Operation, Parameter, header, query
 
 HERE = "/api/v1/realm"
 
-PAGED = tuple(each for each in LISTING if each.name != "type")
+PAGED = UNTYPED
+_TAGGED = {"ETag": "names this state"}
+_UNCHANGED = Answer("it is as it is known", headers=_TAGGED)
+_MATCH = header("If-Match", "entity tags: only if it is one of these; `*`: only if it is there")
+_NONE = header("If-None-Match", "`*`: only if it is not there")
 _PLACED = {"Location": "its address"}
 _IN_PATH = {
     "user": "name of a user",
@@ -75,9 +80,14 @@ def _operation(
 
 
 def _page(path: str, summary: str, page: Any, *others: Parameter, **more: Any) -> Operation:
-    return _operation(
-        "GET", path, summary, {200: Answer("a page", page)}, parameters=(*PAGED, *others), **more
-    )
+    return _told(path, summary, Answer("a page", page), parameters=(*PAGED, *others), **more)
+
+
+def _told(path: str, summary: str, answer: Answer, **more: Any) -> Operation:
+    """What is read, with an entity tag."""
+    answers = {200: answer._replace(headers=_TAGGED), 304: _UNCHANGED}
+    parameters = (*more.pop("parameters", ()), KNOWN)
+    return _operation("GET", path, summary, answers, parameters=parameters, **more)
 
 
 def _new(path: str, summary: str, body: Any, made: Any, **more: Any) -> Operation:
@@ -89,20 +99,29 @@ def _gone(path: str, summary: str, **more: Any) -> Operation:
     return _operation("DELETE", path, summary, {204: Answer("done")}, **more)
 
 
-ABOUT = _operation("GET", "", "The caller's own realm", {200: Answer("the realm", RealmAbout)})
+ABOUT = _told("", "The caller's own realm", Answer("the realm", RealmAbout))
+CHANGE = _operation(
+    "PATCH",
+    "",
+    "Say how long the realm's memory keeps events",
+    {200: Answer("the realm", RealmAbout)},
+    more="Takes a token without a scope. The relay goes by it within ten minutes.",
+    body=RealmChange,
+)
 
 USERS = _page("users", "Users", RealmUsers)
 NEW_USER = _new("users", "Add a user", NewUser, RealmUser)
-USER = _operation("GET", "users/{name}", "One user", {200: Answer("the user", RealmUser)}, named="user")
+USER = _told("users/{name}", "One user", Answer("the user", RealmUser), named="user")
 CHANGE_USER = _operation(
     "PATCH",
     "users/{name}",
     "Change a user",
-    {200: Answer("the user", RealmUser)},
+    {200: Answer("the user", RealmUser, headers=_TAGGED)},
     named="user",
     more="Nobody disables himself, or ceases to be an administrator by his own hand.",
+    parameters=(_MATCH,),
     body=UserChange,
-    errors=(409,),
+    errors=(409, 412),
 )
 REMOVE_USER = _gone("users/{name}", "Remove a user with rights and tokens", named="user", errors=(409,))
 TOKENS = _page("users/{name}/tokens", "A user's tokens and browser sessions", RealmTokens, named="user")
@@ -121,7 +140,7 @@ REVOKE_PROGRAM = _gone("programs/{key}", "Make a program worthless with its toke
 
 GROUPS = _page("groups", "Groups of users", RealmGroups)
 NEW_GROUP = _new("groups", "Add a group", NewGroup, RealmGroup)
-GROUP = _operation("GET", "groups/{name}", "One group", {200: Answer("the group", RealmGroup)}, named="group")
+GROUP = _told("groups/{name}", "One group", Answer("the group", RealmGroup), named="group")
 REMOVE_GROUP = _gone("groups/{name}", "Remove a group with its rights", named="group")
 JOIN = _operation(
     "PUT",
@@ -135,14 +154,16 @@ LEAVE = _gone("groups/{name}/members/{user}", "Take a user out of a group", name
 
 ROBOTS = _page("robots", "Robots, enrolled or not", RealmRobots)
 NEW_ROBOT = _new("robots", "Add a robot", NewRobot, RealmNewRobot)
-ROBOT = _operation("GET", "robots/{name}", "One robot", {200: Answer("the robot", RealmRobot)}, named="robot")
+ROBOT = _told("robots/{name}", "One robot", Answer("the robot", RealmRobot), named="robot")
 CHANGE_ROBOT = _operation(
     "PATCH",
     "robots/{name}",
     "Change a robot's description",
-    {200: Answer("the robot", RealmRobot)},
+    {200: Answer("the robot", RealmRobot, headers=_TAGGED)},
     named="robot",
+    parameters=(_MATCH,),
     body=RobotChange,
+    errors=(412,),
 )
 REMOVE_ROBOT = _gone(
     "robots/{name}",
@@ -165,12 +186,8 @@ REVOKE_KEY = _gone(
 
 ROBOT_GROUPS = _page("robot-groups", "Groups of robots", RealmRobotGroups)
 NEW_ROBOT_GROUP = _new("robot-groups", "Add a group of robots", NewRobotGroup, RealmRobotGroup)
-ROBOT_GROUP = _operation(
-    "GET",
-    "robot-groups/{name}",
-    "One group of robots",
-    {200: Answer("the group", RealmRobotGroup)},
-    named="group",
+ROBOT_GROUP = _told(
+    "robot-groups/{name}", "One group of robots", Answer("the group", RealmRobotGroup), named="group"
 )
 REMOVE_ROBOT_GROUP = _gone("robot-groups/{name}", "Remove a group; its robots stay", named="group")
 JOIN_ROBOT = _operation(
@@ -191,17 +208,19 @@ RIGHTS = _page(
     query("user", "of this user only, also by groups"),
     errors=(404,),
 )
+RIGHT = _told("rights/{name}/{holder}", "One right", Answer("the right", RealmRight), named="robot")
 GRANT = _operation(
     "PUT",
     "rights/{name}/{holder}",
     "Give a right, in the place of the one the holder has on the robot",
     {
-        200: Answer("in the place of another", RealmRight),
-        201: Answer("given", RealmRight, headers=_PLACED),
+        200: Answer("in the place of another", RealmRight, headers=_TAGGED),
+        201: Answer("given", RealmRight, headers={**_PLACED, **_TAGGED}),
     },
     named="robot",
+    parameters=(_MATCH, _NONE),
     body=Granted,
-    errors=(409,),
+    errors=(409, 412),
 )
 REVOKE = _gone(
     "rights/{name}/{holder}", "Take a right away", named="robot", more="What is open by it is cut."

@@ -8,6 +8,7 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from relay_db.models import LABEL
+from relay_db.queries.realms import MOST_DAYS
 from relay_db.queries.rights import PATTERNS
 from relay_protocol.rights import Level
 from relay_server.administration.limits import NAME_SENT, PATTERN_SENT, SCOPE_SENT
@@ -17,6 +18,15 @@ Name = Annotated[str, Meta(max_length=NAME_SENT)]
 Password = Annotated[str, Meta(max_length=MAX_BYTES)]
 Line = Annotated[str, Meta(max_length=LABEL)]
 Patterns = Annotated[list[Annotated[str, Meta(max_length=PATTERN_SENT)]], Meta(max_length=PATTERNS)]
+
+
+class RealmChange(msgspec.Struct, forbid_unknown_fields=True):
+    """What is to be other than it is.
+
+    :param events_days: how long the realm's memory keeps events; null: as long as the relay's
+    """
+
+    events_days: Annotated[float, Meta(gt=0, le=MOST_DAYS)] | None
 
 
 class NewUser(msgspec.Struct, forbid_unknown_fields=True):
@@ -192,6 +202,7 @@ class RealmNewRobot(TypedDict):
     robot: str
     description: str
     keys: int
+    guest: bool
     enrolment_code: str
     expires_in: float
 

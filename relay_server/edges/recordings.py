@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any, Protocol
 
 from klein import Klein
@@ -12,16 +13,21 @@ from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
+from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, Unavailable
 from relay_protocol.limits import KIB
 from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.asked import KNOWN
+from relay_server.edges.once import KEYED, once, send
 from relay_server.edges.problems import problem
 from relay_server.edges.ranges import Part, part_of
+from relay_server.edges.tagged import answers, told_facts
 from relay_server.openapi import Answer, Operation, described, header, query
 from relay_server.openapi.kept import Recordable, Recording, RecordingPage
 from relay_server.recording import PAGE, PAGE_MOST, Ask
+from relay_server.resources import Idempotency, Reply
 
 PART_BYTES = 256 * KIB
 """Read from the disk at a time. No more of a file is in memory than this and what the transport holds."""
@@ -62,6 +68,9 @@ class Desk(Protocol):
     async def start(self, principal: Principal, robot: str, ask: Ask, address: str) -> dict[str, Any]:
         """Begin one."""
 
+    async def may_start(self, principal: Principal, robot: str, ask: Ask, address: str) -> None:
+        """See that it could be begun, as far as rights go."""
+
     async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
         """What could be recorded now."""
 
@@ -93,9 +102,10 @@ class RobotRecordings:
 
     app = Klein()
 
-    def __init__(self, clock: Clock, desk: Desk, api: Api, robot: str) -> None:
+    def __init__(self, clock: Clock, desk: Desk, keys: Idempotency, api: Api, robot: str) -> None:
         self._clock = clock
         self._desk = desk
+        self._keys = keys
         self._api = api
         self._robot = robot
 
@@ -113,8 +123,9 @@ class RobotRecordings:
                     Annotated[int, Meta(ge=1, le=PAGE_MOST)],
                 ),
                 query("before", "`next` of an earlier answer: what comes behind that"),
+                KNOWN,
             ),
-            answers={200: Answer("recordings", RecordingPage)},
+            answers=answers("recordings", RecordingPage),
         )
     )
     def list(self, request: Request) -> Any:
@@ -127,7 +138,7 @@ class RobotRecordings:
             limit.isascii() and limit.isdecimal() and len(limit) <= 9 and 1 <= int(limit) <= PAGE_MOST
         ):
             raise Invalid(f"'limit' is a number from 1 to {PAGE_MOST}")
-        return await self._desk.all(*asked, int(limit or PAGE), before)
+        return told_facts(request, await self._desk.all(*asked, int(limit or PAGE), before))
 
     @app.route("/", methods=["POST"])
     @described(
@@ -136,8 +147,10 @@ class RobotRecordings:
             path=PATH,
             tag="recordings",
             summary="Begin a recording",
+            parameters=(KEYED,),
             body=Ask,
             answers={201: Answer("the recording", Recording, headers={"Location": "its address"})},
+            errors=(422,),
         )
     )
     def start(self, request: Request) -> Any:
@@ -145,10 +158,15 @@ class RobotRecordings:
 
     async def _start(self, request: Request) -> Any:
         principal, robot, address = await self._asked(request)
-        begun = await self._desk.start(principal, robot, body_of(request, Ask), address)
-        request.setResponseCode(201)
-        request.setHeader(b"location", f"/api/v1/robots/{robot}/recordings/{begun['id']}".encode())
-        return begun
+        asked = principal, robot, body_of(request, Ask), address
+
+        async def work() -> Reply:
+            begun = await self._desk.start(*asked)
+            where = f"/api/v1/robots/{robot}/recordings/{begun['id']}"
+            return Reply(201, jsontext.encode(begun), where)
+
+        may = partial(self._desk.may_start, *asked)
+        return send(request, await once(self._keys, request, principal, robot, work, may))
 
     @app.route("/new", methods=["GET"])
     @described(
@@ -369,7 +387,10 @@ def _argument(request: Request, name: bytes) -> str:
     return str(values[0].decode("utf-8", "replace"))
 
 
-def below(clock: Clock, desk: Desk, api: Api, robot: str) -> IResource:
-    """What serves the addresses below a robot's ``recordings``."""
-    resource: IResource = RobotRecordings(clock, desk, api, robot).app.resource()
+def below(clock: Clock, desk: Desk, keys: Idempotency, api: Api, robot: str) -> IResource:
+    """What serves the addresses below a robot's ``recordings``.
+
+    :param keys: requests that were sent with a key
+    """
+    resource: IResource = RobotRecordings(clock, desk, keys, api, robot).app.resource()
     return resource

@@ -13,7 +13,7 @@ from rdflib import Graph
 from twisted.web.server import Request
 
 from relay_protocol import jsontext
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import Invalid, Unavailable
 from relay_protocol.limits import NAME
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.resources import Asker, ResourceDesk
@@ -31,16 +31,26 @@ TypeName = Annotated[str, Meta(max_length=NAME)]
 
 
 class Message(msgspec.Struct, forbid_unknown_fields=True):
-    """Body of what is said on a topic; ``type`` for one that nobody knows yet."""
+    """Body of what is said on a topic; ``type`` for one that nobody knows yet. What was read of it may be sent back.
+
+    :param topic: the one at whose address this is sent
+    :param at: passed over
+    """
 
     value: msgspec.Raw
     type: TypeName = ""
+    topic: TypeName = ""
+    at: float | None = None
 
 
 class Value(msgspec.Struct, forbid_unknown_fields=True):
-    """Body of a parameter that is set."""
+    """Body of a parameter that is set. What was read of it may be sent back.
+
+    :param name: the one at whose address this is sent
+    """
 
     value: msgspec.Raw
+    name: TypeName = ""
 
 
 class Workshop(Threads):
@@ -139,7 +149,9 @@ class Representing:
         """
         form = sent(request.getHeader("content-type"))
         if form is JSON:
-            return body_of(request, Message)
+            message = body_of(request, Message)
+            _see_own("topic", message.topic, name)
+            return message
         meant: Meant = await self._read(request, asker, name, form, message_in)
         return Message(msgspec.Raw(jsontext.encode(meant.value)), meant.type)
 
@@ -147,7 +159,9 @@ class Representing:
         """The value of a parameter in a request's body, as JSON; see :meth:`message`."""
         form = sent(request.getHeader("content-type"))
         if form is JSON:
-            return bytes(body_of(request, Value).value)
+            param = body_of(request, Value)
+            _see_own("name", param.name, name)
+            return bytes(param.value)
         return jsontext.encode(await self._read(request, asker, name, form, value_in))
 
     async def _read(
@@ -175,6 +189,17 @@ class Representing:
 
     def _place(self, request: Request) -> Place:
         return Place(self._api.base(request), self._robot)
+
+
+def _see_own(field: str, said: str, name: str) -> None:
+    """See that a body is about the resource at whose address it is sent, where it names one.
+
+    :raises Invalid: it is about another
+    """
+    if said and said.lstrip("/") != name.lstrip("/"):
+        raise Invalid(
+            f"'{field}' names another resource than the address does: leave it out, or send this there"
+        )
 
 
 def _tagged(request: Request, etag: str, body: bytes) -> Any:

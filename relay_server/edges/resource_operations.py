@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from relay_server.edges.asked import WAIT
-from relay_server.edges.goals import GOAL_HEADERS, LISTING, PREFER, Wish
+from relay_server.edges.asked import LISTING, WAIT
+from relay_server.edges.goals import GOAL_HEADERS, PREFER, Wish
 from relay_server.edges.representing import Message, TypeName, Value
 from relay_server.openapi import PROBLEM, Answer, Operation, Parameter, header, query, raw
 from relay_server.openapi.told import (
@@ -21,6 +21,7 @@ from relay_server.openapi.told import (
     GoalStatus,
     Params,
     ParamValue,
+    Provided,
     Services,
     Topics,
     TopicState,
@@ -106,7 +107,7 @@ def _publish(method: str) -> Operation:
         path=f"{ROBOT}/topics/{{name}}",
         tag="resources",
         summary="Publish a message",
-        more="It is sent once somebody hears it, as far as anybody subscribes.",
+        more="It is sent once somebody hears it, as far as anybody subscribes. `If-Match` does not apply: 400.",
         parameters=_SENT,
         body=Message,
         media=_MEDIA,
@@ -146,6 +147,8 @@ ONE = (
         errors=(504,),
         problems=_NOT_ACCEPTABLE,
     ),
+    member_of("services", "A service", Provided),
+    member_of("actions", "An action", Provided),
     member_of("params", "A parameter", ParamValue, errors=_ASKING),
 )
 CHANGE = (

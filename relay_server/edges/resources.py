@@ -13,9 +13,9 @@ from twisted.internet.task import LoopingCall
 from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
-from werkzeug.exceptions import NotFound as NothingHere
 
 from relay_protocol import jsontext
+from relay_protocol.errors import Invalid
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
 from relay_server.clock import Clock, as_twisted
@@ -26,6 +26,7 @@ from relay_server.edges.asked import WAIT, known_tags, number_in, query_of
 from relay_server.edges.dated import dated_in_form
 from relay_server.edges.flow import Flow
 from relay_server.edges.goals import Giving
+from relay_server.edges.methods import not_taken
 from relay_server.edges.once import Once, send
 from relay_server.edges.representing import Representing
 from relay_server.edges.resource_operations import THROTTLE_MS, Call
@@ -47,6 +48,7 @@ from relay_server.resources import (
     Wanted,
     see_known,
 )
+from relay_server.resources.describing import member_graph
 from relay_server.resources.forms import EVENTS, Form, of_any_form
 from relay_server.session.calling import URGENT
 from relay_server.store import Threads
@@ -56,6 +58,11 @@ PARTS = ("topics", "services", "actions", "params")
 
 QUIET_SECONDS = 5.0
 """How often a stream says that it goes on."""
+
+NO_MATCH = (
+    "'If-Match' does not apply to a topic: a message takes the place of no other, so there is nothing to compare. "
+    "Send it without"
+)
 
 
 class RobotResources:
@@ -86,6 +93,14 @@ class RobotResources:
         self._api = api
         self._robot = robot
         self._forms = Representing(api, desk, robot, part)
+        self._ways = {
+            ("topics", "PUT"): self._publish,
+            ("topics", "POST"): self._publish,
+            ("services", "POST"): self._call,
+            ("actions", "POST"): self._give,
+            ("params", "PUT"): self._set,
+            ("params", "DELETE"): self._remove,
+        }
 
     @app.route("/", methods=["GET"])
     @described(*operations.MEMBERS)
@@ -104,16 +119,20 @@ class RobotResources:
     @app.route("/<path:name>", methods=["GET"])
     @described(*operations.ONE)
     def one(self, request: Request, name: str) -> Any:
-        if self._part not in ("topics", "params"):
-            raise NothingHere
-        return self._answer(request, self._one(request, name))
+        ways = {"topics": self._state, "params": self._param}
+        return self._answer(request, ways.get(self._part, self._member)(request, name))
 
-    async def _one(self, request: Request, name: str) -> Any:
-        asker = await self._asker(request)
-        if self._part == "params":
-            form = self._forms.form(request)
-            return await self._forms.param(request, asker, await self._desk.param(asker, name), form)
-        form = self._forms.form(request, EVENTS)
+    async def _member(self, request: Request, name: str) -> Any:
+        asker, form = await self._asker(request), self._forms.form(request)
+        told = await self._desk.member(asker, self._part, name)
+        return await self._forms.told(request, asker, told, partial(member_graph, self._part), form)
+
+    async def _param(self, request: Request, name: str) -> Any:
+        asker, form = await self._asker(request), self._forms.form(request)
+        return await self._forms.param(request, asker, await self._desk.param(asker, name), form)
+
+    async def _state(self, request: Request, name: str) -> Any:
+        asker, form = await self._asker(request), self._forms.form(request, EVENTS)
         if form is EVENTS:
             await self._stream(request, asker, name)
             return STREAMED
@@ -155,22 +174,33 @@ class RobotResources:
     @app.route("/<path:name>", methods=["PUT", "POST", "DELETE"])
     @described(*operations.CHANGE)
     def change(self, request: Request, name: str) -> Any:
-        method = request.method.decode()
-        ways = {
-            ("topics", "PUT"): self._publish,
-            ("topics", "POST"): self._publish,
-            ("services", "POST"): self._call,
-            ("actions", "POST"): self._give,
-            ("params", "PUT"): self._set,
-            ("params", "DELETE"): self._remove,
-        }
-        way = ways.get((self._part, method))
-        if way is None:
-            raise NothingHere
-        return self._answer(request, way(request, name))
+        way = self._ways.get((self._part, request.method.decode()))
+        return self.other(request, name) if way is None else self._answer(request, way(request, name))
+
+    @app.route("/")
+    @app.route("/<path:name>")
+    def other(self, request: Request, name: str = "") -> Any:
+        """No method of these addresses."""
+        takes = ["GET", *(method for part, method in self._ways if name and part == self._part)]
+        return self._answer(request, not_taken(self._see(request, name), takes))
+
+    async def _see(self, request: Request, name: str) -> None:
+        """See that who asks may know of what is there.
+
+        :raises NotFound: he may not, or there is nothing
+        """
+        asker = await self._asker(request)
+        if not name:
+            await self._desk.see(asker)
+        elif self._part == "params":
+            await _read(self._desk.param(asker, name))
+        else:
+            await self._desk.member(asker, self._part, name)
 
     async def _publish(self, request: Request, name: str) -> Any:
         asker, moment = await self._asker(request), self._moment(request)
+        if request.getHeader("if-match") is not None:
+            raise Invalid(NO_MATCH)
         body = await self._forms.message(request, asker, name)
 
         async def work() -> Reply:
@@ -204,14 +234,9 @@ class RobotResources:
     # --- requests and answers -----------------------------------------------------------------------------
 
     def _answer(self, request: Request, work: Awaitable[Any]) -> Any:
-        async def done() -> Any:
-            try:
-                return await work
-            except MaybeDone as error:
-                # Nothing is done by reading.
-                raise error.reason if request.method in (b"GET", b"HEAD") else error from None
-
-        return self._api.answer(request, dated_in_form(request, self._moments, done()))
+        if request.method in (b"GET", b"HEAD"):
+            work = _read(work)
+        return self._api.answer(request, dated_in_form(request, self._moments, work))
 
     async def _asker(self, request: Request, *, passes: bool = False) -> Asker:
         address = getattr(request.getClientAddress(), "host", "local")
@@ -268,6 +293,14 @@ def _below(
     resources = RobotResources(clock, desk, moments, once, giving, part, api, robot)
     resource: IResource = resources.app.resource()
     return resource
+
+
+async def _read(work: Awaitable[Any]) -> Any:
+    """What comes of work by which nothing is done."""
+    try:
+        return await work
+    except MaybeDone as error:
+        raise error.reason from None
 
 
 def _look(request: Request, following: Following) -> None:

@@ -46,6 +46,8 @@ class Guest:
         self._clock = clock
         self._feeds: dict[str, Feed] = {}
         self._doing: set[Deferred[Any]] = set()
+        self.gave_back = 0
+        """How often it was said that control is not wanted any more."""
 
     def feed(self, topic: str, type_name: str = "") -> Feed:
         """What is said on a topic, from now on.

@@ -10,6 +10,8 @@ from relay_server.inside.guests import Guest
 
 OVER = "your request for control is over: it was refused, withdrawn, not answered in time, or others came before you"
 
+GIVEN_BACK = "control was given back meanwhile, or the request for it withdrawn"
+
 
 async def take_control(clock: Clock, guest: Guest, why: str, seconds: float) -> Answer:
     """Take control of a free robot, or ask who has it for it; who has it keeps it.
@@ -25,9 +27,13 @@ async def take_control(clock: Clock, guest: Guest, why: str, seconds: float) -> 
 
 async def _taken(clock: Clock, guest: Guest, why: str, seconds: float) -> Answer:
     session, until = guest.session, clock.seconds() + seconds
-    desk = session.desk
+    desk, gave_back = session.desk, guest.gave_back
     while True:
         answer = await desk.take(session, why)
+        if guest.gave_back != gave_back:
+            # Said while the robot was being told of it.
+            desk.release(session, "")
+            raise NotDone(GIVEN_BACK)
         if answer.success:
             return answer
         if not desk.lease.requested_by(session):
@@ -37,6 +43,8 @@ async def _taken(clock: Clock, guest: Guest, why: str, seconds: float) -> Answer
             if left <= 0:
                 return answer
             await _change(clock, desk, left)
+        if guest.gave_back != gave_back:
+            raise NotDone(GIVEN_BACK)
         moving = (desk.lease.holder, desk.lease.coming)
         if any(each is not None and each.client is not session for each in moving):
             raise NotDone(OVER)

@@ -196,9 +196,12 @@ async def _set(
     answer = await _ask(session, node, "set_parameters", request, stamp=stamp)
     try:
         (result,) = answer["results"]
-        return {"successful": bool(result["successful"]), "reason": str(result["reason"])}
+        done, reason = bool(result["successful"]), str(result["reason"])
     except (TypeError, KeyError, ValueError) as error:
         raise _odd(node) from error
+    if done:
+        session.notice("param.set", param=f"{node}:{parameter}", deleted=value["type"] == NOT_SET)
+    return {"successful": done, "reason": reason}
 
 
 async def get_param_names(session: Session, args: Any) -> Any:

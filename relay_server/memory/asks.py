@@ -14,6 +14,8 @@ import msgspec
 
 from relay_db.queries import MemoryPlace, MemoryRecord, NameIs
 from relay_protocol.errors import Invalid
+from relay_protocol.rights import Rules
+from relay_server.memory import guarding
 from relay_server.memory.limits import FIELDS, LONGEST, PAGE, TEXT
 
 DATA_FIELD = "data."
@@ -165,19 +167,26 @@ class Forms:
     """Events as they are told.
 
     :param names: of robots that may be seen, by their numbers
+    :param rules: by which those are seen; without them all is told
     """
 
     COLUMNS = ("id", "at", "source", "kind", "robot", "user", "used", "data")
 
-    def __init__(self, names: Mapping[int, str]) -> None:
+    def __init__(self, names: Mapping[int, str], rules: Mapping[int, Rules] | None = None) -> None:
         self._names = names
+        self._rules = {} if rules is None else rules
 
     def robot(self, event: MemoryRecord) -> str | None:
         """The name of the robot that an event is about."""
         return None if event.robot_id is None else self._names.get(event.robot_id)
 
+    def data(self, event: MemoryRecord) -> str:
+        """What it says, as JSON."""
+        rules = None if event.robot_id is None else self._rules.get(event.robot_id)
+        return event.data if rules is None else guarding.told(event, rules)
+
     def json(self, event: MemoryRecord) -> dict[str, Any]:
-        """For an answer; the data as it was written."""
+        """For an answer."""
         return {
             "id": event.number,
             "source": event.source,
@@ -185,14 +194,14 @@ class Forms:
             "robot": self.robot(event),
             "user": event.user,
             "at": event.at,
-            "data": msgspec.Raw(event.data.encode()),
+            "data": msgspec.Raw(self.data(event).encode()),
             "used": event.used,
         }
 
     def cells(self, event: MemoryRecord) -> list[str]:
         """For a table, in the order of :data:`COLUMNS`."""
         words = [_inert(each or "") for each in (event.source, event.kind, self.robot(event), event.user)]
-        return [str(event.number), repr(event.at), *words, str(event.used), event.data]
+        return [str(event.number), repr(event.at), *words, str(event.used), self.data(event)]
 
 
 def _inert(text: str) -> str:

@@ -21,7 +21,9 @@ from relay_db.queries.recalling import LOGIN, OURS
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
 from relay_protocol.limits import ROBOT_NAME
+from relay_protocol.rights import Rules
 from relay_server.access import Access, Principal
+from relay_server.memory import guarding
 from relay_server.memory.asks import Ask, Forms, chosen
 from relay_server.memory.limits import ASKED, ASKED_EACH, DATA, LOOKS, RECENT, SEVERAL
 from relay_server.memory.quota import Quota
@@ -51,10 +53,17 @@ class Sight(NamedTuple):
 
     :param ask: for the database
     :param names: of robots on which he has a right, by their numbers
+    :param rules: what he may there
     """
 
     ask: MemoryAsk
     names: Mapping[int, str]
+    rules: Mapping[int, Rules] = {}
+
+    @property
+    def forms(self) -> Forms:
+        """How what he sees is told."""
+        return Forms(self.names, self.rules)
 
     @property
     def empty(self) -> bool:
@@ -187,13 +196,22 @@ class MemoryDesk:
         """
         if not 1 <= len(events) <= SEVERAL:
             raise Invalid(f"send one event, or a list of 1 to {SEVERAL}")
-        names = await self._robots(principal)
+        names, _ = await self._robots(principal)
         numbers = {name: number for number, name in names.items()}
         own = "" if all(each.source for each in events) else await self._own_name(principal)
         now = self.wall()
         new = [self._new(principal, each, numbers, own, now) for each in events]
         kept, forms = await self._writer.write(new), Forms(names)
         return [forms.json(each) for each in kept]
+
+    async def may_write(self, principal: Principal, events: list[NewEvent]) -> None:
+        """See that somebody could write these now, as far as it depends on robots.
+
+        :raises NotFound: one is about a robot that there is not, or on which the writer has no right
+        """
+        names, _ = await self._robots(principal)
+        if any(each.robot is not None and each.robot not in names.values() for each in events):
+            raise NotFound(NO_ROBOT)
 
     def _new(
         self, principal: Principal, event: NewEvent, robots: Mapping[str, int], own: str, now: float
@@ -223,11 +241,14 @@ class MemoryDesk:
 
     async def sight(self, principal: Principal, ask: Ask) -> Sight:
         """What somebody may see of what he asks for, now."""
-        names = await self._robots(principal)
+        names, rules = await self._robots(principal)
+        robots = chosen(ask, names)
+        if ask.data:
+            robots = frozenset(each for each in robots if guarding.may_ask(rules[each], ask.source, ask.data))
         return Sight(
             MemoryAsk(
                 principal.realm,
-                chosen(ask, names),
+                robots,
                 ask.robot is None,
                 principal.admin,
                 ask.source,
@@ -238,6 +259,7 @@ class MemoryDesk:
                 ask.data,
             ),
             names,
+            rules,
         )
 
     async def count(self, principal: Principal, ask: Ask) -> int:
@@ -279,7 +301,7 @@ class MemoryDesk:
             self._quota.used(told)
         if len(found) > limit:
             place = MemoryPlace(told[-1].at, told[-1].number)
-        return told, Forms(sight.names), None if sight.empty else place
+        return told, sight.forms, None if sight.empty else place
 
     async def follow_from(self, principal: Principal, number: int | None) -> Following:
         """Begin to follow; :meth:`following` must go on with it.
@@ -312,10 +334,12 @@ class MemoryDesk:
         sight = await self.sight(principal, ask)
         if events:
             following.number = events[-1].number
-        return [each for each in events if sight.shows(each)], Forms(sight.names), bool(events)
+        return [each for each in events if sight.shows(each)], sight.forms, bool(events)
 
-    async def _robots(self, principal: Principal) -> dict[int, str]:
-        return {record.id: record.name for record, _ in await self._access.robots(principal)}
+    async def _robots(self, principal: Principal) -> tuple[dict[int, str], dict[int, Rules]]:
+        robots = await self._access.robots(principal)
+        names = {record.id: record.name for record, _ in robots}
+        return names, {record.id: rules for record, rules in robots}
 
     async def _read(self, principal: Principal, query: Callable[..., Any], *args: Any) -> Any:
         """Ask the database, one at a time: the next when the thread is done, also where the asker has left.

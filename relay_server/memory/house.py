@@ -61,6 +61,7 @@ class MemoryHouse(Collector):
         self.note = noticing.note
         """Keeps an event that the relay has put together, if there is room; nobody waits for it."""
         journal.witness(noticing.happened)
+        registry.on_modules(noticing.modules)
         alerts.listen(noticing.alert)
 
     async def start(self) -> None:

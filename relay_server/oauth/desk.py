@@ -214,7 +214,14 @@ class OAuthDesk:
     async def _by_secret(self, ask: TokenAsk, program: ProgramRecord | None, address: str) -> Granted:
         if program is None:
             raise BadCredentials("prove the program by its key and secret: Digest, or Basic over TLS")
-        granted = _new(_scope(ask.scope, program.scope), None)
+        scope = _scope(ask.scope, program.scope)
+        if ask.realm not in (None, program.realm) and scope is not None and not scope.anywhere:
+            raise OAuthError(
+                "invalid_scope",
+                "in another realm a token is for a scope that names no robots and has no 'admin': those meant are of "
+                "the program's own",
+            )
+        granted = _new(scope, None)
         await self._store.write(_to_program, program, ask.realm, granted, address, self._wall())
         return granted
 
@@ -232,14 +239,15 @@ class OAuthDesk:
 
     # --- what is left of them ------------------------------------------------------------------------------
 
-    async def introspect(self, token: str, realm: str) -> dict[str, Any]:
+    async def introspect(self, token: str, realm: str, program: str | None = None) -> dict[str, Any]:
         """What a token is good for, and for how long (RFC 7662 section 2.2).
 
         :param realm: of who asks; tokens of others are not active to him
+        :param program: the key of the program that asks, whose own tokens are, of whatever realm
         """
         now = self._wall()
         record = await self._store.read(queries.issued, passwords.token_hash(token), now)
-        if record is None or record.realm != realm:
+        if record is None or (record.realm != realm and (program is None or record.program != program)):
             return {"active": False}
         told: dict[str, Any] = {
             "active": True,
@@ -258,12 +266,13 @@ class OAuthDesk:
             told["expires_in"] = int(record.expires - now)
         return told
 
-    async def revoke(self, token: str, realm: str) -> None:
+    async def revoke(self, token: str, realm: str, program: str | None = None) -> None:
         """Make a token worthless, and cut what was opened with it; also says nothing of one that is none.
 
         :param realm: of who asks
+        :param program: the key of the program that asks
         """
-        gone = await self._store.write(queries.revoke_issued, passwords.token_hash(token), realm)
+        gone = await self._store.write(queries.revoke_issued, passwords.token_hash(token), realm, program)
         if gone:
             await self._access.refresh()
 

@@ -124,9 +124,13 @@ class Robot(TypedDict):
 
 
 class Robots(TypedDict):
-    """The robots the caller has a right on."""
+    """A page of the robots the caller has a right on.
+
+    :param next: the name behind which there is more, or empty
+    """
 
     robots: list[Robot]
+    next: str
 
 
 class Link(TypedDict):

@@ -127,9 +127,7 @@ class RecordingDesk:
         admission = await self._desk.admit(principal, robot, address)
         try:
             entry = self._recordings.entry(ask, admission.robot, admission.permit)
-            reason = why_denied(admission.permit, entry)
-            if reason:
-                raise Refused(reason)
+            self._see_allowed(admission, entry)
             await self._on_record("recording.start", entry, admission)
             await self._recordings.start(
                 entry, admission.robot, admission.permit, lambda entry: self._ended(entry, admission)
@@ -137,8 +135,22 @@ class RecordingDesk:
         except BaseException:
             self._desk.turn_away(admission)
             raise
-        self._event("recording.started", entry, address=address)
+        self._event("recording.started", entry, admission, address=address)
         return self._view(entry)
+
+    async def may_start(self, principal: Principal, robot: str, ask: Ask, address: str) -> None:
+        """See that somebody might begin a recording now, without doing it.
+
+        :raises SwitchboardError: as :meth:`start`, as far as rights go
+        """
+        with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
+            self._see_allowed(admission, self._recordings.entry(ask, admission.robot, admission.permit))
+
+    @staticmethod
+    def _see_allowed(admission: Admission, entry: Entry) -> None:
+        reason = why_denied(admission.permit, entry)
+        if reason:
+            raise Refused(reason)
 
     async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
         """What the principal could record of a robot now: topics, cameras, and how much.
@@ -321,6 +333,7 @@ class RecordingDesk:
         self._event(
             "recording.ended",
             entry,
+            admission,
             state=entry.state.value,
             reason=entry.reason[:200],
             bytes=entry.bytes,
@@ -328,10 +341,10 @@ class RecordingDesk:
             drops=entry.drops,
         )
 
-    def _event(self, kind: str, entry: Entry, **data: Any) -> None:
+    def _event(self, kind: str, entry: Entry, admission: Admission, **data: Any) -> None:
         self._journal.event(
             kind,
-            f"user:{entry.user}",
+            f"user:{admission.robot.name_of(entry.user, entry.realm)}",
             cause=f"user:{full_name(entry.user, entry.realm)}",
             robot_id=entry.robot_id,
             user_id=entry.user_id,

@@ -221,7 +221,7 @@ class Library:
 
     def full(self, robot_id: int, realm: str) -> str:
         """Why there can't be one more of a robot of this realm, however small; empty when there can."""
-        if len(self._robots.get(robot_id, {})) >= ROBOT_KEPT:
+        if sum(each.realm == realm for each in self._robots.get(robot_id, {}).values()) >= ROBOT_KEPT:
             return (
                 f"{ROBOT_KEPT} recordings of this robot are kept, the most there may be: delete some of them"
             )

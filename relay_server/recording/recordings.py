@@ -332,7 +332,8 @@ class Recordings:
         running = {**self._starting, **begun}.values()
         if sum(each.realm == entry.realm for each in running) >= RECORDINGS:
             raise Unavailable(f"{RECORDINGS} recordings run, the most there may be")
-        if sum(each.robot_id == entry.robot_id for each in running) >= ROBOT_RECORDINGS:
+        of_robot = (each for each in running if each.robot_id == entry.robot_id)
+        if sum(each.realm == entry.realm for each in of_robot) >= ROBOT_RECORDINGS:
             raise Unavailable(f"{ROBOT_RECORDINGS} recordings of this robot run, the most there may be")
         if sum(each.user_id == entry.user_id for each in running) >= USER_RECORDINGS:
             raise Unavailable(f"you have {USER_RECORDINGS} recordings running, the most one user may have")

@@ -1,4 +1,4 @@
-"""What becomes of recordings when their robot is removed: they go with it."""
+"""What becomes of recordings when their robot is removed, or taken out of their realm: they go with it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,27 @@ _log = Logger()
 
 
 async def sweep(recordings: Recordings, store: Store, journal: Journal) -> None:
-    """Delete the recordings of robots that were removed; those that run are stopped before.
+    """Delete the recordings of robots that were removed, and what was recorded of one in a realm that it was taken out
+    of, where nobody could have it any more; those that run are stopped before.
 
-    What is of a robot that the database has never removed stays: it may be another database than before.
+    What is of a robot that the database has never removed or taken out stays: it may be another database than before.
 
     :raises Unavailable: the database can't be asked
     """
-    there = {record.id for record in await store.read(queries.list_robots)}
-    left = [entry for entry in recordings.library if entry.robot_id not in there]
-    removed = await store.read(queries.removed_robots, {entry.robot_full for entry in left})
+    there = {record.id: record.realm for record in await store.read(queries.list_robots)}
+    shares = await store.read(queries.robot_shares)
+    left = [
+        entry
+        for entry in recordings.library
+        if entry.realm != there.get(entry.robot_id) and entry.realm not in shares.get(entry.robot_id, ())
+    ]
+    names = {entry.robot_full for entry in left}
+    removed = await store.read(queries.removed_robots, names)
+    unshared = await store.read(queries.unshared_robots, names)
     for entry in left:
         robot = entry.robot_full
-        if entry.begun > removed.get(robot, -SLACK_SECONDS) + SLACK_SECONDS:
+        gone = unshared.get((robot, entry.realm)) if entry.robot_id in there else removed.get(robot)
+        if gone is None or entry.begun > gone + SLACK_SECONDS:
             continue
         try:
             await recordings.stop(entry, "the robot was removed from the relay")

@@ -98,12 +98,36 @@ def members_graph(part: str, page: Mapping[str, Any], place: Place) -> Graph:
     graph.add((collection, RDF.type, words.own.Collection))
     _say(values, collection, {name: value for name, value in page.items() if name != part})
     for each in page[part]:
-        member = URIRef(place.of(part, each["name"]))
-        graph.add((collection, RDFS.member, member))
-        graph.add((member, RDF.type, words.own[_MEMBERS[part]]))
-        _say(values, member, {name: value for name, value in each.items() if name not in _LINKS})
-        for what, target in _links(each, place):
-            graph.add((member, words.own[what], target))
+        graph.add((collection, RDFS.member, _member(graph, words, part, each, place)))
+    return graph
+
+
+def member_graph(part: str, member: Mapping[str, Any], place: Place) -> Graph:
+    """One member of a collection, as its page tells of it.
+
+    :param member: as JSON has it
+    """
+    graph, words = _graph(place)
+    _member(graph, words, part, member, place)
+    return graph
+
+
+def robot_graph(robot: Mapping[str, Any], place: Place) -> Graph:
+    """A robot, and where what it has is told.
+
+    :param robot: as JSON has it
+    """
+    graph, words = _graph(place)
+    subject = URIRef(place.address)
+    for each in (words.own.Robot, SOSA.Platform):
+        graph.add((subject, RDF.type, each))
+    values = ValueGraph(graph, words, {})
+    _say(values, subject, robot)
+    for part in _MEMBERS:
+        collection = URIRef(place.of(part))
+        graph.add((subject, words.own.collections, collection))
+        graph.add((collection, RDF.type, words.own.Collection))
+        _say(values, collection, {"name": part})
     return graph
 
 
@@ -161,6 +185,16 @@ def _graph(place: Place) -> tuple[Graph, Vocabulary]:
     for prefix, namespace in own.items():
         graph.bind(prefix, namespace)
     return graph, words
+
+
+def _member(graph: Graph, words: Vocabulary, part: str, facts: Mapping[str, Any], place: Place) -> URIRef:
+    member = URIRef(place.of(part, facts["name"]))
+    graph.add((member, RDF.type, words.own[_MEMBERS[part]]))
+    told = {name: value for name, value in facts.items() if name not in _LINKS}
+    _say(ValueGraph(graph, words, {}), member, told)
+    for what, target in _links(facts, place):
+        graph.add((member, words.own[what], target))
+    return member
 
 
 def _made(graph: Graph, topic: URIRef, type_name: str, moves: bool, place: Place) -> None:

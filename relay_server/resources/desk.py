@@ -12,6 +12,7 @@ from twisted.internet.defer import CancelledError, Deferred
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
+from relay_protocol.link import Service, Topic
 from relay_protocol.rights import Operation
 from relay_server.access import Principal
 from relay_server.channel import resolve
@@ -22,6 +23,7 @@ from relay_server.inside.publishing import Speaker, may_move, type_of
 from relay_server.local.catalogue import RELAY, ROSAPI
 from relay_server.local.view import view
 from relay_server.moments import NEEDED, MomentNeeded, TooOld
+from relay_server.registry import Presence
 from relay_server.resources import params
 from relay_server.resources.background import Background, background
 from relay_server.resources.following import Following
@@ -96,20 +98,32 @@ class ResourceDesk:
             robot = guest.session.robot
             members = getattr(view(guest.session), kind)
             page, after = listing.page(members, lambda each: each.types)
-            motion = robot.description.motion
-            moves: dict[str, Callable[[str, list[str]], bool]] = {
-                "topics": lambda name, types: any(robot.is_motion(name, each) for each in types),
-                "services": lambda name, types: motion.moves_by_service(name),
-                "actions": lambda name, types: motion.moves_by_action(name),
-            }
             return {
-                kind: [
-                    {"name": name, **msgspec.to_builtins(each), "moves": moves[kind](name, each.types)}
-                    for name, each in page
-                ],
+                kind: [_told(robot, kind, name, each) for name, each in page],
                 "next": after,
                 "online": robot.control is not None,
             }
+
+    async def member(self, asker: Asker, kind: str, name: str) -> dict[str, Any]:
+        """One member of one of :data:`KINDS`, as the page with it tells of it.
+
+        :raises NotFound: no such robot or member, or no right on it
+        :raises Unavailable: the robot is offline, so that nobody knows
+        """
+        async with self._guests.at(*asker) as guest:
+            resource = resolve(name)
+            found = getattr(view(guest.session), kind).get(resource)
+            if found is None:
+                raise _nothing(guest.session, kind, resource)
+            return _told(guest.session.robot, kind, resource, found)
+
+    async def see(self, asker: Asker) -> None:
+        """See that somebody has a right on a robot.
+
+        :raises NotFound: no such robot, or no right on it
+        """
+        async with self._guests.permit(*asker):
+            pass
 
     async def state(self, asker: Asker, name: str, wanted: Wanted) -> tuple[State, bool]:
         """The newest state of a topic, and whether it is known already, since there is none but those that are.
@@ -251,9 +265,7 @@ class ResourceDesk:
         async with self._guests.at(*asker) as guest:
             service = resolve(name)
             if not type_name and service not in view(guest.session).services:
-                see_online(guest.session)
-                name = guest.session.robot.name
-                raise NotFound(f"there is no service {service} on robot {name}, or you have no right on it")
+                raise _nothing(guest.session, "services", service)
             if service == RESUME and moment is None:
                 raise MomentNeeded(f"this lets the robot move again: {NEEDED}")
             if moves_by(guest.session.robot.description.motion, service):
@@ -339,6 +351,27 @@ class ResourceDesk:
         return moment
 
 
+def _told(robot: Presence, kind: str, name: str, member: Topic | Service) -> dict[str, Any]:
+    """A member as it is listed."""
+    motion = robot.description.motion
+    moves = {
+        "topics": lambda: any(robot.is_motion(name, each) for each in member.types),
+        "services": lambda: motion.moves_by_service(name),
+        "actions": lambda: motion.moves_by_action(name),
+    }
+    return {"name": name, **msgspec.to_builtins(member), "moves": moves[kind]()}
+
+
+def _nothing(session: Session, kind: str, name: str) -> NotFound:
+    """What is said of what there is not, or not for who asks.
+
+    :raises Unavailable: the robot is offline
+    """
+    see_online(session)
+    what = kind.removesuffix("s")
+    return NotFound(f"there is no {what} {name} on robot {session.robot.name}, or you have no right on it")
+
+
 def _nobody_waits(failure: Failure) -> None:
     """Why something was not made, when who asked has left: that is no failure of the relay."""
     failure.trap(SwitchboardError, CancelledError)
@@ -353,8 +386,7 @@ def known_type(session: Session, topic: str) -> str:
     known = view(session).topics.get(topic)
     if known is not None and known.types:
         return known.types[0]
-    see_online(session)
-    raise NotFound(f"there is no topic {topic} on robot {session.robot.name}, or you have no right on it")
+    raise _nothing(session, "topics", topic)
 
 
 def see_online(session: Session) -> None:

@@ -96,6 +96,7 @@ class Publishing:
     """The messages of one session on their way to the robot."""
 
     __slots__ = (
+        "_begun",
         "_desk",
         "_freshness",
         "_grips",
@@ -119,6 +120,8 @@ class Publishing:
         self._number = session.number
         self._freshness = freshness
         self._routes: dict[str, Route] = {}
+        self._begun: set[str] = set()
+        """Topics of which the first message was noted."""
         self._waiting: dict[str, _Waiting] = {}
         """The newest command to each topic, while the robot is being told that it comes from here."""
         self._grips = Grips()
@@ -216,6 +219,10 @@ class Publishing:
             desk.standing,
             not motion or (desk.passes(session, topic) and not self._must_let_go(topic)),
         )
+        if not motion and topic not in self._begun and len(self._begun) < ROUTES:
+            # Commands are noted when they move the robot.
+            self._begun.add(topic)
+            session.notice("publication.begun", topic=topic)
         return route
 
     def _must_let_go(self, topic: str) -> bool:

@@ -213,6 +213,42 @@ def test_a_right_is_changed_in_place_and_not_lost_by_accident(house: House, open
     expect(inside(ann, "right-denied")).to_have_count(0)
 
 
+def test_two_administrators_do_not_overwrite_each_other(house: House, open_page: OpenPage) -> None:
+    """Who changes what somebody else has changed meanwhile is told so and sees how it is now; what he typed stays."""
+    for name in ("bowser", "yoshi"):
+        house.relay.user(name)
+    house.relay.cli("right", "grant", "bowser", "mower", "viewer")
+    page = open_page("/realm/rights")
+    bowser = right(page, "mower", "bowser")
+    inside(bowser, "right-edit").click()
+    inside(bowser, "right-allow").fill("call:/mow")
+    house.relay.cli("right", "grant", "bowser", "mower", "operator", "--deny", "call:/blade")
+    inside(bowser, "right-save").click()
+    expect(inside(bowser, "realm-problem")).to_contain_text("Somebody else has changed this meanwhile")
+    expect(bowser).to_have_attribute("data-level", "operator")
+    expect(inside(bowser, "right-denied")).to_contain_text("call:/blade")
+    expect(inside(bowser, "right-allow")).to_have_value("call:/mow")
+    inside(bowser, "right-save").click()
+    expect(inside(bowser, "right-allowed")).to_contain_text("call:/mow")
+    expect(bowser).to_have_attribute("data-level", "operator")
+
+    house.relay.cli("right", "revoke", "bowser", "mower")
+    inside(bowser, "level-owner").click()
+    was_told(page, "Somebody else has removed this meanwhile")
+    expect(bowser).to_have_count(0)
+
+    page.goto("/realm/people")
+    yoshi = row(page, "person", "yoshi")
+    inside(yoshi, "person-manage").click()
+    house.relay.cli("user", "disable", "yoshi")
+    inside(yoshi, "person-make-admin").click()
+    expect(inside(yoshi, "realm-problem")).to_contain_text("Somebody else has changed this meanwhile")
+    expect(yoshi).to_contain_text("Disabled")
+    expect(yoshi).not_to_contain_text("Administrator")
+    inside(yoshi, "person-make-admin").click()
+    expect(yoshi).to_contain_text("Administrator")
+
+
 def test_what_a_group_may_do_is_seen_with_who_is_in_it(house: House, open_page: OpenPage) -> None:
     """A group is added, filled, given a right and removed; the right goes with it."""
     house.relay.user("mario")

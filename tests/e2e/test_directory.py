@@ -11,8 +11,11 @@ from typing import Any
 
 import httpx
 import pytest
+from switchboard_processes import ros_environment
 from switchboard_relay import Relay
 from switchboard_waiting import PATIENCE, wait_for
+
+from tests.robot_client.ros import Peer
 
 DIRECTORY = "/api/v1/directory"
 MAP = {"kind": "application", "name": "map", "address": "http://10.0.0.7:8000/"}
@@ -132,24 +135,44 @@ def alike(client: httpx.Client, kind: str) -> bool:
     return [each["name"] for each in entries] == [each["name"] for each in listed]
 
 
-def test_what_robots_have_is_where_the_directory_says(world: Any) -> None:
+def leads(client: httpx.Client, kind: str) -> int:
+    """To how many of a kind the directory leads; none where one has gone meanwhile."""
+    entries = found(client, robot="rover", kind=kind)
+    told = [client.get(each["address"]).json().get("name") for each in entries]
+    return len(told) if told == [each["name"] for each in entries] else 0
+
+
+@pytest.fixture
+def peer(world: Any) -> Iterator[Peer]:
+    """A node of the robot with an action."""
+    peer = Peer(ros_environment(world.robot.domain))
+    peer.do("act", "/directory/counts", "ok")
+    yield peer
+    peer.close()
+
+
+def test_what_robots_have_is_where_the_directory_says(world: Any, peer: Peer) -> None:
     """For each as far as he may see it, as in the lists of resources."""
     for token in (world.operator, world.viewer):
         with client_of(world.relay, token) as client:
             # A robot finds out about its graph and its cameras by and by.
             wait_for("a camera is there", partial(found, client, robot="rover", kind="camera"))
             wait_for("odometry is there", partial(found, client, kind="topic", name="/odom"))
-            for kind in ("topic", "service", "action", "camera"):
+            for kind in ("topic", "service", "action", "camera", "module"):
                 wait_for(f"each {kind} is told alike", partial(alike, client, kind))
+            wait_for("services are there", partial(leads, client, "service"))
             (odom,) = found(client, kind="topic", name="/odom")
             assert client.get(odom["address"]).json()["topic"] == "/odom"
             (robot,) = found(client, kind="robot", name="rover")
             assert client.get(robot["address"]).json()["name"] == "rover"
-            for each in found(client, robot="rover", kind="camera"):
-                assert client.get(each["address"]).json()["name"] == each["name"]
+            wait_for("cameras are there", partial(leads, client, "camera"))
             one = client.get(f"{DIRECTORY}/{odom['id']}")
             assert one.json() == odom
+    with client_of(world.relay, world.operator) as client:
+        wait_for("the action is there", partial(leads, client, "action"))
+        (reset,) = found(client, kind="service", name="/reset")
     with client_of(world.relay, world.stranger) as client:
+        assert client.get(reset["address"]).status_code == 404
         assert [each for each in found(client) if each["robot"]] == []
         assert client.get(f"{DIRECTORY}/{odom['id']}").status_code == 404
         body = {"kind": "service", "name": "speech", "robot": "rover", "address": "http://a/"}

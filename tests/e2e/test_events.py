@@ -6,15 +6,19 @@ import csv
 import io
 import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from switchboard_processes import ros_environment
 from switchboard_pulse import Pulse
 from switchboard_relay import Relay
 from switchboard_waiting import wait_for
+
+from tests.robot_client.ros import Peer
 
 EVENTS = "/api/v1/events"
 
@@ -117,6 +121,87 @@ def test_what_clients_do_leaves_events(world: Any, operator: httpx.Client) -> No
     with client_of(world.relay, world.stranger) as stranger:
         assert asked(stranger, source="relay*") == []
         assert stranger.get(EVENTS, params={"robot": "rover", "count": "true"}).json() == {"count": 0}
+
+
+def test_what_is_watched_recorded_and_published_leaves_events(operator: httpx.Client) -> None:
+    """To view a camera, to record, once for both who ask by one key, and the first message to a topic."""
+    own = "/api/v1/robots/rover"
+    begun = time.time() - 1
+
+    def latest(kind: str) -> dict[str, Any] | None:
+        return next(iter(asked(operator, kind=kind, robot="rover", since=begun)), None)
+
+    camera = operator.get(f"{own}/cameras").json()["cameras"][0]["name"]
+    with operator.stream("GET", "/robots/rover/video/stream", params={"topic": camera}) as answer:
+        next(answer.iter_bytes())
+    wait_for("he has left", lambda: latest("video.left"))
+    joined = latest("video.joined")
+    assert joined is not None and (joined["user"], joined["data"]) == ("operator", {"camera": camera})
+    key = {"Idempotency-Key": f'"{begun}"'}
+    twice = [operator.post(f"{own}/recordings", json={"topics": ["/odom"]}, headers=key) for _ in "ab"]
+    assert [each.status_code for each in twice] == [201, 201]
+    assert twice[0].json()["id"] == twice[1].json()["id"]
+    operator.post(f"{own}/recordings/{twice[0].json()['id']}/stop").raise_for_status()
+    wait_for("it has ended", lambda: latest("recording.ended"))
+    ended = latest("recording.ended")
+    assert ended is not None
+    assert ended["data"] == {"recording": twice[0].json()["id"], "state": "complete"}
+    said = {"type": "std_msgs/msg/String", "value": {"data": "x"}}
+    for _ in range(3):
+        operator.post(f"{own}/topics/events/said", json=said).raise_for_status()
+    wait_for("that is told", lambda: latest("publication.begun"))
+    query = {"kind": "publication.begun", "data.topic": "/events/said", "since": begun}
+    assert len(asked(operator, **query)) == 1
+
+
+def test_nodes_that_come_and_go_and_their_parameters_leave_events(world: Any, operator: httpx.Client) -> None:
+    """A node is told of once; which parameter was set is told to who might ask for it."""
+    (online, *_) = asked(operator, kind="robot.online", robot="rover")
+    # A robot that has come finds its nodes one by one, which is no news.
+    wait_for("it has settled", lambda: time.time() - online["at"] > 11)
+    begun, param = time.time() - 1, "/robot/peer:loose"
+
+    def told(kind: str) -> list[dict[str, Any]]:
+        return asked(operator, kind=kind, robot="rover", since=begun, **{"data.module": "/robot/peer"})
+
+    def is_set() -> bool:
+        return operator.put(f"/api/v1/robots/rover/params{param}", json={"value": "there"}).status_code == 204
+
+    peer = Peer(ros_environment(world.robot.domain))
+    try:
+        peer.do("declare", "loose", "here")
+        wait_for("its parameter is set", is_set)
+        wait_for("it is told to be there", lambda: told("module.up"))
+        assert told("module.down") == []
+    finally:
+        peer.close()
+    wait_for("it is told to be gone", lambda: told("module.down"))
+    assert len(told("module.up")) == 1
+    asking = {"kind": "param.set", "robot": "rover", "since": begun}
+    # A request whose answer came too late was sent again.
+    was_set = asked(operator, **asking)
+    assert was_set[0]["data"] == {"param": param, "deleted": False}
+    with client_of(world.relay, world.viewer) as viewer:
+        assert [each["data"] for each in asked(viewer, **asking)] == [{"deleted": False}] * len(was_set)
+        assert asked(viewer, **asking, **{"data.param": param}) == []
+
+
+def test_what_is_sent_again_with_its_key_is_written_once(operator: httpx.Client) -> None:
+    """And answered as before; where keys are not understood they are refused in words."""
+    event, key = {"kind": "once", "source": "again"}, {"Idempotency-Key": '"a first"'}
+    told = [operator.post(EVENTS, json=event, headers=key) for _ in range(3)]
+    assert {(each.status_code, each.text) for each in told} == {(201, told[0].text)}
+    assert [each["id"] for each in asked(operator, source="again")] == [told[0].json()["id"]]
+    changed = operator.post(EVENTS, json={**event, "data": {"n": 1}}, headers=key)
+    assert (changed.status_code, changed.json()["code"]) == (422, "key_reused")
+    for path, body in (
+        ("tickets", {"robot": "rover"}),
+        ("directory", {"kind": "service", "name": "keyed", "address": "http://a/"}),
+        ("alerts/rules", {"channel": "portal"}),
+        ("fleet", {"do": "call", "robots": ["rover"], "service": "/nobody"}),
+    ):
+        refused = operator.post(f"/api/v1/{path}", json=body, headers=key)
+        assert refused.status_code == 400 and "not understood" in refused.json()["detail"], path
 
 
 def test_was_this_person_greeted_in_the_last_minute(operator: httpx.Client, stranger: httpx.Client) -> None:

@@ -7,6 +7,7 @@ import json
 import re
 import stat
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -205,13 +206,41 @@ def test_everyone_sees_the_robots_they_have_a_right_on_and_no_other(world: Any) 
     assert [(each["name"], each["level"]) for each in mine] == [("rover", "viewer")]
     assert mine[0]["state"] in ("online", "in_use")
     assert mine[0]["platform"] == "ros2"
-    assert ask(port, "GET", "/api/v1/robots", token=world.stranger).json == {"robots": []}
+    assert ask(port, "GET", "/api/v1/robots", token=world.stranger).json == {"robots": [], "next": ""}
     assert ask(port, "GET", "/api/v1/robots/rover", token=world.viewer).json["name"] == "rover"
     foreign = ask(port, "GET", "/api/v1/robots/rover", token=world.stranger)
     missing = ask(port, "GET", "/api/v1/robots/none", token=world.stranger)
     assert foreign.status == missing.status == 404
     assert foreign.body == missing.body
     assert ask(port, "GET", "/api/v1/robots").status == 401
+
+
+def test_robots_are_listed_in_pages_and_told_once(world: Any) -> None:
+    """By name, with where the next page begins; who knows a list by its tag is told so while nothing changes."""
+    port = world.relay.http_port
+    names = [f"shelf-{each}" for each in "abc"]
+    reader = world.relay.user("shelf-reader")
+    for name in names:
+        world.relay.cli("robot", "add", name)
+        world.relay.cli("right", "grant", "shelf-reader", name, "viewer")
+
+    def listed(query: str) -> tuple[list[str], str]:
+        page = ask(port, "GET", f"/api/v1/robots{query}", token=reader).json
+        return [each["name"] for each in page["robots"]], page["next"]
+
+    assert listed("") == listed("?name=shelf-*") == (names, "")
+    assert listed("?limit=2") == (names[:2], names[1])
+    assert listed(f"?limit=2&after={names[1]}") == (names[2:], "")
+    assert listed("?name=*-b") == ([names[1]], "")
+    refused = ask(port, "GET", "/api/v1/robots?state=online", token=reader)
+    assert refused.status == 400 and "'state'" in refused.json["detail"]
+    for path in ("/api/v1/robots", "/api/v1/robots?limit=1", f"/api/v1/robots/{names[0]}"):
+        known = {"If-None-Match": ask(port, "GET", path, token=reader).headers["ETag"]}
+        assert ask(port, "GET", path, token=reader, headers=known).status == 304
+        world.relay.cli("robot", "describe", names[0], f"told at {path}")
+        look = partial(ask, port, "GET", path, token=reader, headers=known)
+        wait_for("it is another", lambda look=look: look().status == 200)
+        assert f"told at {path}" in look().body.decode()
 
 
 def states(stream: http.client.HTTPResponse) -> Iterator[str]:

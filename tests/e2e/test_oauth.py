@@ -61,7 +61,10 @@ def test_a_token_does_not_show_robots_outside_its_scope(world: Any, http: httpx.
     with pytest.raises(InvalidStatus) as caught:
         world.relay.connect("rover", narrow)
     assert caught.value.response.status_code == 403
-    assert ask(world.relay.http_port, "GET", "/api/v1/robots", token=narrow).json == {"robots": []}
+    assert ask(world.relay.http_port, "GET", "/api/v1/robots", token=narrow).json == {
+        "robots": [],
+        "next": "",
+    }
 
 
 def test_a_person_logs_in_goes_on_and_leaves(world: Any, http: httpx.Client) -> None:

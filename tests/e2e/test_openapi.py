@@ -32,7 +32,10 @@ from relay_server.edges.documents import operations
 from relay_server.openapi import Credential, document
 
 EXAMPLES = 12
-"""Requests of each operation."""
+"""Requests of each operation by who owns the robot and administers the relay."""
+
+FEWER = 3
+"""By somebody who may only look."""
 
 CHECKS = [content_type_conformance, response_schema_conformance, status_code_conformance]
 
@@ -119,12 +122,16 @@ def narrow(parameter: dict[str, Any]) -> None:
 
 @dataclass
 class House:
-    """A relay with a robot, and somebody who owns it and administers the relay."""
+    """A relay with a robot, somebody who owns it and administers the relay, and somebody who may only look.
+
+    :ivar spare: a token that may end
+    :ivar viewers: of who may only look, and one that may end
+    """
 
     relay: Relay
     token: str
     spare: str
-    """A token that may end."""
+    viewers: tuple[str, str]
     session: requests.Session = field(default_factory=requests.Session)
 
     @property
@@ -143,7 +150,9 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
         relay.cli("right", "grant", "ann", "rover", "owner")
         robot.comes()
         try:
-            house = House(relay, token, relay.token("ann"))
+            viewer = relay.user("vic")
+            relay.cli("right", "grant", "vic", "rover", "viewer")
+            house = House(relay, token, relay.token("ann"), (viewer, relay.token("vic")))
             yield house
             house.session.close()
         finally:
@@ -214,6 +223,8 @@ def test_what_is_asked_rightly_is_answered_as_described(house: House) -> None:
     visit("POST", "/api/v1/events", {"kind": "greeted"})
     assert len(visit("GET", "/api/v1/events")["events"]) > 3
     assert visit("POST", f"{robot}/services/{{name}}", {}, name="/start")["values"]["success"]
+    start = visit("GET", f"{robot}/services/{{name}}", name="/start")
+    assert start in visit("GET", f"{robot}/services")["services"] and start["types"]
     visit("POST", f"{robot}/topics/{{name}}", {"value": {"data": "dock"}}, name="mode")
     visit("POST", "/api/v1/tickets", {"robot": "rover", "for": "video", "camera": "/front"})
     base = visit("GET", f"{robot}/modules/{{name}}", name="base")
@@ -269,21 +280,41 @@ def administer(visit: Visit, realm: str) -> None:
     assert "bob" not in [each["user"] for each in visit("GET", f"{realm}/users")["users"]]
 
 
-@SCHEMA.parametrize()
-@settings(
-    max_examples=EXAMPLES,
-    derandomize=True,
-    database=None,
-    deadline=None,
-    suppress_health_check=list(HealthCheck),
-)
-def test_no_answer_is_undocumented(case: Any, house: House) -> None:
-    """Whatever is asked, right or wrong: no failure, no status, media type or field that is not described."""
+def examples(most: int) -> settings:
+    """So many of each operation, always the same."""
+    return settings(
+        max_examples=most,
+        derandomize=True,
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+def see_described(case: Any, house: House, token: str, spare: str) -> None:
+    """Ask, and see that the answer is one of those that are described.
+
+    :param spare: for what ends the token that is sent
+    """
     ends = (case.method, case.path) == ("DELETE", "/api/v1/session")
-    headers = {"Authorization": f"Bearer {house.spare if ends else house.token}"}
+    headers = {"Authorization": f"Bearer {spare if ends else token}"}
     answer = case.call(base_url=house.url, headers=headers, session=house.session)
     assert answer.status_code not in (500, 501, 502), answer.text
     case.validate_response(answer, checks=CHECKS)
+
+
+@SCHEMA.parametrize()
+@examples(EXAMPLES)
+def test_no_answer_is_undocumented(case: Any, house: House) -> None:
+    """Whatever is asked, right or wrong: no failure, no status, media type or field that is not described."""
+    see_described(case, house, house.token, house.spare)
+
+
+@SCHEMA.parametrize()
+@examples(FEWER)
+def test_no_refusal_is_undocumented(case: Any, house: House) -> None:
+    """Nor is what somebody is told who may only look."""
+    see_described(case, house, *house.viewers)
 
 
 def test_every_operation_has_its_address(house: House) -> None:

@@ -144,6 +144,22 @@ def test_a_group_of_robots_takes_one_order(labs: Labs) -> None:
     ]
 
 
+def test_how_long_events_are_kept_is_said(labs: Labs) -> None:
+    """The command line tells it too, and that of another realm stays; a token for administration alone may not."""
+    assert labs.do("PATCH", "", {"events_days": 7})["events_days"] == 7
+    assert labs.do("GET", "", who="lab2")["events_days"] is None
+    kept = {each["realm"]: each["events_days"] for each in labs.relay.cli("realm", "list")}
+    assert (kept["lab1"], kept["lab2"]) == (7, None)
+    assert labs.do("PATCH", "", {"events_days": None}) == labs.do("GET", "")
+    for body in ({"events_days": 0}, {"events_days": 1e6}, {"events_days": "7"}, {"days": 7}, {}):
+        assert labs.ask("lab1", "PATCH", "", body).status == 400
+    assert labs.ask("narrow lab1", "PATCH", "", {"events_days": 7}).status == 403
+    set_to = [
+        each["data"] for each in labs.log() if (each["action"], each["target"]) == ("realm.set", "lab1")
+    ]
+    assert sorted(map(str, set_to)) == ["{'events_days': 7.0}", "{'events_days': None}"]
+
+
 def test_a_robot_is_described(labs: Labs) -> None:
     """The command line tells it too."""
     told = labs.do("PATCH", "/robots/mobile", {"description": "on the bench"})

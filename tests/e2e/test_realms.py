@@ -138,6 +138,7 @@ BODIES: dict[str, Any] = {
     "params/{name}": {"value": 1},
     "suppress": {"resource": "/mode", "ms": 100},
     "inhibit": {"resource": "/mode", "ms": 100},
+    "hold": {"resource": "/mode", "ms": 100},
     "recordings": {"topics": ["/mode"]},
 }
 """What is sent, by the end of the path, where it is not an empty object."""
@@ -204,6 +205,7 @@ def test_what_programs_register_stays_in_their_realm(labs: Labs) -> None:
     made = labs.ask("toad@lab2", "POST", "/api/v1/directory", entry)
     assert made.status == 201
     assert _names(labs.ask("mole@lab2", "GET", "/api/v1/directory?kind=service")) == ["speech"]
+    assert _names(labs.ask("mole@lab2", "GET", "/api/v1/directory?realm=lab2&kind=service")) == ["speech"]
     for query in ("?kind=service&name=spe*", "?realm=lab2", "?name=speech"):
         assert _names(labs.ask("root@lab1", "GET", f"/api/v1/directory{query}")) == []
     place = made.headers["Location"]

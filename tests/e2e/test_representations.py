@@ -189,6 +189,41 @@ def test_a_page_lists_addresses(client: httpx.Client) -> None:
     known = {"If-None-Match": services.headers["etag"]}
     assert get(client, "services", "text/turtle", **known).status_code == 304
     assert len(graph_of(get(client, "services", "application/ld+json"))) > 10
+    (stop,) = graph_of(get(client, "services?name=/relay/stop", "text/turtle")).objects(None, RDFS.member)
+    for media in RDF_MEDIA:
+        told = graph_of(get(client, str(stop), media))
+        assert set(told.subjects()) == {stop} and len(told) > 3
+
+
+def test_a_robot_is_a_platform_with_its_collections(world: Any, client: httpx.Client) -> None:
+    """The one that the graphs of its topics name; each collection has the address at which it is listed."""
+    robot, here = URIRef(f"{base_of(client)}{ROBOT}"), f"{base_of(client)}/api/v1/vocabulary/switchboard#"
+    world.robot.wait_online()
+    topic = graph_of(get(client, "topics/odom?wait=60", "text/turtle"))
+    assert (robot, RDF.type, SOSA.Platform) in topic
+    tags = {client.get(str(robot)).headers["etag"]}
+    for media in RDF_MEDIA:
+        answer = get(client, str(robot), media)
+        assert answer.headers["content-type"] == f"{media}; charset=utf-8"
+        assert answer.headers["vary"] == "Accept"
+        tags.add(answer.headers["etag"])
+        graph = graph_of(answer)
+        assert (robot, RDF.type, SOSA.Platform) in graph and (
+            robot,
+            RDF.type,
+            URIRef(f"{here}Robot"),
+        ) in graph
+        assert graph.value(robot, URIRef(f"{here}name")) == Literal("rover", datatype=XSD.string)
+        assert graph.value(robot, URIRef(f"{here}platform")) == Literal("ros2", datatype=XSD.string)
+        collections = {str(each) for each in graph.objects(robot, URIRef(f"{here}collections"))}
+        parts = ("topics", "services", "actions", "params", "cameras", "modules")
+        assert collections == {f"{robot}/{each}" for each in parts}
+    assert len(tags) == 1 + len(RDF_MEDIA)
+    for each in sorted(collections - {f"{robot}/params"}):
+        assert graph_of(get(client, each, "text/turtle"))
+    assert get(client, str(robot), "text/html").status_code == 406
+    hidden = {"Authorization": f"Bearer {world.stranger}"}
+    assert get(client, str(robot), "text/turtle", **hidden).status_code == 404
 
 
 def test_what_is_not_there_is_told_with_what_is(client: httpx.Client) -> None:
@@ -210,7 +245,7 @@ def test_what_is_not_there_is_told_with_what_is(client: httpx.Client) -> None:
 
 def test_every_word_has_a_meaning_at_its_address(client: httpx.Client) -> None:
     """The relay's own, types and their fields: what is read of a robot can be looked up, word by word."""
-    read = ("topics/odom?wait=60", "topics", "cameras")
+    read = (f"{base_of(client)}{ROBOT}", "topics/odom?wait=60", "topics", "cameras")
     graphs = [graph_of(get(client, each, "text/turtle")) for each in read]
     here = f"{base_of(client)}/api/v1/vocabulary/"
     words = {
@@ -225,7 +260,8 @@ def test_every_word_has_a_meaning_at_its_address(client: httpx.Client) -> None:
         for media in (*RDF_MEDIA, "text/html"):
             assert get(client, document, media).status_code == 200, document
         told = graph_of(get(client, document, "text/turtle"))
-        for each in words:
+        # What names of fields mean that have no type is told of all of them at once.
+        for each in set() if document.endswith("/fields") else words:
             if each.partition("#")[0] == document:
                 assert told.value(URIRef(each), RDFS.comment) is not None, each
 

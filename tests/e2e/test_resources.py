@@ -10,9 +10,11 @@ from typing import Any
 import httpx
 import pytest
 from switchboard_drive import LET_GO_SECONDS
+from switchboard_processes import ros_environment
 from switchboard_waiting import wait_for
 
 from relay_server.resources import HEADER
+from tests.robot_client.ros import Peer
 
 ROBOT = "/api/v1/robots/rover"
 GO = {"value": {"linear": {"x": 0.2}, "angular": {"z": 0.3}}}
@@ -240,6 +242,103 @@ def test_a_service_is_called(operator: httpx.Client) -> None:
     assert missing.status_code == 404 and "/nowhere" in missing.json()["detail"]
 
 
+def test_one_service_is_told_as_it_is_listed(world: Any, viewer: httpx.Client) -> None:
+    """To who may use it, and with a tag by which it is known; to others it is not there."""
+    (listed,) = viewer.get("services", params={"name": "/relay/stop"}).json()["services"]
+    answer = viewer.get("services/relay/stop")
+    assert (answer.status_code, answer.json()) == (200, listed)
+    known = viewer.get("services/relay/stop", headers={"If-None-Match": answer.headers["etag"]})
+    assert (known.status_code, known.content) == (304, b"")
+    with client_of(world, world.operator) as operator:
+        assert operator.get("services/reset").json()["types"] == ["std_srvs/srv/Trigger"]
+    hidden, missing = viewer.get("services/reset"), viewer.get("services/nowhere")
+    assert (hidden.status_code, missing.status_code) == (404, 404)
+    assert hidden.json()["detail"].replace("/reset", "/nowhere") == missing.json()["detail"]
+
+
+def test_what_a_module_has_is_where_its_names_lead(viewer: httpx.Client) -> None:
+    """Each service of the relay's own node."""
+    services = viewer.get("modules/relay").json()["services"]
+    assert "/relay/stop" in services
+    for name in services:
+        assert viewer.get(f"services{name}").json()["name"] == name
+
+
+def test_a_method_that_an_address_does_not_take(world: Any, viewer: httpx.Client) -> None:
+    """Is told with those it takes, to who may know of what is there."""
+    for method, address, takes in (
+        ("PUT", "services/relay/stop", "GET, HEAD, POST"),
+        ("DELETE", "topics/odom", "GET, HEAD, POST, PUT"),
+        ("POST", "params", "GET, HEAD"),
+        ("GET", "stop", "POST"),
+        ("DELETE", "hold", "POST"),
+    ):
+        answer = viewer.request(method, address)
+        assert (answer.status_code, answer.headers["allow"]) == (405, takes), answer.text
+        assert answer.headers["content-type"] == "application/problem+json"
+        with client_of(world, world.stranger) as stranger:
+            assert stranger.request(method, address).status_code == 404
+    assert viewer.put("services/reset").status_code == viewer.delete("topics/nowhere").status_code == 404
+
+
+def test_what_is_said_on_a_topic_is_compared_with_nothing(operator: httpx.Client) -> None:
+    """It takes the place of no other message."""
+    said = {"value": {"data": "x"}, "type": "std_msgs/msg/String"}
+    for method in ("PUT", "POST"):
+        answer = operator.request(method, "topics/resources/said", json=said, headers={"If-Match": "*"})
+        assert answer.status_code == 400 and "does not apply" in answer.json()["detail"]
+
+
+def test_a_message_may_be_too_old(operator: httpx.Client, viewer: httpx.Client) -> None:
+    """Of a topic on which nobody speaks any more, who wants it younger than it is gets none."""
+    address, now = "topics/resources/quiet", {"wait": 0}
+    said = {"value": {"data": "once"}, "type": "std_msgs/msg/String"}
+    assert operator.post(address, json=said).status_code == 204
+
+    def heard() -> bool:
+        assert operator.post(address, json=said).status_code == 204
+        return viewer.get(address, params={"wait": 1, "max_age": 60}).status_code == 200
+
+    def grown_old() -> httpx.Response | None:
+        """The message, which was too old; none where the machine was so slow that its reader was forgotten."""
+        wait_for("it is heard", heard)
+        young = {**now, "max_age": 0.2}
+        wait_for("it is too old", lambda: viewer.get(address, params=young).status_code == 504)
+        return _found(viewer.get(address, params=now))
+
+    kept = wait_for("it is kept", grown_old)
+    assert kept.json()["value"] == {"data": "once"}
+
+
+def _found(answer: httpx.Response) -> httpx.Response | None:
+    return answer if answer.status_code == 200 else None
+
+
+@pytest.fixture(scope="module")
+def peer(world: Any) -> Iterator[Peer]:
+    """A node of the robot with a parameter that may be deleted."""
+    peer = Peer(ros_environment(world.robot.domain))
+    peer.do("declare", "loose", "here")
+    yield peer
+    peer.close()
+
+
+def test_a_parameter_is_deleted(operator: httpx.Client, peer: Peer) -> None:
+    """As it was read, or not at all; then it is not there, and the node's others are."""
+    address = "params/robot/peer:loose"
+    read = wait_for("the node tells it", lambda: _found(operator.get(address)))
+    assert read.json()["value"] == "here"
+    assert operator.delete(address, headers={"If-Match": '"other"'}).status_code == 412
+    assert operator.get(address).json() == read.json()
+    deleted = operator.delete(address, headers={"If-Match": read.headers["etag"]})
+    assert (deleted.status_code, deleted.content) == (204, b""), deleted.text
+    assert operator.get(address).status_code == 404
+    kept = "params/robot/peer:use_sim_time"
+    refused = operator.delete(kept)
+    assert refused.status_code == 409 and refused.json()["detail"]
+    assert operator.get(kept).json()["value"] is False
+
+
 def test_a_parameter_is_read_and_written_as_it_was_read(operator: httpx.Client) -> None:
     """Who has read another value than there is now changes nothing."""
 
@@ -269,7 +368,9 @@ def test_a_parameter_is_read_and_written_as_it_was_read(operator: httpx.Client) 
         ("topics/odom?wait=nan", 400),
         ("topics/odom?wait=1&wait=2", 400),
         ("topics/no name", 400),
-        ("services/reset", 404),
+        ("services/nowhere", 404),
+        ("actions/nowhere", 404),
+        ("services/no name", 400),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(viewer: httpx.Client, address: str, status: int) -> None:

@@ -47,7 +47,7 @@ class Labs:
 
     def unshare(self) -> None:
         """It is not."""
-        self.relay.cli("robot", "unshare", "mobile@lab1", "lab2")
+        self.relay.cli("robot", "unshare", "mobile@lab1", "lab2", "--yes")
 
     def events(self, who: str, kind: str) -> list[dict[str, Any]]:
         """What somebody finds in the memory of his realm, the newest first."""
@@ -200,6 +200,20 @@ def test_who_is_let_out_is_cut_at_once(labs: Labs) -> None:
     wait_for(
         "control is free", lambda: labs.ask("toad@lab1", "GET", HERE + "/control").json["holder"] is None
     )
+    lost = wait_for(
+        "the loss is on record",
+        lambda: [
+            each
+            for each in labs.relay.cli("audit", "list", "--limit", "1000")
+            if each["action"] == "control.lost"
+        ],
+    )
+    assert lost[-1]["actor"] == "user:toad@lab2"
+    assert {each["data"].get("by") for each in labs.events("toad@lab1", "control.lost")} <= {
+        "toad@lab2",
+        None,
+    }
+    assert labs.events("toad@lab1", "control.lost")[0]["user"] is None
     # Though it is shared again: rights are given anew.
     labs.relay.cli("robot", "share", "mobile@lab1", "lab2")
     wait_for("its owner sees it", lambda: labs.ask("root@lab2", "GET", "/api/v1/robots").json["robots"])

@@ -15,6 +15,7 @@ from example_interfaces.action import Fibonacci
 from example_interfaces.srv import AddTwoInts
 from fixture_node import Pursuer
 from geometry_msgs.msg import Twist, TwistStamped
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
@@ -196,6 +197,11 @@ def clock(seconds: float) -> None:
     publisher = ends.setdefault("/clock", node.create_publisher(Clock, "/clock", 1))
     now = Time(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
     publisher.publish(Clock(clock=now))
+
+
+def declare(parameter: str, value: object) -> None:
+    """Have a parameter that may be deleted."""
+    node.declare_parameter(parameter, value, ParameterDescriptor(dynamic_typing=True))
 
 
 def battery(topic: str, charge: float) -> None:

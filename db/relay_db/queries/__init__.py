@@ -64,6 +64,7 @@ from relay_db.queries.history import (
     purge_events,
     record_event,
     removed_robots,
+    unshared_robots,
     verify_audit,
 )
 from relay_db.queries.oauth import (
@@ -329,6 +330,7 @@ __all__ = [
     "take_turn",
     "token_is_live",
     "unshare_robot",
+    "unshared_robots",
     "use_memories",
     "user_is_live",
     "user_of_program",

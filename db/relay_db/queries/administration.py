@@ -28,6 +28,7 @@ from relay_db.models import (
 from relay_db.names import findable, findable_hex, label
 from relay_db.queries.records import TokenRecord
 from relay_db.queries.rights import holders_realm, of_user
+from relay_db.queries.state import bump
 from relay_db.queries.tokens import list_tokens
 from relay_protocol.errors import NotFound
 from relay_protocol.realms import full_name
@@ -166,6 +167,8 @@ def describe_robot(s: Session, robot_id: int, description: str) -> None:
     :raises NotFound: no such robot
     """
     text = label(description, "description of a robot")
+    # Relays remember whom they show which robots.
+    bump(s)
     changed = update(Robot).where(Robot.id == robot_id).values(description=text).returning(Robot.id)
     if s.scalar(changed) is None:
         raise NotFound("there is no such robot")

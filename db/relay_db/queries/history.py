@@ -131,6 +131,17 @@ def removed_robots(s: Session, names: Collection[str]) -> dict[str, float]:
     return {row.target: row.at for row in s.execute(query)} if names else {}
 
 
+def unshared_robots(s: Session, names: Collection[str]) -> dict[tuple[str, str], float]:
+    """When robots of these names were taken out of realms the last time, Unix seconds, by name and realm."""
+    query = (
+        select(AuditEntry.target, AuditEntry.data, AuditEntry.at)
+        .where(AuditEntry.action == "robot.unshare", AuditEntry.target.in_(names))
+        .order_by(AuditEntry.id)
+    )
+    found = s.execute(query) if names else ()
+    return {(row.target, str(row.data["realm"])): row.at for row in found}
+
+
 def verify_audit(s: Session) -> int | None:
     """The number of the first entry that was changed, removed or put in; None if the chain is whole."""
     end = s.execute(select(Revision.audit_id, Revision.audit_hash)).one()

@@ -187,15 +187,21 @@ def issued(s: Session, token_hash: str, now: float) -> IssuedRecord | None:
     return None if row is None else IssuedRecord(*row)
 
 
-def revoke_issued(s: Session, token_hash: str, realm: str) -> bool:
+def revoke_issued(s: Session, token_hash: str, realm: str, program: str | None = None) -> bool:
     """Make a token worthless, with a refresh token all of its family (RFC 7009); false if there was none.
 
     :param realm: whose token it has to be
+    :param program: key of the program to which it may have been given instead, in whatever realm
     """
     found = findable_hex(token_hash)
     users = select(User.id).join(Realm, Realm.id == User.realm_id).where(Realm.name == realm)
     token = delete(AccessToken).where(
-        AccessToken.token_hash == found, AccessToken.kind == "access", AccessToken.user_id.in_(users)
+        AccessToken.token_hash == found,
+        AccessToken.kind == "access",
+        or_(
+            AccessToken.user_id.in_(users),
+            AccessToken.program_id.in_(select(Program.id).where(Program.key == program)),
+        ),
     )
     family = delete(TokenFamily).where(
         or_(TokenFamily.refresh_hash == found, TokenFamily.former_hash == found),

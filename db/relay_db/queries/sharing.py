@@ -69,6 +69,8 @@ def unshare_robot(s: Session, robot_id: int, realm: str) -> None:
             f"'{findable(realm)}' is the robot's own realm; only to remove the robot takes it out of that"
         )
     bump(s)
+    # Who registers something about the robot there has done so by now, or finds it gone.
+    s.execute(select(Realm.id).where(Realm.id == number).with_for_update())
     shared = (RobotRealm.robot_id == robot_id) & (RobotRealm.realm_id == number)
     if s.scalar(delete(RobotRealm).where(shared).returning(RobotRealm.robot_id)) is None:
         raise NotFound(f"the robot is not of the realm '{findable(realm)}'")

@@ -125,8 +125,10 @@ def remove_user(s: Session, user_id: int) -> None:
     :raises NotFound: no such user
     """
     bump(s)
-    guests = select(GuestAccount.user_id).where(GuestAccount.home_id == user_id)
-    s.execute(delete(User).where(User.id.in_(list(s.scalars(guests)))))
+    guests = list(s.scalars(select(GuestAccount.user_id).where(GuestAccount.home_id == user_id)))
+    # In the order in which who logs in does it.
+    s.execute(select(User.id).where(User.id.in_([user_id, *guests])).order_by(User.id).with_for_update())
+    s.execute(delete(User).where(User.id.in_(guests)))
     if s.scalar(delete(User).where(User.id == user_id).returning(User.id)) is None:
         raise NotFound("there is no such user")
 

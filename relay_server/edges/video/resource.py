@@ -90,6 +90,8 @@ class Desk(Protocol):
         settings: link.VideoSettings,
         screen: Screen,
         address: str,
+        *,
+        snapshot: bool = False,
     ) -> Watching:
         """Begin to watch."""
 
@@ -257,7 +259,7 @@ class Video(Resource):
             return b""
         screen = Snapshot(self._clock.seconds)
         watching = await self._desk.viewing(
-            principal, robot, wanted.camera, wanted.settings, screen, _address(request)
+            principal, robot, wanted.camera, wanted.settings, screen, _address(request), snapshot=True
         )
         try:
             picture = await screen.done

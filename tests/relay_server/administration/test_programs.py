@@ -175,3 +175,41 @@ async def test_a_shared_robot_is_its_own_realms(office: Office) -> None:
     await office.do(machines.join, "cleaners", "arm", who="root@lab2")
     assert (await office.see(machines.group, "cleaners", who="root@lab2"))["robots"] == ["arm"]
     assert (await office.see(machines.group, "cleaners"))["robots"] == []
+    with pytest.raises(Refused, match="a matter of its own realm"):
+        await office.see(machines.keys, "arm", Listing(), who="root@lab2")
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_shuts_out_a_guest_has_shut_him_out(office: Office) -> None:
+    """Also while the guest's own realm has done so for a time; nor is his password anybody's but there."""
+    with office.store.database.begin() as s:
+        queries.add_user(s, "peach", "hash", realm="lab1")
+        peach = queries.find_user(s, "peach", "lab1")
+        assert peach is not None
+        guest = queries.add_guest(s, peach.id, "lab2")
+        queries.set_disabled(s, peach.id, True)
+    change = people.change_user
+    told = await office.do(change, "peach", None, True, None, who="root@lab2")
+    assert (told["disabled"], told["guest"]) == (True, True)
+    with office.store.database.begin() as s:
+        queries.set_disabled(s, peach.id, False)
+        assert not queries.user_is_live(s, guest.id)
+    with pytest.raises(Refused, match="an account elsewhere"):
+        await office.do(change, "peach", "hash", None, None, who="root@lab2")
+
+
+@pytest_twisted.ensureDeferred
+async def test_how_long_events_are_kept_is_said_for_ones_own_realm(office: Office) -> None:
+    """On record as by the command line; by a token for all, and for no longer than may be."""
+    assert (await office.do(people.keep_events, 7.0))["events_days"] == 7.0
+    assert (await office.see(people.about, who="root@lab2"))["events_days"] is None
+    assert (await office.do(people.keep_events, None))["events_days"] is None
+    assert office.record() == [
+        ("user:root@lab1", HERE, "realm.set", "lab1", {"events_days": days}) for days in (7.0, None)
+    ]
+    for days in (0.0, 1e6):
+        with pytest.raises(Invalid, match="more than 0 days"):
+            await office.do(people.keep_events, days)
+    office.people["narrow"] = office.by_token("root", "lab1", "admin")
+    with pytest.raises(Refused):
+        await office.do(people.keep_events, 7.0, who="narrow")

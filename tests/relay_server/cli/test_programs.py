@@ -69,3 +69,10 @@ def test_a_token_may_be_for_less_than_its_user_may(ann: Any) -> None:
     assert principal is not None and principal.scope == "viewer@rover"
     assert ann.json("token", "list")[0]["scope"] == "viewer@rover"
     assert "is no scope" in ann.fails("token", "create", "ann", "--scope", "king")
+
+
+def test_key_and_secret_stand_in_lines_of_their_own(ann: Any) -> None:
+    """For people, who copy them; that the secret comes once is said beside."""
+    result = ann("program", "add", "ann")
+    assert [each.split()[0] for each in result.stdout.splitlines()] == ["key", "secret"]
+    assert "not shown again" in result.stderr

@@ -34,7 +34,7 @@ def test_a_robot_is_shared_and_taken_out_again(labs: Any) -> None:
     (listed,) = labs.json("robot", "list", "--realm", "lab2")
     assert (listed["robot"], listed["shared"]) == ("mobile@lab1", ["lab2"])
     assert [each["robots"] for each in labs.json("realm", "list")] == [0, 1, 1]
-    assert "not of the realm lab2 any more" in labs.ok("robot", "unshare", "mobile@lab1", "lab2")
+    assert "not of the realm lab2 any more" in labs.ok("robot", "unshare", "mobile@lab1", "lab2", "--yes")
     assert labs.json("right", "list") == []
     done = [
         (each["action"], each["target"], each["data"].get("realm")) for each in labs.json("audit", "list")
@@ -54,7 +54,7 @@ def test_a_shared_robot_is_removed_by_its_own_name(labs: Any) -> None:
 def test_sharing_says_what_is_wrong(labs: Any) -> None:
     """A realm that there is not, a name that is taken, a robot that is not shared."""
     assert "realm list" in labs.fails("robot", "share", "mobile@lab1", "lab3")
-    assert "not of the realm" in labs.fails("robot", "unshare", "mobile@lab1", "lab2")
+    assert "not of the realm" in labs.fails("robot", "unshare", "mobile@lab1", "lab2", "--yes")
     labs.ok("robot", "add", "mobile@lab2")
     assert "another robot" in labs.fails("robot", "share", "mobile@lab1", "lab2")
 

@@ -54,6 +54,9 @@ async def test_robots_and_what_they_have_are_entries(there: Room) -> None:
     )
     (reset,) = await of_rover(there, kind="service", name="/re[s]et")
     assert reset["address"] == "/api/v1/robots/rover/services/reset" and reset["data"] == {"types": [TRIGGER]}
+    modules = {each["name"]: each for each in await of_rover(there, kind="module")}
+    assert modules["/base"]["address"] == "/api/v1/robots/rover/modules/base"
+    assert (modules["/base"]["id"], modules["/base"]["data"]) == ("module:rover:/base", {})
     cameras = await of_rover(there, kind="camera")
     assert [(each["name"], each["data"]) for each in cameras] == [
         ("/eye", {"type": "sensor_msgs/msg/Image"}),
@@ -77,6 +80,7 @@ async def test_they_are_what_a_connection_of_the_reader_would_show(there: Room, 
         assert {each["name"]: each["data"]["types"] for each in told} == {
             name: each.types for name, each in members.items()
         }
+    assert [each["name"] for each in await of_rover(there, kind="module")] == shown.nodes
     assert len(await of_rover(there, kind="camera")) == (1 if deny else 2)
     secret = [each for each in await of_rover(there) if each["name"] in ("/secret", "/vault/open")]
     assert len(secret) == (0 if deny else 2)

@@ -7,7 +7,7 @@ from collections import ChainMap
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from autobahn.twisted.resource import WebSocketResource
 from prometheus_client import CollectorRegistry
@@ -23,6 +23,7 @@ from relay_server.edges.caps import AddressCap
 from relay_server.edges.documents import Documents
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.pages import PageFactory, PageGate
+from relay_server.edges.robot_pages import RobotPages
 from relay_server.edges.site import Missing, Portal, RelaySite, Robots, Root
 from relay_server.edges.websocket import ClientFactory
 from relay_server.origins import Origins
@@ -141,6 +142,14 @@ class Transport(StringTransportWithDisconnection):
         """As TCP."""
 
 
+class AtOnce:
+    """Threads that do things at once."""
+
+    async def run(self, work: Callable[..., Any], *args: Any) -> Any:
+        """Do it."""
+        return work(*args)
+
+
 def api_of(
     clock: Any,
     desk: Any,
@@ -160,6 +169,7 @@ def api_of(
         CollectorRegistry(),
         {} if below is None else below,
         {} if beside is None else beside,
+        RobotPages(desk, cast(Any, AtOnce())),
         cookie="sb",
         secure=tls,
         events=events,

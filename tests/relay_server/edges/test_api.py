@@ -104,7 +104,8 @@ def test_robots_and_tickets(world: World) -> None:
     """What the principal sees; a robot that is not there is not found."""
     token = {"Authorization": "Bearer ann"}
     assert world.ask("GET", "/api/v1/robots", **token).json == {
-        "robots": [{"name": "rover", "seen by": "ann"}]
+        "robots": [{"name": "rover", "seen by": "ann"}],
+        "next": "",
     }
     assert world.ask("GET", "/api/v1/robots/rover", **token).json["name"] == "rover"
     assert world.ask("GET", "/api/v1/robots/tank", **token).status == 404
@@ -120,6 +121,23 @@ def test_robots_and_tickets(world: World) -> None:
     assert world.ask("POST", "/api/v1/tickets", {}, **token).status == 400
     for path in ("/api/v1/robots", "/api/v1/robots/rover", "/api/v1/robots/stream", "/metrics"):
         assert world.ask("GET", path).status == 401
+
+
+def test_robots_are_told_in_pages_and_once(world: World) -> None:
+    """Who knows them already is told so, whatever the ping is; what is no parameter is told."""
+    token = {"Authorization": "Bearer ann"}
+    assert world.ask("GET", "/api/v1/robots?name=t*", **token).json == {"robots": [], "next": ""}
+    for wrong in ("limit=0", "type=x", "name=rover&name=rover", "name=" + "*a" * 40):
+        assert world.ask("GET", f"/api/v1/robots?{wrong}", **token).status == 400, wrong
+    for path in ("/api/v1/robots", "/api/v1/robots/rover"):
+        tag = world.ask("GET", path, **token).headers["etag"]
+        assert tag.startswith('W/"')
+        for known in (tag, tag.removeprefix("W/"), f'"another", {tag}'):
+            again = world.ask("GET", path, If_None_Match=known, **token)
+            assert (again.status, again.body, again.headers["etag"]) == (304, b"", tag)
+        assert world.ask("GET", path, If_None_Match='"another"', **token).status == 200
+    form = world.ask("GET", "/api/v1/robots/rover", Accept="text/csv", **token)
+    assert form.status == 406 and "text/turtle" in form.json["available"]
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,6 @@ def test_control_is_given_back_handed_over_and_kept(site: Site) -> None:
     assert site.post("control/grant", {"client": -1}).status == 400
     assert site.post("control/grant", {"client": "bob"}).status == 400
     assert site.post("control/take").status == 404
-    assert site.post("control").status == 404
 
 
 def test_control_is_taken_or_asked_for(site: Site) -> None:
@@ -229,7 +228,7 @@ def test_who_resumes_says_when_he_asks(site: Site) -> None:
 def test_what_goes_wrong_is_told_in_words(site: Site, error: Exception, status: int) -> None:
     """As problem details; with a stop that is not all done, how the robot stands."""
     site.console.fails = error
-    for part in ("stop", "resume", "suppress", "inhibit", "control/release"):
+    for part in ("stop", "resume", "suppress", "inhibit", "hold", "control/release"):
         answer = site.post(part, {"resource": "/cmd_vel"})
         assert (answer.status, answer.json["detail"]) == (status, str(error)), part
         assert answer.headers["content-type"] == "application/problem+json"
@@ -248,16 +247,21 @@ def test_who_is_known_stops_a_robot_though_the_database_is_gone(site: Site) -> N
     assert site.post("stop", Authorization="Bearer nobody").status == 401
 
 
-def test_topics_are_suppressed_and_inhibited(site: Site) -> None:
+def test_topics_are_suppressed_inhibited_and_held(site: Site) -> None:
     """With the times that are usual where none is given."""
     assert site.post("suppress", {"resource": "/cmd_vel"}).json == {"resource": "/cmd_vel", "ms": 100}
     site.post("suppress", {"resource": "/cmd_vel", "ms": 0})
-    assert site.post("inhibit", {"resource": "/scan", "ms": 5000, "hold": True}).status == 200
+    assert site.post("inhibit", {"resource": "/scan", "ms": 5000}).json == {"resource": "/scan", "ms": 5000}
+    assert site.post("hold", {"resource": "/scan"}).json == {"resource": "/scan", "ms": 1000}
     assert site.console.asked == [
         ("suppress", "rover", "/cmd_vel", 100, "192.0.2.9"),
         ("suppress", "rover", "/cmd_vel", 0, "192.0.2.9"),
-        ("inhibit", "rover", "/scan", 5000, True, "192.0.2.9"),
+        ("inhibit", "rover", "/scan", 5000, False, "192.0.2.9"),
+        ("inhibit", "rover", "/scan", 1000, True, "192.0.2.9"),
     ]
+    refused = site.post("inhibit", {"resource": "/scan", "hold": True})
+    assert (refused.status, len(site.console.asked)) == (400, 4)
+    assert "hold" in refused.json["detail"]
 
 
 @pytest.mark.parametrize(
@@ -267,6 +271,7 @@ def test_bodies_that_make_no_sense_are_refused(site: Site, body: Any) -> None:
     """Nothing is done."""
     assert site.post("suppress", body).status == 400
     assert site.post("inhibit", body).status == 400
+    assert site.post("hold", body).status == 400
     assert site.console.asked == []
 
 
@@ -303,8 +308,8 @@ def test_no_stop_is_refused_for_its_reason(site: Site, body: bytes, why: str) ->
 def test_a_cookie_counts_only_with_a_listed_origin(site: Site) -> None:
     """Another site's page can't resume a robot, nor stop it."""
     cookie = {"Cookie": "sb=ann"}
-    for part in ("stop", "resume", "suppress", "inhibit", "control/release"):
-        body = {"resource": "/x"} if part in ("suppress", "inhibit") else {}
+    for part in ("stop", "resume", "suppress", "inhibit", "hold", "control/release"):
+        body = {"resource": "/x"} if part in ("suppress", "inhibit", "hold") else {}
         assert site.ask("POST", f"{HERE}/{part}", body, **cookie).status == 403
         assert site.ask("POST", f"{HERE}/{part}", body, **cookie, Origin="https://evil.example").status == 403
     for method in ("PUT", "DELETE"):
@@ -313,11 +318,35 @@ def test_a_cookie_counts_only_with_a_listed_origin(site: Site) -> None:
     assert site.ask("POST", f"{HERE}/stop", {}, **cookie, Origin=ORIGIN).status == 200
 
 
-def test_addresses_take_their_own_methods(site: Site) -> None:
-    """And there is nothing below them."""
-    assert site.ask("GET", f"{HERE}/stop", **ANN).status == 404
-    assert site.ask("PATCH", f"{HERE}/control", **ANN).status == 405
-    for method in ("PUT", "DELETE"):
-        assert site.ask(method, f"{HERE}/stop", **ANN).status == 404
+ORDERS = ("stop", "resume", "suppress", "inhibit", "hold", "control/grant")
+
+
+@pytest.mark.parametrize(
+    ("part", "methods", "takes"),
+    [
+        *((part, ("GET", "HEAD", "PUT", "DELETE", "PATCH"), "POST") for part in ORDERS),
+        ("control", ("POST", "PATCH"), "DELETE, GET, HEAD, PUT"),
+    ],
+)
+def test_addresses_take_their_own_methods(
+    site: Site, part: str, methods: tuple[str, ...], takes: str
+) -> None:
+    """Of others they say so to who knows the robot, and to nobody else; nothing is done."""
+    for method in methods:
+        answer = site.ask(method, f"{HERE}/{part}", **ANN)
+        assert (answer.status, answer.headers["allow"]) == (405, takes), method
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert method == "HEAD" or takes in answer.json["detail"]
+        strange = site.ask(method, f"{HERE.replace('rover', 'other')}/{part}", **ANN)
+        assert (strange.status, "allow" in strange.headers) == (404, False), method
+        assert site.ask(method, f"{HERE}/{part}").status == 401, method
     assert site.console.asked == []
-    assert site.post("stop/now").status == 404
+
+
+def test_there_is_nothing_below_these_addresses(site: Site) -> None:
+    """By no method."""
+    for path in ("stop/now", "stop/release", "hold/grant", "control/now", "control/grant/now"):
+        for method in ("GET", "POST"):
+            answer = site.ask(method, f"{HERE}/{path}", **ANN)
+            assert (answer.status, "allow" in answer.headers) == (404, False), (method, path)
+    assert site.console.asked == []

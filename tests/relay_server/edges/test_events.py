@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 from relay_db.queries import MemoryPlace, MemoryRecord
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import BadCredentials, Principal
 from relay_server.edges import events as module
 from relay_server.memory import Ask, Following, Forms, Full, NewEvent
+from relay_server.resources import Idempotency
 from tests.relay_server.edges.http_client import Transport, World
 
 HERE = "/api/v1/events"
@@ -44,6 +45,11 @@ class Desk:
             raise self.error
         self.asked.append((principal.name, [each.kind for each in events]))
         return [{"id": number} for number, _ in enumerate(events)]
+
+    async def may_write(self, principal: Principal, events: list[NewEvent]) -> None:
+        """As long as there is no error."""
+        if self.error is not None:
+            raise self.error
 
     async def count(self, principal: Principal, ask: Ask) -> int:
         """Always the same."""
@@ -93,7 +99,7 @@ def desk() -> Desk:
 def world(tmp_path: Path, desk: Desk) -> World:
     """A site with a memory."""
     made = World(tmp_path)
-    made.beside["events"] = partial(module.beside, made.clock, desk)
+    made.beside["events"] = partial(module.beside, made.clock, desk, Idempotency(made.clock))
     return made
 
 
@@ -104,6 +110,17 @@ def test_one_event_or_several_are_written(world: World, desk: Desk) -> None:
     answer = world.ask("POST", HERE, [{"kind": "x"}, {"kind": "y", "data": {"n": 1}}], **ANN)
     assert (answer.status, answer.json) == (201, {"events": [{"id": 0}, {"id": 1}]})
     assert desk.asked == [("ann", ["x"]), ("ann", ["x", "y"])]
+
+
+def test_what_is_sent_again_with_its_key_is_written_once(world: World, desk: Desk) -> None:
+    """And answered as before; with another body it is refused, and so is who may not any more."""
+    key = {"Idempotency-Key": '"a"', **ANN}
+    told = [world.ask("POST", HERE, {"kind": "x"}, **key) for _ in "ab"]
+    assert [(each.status, each.json) for each in told] == [(201, {"id": 0})] * 2
+    assert desk.asked == [("ann", ["x"])]
+    assert world.ask("POST", HERE, {"kind": "y"}, **key).status == 422
+    desk.error = NotFound("no such robot")
+    assert world.ask("POST", HERE, {"kind": "x"}, **key).status == 404
 
 
 def test_when_too_many_wait_it_is_said_when_to_come_again(world: World, desk: Desk) -> None:

@@ -11,7 +11,7 @@ from twisted.web.test.requesthelper import DummyRequest
 
 from relay_protocol.errors import Invalid, Refused
 from relay_protocol.rights import Operation
-from relay_server.edges.once import Once, send
+from relay_server.edges.once import Once, see_no_key, send
 from relay_server.resources import KEY_HEADER, Asker, Idempotency, Reply
 from tests.relay_server.edges.http_client import ANN
 from tests.relay_server.steering import outcome, result
@@ -87,6 +87,15 @@ def test_who_may_not_any_more_is_not_answered_again(requests: Requests) -> None:
     requests.desk.withdrawn = True
     (error,) = outcome(requests.send("k"))
     assert str(error) == "no more call on reset"
+
+
+def test_where_a_key_is_not_understood_it_is_refused() -> None:
+    """In words: who sends one relies on it."""
+    request: Any = DummyRequest([b""])
+    see_no_key(request)
+    request.requestHeaders.setRawHeaders(KEY_HEADER, ["k"])
+    with pytest.raises(Invalid, match="is not understood at this address"):
+        see_no_key(request)
 
 
 @pytest.mark.parametrize(

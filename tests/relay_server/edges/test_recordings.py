@@ -14,6 +14,7 @@ from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import Principal
 from relay_server.edges import recordings as module
 from relay_server.recording import Ask
+from relay_server.resources import Idempotency
 from tests.relay_server.edges.http_client import HOST, Answer, Transport, World, parse
 
 HERE = "/api/v1/robots/rover/recordings"
@@ -77,6 +78,9 @@ class Desk:
         self.asks.append(ask)
         return {"id": "a"}
 
+    async def may_start(self, principal: Principal, robot: str, ask: Ask, address: str) -> None:
+        """Still."""
+
     async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
         """One topic."""
         return {"topics": ["/odom"]}
@@ -117,7 +121,7 @@ def desk() -> Desk:
 def world(tmp_path: Path, desk: Desk) -> World:
     """A site with recordings."""
     made = World(tmp_path)
-    made.below["recordings"] = partial(module.below, made.clock, desk)
+    made.below["recordings"] = partial(module.below, made.clock, desk, Idempotency(made.clock))
     return made
 
 
@@ -146,6 +150,10 @@ def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     assert desk.asks == [Ask(topics=["/odom"], seconds=5.0)]
     assert world.ask("GET", f"{HERE}/a", **ANN).json == {"id": "a"}
     assert world.ask("GET", f"{HERE}/new", **ANN).json == {"topics": ["/odom"]}
+    again = {"Idempotency-Key": "k", **ANN}
+    told = [world.ask("POST", HERE, {"topics": ["/odom"]}, **again) for _ in "ab"]
+    assert len({(each.status, each.headers["location"], each.body) for each in told}) == 1
+    assert len(desk.asks) == 2
     assert world.ask("POST", f"{HERE}/a/stop", **ANN).json["state"] == "complete"
     assert world.ask("DELETE", f"{HERE}/a", **ANN).status == 204
     assert desk.deleted == ["a"]

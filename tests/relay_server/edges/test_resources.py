@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from twisted.internet.defer import Deferred
 
-from relay_protocol.errors import Refused, SwitchboardError
+from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_server.edges import resources as module
 from relay_server.edges.resources import RobotResources
 from relay_server.inside import MaybeDone
@@ -28,8 +28,11 @@ MEDIA = [each.media for each in FORMS]
 NEWEST = State("/said", "std_msgs/msg/String", 5.0, b'{"data":"hello"}')
 
 
+SERVICE = {"name": "/reset", "types": ["std_srvs/srv/Trigger"], "providers": ["/base"], "moves": True}
+
+
 class Desk:
-    """Knows one topic, which says the same for ever, and one parameter."""
+    """Knows one topic, which says the same for ever, one service, one action, and one parameter."""
 
     def __init__(self) -> None:
         self.over: Deferred[None] = Deferred()
@@ -40,6 +43,21 @@ class Desk:
         """None."""
         return {kind: [], "next": "", "online": True}
 
+    async def member(self, asker: Asker, kind: str, name: str) -> dict[str, Any]:
+        """One of each kind."""
+        if (asker.robot, kind, name) not in (
+            ("rover", "topics", "said"),
+            ("rover", "services", "reset"),
+            ("rover", "actions", "reset"),
+        ):
+            raise NotFound("there is none, or you have no right on it")
+        return SERVICE
+
+    async def see(self, asker: Asker) -> None:
+        """One robot is there."""
+        if asker.robot != "rover":
+            raise NotFound("there is no such robot, or you have no right on it")
+
     async def state(self, asker: Asker, name: str, wanted: Wanted) -> tuple[State, bool]:
         """What is said."""
         return NEWEST, NEWEST.etag in wanted.unlike
@@ -48,6 +66,8 @@ class Desk:
         """A truth."""
         if self.cut is not None:
             raise self.cut
+        if (asker.robot, name) != ("rover", "node:truth"):
+            raise NotFound("there is none")
         return Param(name, b"true")
 
     async def remove_param(self, asker: Asker, name: str, match: str | None) -> None:
@@ -101,7 +121,9 @@ def world(tmp_path: Path, desk: Any) -> World:
 
 
 @pytest.mark.parametrize("media", MEDIA)
-@pytest.mark.parametrize("address", ["topics", "topics/said", "params/node:truth"])
+@pytest.mark.parametrize(
+    "address", ["topics", "topics/said", "services/reset", "actions/reset", "params/node:truth"]
+)
 def test_an_answer_has_a_moment_in_every_form(world: World, address: str, media: str) -> None:
     """Who reads in that form gives it back."""
     answer = world.ask("GET", f"{HERE}/{address}", Accept=media, **ANN)
@@ -143,6 +165,63 @@ def test_what_may_have_been_done_is_told_so(world: World, desk: Desk) -> None:
     told = changed.json
     assert (changed.status, told["code"], told["title"]) == (409, "maybe_done", "Perhaps done")
     assert "revoked" in told["detail"] and "may have been done" in told["detail"]
-    read = world.ask("GET", address, **ANN)
-    assert (read.status, read.json["code"], read.json["detail"]) == (403, "refused", "your right was revoked")
-    assert read.headers[HEADER][:2] == "1."
+    # Which is all that is done for a method that there is not.
+    for method in ("GET", "POST"):
+        read = world.ask(method, address, **ANN)
+        assert (read.status, read.json["code"]) == (403, "refused")
+        assert read.json["detail"] == "your right was revoked" and read.headers[HEADER][:2] == "1."
+
+
+@pytest.mark.parametrize("media", MEDIA)
+@pytest.mark.parametrize("part", ["services", "actions"])
+def test_one_service_or_action_is_told(world: World, part: str, media: str) -> None:
+    """As it is listed, in every form, each with a tag of its own by which it is known."""
+    address = f"{HERE}/{part}/reset"
+    answer = world.ask("GET", address, Accept=media, **ANN)
+    if media == "application/json":
+        assert answer.json == SERVICE
+    assert b"std_srvs/srv/Trigger" in answer.body and b"/base" in answer.body
+    known = world.ask("GET", address, Accept=media, If_None_Match=answer.headers["etag"], **ANN)
+    assert (known.status, known.body, known.headers["etag"]) == (304, b"", answer.headers["etag"])
+    others = [each for each in MEDIA if each != media]
+    for other in others:
+        assert (
+            world.ask("GET", address, Accept=other, If_None_Match=known.headers["etag"], **ANN).status == 200
+        )
+    assert world.ask("GET", f"{address}/now", Accept=media, **ANN).status == 404
+    assert world.ask("GET", address, Accept=media).status == 401
+
+
+@pytest.mark.parametrize(
+    ("address", "methods", "takes"),
+    [
+        ("topics", ("PUT", "POST", "DELETE", "PATCH"), "GET, HEAD"),
+        ("params", ("POST",), "GET, HEAD"),
+        ("topics/said", ("DELETE", "PATCH"), "GET, HEAD, POST, PUT"),
+        ("services/reset", ("PUT", "DELETE"), "GET, HEAD, POST"),
+        ("actions/reset", ("PUT", "DELETE"), "GET, HEAD, POST"),
+        ("params/node:truth", ("POST", "PATCH"), "DELETE, GET, HEAD, PUT"),
+    ],
+)
+def test_addresses_take_their_own_methods(
+    world: World, address: str, methods: tuple[str, ...], takes: str
+) -> None:
+    """Of others they say so to who may know what is there; where there is nothing for him, there is nothing."""
+    for method in methods:
+        answer = world.ask(method, f"{HERE}/{address}", **ANN)
+        assert (answer.status, answer.headers["allow"]) == (405, takes), method
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert takes in answer.json["detail"] and answer.headers[HEADER]
+        other = HERE.replace("rover", "other")
+        absent = [f"{other}/{address}", *([f"{HERE}/{address}x"] if "/" in address else [])]
+        for path in absent:
+            strange = world.ask(method, path, **ANN)
+            assert (strange.status, "allow" in strange.headers) == (404, False), (method, path)
+        assert world.ask(method, f"{HERE}/{address}").status == 401, method
+
+
+@pytest.mark.parametrize("method", ["PUT", "POST"])
+def test_a_message_takes_the_place_of_none(world: World, method: str) -> None:
+    """Who wants it compared with what was said before is refused in words."""
+    answer = world.ask(method, f"{HERE}/topics/said", {"value": {}}, If_Match="*", **ANN)
+    assert answer.status == 400 and "'If-Match' does not apply" in answer.json["detail"]

@@ -610,7 +610,7 @@ async def test_a_stop_counts_where_rights_can_not_be_looked_up_again(
     async def locked(*_: object) -> None:
         raise Unavailable("the database is locked")
 
-    monkeypatch.setattr(fleet.front.access, "permit", locked)
+    monkeypatch.setattr(fleet.front.access, "permit_by_name", locked)
     assert (await carried_out(fleet, stop)).outcome.pending
     assert (await carried_out(fleet, resume)).outcome.message == "the database is locked"
 

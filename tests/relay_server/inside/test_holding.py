@@ -17,7 +17,7 @@ from relay_server.control import Desk as ControlDesk
 from relay_server.control import NotDone
 from relay_server.control.terms import ControlRules
 from relay_server.inside import LINGER_SECONDS, Guests
-from relay_server.inside.holding import OVER
+from relay_server.inside.holding import GIVEN_BACK, OVER
 from relay_server.session import Session
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.steering import outcome
@@ -198,8 +198,27 @@ async def test_it_is_let_go_by_the_same_connection(place: Place) -> None:
     waits = await place.waits(ann)
     await place.console.let_go(ann, ROBOT, HERE)
     place.passes(0.5)
-    assert [str(error) for error in waits] == [OVER]
+    assert [str(error) for error in waits] == [GIVEN_BACK]
     assert place.desk.lease.request is None and place.holder == "bob"
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_has_let_go_is_given_nothing_by_what_he_asked_before(place: Place) -> None:
+    """Though control was just granted, or has become free meanwhile."""
+    held, ann = await place.holding("bob"), await place.principal("ann")
+    waits = await place.waits(ann)
+    place.desk.grant(held, "")
+    await place.console.let_go(ann, ROBOT, HERE)
+    place.passes(0.5)
+    assert [str(error) for error in waits] == [GIVEN_BACK]
+    assert place.holder is None
+    held = await place.holding("bob")
+    waits = await place.waits(ann)
+    await place.console.let_go(ann, ROBOT, HERE)
+    place.desk.release(held, "")
+    place.passes(0.5)
+    assert [str(error) for error in waits] == [GIVEN_BACK]
+    assert place.holder is None
 
 
 @pytest.mark.parametrize("end", ["the token", "its time", "the right", "the relay"])

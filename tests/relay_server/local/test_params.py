@@ -147,6 +147,21 @@ def test_a_whole_number_becomes_what_the_parameter_is(world: World, person: Pers
     assert got() == {"successful": True, "reason": ""}
 
 
+def test_what_was_set_or_deleted_is_noted(world: World, person: Person) -> None:
+    """Not what its node would not have."""
+    notes: list[Any] = []
+    person.session.notice = lambda kind, **data: notes.append((kind, data))
+    for service, extra, done in (
+        ("set_param", {"value": "true"}, False),
+        ("set_param", {"value": "true"}, True),
+        ("delete_param", {}, True),
+    ):
+        got = begin(person, f"/rosapi/{service}", {"name": "base:x", **extra})
+        answers(world, "/base/set_parameters", {"results": [{"successful": done, "reason": ""}]})
+        assert got()["successful"] is done
+    assert notes == [("param.set", {"param": "/base:x", "deleted": deleted}) for deleted in (False, True)]
+
+
 def test_without_a_look_at_its_type_a_whole_number_is_an_integer(world: World, person: Person) -> None:
     """The node may not tell, or the caller may not ask."""
     writer = world.person(Level.VIEWER, allow=("call:/base/set_parameters",))

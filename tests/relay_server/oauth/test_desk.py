@@ -50,10 +50,19 @@ class World:
         ask = TokenAsk("password", username="ann", password=password, scope=scope)
         return (await self.desk.token(ask, None, HERE)).told()
 
-    async def by_secret(self, scope: str | None = None) -> dict[str, Any]:
+    async def by_secret(self, scope: str | None = None, realm: str | None = None) -> dict[str, Any]:
         """What her program gets."""
         program = await self.desk.program("", "POST", "/", HERE, (KEY, SECRET))
-        return (await self.desk.token(TokenAsk("client_credentials", scope=scope), program, HERE)).told()
+        ask = TokenAsk("client_credentials", scope=scope, realm=realm)
+        return (await self.desk.token(ask, program, HERE)).told()
+
+    async def joins(self, realm: str) -> None:
+        """Ann has an account in another realm, too."""
+        with self.store.database.begin() as s:
+            ann = queries.find_user(s, "ann")
+            assert ann is not None
+            queries.add_realm(s, realm)
+            queries.add_guest(s, ann.id, realm)
 
     async def refreshed(self, token: str, scope: str | None = None) -> dict[str, Any]:
         """What follows on a refresh token."""
@@ -300,3 +309,56 @@ async def test_a_revoked_token_is_over(there: World) -> None:
     assert ended == []
     await there.desk.revoke(told["refresh_token"], "default")
     assert ended == ["bad_credentials"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_program_ends_the_token_it_got_in_another_realm(there: World) -> None:
+    """It proves itself by its key: neither who asks in its realm otherwise, nor another program, can."""
+    await there.fill()
+    await there.joins("lab2")
+    token = (await there.by_secret(realm="lab2"))["access_token"]
+    assert (await there.auth.token(token)).full == "ann@lab2"
+    assert not (await there.desk.introspect(token, "default"))["active"]
+    assert not (await there.desk.introspect(token, "default", "swp_2"))["active"]
+    assert (await there.desk.introspect(token, "default", KEY))["sub"] == "ann@lab2"
+    for program in (None, "swp_2"):
+        await there.desk.revoke(token, "default", program)
+        assert (await there.auth.token(token)).full == "ann@lab2"
+    await there.desk.revoke(token, "default", KEY)
+    with pytest.raises(BadCredentials):
+        await there.auth.token(token)
+
+
+@pytest.mark.parametrize(
+    ("scope", "asked", "error"),
+    [
+        ("operator@mobile", None, "invalid_scope"),
+        ("operator@mobile viewer", "viewer", ""),
+        ("viewer admin", None, "invalid_scope"),
+        ("viewer call:/reset", None, ""),
+        (None, "viewer@*", ""),
+        (None, "viewer@rover", "invalid_scope"),
+    ],
+)
+@pytest_twisted.ensureDeferred
+async def test_a_scope_that_names_robots_is_for_those_of_ones_own_realm(
+    there: World, scope: str | None, asked: str | None, error: str
+) -> None:
+    """In another one other robots have these names; nor does anybody administer there by it."""
+    await there.fill(scope)
+    await there.joins("lab2")
+    assert (await there.by_secret(asked))["access_token"]
+    if error:
+        assert await there.error(there.by_secret(asked, "lab2")) == error
+    else:
+        assert (await there.by_secret(asked, "lab2"))["access_token"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_realm_that_the_user_is_not_of_is_like_one_that_there_is_not(there: World) -> None:
+    """The program is told the same."""
+    await there.fill()
+    await there.store.write(queries.add_realm, "lab2")
+    assert [await there.error(there.by_secret(realm=each)) for each in ("lab2", "lab3", "")] == [
+        "invalid_target"
+    ] * 3

@@ -200,3 +200,31 @@ def test_what_is_kept_of_a_robot_is_counted(left: Left) -> None:
     left.recordings.open()
     assert kept_of(left.folder, rover) == (2, 500)
     assert kept_of(left.folder / "nowhere", rover) == (0, 0)
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_was_recorded_in_a_realm_goes_when_the_robot_is_taken_out_of_it(left: Left) -> None:
+    """What another realm has recorded of it stays, and so does all that the database knows nothing of."""
+    rover = left.recording("a", "rover")
+    with left.store.database.begin() as session:
+        for realm in ("lab1", "lab2", "lab3"):
+            queries.add_realm(session, realm)
+            queries.share_robot(session, rover, realm)
+    for id, realm in (("b", "lab1"), ("c", "lab2"), ("d", "lab3")):
+        entry = Entry(
+            id, rover, "rover", 1, "ann", ("/odom",), (), BEGUN, 1000, 60.0, realm=realm, home=DEFAULT_REALM
+        )
+        entry.state = State.COMPLETE
+        (left.folder / f"{id}.json").write_bytes(text_of(entry))
+        (left.folder / f"{id}.mcap").write_bytes(b"x")
+    with left.store.database.begin() as session:
+        for realm, told in (("lab1", True), ("lab3", False)):
+            queries.unshare_robot(session, rover, realm)
+            if told:
+                data = {"realm": realm}
+                queries.append_audit(
+                    session, at=BEGUN + 1, actor="cli:root", action="robot.unshare", target="rover", data=data
+                )
+    left.recordings.open()
+    await left.sweep()
+    assert sorted(entry.id for entry in left.recordings.library) == ["a", "c", "d"]

@@ -128,6 +128,22 @@ async def test_who_sees_what(room: Room) -> None:
 
 
 @pytest_twisted.ensureDeferred
+async def test_what_one_may_not_use_is_not_named(room: Room) -> None:
+    """Neither told, nor found by its name; what a program says of it is."""
+    room.noticing.happened("call.begun", "user:bob", room.robots["rover"], {"service": "/reset"})
+    await room.writer.flush()
+    await room.write("ann", {"kind": "x", "robot": "rover", "data": {"service": "/reset"}})
+    wanted = {"data.service": "/reset"}
+    assert await room.reads("ann") == ["x", "call.begun"]
+    assert await room.reads("ann", **wanted) == []
+    assert await room.reads("ann", source="ann", **wanted) == ["x"]
+    with room.store.database.begin() as s:
+        queries.grant_right(s, room.robots["rover"], "operator", user_id=room.people["ann"].user_id)
+    await room.access.refresh()
+    assert await room.reads("ann", **wanted) == ["x", "call.begun"]
+
+
+@pytest_twisted.ensureDeferred
 async def test_a_right_that_comes_or_goes_counts_at_once(room: Room) -> None:
     """For what was written before as well."""
     await room.write("ann", {"kind": "x", "robot": "rover"})

@@ -14,8 +14,8 @@ from relay_server.journal import Journal
 from relay_server.memory.limits import NOTED_AT_ONCE
 from relay_server.memory.noticing import Noticing
 from relay_server.memory.writer import Writer
-from relay_server.registry import Registry
-from tests.relay_server.memory import FIBONACCI, TRIGGER, TWIST, Person, Time, World
+from relay_server.registry import SETTLING_SECONDS, Registry
+from tests.relay_server.memory import FIBONACCI, STRING, TRIGGER, TWIST, Person, Time, World
 
 GO = {"linear": {"x": 0.5}}
 
@@ -81,6 +81,74 @@ def test_an_event_of_a_shared_robot_is_told_in_all_its_realms(time: Time, notes:
     assert {each.source for each in notes.events} == {"relay:rover"}
 
 
+def test_who_is_of_another_realm_takes_no_room_from_what_becomes_of_a_robot(time: Time, notes: Notes) -> None:
+    """His share is his own, and what the robot does by itself has another."""
+    registry = Registry(time)
+    registry.share({1: frozenset({"lab2"})})
+    registry.presence(1, "rover", "lab")
+    noticing = Noticing(notes, registry, time, time)
+    for _ in range(NOTED_AT_ONCE + 5):
+        noticing.happened("call.begun", "user:ann@lab2", 1, {"service": "/reset"})
+    noticing.happened("robot.offline", "relay", 1, {})
+    told = [(each.realm, each.kind) for each in notes.events]
+    assert told[-2:] == [("lab", "robot.offline"), ("lab2", "robot.offline")]
+    assert [kind for _, kind in told].count("call.begun") == NOTED_AT_ONCE
+
+
+def test_a_recording_is_told_at_home_without_what_is_in_it(time: Time, notes: Notes) -> None:
+    """Its realm is that of who recorded; why it ended may name what not everybody of the robot may see."""
+    registry = Registry(time)
+    registry.share({1: frozenset({"lab2"})})
+    registry.presence(1, "rover", "lab")
+    noticing = Noticing(notes, registry, time, time)
+    noticing.happened("recording.started", "user:ann@lab2", 1, {"recording": "r1", "address": "192.0.2.1"})
+    ended = {"recording": "r1", "state": "complete", "reason": "you may not view /eye", "bytes": 5}
+    noticing.happened("recording.ended", "user:ann@lab2", 1, ended)
+    told = [(each.realm, each.kind, each.user, json.loads(each.data)) for each in notes.events]
+    assert told == [
+        ("lab2", "recording.started", "ann", {"recording": "r1"}),
+        ("lab2", "recording.ended", "ann", {"recording": "r1", "state": "complete"}),
+    ]
+
+
+def test_nodes_that_come_and_go_are_told_once(world: World, notes: Notes) -> None:
+    """While the robot is there and has told of those that it had when it came, however it tells of them."""
+    noticing = Noticing(notes, world.registry, world.clock.seconds, world.clock.seconds)
+    world.registry.on_modules(noticing.modules)
+
+    def told(**graph: Any) -> list[tuple[str, str]]:
+        notes.events.clear()
+        world.registry.graph(world.robot, link.Graph(**graph))
+        return [(each.kind, json.loads(each.data)["module"]) for each in notes.events]
+
+    world.robot_comes()
+    assert told(nodes={"/late": {}}) == []
+    world.wait(SETTLING_SECONDS)
+    assert told(nodes={"/arm": {}, "/_hidden": {}}) == [("module.up", "/arm")]
+    assert told(nodes={"/arm": {}}) == told(topics={"/x": link.Topic(types=[])}) == []
+    assert told(nodes={"/arm": None, "/nobody": None}) == [("module.down", "/arm")]
+    assert told(full=True, nodes={"/late": {}, "/eye": {}})[:2] == [
+        ("module.up", "/eye"),
+        ("module.down", "/base"),
+    ]
+    notes.events.clear()
+    world.robot_goes()
+    world.wait(60.0)
+    world.robot_comes()
+    assert notes.events == []
+
+
+def test_nodes_that_flutter_take_no_room_from_what_becomes_of_the_robot(
+    notes: Notes, noticing: Noticing, time: Time
+) -> None:
+    """They have a share of their own."""
+    rover = Registry(time).presence(1, "rover", "lab")
+    noticing.modules(rover, [f"/n{each}" for each in range(NOTED_AT_ONCE + 5)], [])
+    noticing.happened("robot.stopped", "relay", 1, {})
+    assert (len(notes.events), notes.dropped) == (NOTED_AT_ONCE + 1, 5)
+    assert notes.events[0][2:6] == ("relay:rover", "module.up", 1, None)
+
+
 def test_a_refused_login_is_told_in_full(notes: Notes, noticing: Noticing) -> None:
     """Only administrators read it."""
     data = {"user": "ann", "address": "192.0.2.1", "reason": "bad_credentials"}
@@ -127,7 +195,9 @@ def test_a_flood_in_one_realm_leaves_room_in_others(notes: Notes, noticing: Noti
 
 def test_what_is_not_for_the_memory_leaves_nothing(notes: Notes, noticing: Noticing) -> None:
     """Nor does what is about a robot that is gone."""
-    noticing.happened("video.joined", "user:ann", 1, {})
+    noticing.happened("client.refused", "user:ann", 1, {})
+    for kind in ("video.joined", "video.left"):
+        noticing.happened(kind, "user:ann", 1, {"camera": "/eye", "snapshot": True})
     noticing.happened("robot.online", "relay", 2, {})
     assert notes.events == []
 
@@ -214,6 +284,21 @@ def test_the_first_command_that_moves_is_noted_once_for_each_time_of_control(wor
     world.wait(0.5, ann)
     drive(ann)
     assert notes == [begun, begun]
+
+
+def test_the_first_message_to_a_topic_is_noted(world: World) -> None:
+    """Not the next ones, also when something has changed meanwhile; not to one that moves the robot."""
+    world.robot_comes(encodings=["json"])
+    ann = world.person()
+    world.robot_joins()
+    world.registry.described(world.robot, link.Describe(motion=link.MotionPolicy(types=[TWIST])))
+    notes = noticed(ann)
+    for topic in ("/chatter", "chatter", "/other", "/chatter"):
+        ann.says("publish", topic=topic, type=STRING, msg={"data": "x"})
+    ann.says("publish", topic="/cmd_vel", type=TWIST, msg={})
+    world.registry.described(world.robot, link.Describe(motion=link.MotionPolicy(types=[TWIST])))
+    ann.says("publish", topic="/chatter", type=STRING, msg={"data": "x"})
+    assert notes == [("publication.begun", {"topic": each}) for each in ("/chatter", "/other")]
 
 
 def test_a_call_of_the_robot_is_noted_when_it_begins_and_ends(world: World) -> None:

@@ -9,6 +9,7 @@ from rdflib import OWL, RDF, RDFS, XSD, Graph, Literal, URIRef
 
 from relay_protocol import jsontext
 from relay_protocol.ros_types import TypeRegistry
+from relay_server.openapi.answers import Robot
 from relay_server.resources.background import Background
 from relay_server.resources.describing import (
     Place,
@@ -16,6 +17,7 @@ from relay_server.resources.describing import (
     members_graph,
     module_graph,
     param_graph,
+    robot_graph,
     state_graph,
 )
 from relay_server.resources.forms import Form
@@ -83,6 +85,9 @@ def used() -> set[str]:
         ),
         members_graph("modules", {"modules": [module], "next": "x", "online": True}, PLACE),
         module_graph(module, PLACE),
+        robot_graph(
+            {"name": "rover", **dict.fromkeys(Robot.__annotations__, "x"), "clients": [shown]}, PLACE
+        ),
         camera_graph({**camera, "streams": [shown], "addresses": addresses}, PLACE),
         param_graph(Param("n:p", b'{"a":"\\u0001"}'), PLACE),
         said(ODD, {"stamp": {"sec": 1, "nanosec": 2}}),
@@ -101,6 +106,7 @@ def test_every_word_that_is_used_has_a_meaning() -> None:
     """Whoever follows its address finds it there."""
     found = used()
     assert {"Topic", "Camera", "value", "dateTime", "doubleList", "base64Text", "snapshot"} <= found
+    assert {"Robot", "collections", *Robot.__annotations__} <= found
     assert {"Module", "publishes", "subscribes", "services"} <= found
     assert found <= set(WORDS)
 

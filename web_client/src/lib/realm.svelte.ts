@@ -2,7 +2,7 @@
 import { Refusal } from './api'
 import { app } from './app.svelte'
 import { administrators, why, type Directory } from './administration'
-import { about, gather, groups, users, type Asked, type Part, type RealmAbout } from './realm'
+import { about, gather, groups, Overtaken, users, type Asked, type Part, type RealmAbout } from './realm'
 
 const PART = 100
 /** Who types is done when he pauses. */
@@ -25,6 +25,8 @@ export class Attempt {
       return true
     } catch (error) {
       this.failure = why(error)
+      // What this would stand beside goes.
+      if (error instanceof Overtaken && error.gone) app.tell('error', this.failure)
       if (error instanceof Refusal && error.status === 401) app.checkSession()
       return false
     } finally {

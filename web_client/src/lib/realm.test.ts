@@ -1,5 +1,5 @@
 import { afterEach, beforeEach, describe, expect, it, vi } from 'vitest'
-import { addUser, AT_ONCE, gather, grant, held, leave, rights, tokens, type Asked } from './realm'
+import { addUser, AT_ONCE, changeUser, gather, grant, held, leave, Overtaken, rights, tokens, type Asked } from './realm'
 
 const HERE = '/api/v1/realm'
 let asked: { path: string; init: RequestInit }[]
@@ -10,7 +10,8 @@ beforeEach(() => {
   answers = []
   vi.stubGlobal('fetch', async (path: string, init: RequestInit) => {
     asked.push({ path, init })
-    return new Response(JSON.stringify(answers.shift() ?? {}))
+    const answer = answers.shift() ?? {}
+    return answer instanceof Response ? answer : new Response(JSON.stringify(answer), { headers: { ETag: '"now"' } })
   })
 })
 
@@ -18,17 +19,20 @@ afterEach(() => {
   vi.unstubAllGlobals()
 })
 
+const MISSING = () => new Response('{}', { status: 404 })
 const RIGHT = { robot: 'rover', holder: '@night shift', level: 'viewer', allow: [], deny: ['call:/x'] } as const
 
 describe('what is asked of a realm', () => {
   it('has names in its address, the mark of a group as it is', async () => {
-    await grant({ ...RIGHT, allow: [], deny: ['call:/x'] })
+    answers = [MISSING()]
+    await grant({ ...RIGHT, allow: [], deny: ['call:/x'] }, null)
     await leave('crew', 'ä?b')
     expect(asked.map(({ path, init }) => [init.method, path])).toEqual([
+      ['GET', `${HERE}/rights/rover/@night%20shift`],
       ['PUT', `${HERE}/rights/rover/@night%20shift`],
       ['DELETE', `${HERE}/groups/crew/members/%C3%A4%3Fb`],
     ])
-    expect(JSON.parse(String(asked[0]?.init.body))).toEqual({ level: 'viewer', allow: [], deny: ['call:/x'] })
+    expect(JSON.parse(String(asked[1]?.init.body))).toEqual({ level: 'viewer', allow: [], deny: ['call:/x'] })
   })
 
   it('says that it comes from the portal, which the cookie of a session takes', async () => {
@@ -70,9 +74,44 @@ it('gathers a list of parts up to a length', async () => {
   expect([all.items.length, all.next]).toEqual([2500, ''])
 })
 
-it('finds the right that somebody has already, however his name is written', async () => {
-  const page = { rights: [{ ...RIGHT, holder: 'ann' }], next: '' }
-  answers = [page, page]
+it('finds the right that somebody has already', async () => {
+  answers = [{ ...RIGHT, holder: 'ann' }, MISSING()]
   expect((await held('rover', 'Ann'))?.holder).toBe('ann')
   expect(await held('rover', '@ann')).toBeNull()
+})
+
+describe('what several administrators change', () => {
+  const ann = { user: 'ann', admin: false, disabled: false, password: true, guest: false, groups: ['crew'] }
+  const shown = { ...RIGHT, allow: [], deny: ['call:/x'] }
+  const sent = (name: string) => new Headers(asked.at(-1)?.init.headers).get(name)
+
+  it('is changed only as it was shown', async () => {
+    answers = [ann, { ...ann, admin: true }]
+    expect((await changeUser(ann, { admin: true })).admin).toBe(true)
+    expect([asked.at(-1)?.init.method, sent('If-Match')]).toEqual(['PATCH', '"now"'])
+    answers = [shown, shown]
+    await grant({ ...shown, level: 'owner' }, shown)
+    expect([asked.at(-1)?.init.method, sent('If-Match')]).toEqual(['PUT', '"now"'])
+    answers = [MISSING(), shown]
+    await grant(shown, null)
+    expect([sent('If-Match'), sent('If-None-Match')]).toEqual([null, '*'])
+  })
+
+  it('is left as it is when somebody else was there before', async () => {
+    for (const now of [{ ...ann, disabled: true }, { ...ann, groups: [] }, MISSING()]) {
+      asked = []
+      answers = [now]
+      const failure: unknown = await changeUser(ann, { admin: true }).catch((error: unknown) => error)
+      expect(failure).toBeInstanceOf(Overtaken)
+      expect((failure as Overtaken).gone).toBe(now instanceof Response)
+      expect(asked).toHaveLength(1)
+    }
+    answers = [shown]
+    await expect(grant(shown, null)).rejects.toBeInstanceOf(Overtaken)
+  })
+
+  it('is left as it is when somebody else is there in between', async () => {
+    answers = [ann, new Response('{}', { status: 412 })]
+    await expect(changeUser(ann, { admin: true })).rejects.toThrow('Somebody else has changed this meanwhile')
+  })
 })

@@ -1,5 +1,5 @@
 /** An administrator's own realm over HTTP (protocol/SPEC.md 1.16). Times in Unix seconds. */
-import { request } from './api'
+import { Refusal, request } from './api'
 import type { Level } from './types'
 
 export interface RealmAbout {
@@ -86,8 +86,58 @@ function path(...names: string[]): string {
   return [HERE, ...names.map((name) => encodeURIComponent(name).replace(/^%40/, '@'))].join('/')
 }
 
-async function told<T>(method: string, at: string, body?: unknown): Promise<T> {
-  return (await (await request(method, at, body)).json()) as T
+async function told<T>(method: string, at: string, body?: unknown, headers: Record<string, string> = {}): Promise<T> {
+  return (await (await request(method, at, body, { headers })).json()) as T
+}
+
+/** What was to be changed is not as it was shown: somebody else was there meanwhile, and nothing was done. */
+export class Overtaken extends Error {
+  constructor(
+    /** Whether it is there no more. */
+    readonly gone: boolean,
+  ) {
+    super(
+      gone
+        ? 'Somebody else has removed this meanwhile: nothing was done.'
+        : 'Somebody else has changed this meanwhile: it is shown as it is now, and nothing was done. Do it again if it is still right.',
+    )
+  }
+}
+
+/** Changes something that still is as it was shown; what others do in between has the relay refuse it.
+ *
+ * @param shown null: there was none
+ * @throws Overtaken
+ */
+async function changed<T extends object>(method: string, at: string, shown: T | null, body: unknown): Promise<T> {
+  const tag = await tagOf(at, shown)
+  try {
+    return await told<T>(method, at, body, tag === null ? { 'If-None-Match': '*' } : { 'If-Match': tag })
+  } catch (error) {
+    throw error instanceof Refusal && error.status === 412 ? new Overtaken(false) : error
+  }
+}
+
+/** The entity tag of what is as it was shown; null of what is not there. */
+async function tagOf<T extends object>(at: string, shown: T | null): Promise<string | null> {
+  const answer = await found(at)
+  if (answer === null) {
+    if (shown !== null) throw new Overtaken(true)
+    return null
+  }
+  const now = (await answer.json()) as Record<string, unknown>
+  const same = Object.entries(shown ?? { none: null }).every(([name, value]) => JSON.stringify(value) === JSON.stringify(now[name]))
+  if (!same) throw new Overtaken(false)
+  return answer.headers.get('ETag')
+}
+
+async function found(at: string): Promise<Response | null> {
+  try {
+    return await request('GET', at)
+  } catch (error) {
+    if (error instanceof Refusal && error.status === 404) return null
+    throw error
+  }
 }
 
 async function part<T>(what: string, at: string, asked: Asked): Promise<Part<T>> {
@@ -117,7 +167,8 @@ export function addUser(name: string, password: string, admin: boolean): Promise
 }
 
 export type UserChange = Partial<{ password: string; disabled: boolean; admin: boolean }>
-export const changeUser = (user: string, change: UserChange) => told<RealmUser>('PATCH', path('users', user), change)
+/** @param shown the user as he was shown to who changes him */
+export const changeUser = (shown: RealmUser, change: UserChange) => changed('PATCH', path('users', shown.user), shown, change)
 export const removeUser = (user: string) => request('DELETE', path('users', user))
 export const revokeToken = (id: string) => request('DELETE', path('tokens', id))
 
@@ -126,8 +177,9 @@ export const removeGroup = (group: string) => request('DELETE', path('groups', g
 export const join = (group: string, user: string) => request('PUT', path('groups', group, 'members', user))
 export const leave = (group: string, user: string) => request('DELETE', path('groups', group, 'members', user))
 
-export function grant({ robot, holder, level, allow, deny }: RealmRight): Promise<RealmRight> {
-  return told('PUT', path('rights', robot, holder), { level, allow, deny })
+/** @param shown what the holder has there, as it was shown to who gives the right; null: none */
+export function grant({ robot, holder, level, allow, deny }: RealmRight, shown: RealmRight | null): Promise<RealmRight> {
+  return changed('PUT', path('rights', robot, holder), shown, { level, allow, deny })
 }
 export const revoke = ({ robot, holder }: RealmRight) => request('DELETE', path('rights', robot, holder))
 
@@ -145,7 +197,5 @@ export async function gather<T>(ask: (asked: Asked) => Promise<Part<T>>, most: n
 
 /** The right that a holder has on a robot, or null. */
 export async function held(robot: string, holder: string): Promise<RealmRight | null> {
-  const { items } = await gather((asked) => rights({ ...asked, robot }), 25 * AT_ONCE)
-  const wanted = holder.toLowerCase()
-  return items.find((right) => right.holder === wanted) ?? null
+  return ((await (await found(path('rights', robot, holder)))?.json()) ?? null) as RealmRight | null
 }

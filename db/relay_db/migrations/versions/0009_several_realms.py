@@ -53,5 +53,14 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
+    # Without their homes nobody could say whether guests may come in, nor whose password is theirs.
+    op.execute("DELETE FROM user_account WHERE id IN (SELECT user_id FROM guest_account)")
+    other = (
+        "DELETE FROM robot_right WHERE coalesce("
+        "(SELECT realm_id FROM user_account WHERE id = robot_right.user_id), "
+        "(SELECT realm_id FROM user_group WHERE id = robot_right.group_id)) "
+        "<> (SELECT realm_id FROM robot WHERE id = robot_right.robot_id)"
+    )
+    op.execute(other)
     op.drop_table("guest_account")
     op.drop_table("robot_realm")

@@ -1,0 +1,313 @@
+"""Nothing of another realm, nor of what somebody has no right on, can be told by how long its refusal takes.
+
+Times themselves say little on a machine that does other things as well. What makes them is the questions that are put
+to the database: a relay with everything in it is asked over a real socket for what there is and for what nobody has,
+and its questions are counted.
+"""
+
+from __future__ import annotations
+
+import http.client
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_twisted
+from sqlalchemy import event
+from switchboard_http import Answer, ask
+from twisted.internet import reactor
+from twisted.internet.task import deferLater
+from twisted.internet.threads import deferToThread
+
+from relay_db import queries
+from relay_db.queries import NewEntry
+from relay_server import passwords
+from relay_server.alerts import kinds
+from relay_server.config import Endpoint, Settings
+from relay_server.edges.documents import operations
+from relay_server.openapi import document
+from relay_server.recording.library import FOLDER, Entry, State, text_of
+from relay_server.resources import HEADER
+from relay_server.service import Relay
+
+NOBODYS = "nobody"
+UNKNOWN = {"root@lab1": ("secret",), "toad@lab1": ("secret", "hidden")}
+"""Robots of which somebody may not know: those of another realm, and those of his own that he has no right on."""
+
+HEX = "0123456789abcdef"
+IDS = {"secret": HEX * 2, "hidden": HEX[::-1] * 2, NOBODYS: "0" * 32}
+"""Of directory entries and recordings, by the robot they are about."""
+
+BODIES: dict[str, Any] = {
+    "topics/{name}": {"value": {"data": "x"}},
+    "params/{name}": {"value": 1},
+    "suppress": {"resource": "/mode", "ms": 100},
+    "inhibit": {"resource": "/mode", "ms": 100},
+    "hold": {"resource": "/mode", "ms": 100},
+    "recordings": {"topics": ["/mode"]},
+}
+"""What is sent, by the end of the path, where it is not an empty object."""
+
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+}
+
+Asked = Counter[str]
+"""Questions that were put to the database: named queries, and statements of SQL."""
+
+
+class Lab:
+    """A relay that counts what it asks the database. Nothing happens in it but what is asked for.
+
+    There are realms lab1 and lab2. In the first ``root`` administers, ``toad`` operates ``mobile`` and has no right on
+    ``hidden``; in the second there is ``secret``. Of ``secret`` and ``hidden`` there is an entry in the directory, a
+    recording, and an alert that lasts.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        nowhere = Endpoint("127.0.0.1", 0)
+        self._folder = folder
+        self.relay = Relay(
+            reactor,
+            Settings(folder, f"sqlite:///{folder}/relay.db", nowhere, nowhere, refresh=3600.0, requests=0.0),
+        )
+        self.alerts = {NOBODYS: "0" * 16}
+        self.moment = ""
+        self._asked: list[str] = []
+        self._under_way = 0
+
+    async def opens(self, monkeypatch: pytest.MonkeyPatch) -> Lab:
+        """Fill the database, and begin to count."""
+        relay, store = self.relay, self.relay._store
+        relay._database.upgrade()
+        robots = self._filled()
+        for name in ("read", "write"):
+            monkeypatch.setattr(store, name, self._counting(getattr(store, name)))
+        await relay.start()
+        for name in ("secret", "hidden"):
+            robot = relay._registry.presence(robots[name].id, name, robots[name].realm)
+            relay._alerts.alerts.tell(robot, kinds.STOP, "", "error", "stopped")
+        self.alerts |= {each.robot: each.id for each in relay._alerts.alerts.book}
+        await relay._alerts.alerts.flush()
+        # What it asks by itself, now and then, is none of what is counted here.
+        alerts, quota, leases = relay._alerts.alerts, relay._memory._quota, relay._directory.leases
+        for each in (relay._polling, relay._purging, alerts._looking, quota._looking, leases.looking):
+            each.stop()
+        # For ever: tokens that were proved once need not be looked up, however slow the machine is.
+        relay._access.in_step(float("inf"))
+        event.listen(relay._database._engine, "before_cursor_execute", self._statement)
+        own = await self._sent(ask, "toad@lab1", "GET", "/api/v1/robots/mobile/control")
+        self.moment = own.headers[HEADER]
+        return self
+
+    def _filled(self) -> dict[str, queries.RobotRecord]:
+        with self.relay._database.begin() as session:
+            for realm in ("lab1", "lab2"):
+                queries.add_realm(session, realm)
+            users = {
+                name: queries.add_user(session, name, None, admin=name == "root", realm=realm)
+                for name, realm in (("root", "lab1"), ("toad", "lab1"), ("mole", "lab2"))
+            }
+            for user in users.values():
+                hash = passwords.token_hash(user.full)
+                queries.create_token(session, user.id, hash, kind="access", expires=None, now=1.0)
+            places = {"mobile": "lab1", "hidden": "lab1", "secret": "lab2"}
+            robots = {name: queries.add_robot(session, name, realm=realm) for name, realm in places.items()}
+            queries.grant_right(session, robots["mobile"].id, "operator", user_id=users["toad"].id)
+            (self._folder / FOLDER).mkdir()
+            for name, user in (("secret", users["mole"]), ("hidden", users["root"])):
+                robot, id = robots[name], IDS[name]
+                new = NewEntry(user.realm, "service", name, "http://a/", "", robot.id, user.id, "{}", 86400.0)
+                queries.register_entry(session, new, id, 4e9, of_user=10, of_realm=10)
+                entry = Entry(id, robot.id, name, user.id, user.name, ("/mode",), (), 1.0, 1, 1.0)
+                entry.realm, entry.state = user.realm, State.COMPLETE
+                (self._folder / FOLDER / f"{id}.json").write_bytes(text_of(entry))
+                (self._folder / FOLDER / f"{id}.mcap").write_bytes(b"")
+        return robots
+
+    def _counting(self, do: Callable[..., Any]) -> Callable[..., Any]:
+        async def counted(query: Callable[..., Any], *args: Any, **named: Any) -> Any:
+            self._asked.append(f"{do.__name__} {query.__qualname__}")
+            self._under_way += 1
+            try:
+                return await do(query, *args, **named)
+            finally:
+                self._under_way -= 1
+
+        return counted
+
+    def _statement(self, connection: Any, cursor: Any, statement: str, *more: Any) -> None:
+        self._asked.append(statement)
+
+    async def _sent(self, way: Callable[..., Answer], who: str, *args: Any, **named: Any) -> Answer:
+        answer: Answer = await deferToThread(way, self.relay.http_port, *args, token=who, **named)
+        # Nobody waits for what he has put on record, nor for the first look of a stream.
+        while self._under_way:
+            await self._turn()
+        return answer
+
+    async def _turn(self) -> None:
+        await deferLater(reactor, 0.001)  # type: ignore[arg-type]  # to mypy it is a module
+
+    async def asks(
+        self, way: Callable[..., Answer], fresh: bool, who: str, *args: Any, **named: Any
+    ) -> tuple[Answer, Asked]:
+        """Somebody's request: the answer, and what the database was asked for it.
+
+        :param fresh: everything may have changed since the last one
+        """
+        # Of one cause no more than so much is put on record.
+        self.relay._journal._causes.clear()
+        if fresh:
+            await self.relay._access.refresh()
+        self._asked.clear()
+        answer = await self._sent(way, who, *args, **named)
+        asked = Counter(self._asked)
+        if isinstance(answer, Begun):
+            answer.ends()
+        # A stream goes on until it is seen that its reader has left.
+        while self._under_way or self.relay._ports[0].factory.cap._counts:
+            await self._turn()
+        return answer, asked
+
+    async def same(
+        self, who: str, *requests: Callable[[str], tuple[Any, ...]], way: Callable[..., Answer] = ask
+    ) -> None:
+        """See that the same is asked of the database for what somebody may not know of as for what there is not.
+
+        :param requests: each makes a method, an address, a body and headers of the name of a robot
+        """
+        for made in requests:
+            nobodys = made(NOBODYS)
+            # What is found out once and then known.
+            await self.asks(way, False, who, *nobodys[:3], headers=nobodys[3])
+            for fresh in (True, False):
+                answer, asked = await self.asks(way, fresh, who, *nobodys[:3], headers=nobodys[3])
+                for name in UNKNOWN[who]:
+                    method, path, body, headers = made(name)
+                    other = await self.asks(way, fresh, who, method, path, body, headers=headers)
+                    where = f"{who} {method} {path}"
+                    assert other[0].status == answer.status != 500, where
+                    assert other[1] == asked, where
+
+
+@pytest_twisted.async_yield_fixture
+async def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Lab]:
+    """One for a test."""
+    made = Lab(tmp_path)
+    await made.opens(monkeypatch)
+    yield made
+    await made.relay.stop()
+
+
+class Begun(Answer):
+    """What has come of an answer that goes on: its first line."""
+
+    def __init__(self, connection: http.client.HTTPConnection) -> None:
+        self._connection = connection
+        self._response = connection.getresponse()
+        self.status = self._response.status
+        self.headers = self._response.headers
+        self.body = self._response.readline()
+
+    def ends(self) -> None:
+        """Leave."""
+        self._response.close()
+        self._connection.close()
+
+
+def stream(port: int, method: str, path: str, body: Any, *, headers: dict[str, str], token: str) -> Begun:
+    """As :func:`switchboard_http.ask`, of what has no end; :meth:`Begun.ends` must follow."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    connection.request(method, path, headers={**headers, "Authorization": f"Bearer {token}"})
+    return Begun(connection)
+
+
+def of_a_robot() -> list[tuple[str, str]]:
+    """All that the HTTP interface does with a robot, by its own description."""
+    paths = document(operations(), "1", "session")["paths"]
+    return [(method, path) for path in paths if "{robot}" in path for method in paths[path]]
+
+
+@pytest.mark.parametrize("who", UNKNOWN)
+@pytest_twisted.ensureDeferred
+async def test_robots_that_one_may_not_know_of_ask_as_much_as_those_there_are_not(lab: Lab, who: str) -> None:
+    """By whatever operation: robots of another realm, and those of the own one on which there is no right."""
+
+    def request(method: str, path: str) -> Callable[[str], tuple[Any, ...]]:
+        query = "?topic=/camera" if path.startswith("/robots/") else ""
+        body = None if method == "get" else BODIES.get(path.partition("{robot}/")[2], {})
+
+        def made(robot: str) -> tuple[Any, ...]:
+            at = path.replace("{robot}", robot).replace("{name}", "mode").replace("{id}", IDS[robot])
+            return method.upper(), at + query, body, {HEADER: lab.moment}
+
+        return made
+
+    await lab.same(who, *(request(*each) for each in of_a_robot()))
+    # Where it may be known, more happens: so it would be seen.
+    known = await lab.asks(ask, True, "toad@lab1", "GET", "/api/v1/robots/mobile/topics")
+    unknown = await lab.asks(ask, True, "toad@lab1", "GET", "/api/v1/robots/hidden/topics")
+    assert (known[0].status, unknown[0].status) == (200, 404)
+    assert known[1] != unknown[1]
+
+
+@pytest.mark.parametrize("who", UNKNOWN)
+@pytest_twisted.ensureDeferred
+async def test_so_do_websockets(lab: Lab, who: str) -> None:
+    """That of a robot, and that of a camera."""
+    await lab.same(
+        who,
+        lambda robot: ("GET", f"/robots/{robot}", None, UPGRADE),
+        lambda robot: ("GET", f"/robots/{robot}/video/ws?topic=/camera", None, UPGRADE),
+    )
+
+
+@pytest.mark.parametrize("who", UNKNOWN)
+@pytest_twisted.ensureDeferred
+async def test_so_does_what_is_about_them(lab: Lab, who: str) -> None:
+    """Entries of the directory, recordings, alerts, by their own ids; and whatever a robot is named for."""
+    recording = "/api/v1/robots/mobile/recordings"
+    order = {"do": "call", "service": "/where"}
+    entry = {"kind": "service", "name": "x", "address": "http://a/"}
+    await lab.same(
+        who,
+        *(
+            lambda robot, method=method: (method, f"/api/v1/directory/{IDS[robot]}", None, {})
+            for method in ("GET", "PUT", "DELETE")
+        ),
+        lambda robot: ("GET", f"/api/v1/directory/robot:{robot}", None, {}),
+        lambda robot: ("GET", f"{recording}/{IDS[robot]}", None, {}),
+        lambda robot: ("GET", f"{recording}/{IDS[robot]}/file", None, {}),
+        lambda robot: ("POST", f"{recording}/{IDS[robot]}/stop", {}, {}),
+        lambda robot: ("DELETE", f"{recording}/{IDS[robot]}", None, {}),
+        lambda robot: ("POST", f"/api/v1/alerts/{lab.alerts[robot]}/acknowledge", {}, {}),
+        lambda robot: ("GET", f"/api/v1/alerts?robot={robot}", None, {}),
+        lambda robot: ("GET", f"/api/v1/events?robot={robot}", None, {}),
+        lambda robot: ("GET", f"/api/v1/events?robot={robot}&count=true", None, {}),
+        lambda robot: ("GET", f"/api/v1/events?robot={robot}", None, {"Accept": "text/csv"}),
+        lambda robot: ("GET", f"/api/v1/directory?robot={robot}", None, {}),
+        lambda robot: ("POST", "/api/v1/events", {"kind": "x", "robot": robot}, {}),
+        lambda robot: ("POST", "/api/v1/directory", {**entry, "robot": robot}, {}),
+        lambda robot: ("POST", "/api/v1/tickets", {"robot": robot}, {}),
+        lambda robot: ("POST", "/api/v1/fleet", {**order, "robots": [robot]}, {}),
+    )
+
+
+@pytest.mark.parametrize("who", UNKNOWN)
+@pytest_twisted.ensureDeferred
+async def test_so_do_streams(lab: Lab, who: str) -> None:
+    """Of events, of the directory, of a topic."""
+    events = {"Accept": "text/event-stream"}
+    await lab.same(
+        who,
+        lambda robot: ("GET", f"/api/v1/events?robot={robot}", None, events),
+        lambda robot: ("GET", f"/api/v1/directory?robot={robot}", None, events),
+        lambda robot: ("GET", f"/api/v1/robots/{robot}/topics/mode", None, events),
+        way=stream,
+    )
