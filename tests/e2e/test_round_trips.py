@@ -185,7 +185,7 @@ def plain(graph: Graph) -> Graph:
         if isinstance(value, Literal) and value.datatype == XSD.string:
             value = Literal(str(value))
         elif isinstance(value, Literal) and value.datatype == XSD.double:
-            value = Literal(f"{float(value):.14e}", datatype=XSD.double)
+            value = Literal(f"{float(value):.15e}", datatype=XSD.double)
         made.add((subject, predicate, value))
     return made
 
