@@ -16,7 +16,7 @@ import psutil
 import psycopg
 import pytest
 from switchboard_client import Client
-from switchboard_drive import LET_GO_SECONDS
+from switchboard_drive import LET_GO_SECONDS, understood
 from switchboard_http import ask, log_in
 from switchboard_processes import Process, running
 from switchboard_pulse import Pulse
@@ -78,7 +78,7 @@ def drives(relay: Relay, robot: Robot, token: str) -> None:
     driver.begin_with_a_pause(LET_GO_SECONDS)
     driver.start()
     try:
-        wait_for("the robot moves", robot.moving)
+        understood(driver, robot)
     finally:
         driver.stop()
     wait_for("the robot stands", lambda: not robot.moving())
@@ -290,10 +290,13 @@ def test_a_relay_on_postgresql_does_the_daily_round(postgres: str, tmp_path: Pat
                 relay.run_cli("right", "revoke", "driver", "rover").check_returncode()
                 with Pulse() as pulse:
                     begun = time.monotonic()
-                    closed = close_of(client)
+                    with pytest.raises(ConnectionClosed) as closed:
+                        while True:
+                            client.receive()
                     assert time.monotonic() - begun < 1 + pulse.lost()
-                assert closed.code == 4403
-                assert "revoked" in closed.reason
+                # Who reads so late on a busy machine that the relay gives up waiting for his answer sees no frame.
+                assert closed.value.rcvd is None or closed.value.rcvd.code == 4403
+            assert "is cut: your right on this robot was revoked" in relay.log
             assert not (relay.data / "switchboard.db").exists()
     assert "Traceback" not in relay.log
     assert "postgres" not in relay.log

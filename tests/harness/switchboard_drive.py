@@ -30,6 +30,16 @@ UNDERSTOOD_SECONDS = 5.0
 """Who has let go, and commands, moves the robot long before."""
 
 
+def understood(driver: Driver, robot: Robot) -> None:
+    """Wait until a robot moves by a driver: whom a busy machine has not understood to have let go does so once more."""
+    for _ in range(12):
+        with contextlib.suppress(AssertionError):
+            wait_for("the robot moves", robot.moving, UNDERSTOOD_SECONDS)
+            return
+        driver.let_go(LET_GO_SECONDS)
+    wait_for("the robot moves", robot.moving)
+
+
 class Drive:
     """A relay, a robot and somebody driving, each behind a proxy that can be broken."""
 
@@ -96,20 +106,12 @@ class Drive:
         driver.begin_with_a_pause(LET_GO_SECONDS)
         driver.start()
         try:
-            self._let_go(driver)
+            understood(driver, self.robot)
             self._driven(driver)
         finally:
             # Whoever goes on would keep control from all tests that follow.
             driver.stop()
         self.stands()
-
-    def _let_go(self, driver: Driver) -> None:
-        """Whom a busy machine has not understood to have let go does so once more."""
-        for _ in range(8):
-            with contextlib.suppress(AssertionError):
-                wait_for("the robot moves", self.robot.moving, UNDERSTOOD_SECONDS)
-                return
-            driver.let_go(LET_GO_SECONDS)
 
     def stop(self) -> None:
         """End everything."""
