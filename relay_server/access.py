@@ -21,7 +21,7 @@ from relay_protocol.errors import Refused
 from relay_protocol.realms import full_name
 from relay_protocol.rights import Grant, Operation, Rules, Verdict
 from relay_protocol.scopes import Scope
-from relay_server.clock import Turns
+from relay_server.clock import Coalesced
 from relay_server.store import Store
 
 K = TypeVar("K")
@@ -36,11 +36,14 @@ IN_STEP_SECONDS = 1.0
 ADMITTED = 4096
 """Users on robots that are remembered, in the same way."""
 
-NO_ROBOT = -1
-"""The number of none."""
+_NOBODYS = -1
+"""The number of no robot."""
 
 LISTED = 1024
 """Users, with the scopes of their tokens, whose robots are remembered."""
+
+NO_ROBOT = "there is no such robot, or you have no right on it"
+"""What who asks for one is told: the same of both."""
 
 Changed = Callable[[], None]
 Revoked = Callable[[Refused], None]
@@ -139,7 +142,7 @@ class Access:
         self._robots: OrderedDict[tuple[int, str | None], list[tuple[RobotRecord, Rules]]] = OrderedDict()
         """By user and scope; those of the longest unchanged are forgotten first."""
         self._refreshed = 0
-        self._refreshing = Turns(self._refresh)
+        self._refreshing = Coalesced(self._refresh)
         self._proved: OrderedDict[str, Principal] = OrderedDict()
         """By the hash of a token, who it proved. Kept in step with the database as permits are."""
         self._admitted: OrderedDict[tuple[int, str | None, int], None] = OrderedDict()
@@ -342,5 +345,5 @@ def _standing_on(
 ) -> tuple[RobotRecord | None, _Standing]:
     """A robot, and how the principal stands to it; of none as much is asked."""
     robot = find(session)
-    key = principal.user_id, principal.token_id, NO_ROBOT if robot is None else robot.id
+    key = principal.user_id, principal.token_id, _NOBODYS if robot is None else robot.id
     return robot, _standing(session, {key}, now)[key]

@@ -84,7 +84,7 @@ async def within(
     return await running
 
 
-class Turns:
+class Coalesced:
     """Work that many ask for: it is never under way twice, and all who ask while it is share the next time.
 
     :param work: what is done; were it to ask itself, it would wait for ever

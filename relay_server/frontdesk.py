@@ -14,7 +14,7 @@ from relay_protocol import link
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server import closing, passwords
-from relay_server.access import Access, Permit, Principal
+from relay_server.access import NO_ROBOT, Access, Permit, Principal
 from relay_server.auth import NAMED, Authenticator, Opening, TooManyTries, named_realm, session_token
 from relay_server.budget import Budgets
 from relay_server.channel import Channels
@@ -25,7 +25,7 @@ from relay_server.journal import Journal
 from relay_server.local import RelayNode
 from relay_server.numbers import Numbers
 from relay_server.origins import Origins
-from relay_server.overview import NO_ROBOT, Overview
+from relay_server.overview import Overview
 from relay_server.people import People
 from relay_server.registry import Presence, Registry
 from relay_server.rounds import Rounds

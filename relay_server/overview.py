@@ -10,14 +10,12 @@ import msgspec
 from relay_db import queries
 from relay_protocol.errors import NotFound
 from relay_protocol.rights import Rules
-from relay_server.access import Access, Principal
+from relay_server.access import NO_ROBOT, Access, Principal
 from relay_server.control import Desks, view
 from relay_server.linkmeter import Reading, joined, milliseconds
 from relay_server.people import Asker, People, clients
 from relay_server.registry import Presence, Registry
 from relay_server.session import Session
-
-NO_ROBOT = "there is no such robot, or you have no right on it"
 
 
 class Overview:

@@ -195,7 +195,7 @@ class Relay:
         below = {
             "recordings": partial(recordings.below, self._reactor, keeper, keys),
             "people": partial(presence.below, desk.overview),
-            **resources.parts(self._reactor, desk, guests, self._workshop, moments, now_ns, time.time),
+            **resources.parts(self._reactor, desk, guests, keys, self._workshop, moments, now_ns, time.time),
             **{
                 part: partial(control_edge.below, self._console, moments, part) for part in control_edge.PARTS
             },

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from relay_db import queries
 from relay_server.access import Access
 from relay_server.alerts.hub import Alerts
-from relay_server.clock import Turns
+from relay_server.clock import Coalesced
 from relay_server.control import Desks
 from relay_server.directory.leases import Leases
 from relay_server.registry import Registry
@@ -48,7 +48,7 @@ class TakingUp:
         self._sweep = sweep
         self._seconds = seconds
         self._revision = -1
-        self._turns = Turns(self._look)
+        self._turns = Coalesced(self._look)
 
     async def begin(self) -> None:
         """Before anything is served: what there is counts as taken up.

@@ -295,7 +295,8 @@ class Change:
             label=label,
             now=self._wall(),
         )
-        added = queries.list_programs(self.session, user.id)[-1]
+        added = queries.find_program(self.session, key)
+        assert added is not None
         self.audit("program.add", user.full, id=added.id, key=key, scope=scope, label=label)
         return added, secret
 

@@ -204,15 +204,15 @@ class OwnChange(Change):
         """:param more: patterns that the rights on a robot are to have beside those there are
         :raises NoRoom: there would be too many
         """
-        for where, most in (
-            ({}, MOST_PATTERNS),
-            ({"robot_id": robot.id}, MOST_PATTERNS_OF_A_ROBOT),
-        ):
-            if more > 0 and queries.count_patterns(self.session, realm=self.realm, **where) + more > most:
-                raise NoRoom(
-                    f"the rights in a realm have {MOST_PATTERNS} patterns at most, those on one robot "
-                    f"{MOST_PATTERNS_OF_A_ROBOT}; use wildcards, or remove some first"
-                )
+        if more <= 0:
+            return
+        all_ = queries.count_patterns(self.session, realm=self.realm)
+        of_robot = queries.count_patterns(self.session, realm=self.realm, robot_id=robot.id)
+        if all_ + more > MOST_PATTERNS or of_robot + more > MOST_PATTERNS_OF_A_ROBOT:
+            raise NoRoom(
+                f"the rights in a realm have {MOST_PATTERNS} patterns at most, those on one robot "
+                f"{MOST_PATTERNS_OF_A_ROBOT}; use wildcards, or remove some first"
+            )
 
     def see_room(self, what: str) -> None:
         """:param what: one of :data:`MOST`, of which there is to be one more

@@ -94,6 +94,7 @@ def change_user(
     if admin is False:
         change.see_another(found, "take administration from")
     if password_hash is not None and found.home is not None:
+        # In words of its own: those of the query would name an account of another realm.
         raise Refused(
             "this is a guest of your realm, whose password is that of an account elsewhere: it is changed there"
         )

@@ -7,8 +7,6 @@ what the user may know of gets to the second and third, and only of that it is c
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Collection
-from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass
 from math import inf
 
@@ -23,8 +21,9 @@ from relay_server.alerts import kinds, rules
 from relay_server.alerts.book import Change
 from relay_server.alerts.heap import Heap, Waiting
 from relay_server.alerts.message import Message, Notice, Undelivered
+from relay_server.alerts.office import Office
 from relay_server.bucket import TokenBucket
-from relay_server.clock import Clock, Timer, cancel
+from relay_server.clock import Timer, cancel
 
 MOST = 200
 """Notices that wait for one rule, and again those that wait for the end of quiet hours."""
@@ -54,20 +53,6 @@ JUDGE_SECONDS = 2.0
 LONGEST_REST = 3600.0
 """Wall clocks are set: nobody sleeps longer on the word of one."""
 
-Send = Callable[[AlertRuleRecord, Message], Awaitable[None]]
-"""Sends a message by a rule's way. Raises :class:`Undelivered`."""
-
-Room = Callable[[AlertRuleRecord, bool], AbstractAsyncContextManager[None]]
-"""What a message has to wait for, and keeps while it is sent. The last says whether the one before has failed."""
-
-Known = Callable[[AlertRuleRecord, Collection[AlertRecord]], Awaitable[set[str]]]
-"""Which of these alerts the rule's user may still know of, by their ids. Raises :class:`SwitchboardError`."""
-
-
-def at_once(rule: AlertRuleRecord, doubtful: bool) -> AbstractAsyncContextManager[None]:
-    """The room of a way on which no message waits."""
-    return nullcontext()
-
 
 @dataclass
 class Status:
@@ -80,28 +65,6 @@ class Status:
     failed: int = 0
     reason: str = ""
     last: float | None = None
-
-
-@dataclass(frozen=True)
-class Office:
-    """What all deliveries share.
-
-    :param wall: Unix time in seconds
-    :param random: 0 to 1
-    :param name: makes a fresh name for a message
-    :param lasts: whether the alert of this id is not over
-    :param realms: those that the robot of an alert is of
-    """
-
-    clock: Clock
-    wall: Callable[[], float]
-    random: Callable[[], float]
-    name: Callable[[], str]
-    send: Send
-    known: Known
-    lasts: Callable[[str], bool]
-    realms: Callable[[AlertRecord], Collection[str]]
-    room: Room = at_once
 
 
 class Delivery:

@@ -16,7 +16,7 @@ from relay_protocol.rights import Rules
 from relay_server.access import Access, Principal
 from relay_server.alerts import kinds, rules
 from relay_server.alerts.book import Book, Change, Key, Moment
-from relay_server.alerts.delivery import Office, Room, Send, at_once
+from relay_server.alerts.office import Office, Room, Send, at_once
 from relay_server.alerts.senses import LOOK_SECONDS, Senses, Thresholds, stopped_by
 from relay_server.alerts.tellers import Tellers
 from relay_server.channel import Channels

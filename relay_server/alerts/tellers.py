@@ -9,8 +9,9 @@ from twisted.internet.defer import DeferredSemaphore
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_server.alerts import delivery, kinds, rules
 from relay_server.alerts.book import Change
-from relay_server.alerts.delivery import Delivery, Office, Status
+from relay_server.alerts.delivery import Delivery, Status
 from relay_server.alerts.kinds import Event
+from relay_server.alerts.office import Office
 
 PLACES = 2
 """Messages of one user under way at a time."""

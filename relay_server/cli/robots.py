@@ -119,8 +119,8 @@ def share(app: App, name: str, realm: str, as_json: bool) -> None:
     with app.change() as change:
         found, realm = change.robot(name), known_realm(change.session, realm)
         change.share_robot(found, realm)
-    told = {"robot": found.full, "realm": realm, "shared": True}
-    tell(as_json, told, f"Robot {found.full} is of the realm {realm} too.")
+    answer = {"robot": found.full, "realm": realm, "shared": True}
+    tell(as_json, answer, f"Robot {found.full} is of the realm {realm} too.")
 
 
 @robot.command(epilog=examples("switchboard robot unshare mobile@lab1 lab2 --yes"))
@@ -138,8 +138,8 @@ def unshare(app: App, name: str, realm: str, yes: bool, as_json: bool) -> None:
     with app.change() as change:
         found, realm = change.robot(name), known_realm(change.session, realm)
         change.unshare_robot(found, realm)
-    told = {"robot": found.full, "realm": realm, "shared": False}
-    tell(as_json, told, f"Robot {found.full} is not of the realm {realm} any more.")
+    answer = {"robot": found.full, "realm": realm, "shared": False}
+    tell(as_json, answer, f"Robot {found.full} is not of the realm {realm} any more.")
 
 
 @robot.command(epilog=examples("switchboard robot remove rover --yes"))

@@ -13,7 +13,7 @@ from relay_db.queries import EntryAsk, EntryPlace, EntryRecord, NewEntry, NewMem
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.rights import Operation
-from relay_server.access import Access, Principal
+from relay_server.access import NO_ROBOT, Access, Principal
 from relay_server.bucket import Buckets
 from relay_server.directory.addresses import check_address
 from relay_server.directory.changes import Change, Changes
@@ -28,7 +28,6 @@ from relay_server.resources.states import see_match, tag_of
 from relay_server.store import Store
 
 NO_ENTRY = "there is no such entry, or none for you"
-NO_ROBOT = "there is no such robot, or you have no right on it"
 
 
 class TooManyChanges(Refused):

@@ -159,33 +159,28 @@ RESUME = Operation(
     answers={200: Told("it may move", StopAnswer, headers=_DATED)},
     errors=(409, 412, 428),
 )
-SUPPRESS = Operation(
-    method="POST",
-    path=f"{ROBOT}/suppress",
-    tag="control",
-    summary="Command a topic for moments",
-    body=Suppress,
-    answers={200: Told("as it was asked", Suppress)},
-    errors=(409,),
-)
-INHIBIT = Operation(
-    method="POST",
-    path=f"{ROBOT}/inhibit",
-    tag="control",
-    summary="Have a topic say nothing for a time",
-    body=Inhibit,
-    answers={200: Told("as it was asked", Inhibit)},
-    errors=(409,),
-)
-HOLD = Operation(
-    method="POST",
-    path=f"{ROBOT}/hold",
-    tag="control",
-    summary="Have a topic say its last value for a time",
-    more="What it says meanwhile nobody gets: in its place the last value before comes again.",
-    body=Inhibit,
-    answers={200: Told("as it was asked", Inhibit)},
-    errors=(409,),
+
+
+def _subsuming(part: str, body: type[msgspec.Struct], summary: str, more: str = "") -> Operation:
+    return Operation(
+        method="POST",
+        path=f"{ROBOT}/{part}",
+        tag="control",
+        summary=summary,
+        more=more,
+        body=body,
+        answers={200: Told("as it was asked", body)},
+        errors=(409,),
+    )
+
+
+SUPPRESS = _subsuming("suppress", Suppress, "Command a topic for moments")
+INHIBIT = _subsuming("inhibit", Inhibit, "Have a topic say nothing for a time")
+HOLD = _subsuming(
+    "hold",
+    Inhibit,
+    "Have a topic say its last value for a time",
+    "What it says meanwhile nobody gets: in its place the last value before comes again.",
 )
 
 

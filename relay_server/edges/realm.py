@@ -7,7 +7,8 @@ from typing import Any
 from urllib.parse import quote
 
 from klein import Klein
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import astuple
 from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
@@ -88,6 +89,29 @@ class RealmPages:
             return await self._desk.change(principal, _address(request), work, *args)
 
         return self._api.answer(request, change())
+
+    def _added(
+        self,
+        request: Request,
+        kind: type[Struct],
+        work: Callable[..., Any],
+        place: str,
+        named: str,
+        *args: Any,
+    ) -> Any:
+        """Add something that the body says, and answer with it.
+
+        :param kind: of the body, whose fields follow the others in ``work``
+        :param place: the collection it is in, where ``named`` is the field that has its name
+        """
+
+        async def add() -> Any:
+            principal = await self._admitted(request, changes=True)
+            new = (None if each is UNSET else each for each in astuple(body_of(request, kind)))
+            told = await self._desk.change(principal, _address(request), work, *args, *new)
+            return _made(request, told, place, told[named])
+
+        return self._api.answer(request, add())
 
     @app.route("/", methods=["GET"])
     @described(operations.ABOUT)
@@ -173,14 +197,7 @@ class RealmPages:
     @app.route("/users/<name>/programs", methods=["POST"])
     @described(operations.NEW_PROGRAM)
     def add_program(self, request: Request, name: str) -> Any:
-        return self._api.answer(request, self._add_program(request, name))
-
-    async def _add_program(self, request: Request, name: str) -> Any:
-        principal = await self._admitted(request, changes=True)
-        new = body_of(request, NewProgram)
-        wanted = name, new.label, None if new.scope is UNSET else new.scope
-        told = await self._desk.change(principal, _address(request), people.add_program, *wanted)
-        return _made(request, told, "programs", told["key"])
+        return self._added(request, NewProgram, people.add_program, "programs", "key", name)
 
     @app.route("/programs/<key>", methods=["DELETE"])
     @described(operations.REVOKE_PROGRAM)
@@ -197,13 +214,7 @@ class RealmPages:
     @app.route("/groups", methods=["POST"])
     @described(operations.NEW_GROUP)
     def add_group(self, request: Request) -> Any:
-        return self._api.answer(request, self._add_group(request))
-
-    async def _add_group(self, request: Request) -> Any:
-        principal = await self._admitted(request, changes=True)
-        new = body_of(request, NewGroup)
-        told = await self._desk.change(principal, _address(request), people.add_group, new.name)
-        return _made(request, told, "groups", told["group"])
+        return self._added(request, NewGroup, people.add_group, "groups", "group")
 
     @app.route("/groups/<name>", methods=["GET"])
     @described(operations.GROUP)
@@ -235,15 +246,7 @@ class RealmPages:
     @app.route("/robots", methods=["POST"])
     @described(operations.NEW_ROBOT)
     def add_robot(self, request: Request) -> Any:
-        return self._api.answer(request, self._add_robot(request))
-
-    async def _add_robot(self, request: Request) -> Any:
-        principal = await self._admitted(request, changes=True)
-        new = body_of(request, NewRobot)
-        told = await self._desk.change(
-            principal, _address(request), machines.add_robot, new.name, new.description
-        )
-        return _made(request, told, "robots", told["robot"])
+        return self._added(request, NewRobot, machines.add_robot, "robots", "robot")
 
     @app.route("/robots/<name>", methods=["GET"])
     @described(operations.ROBOT)
@@ -304,13 +307,7 @@ class RealmPages:
     @app.route("/robot-groups", methods=["POST"])
     @described(operations.NEW_ROBOT_GROUP)
     def add_robot_group(self, request: Request) -> Any:
-        return self._api.answer(request, self._add_robot_group(request))
-
-    async def _add_robot_group(self, request: Request) -> Any:
-        principal = await self._admitted(request, changes=True)
-        new = body_of(request, NewRobotGroup)
-        told = await self._desk.change(principal, _address(request), machines.add_group, new.name)
-        return _made(request, told, "robot-groups", told["group"])
+        return self._added(request, NewRobotGroup, machines.add_group, "robot-groups", "group")
 
     @app.route("/robot-groups/<name>", methods=["GET"])
     @described(operations.ROBOT_GROUP)

@@ -33,13 +33,12 @@ from relay_server.edges.realm_shapes import (
     RobotChange,
     UserChange,
 )
+from relay_server.edges.tagged import TAGGED, answers
 from relay_server.openapi import Answer, Operation, Parameter, header, query
 
 HERE = "/api/v1/realm"
 
 PAGED = UNTYPED
-_TAGGED = {"ETag": "names this state"}
-_UNCHANGED = Answer("it is as it is known", headers=_TAGGED)
 _MATCH = header("If-Match", "entity tags: only if it is one of these; `*`: only if it is there")
 _NONE = header("If-None-Match", "`*`: only if it is not there")
 _PLACED = {"Location": "its address"}
@@ -80,14 +79,13 @@ def _operation(
 
 
 def _page(path: str, summary: str, page: Any, *others: Parameter, **more: Any) -> Operation:
-    return _told(path, summary, Answer("a page", page), parameters=(*PAGED, *others), **more)
+    return _told(path, summary, "a page", page, parameters=(*PAGED, *others), **more)
 
 
-def _told(path: str, summary: str, answer: Answer, **more: Any) -> Operation:
+def _told(path: str, summary: str, words: str, body: Any, **more: Any) -> Operation:
     """What is read, with an entity tag."""
-    answers = {200: answer._replace(headers=_TAGGED), 304: _UNCHANGED}
     parameters = (*more.pop("parameters", ()), KNOWN)
-    return _operation("GET", path, summary, answers, parameters=parameters, **more)
+    return _operation("GET", path, summary, answers(words, body), parameters=parameters, **more)
 
 
 def _new(path: str, summary: str, body: Any, made: Any, **more: Any) -> Operation:
@@ -99,7 +97,12 @@ def _gone(path: str, summary: str, **more: Any) -> Operation:
     return _operation("DELETE", path, summary, {204: Answer("done")}, **more)
 
 
-ABOUT = _told("", "The caller's own realm", Answer("the realm", RealmAbout))
+def _joined(path: str, what: str) -> Operation:
+    answers = {204: Answer(f"the {what} is in it")}
+    return _operation("PUT", path, f"Put a {what} into a group", answers, named="group", errors=(409,))
+
+
+ABOUT = _told("", "The caller's own realm", "the realm", RealmAbout)
 CHANGE = _operation(
     "PATCH",
     "",
@@ -111,12 +114,12 @@ CHANGE = _operation(
 
 USERS = _page("users", "Users", RealmUsers)
 NEW_USER = _new("users", "Add a user", NewUser, RealmUser)
-USER = _told("users/{name}", "One user", Answer("the user", RealmUser), named="user")
+USER = _told("users/{name}", "One user", "the user", RealmUser, named="user")
 CHANGE_USER = _operation(
     "PATCH",
     "users/{name}",
     "Change a user",
-    {200: Answer("the user", RealmUser, headers=_TAGGED)},
+    {200: Answer("the user", RealmUser, headers=TAGGED)},
     named="user",
     more="Nobody disables himself, or ceases to be an administrator by his own hand.",
     parameters=(_MATCH,),
@@ -140,26 +143,19 @@ REVOKE_PROGRAM = _gone("programs/{key}", "Make a program worthless with its toke
 
 GROUPS = _page("groups", "Groups of users", RealmGroups)
 NEW_GROUP = _new("groups", "Add a group", NewGroup, RealmGroup)
-GROUP = _told("groups/{name}", "One group", Answer("the group", RealmGroup), named="group")
+GROUP = _told("groups/{name}", "One group", "the group", RealmGroup, named="group")
 REMOVE_GROUP = _gone("groups/{name}", "Remove a group with its rights", named="group")
-JOIN = _operation(
-    "PUT",
-    "groups/{name}/members/{user}",
-    "Put a user into a group",
-    {204: Answer("the user is in it")},
-    named="group",
-    errors=(409,),
-)
+JOIN = _joined("groups/{name}/members/{user}", "user")
 LEAVE = _gone("groups/{name}/members/{user}", "Take a user out of a group", named="group")
 
 ROBOTS = _page("robots", "Robots, enrolled or not", RealmRobots)
 NEW_ROBOT = _new("robots", "Add a robot", NewRobot, RealmNewRobot)
-ROBOT = _told("robots/{name}", "One robot", Answer("the robot", RealmRobot), named="robot")
+ROBOT = _told("robots/{name}", "One robot", "the robot", RealmRobot, named="robot")
 CHANGE_ROBOT = _operation(
     "PATCH",
     "robots/{name}",
     "Change a robot's description",
-    {200: Answer("the robot", RealmRobot, headers=_TAGGED)},
+    {200: Answer("the robot", RealmRobot, headers=TAGGED)},
     named="robot",
     parameters=(_MATCH,),
     body=RobotChange,
@@ -186,18 +182,9 @@ REVOKE_KEY = _gone(
 
 ROBOT_GROUPS = _page("robot-groups", "Groups of robots", RealmRobotGroups)
 NEW_ROBOT_GROUP = _new("robot-groups", "Add a group of robots", NewRobotGroup, RealmRobotGroup)
-ROBOT_GROUP = _told(
-    "robot-groups/{name}", "One group of robots", Answer("the group", RealmRobotGroup), named="group"
-)
+ROBOT_GROUP = _told("robot-groups/{name}", "One group of robots", "the group", RealmRobotGroup, named="group")
 REMOVE_ROBOT_GROUP = _gone("robot-groups/{name}", "Remove a group; its robots stay", named="group")
-JOIN_ROBOT = _operation(
-    "PUT",
-    "robot-groups/{name}/members/{member}",
-    "Put a robot into a group",
-    {204: Answer("the robot is in it")},
-    named="group",
-    errors=(409,),
-)
+JOIN_ROBOT = _joined("robot-groups/{name}/members/{member}", "robot")
 LEAVE_ROBOT = _gone("robot-groups/{name}/members/{member}", "Take a robot out of a group", named="group")
 
 RIGHTS = _page(
@@ -208,14 +195,14 @@ RIGHTS = _page(
     query("user", "of this user only, also by groups"),
     errors=(404,),
 )
-RIGHT = _told("rights/{name}/{holder}", "One right", Answer("the right", RealmRight), named="robot")
+RIGHT = _told("rights/{name}/{holder}", "One right", "the right", RealmRight, named="robot")
 GRANT = _operation(
     "PUT",
     "rights/{name}/{holder}",
     "Give a right, in the place of the one the holder has on the robot",
     {
-        200: Answer("in the place of another", RealmRight, headers=_TAGGED),
-        201: Answer("given", RealmRight, headers={**_PLACED, **_TAGGED}),
+        200: Answer("in the place of another", RealmRight, headers=TAGGED),
+        201: Answer("given", RealmRight, headers={**_PLACED, **TAGGED}),
     },
     named="robot",
     parameters=(_MATCH, _NONE),

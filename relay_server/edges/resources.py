@@ -255,6 +255,7 @@ def parts(
     clock: Clock,
     front: FrontDesk,
     guests: Guests,
+    keys: Idempotency,
     threads: Threads,
     moments: Moments,
     clock_ns: Callable[[], int],
@@ -263,13 +264,14 @@ def parts(
     """What serves the addresses below a robot's :data:`PARTS`, its goals, cameras and modules.
 
     :param guests: those who are there by HTTP, whatever they ask for
+    :param keys: requests that were sent with a key
     :param threads: do what takes long
     :param clock_ns: monotonic nanoseconds
     :param wall: Unix time in seconds
     """
     desk = ResourceDesk(clock, guests, threads, clock_ns, wall)
     pursued = GoalDesk(clock, guests, desk, wall)
-    once = Once(Idempotency(clock), desk)
+    once = Once(keys, desk)
     shared = clock, desk, moments, once, Giving(pursued, once)
     below = {part: partial(_below, *shared, part) for part in PARTS}
     return {

@@ -14,10 +14,10 @@ from relay_server.edges.asked import known_tags
 from relay_server.openapi import Answer
 from relay_server.resources.states import tag_of
 
-_TAGGED = {"ETag": "names this state"}
+TAGGED = {"ETag": "names this state"}
 
 
-def answers(words: str, body: Any, headers: Mapping[str, str] = _TAGGED) -> dict[int, Answer]:
+def answers(words: str, body: Any, headers: Mapping[str, str] = TAGGED) -> dict[int, Answer]:
     """How such answers are described, for an operation that takes ``KNOWN``.
 
     :param body: its type

@@ -22,15 +22,13 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
 from relay_protocol.limits import ROBOT_NAME
 from relay_protocol.rights import Rules
-from relay_server.access import Access, Principal
+from relay_server.access import NO_ROBOT, Access, Principal
 from relay_server.memory import guarding
 from relay_server.memory.asks import Ask, Forms, chosen
 from relay_server.memory.limits import ASKED, ASKED_EACH, DATA, LOOKS, RECENT, SEVERAL
 from relay_server.memory.quota import Quota
 from relay_server.memory.writer import Writer
 from relay_server.store import Store
-
-NO_ROBOT = "there is no such robot, or you have no right on it"
 
 PROGRAMS = 1024
 """Tokens of which it is known whose name they write under; the longest unused are forgotten first."""

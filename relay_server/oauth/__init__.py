@@ -4,7 +4,8 @@
 ``edges/oauth.py``.
 """
 
-from relay_server.oauth.desk import Granted, OAuthDesk, OAuthError, TokenAsk
+from relay_server.oauth.desk import OAuthDesk
 from relay_server.oauth.digest import Digest, Proof, StaleNonce
+from relay_server.oauth.terms import Granted, OAuthError, TokenAsk
 
 __all__ = ["Digest", "Granted", "OAuthDesk", "OAuthError", "Proof", "StaleNonce", "TokenAsk"]

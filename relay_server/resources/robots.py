@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from relay_protocol import jsontext
 from relay_protocol.errors import NotFound
-from relay_server.access import Principal
+from relay_server.access import NO_ROBOT, Principal
 from relay_server.resources.listing import Listing
 from relay_server.resources.states import tag_of
 
@@ -42,7 +42,7 @@ class RobotDesk:
         for each in await self._overview.robots(principal):
             if each["name"] == name:
                 return each
-        raise NotFound("there is no such robot, or you have no right on it")
+        raise NotFound(NO_ROBOT)
 
 
 def robot_tag(robot: Mapping[str, Any]) -> str:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 from switchboard_browser import chromium
@@ -61,6 +62,16 @@ class World:
         """An operator's connection, who wants to hear errors."""
         with self.relay.connect("rover", self.operator) as client:
             client.send(op="set_level", level="error")
+            yield client
+
+    @contextmanager
+    def over_http(self) -> Iterator[httpx.Client]:
+        """Requests of the operator's to the robot's resources."""
+        with httpx.Client(
+            base_url=f"http://127.0.0.1:{self.relay.http_port}/api/v1/robots/rover",
+            headers={"Authorization": f"Bearer {self.operator}"},
+            timeout=90,
+        ) as client:
             yield client
 
 

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_http import Answer, ask, log_in
-from switchboard_relay import Relay
-from switchboard_small_robot import SmallRobot
+from switchboard_http import ask, log_in
+from switchboard_labs import REALM, TwoRealms
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from relay_server.edges.documents import operations
 from relay_server.openapi import document
 
-REALM = "/api/v1/realm"
 PASSWORD = "correct horse"
 BODIES = {
     "users": {"name": "new"},
@@ -30,43 +28,16 @@ BODIES = {
 }
 
 
-class Labs:
-    """A relay with two realms, and an administrator ``root`` and a robot ``mobile`` in each; ``mole`` is a user,
-    a group, a robot and a group of robots of lab2 and of the default realm.
-    """
+class Labs(TwoRealms):
+    """``mole`` is a user, a group, a robot and a group of robots of lab2 and of the default realm."""
 
     def __init__(self, folder: Path) -> None:
-        self.relay = Relay(folder, "--requests-per-second", "0")
-        self.tokens: dict[str, str] = {}
-        self.robots: list[SmallRobot] = []
-        for lab in ("lab1", "lab2"):
-            self.relay.cli("realm", "add", lab)
-            self.tokens[f"root@{lab}"] = self.relay.user(f"root@{lab}", admin=True)
-            robot = SmallRobot(self.relay, f"mobile@{lab}", {"/where": lambda *_: {"message": "here"}})
-            self.robots.append(robot.comes())
+        super().__init__(folder)
         for end in ("@lab2", ""):
             self.tokens[f"mole{end}"] = self.relay.user(f"mole{end}")
             self.relay.cli("group", "add", f"mole{end}")
             self.relay.cli("robot", "add", f"mole{end}")
             self.relay.cli("robot", "group", "add", f"mole{end}", f"mole{end}")
-
-    def ask(self, who: str, method: str, path: str = "", body: Any = None, **headers: str) -> Answer:
-        """What somebody is answered about the realm."""
-        sent = {name.replace("_", "-"): value for name, value in headers.items()}
-        port, token = self.relay.http_port, self.tokens.get(who, "")
-        return ask(port, method, f"{REALM}{path}", body, headers=sent, token=token)
-
-    def do(self, method: str, path: str, body: Any = None, who: str = "root@lab1") -> Any:
-        """Something that has to succeed."""
-        answer = self.ask(who, method, path, body)
-        assert answer.status < 300, answer.body
-        return answer.json if answer.body else None
-
-    def stop(self) -> None:
-        """End everything."""
-        for each in self.robots:
-            each.goes()
-        self.relay.stop()
 
 
 @pytest.fixture(scope="module")
@@ -86,12 +57,6 @@ def of_a_realm() -> list[tuple[str, str]]:
         if path.startswith(REALM)
         for method in paths[path]
     ]
-
-
-def log_of(labs: Labs) -> list[dict[str, Any]]:
-    """The audit log."""
-    told: list[dict[str, Any]] = labs.relay.cli("audit", "list", "--limit", "1000")
-    return told
 
 
 def test_a_user_is_added_given_a_right_and_cut_when_it_is_taken(labs: Labs) -> None:
@@ -126,9 +91,7 @@ def test_a_user_is_added_given_a_right_and_cut_when_it_is_taken(labs: Labs) -> N
     assert ask(port, "GET", "/api/v1/robots", token=token).status == 401
     labs.do("DELETE", "/users/luigi")
     assert labs.ask("root@lab1", "GET", "/users/luigi").status == 404
-    entries = [
-        each for each in log_of(labs) if "luigi" in each["target"] and each["actor"].startswith("user:")
-    ]
+    entries = [each for each in labs.log() if "luigi" in each["target"] and each["actor"].startswith("user:")]
     assert {(each["actor"], each["origin"]) for each in entries if each["action"] != "login"} == {
         ("user:root@lab1", "127.0.0.1")
     }

@@ -9,60 +9,34 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_http import Answer, ask
-from switchboard_relay import Relay
-from switchboard_small_robot import SmallRobot
+from switchboard_http import ask
+from switchboard_labs import LABS, REALM, TwoRealms
 from websockets.exceptions import ConnectionClosed
 
-REALM = "/api/v1/realm"
 
-
-class Labs:
-    """A relay with two realms: in each an administrator ``root``, a user ``toad`` who operates the robot ``mobile``,
-    and a token of the administrator for administration alone.
+class Labs(TwoRealms):
+    """In each realm a user ``toad`` who operates the robot, and a token of the administrator for administration alone:
+    ``narrow@lab1``.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.relay = Relay(folder, "--requests-per-second", "0")
-        self.tokens: dict[str, str] = {}
-        self.robots: list[SmallRobot] = []
-        for lab in ("lab1", "lab2"):
-            self.relay.cli("realm", "add", lab)
-            self.tokens[lab] = self.relay.user(f"root@{lab}", admin=True)
+        super().__init__(folder)
+        for lab in LABS:
             narrow = self.relay.cli("token", "create", f"root@{lab}", "--scope", "admin")
-            self.tokens[f"narrow {lab}"] = narrow["token"]
+            self.tokens[f"narrow@{lab}"] = narrow["token"]
             self.relay.user(f"toad@{lab}")
-            robot = SmallRobot(self.relay, f"mobile@{lab}", {"/where": lambda *_: {"message": "here"}})
-            self.robots.append(robot.comes())
             self.relay.cli("right", "grant", f"toad@{lab}", f"mobile@{lab}", "operator")
         self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.relay.http_port}")
-
-    def ask(self, who: str, method: str, path: str, body: Any = None) -> Answer:
-        """What somebody is answered about the realm."""
-        return ask(self.relay.http_port, method, f"{REALM}{path}", body, token=self.tokens[who])
-
-    def do(self, method: str, path: str, body: Any = None, who: str = "lab1") -> Any:
-        """Something that has to succeed."""
-        answer = self.ask(who, method, path, body)
-        assert answer.status < 300, answer.body
-        return answer.json if answer.body else None
 
     def token_for(self, program: Any, **fields: str) -> httpx.Response:
         """A token by client credentials."""
         auth = httpx.BasicAuth(program["key"], program["secret"])
         return self.http.post("/oauth/token", data={"grant_type": "client_credentials", **fields}, auth=auth)
 
-    def log(self) -> list[dict[str, Any]]:
-        """The audit log."""
-        told: list[dict[str, Any]] = self.relay.cli("audit", "list", "--limit", "1000")
-        return told
-
     def stop(self) -> None:
         """End everything."""
         self.http.close()
-        for each in self.robots:
-            each.goes()
-        self.relay.stop()
+        super().stop()
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +50,7 @@ def labs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Labs]:
 def test_a_program_made_over_http_acts_until_it_is_removed(labs: Labs) -> None:
     """It gets tokens by its secret, within its scope and what its user may; removed, all of them are worthless."""
     wanted = {"label": "caller", "scope": "viewer call:/where"}
-    made = labs.ask("lab1", "POST", "/users/toad/programs", wanted)
+    made = labs.ask("root@lab1", "POST", "/users/toad/programs", wanted)
     program = made.json
     assert (made.status, made.headers["Location"]) == (201, f"{REALM}/programs/{program['key']}")
     assert {name: program[name] for name in wanted} == wanted
@@ -98,7 +72,7 @@ def test_a_program_made_over_http_acts_until_it_is_removed(labs: Labs) -> None:
     assert ask(port, "GET", "/api/v1/session", token=token).status == 401
     assert labs.token_for(program).status_code == 401
     assert labs.do("GET", "/users/toad/programs")["programs"] == []
-    assert labs.ask("lab1", "DELETE", f"/programs/{program['key']}").status == 404
+    assert labs.ask("root@lab1", "DELETE", f"/programs/{program['key']}").status == 404
     entries = [each for each in labs.log() if each["action"].startswith("program.")]
     assert {(each["action"], each["actor"], each["origin"]) for each in entries} == {
         ("program.add", "user:root@lab1", "127.0.0.1"),
@@ -109,19 +83,19 @@ def test_a_program_made_over_http_acts_until_it_is_removed(labs: Labs) -> None:
 
 def test_a_token_for_administration_alone_makes_no_program_but_revokes_one(labs: Labs) -> None:
     """By a program of his own its holder would have all that its user may."""
-    refused = labs.ask("narrow lab1", "POST", "/users/root/programs", {})
+    refused = labs.ask("narrow@lab1", "POST", "/users/root/programs", {})
     assert (refused.status, refused.json["code"]) == (403, "refused")
     program = labs.do("POST", "/users/toad/programs", {})
     assert program["scope"] is None
-    assert labs.ask("narrow lab1", "DELETE", f"/programs/{program['key']}").status == 204
+    assert labs.ask("narrow@lab1", "DELETE", f"/programs/{program['key']}").status == 204
     assert labs.token_for(program).status_code == 401
 
 
 def test_a_group_of_robots_takes_one_order(labs: Labs) -> None:
     """Made over HTTP it is known to who orders, and to the command line; removed, nothing is meant by it."""
-    made = labs.ask("narrow lab1", "POST", "/robot-groups", {"name": "Upstairs"})
+    made = labs.ask("narrow@lab1", "POST", "/robot-groups", {"name": "Upstairs"})
     assert (made.status, made.headers["Location"]) == (201, f"{REALM}/robot-groups/upstairs")
-    assert labs.ask("lab1", "POST", "/robot-groups", {"name": "upstairs"}).json["code"] == "taken"
+    assert labs.ask("root@lab1", "POST", "/robot-groups", {"name": "upstairs"}).json["code"] == "taken"
     for _ in range(2):
         labs.do("PUT", "/robot-groups/upstairs/members/mobile")
     group = {"group": "upstairs", "robots": ["mobile"]}
@@ -132,9 +106,9 @@ def test_a_group_of_robots_takes_one_order(labs: Labs) -> None:
     done = labs.relay.cli("robot", "call", "group:upstairs", "/where", "--realm", "lab1")
     assert [(each["robot"], each["ok"]) for each in done["results"]] == [("mobile@lab1", True)]
     labs.do("DELETE", "/robot-groups/upstairs/members/mobile")
-    assert labs.ask("lab1", "DELETE", "/robot-groups/upstairs/members/mobile").status == 404
+    assert labs.ask("root@lab1", "DELETE", "/robot-groups/upstairs/members/mobile").status == 404
     labs.do("DELETE", "/robot-groups/upstairs")
-    assert labs.ask("lab1", "GET", "/robot-groups/upstairs").status == 404
+    assert labs.ask("root@lab1", "GET", "/robot-groups/upstairs").status == 404
     entries = [each for each in labs.log() if each["target"] == "upstairs@lab1"]
     assert sorted((each["action"], tuple(each["data"]["robots"])) for each in entries) == [
         ("robot.group.add", ()),
@@ -147,13 +121,13 @@ def test_a_group_of_robots_takes_one_order(labs: Labs) -> None:
 def test_how_long_events_are_kept_is_said(labs: Labs) -> None:
     """The command line tells it too, and that of another realm stays; a token for administration alone may not."""
     assert labs.do("PATCH", "", {"events_days": 7})["events_days"] == 7
-    assert labs.do("GET", "", who="lab2")["events_days"] is None
+    assert labs.do("GET", "", who="root@lab2")["events_days"] is None
     kept = {each["realm"]: each["events_days"] for each in labs.relay.cli("realm", "list")}
     assert (kept["lab1"], kept["lab2"]) == (7, None)
     assert labs.do("PATCH", "", {"events_days": None}) == labs.do("GET", "")
     for body in ({"events_days": 0}, {"events_days": 1e6}, {"events_days": "7"}, {"days": 7}, {}):
-        assert labs.ask("lab1", "PATCH", "", body).status == 400
-    assert labs.ask("narrow lab1", "PATCH", "", {"events_days": 7}).status == 403
+        assert labs.ask("root@lab1", "PATCH", "", body).status == 400
+    assert labs.ask("narrow@lab1", "PATCH", "", {"events_days": 7}).status == 403
     set_to = [
         each["data"] for each in labs.log() if (each["action"], each["target"]) == ("realm.set", "lab1")
     ]
@@ -175,7 +149,7 @@ def test_what_is_in_another_realm_is_nowhere(labs: Labs) -> None:
     labs.do("POST", "/robot-groups", {"name": "diggers"})
     labs.do("PUT", "/robot-groups/diggers/members/digger")
     program = labs.do("POST", "/users/mole/programs", {})
-    labs.do("POST", "/robot-groups", {"name": "own"}, who="lab2")
+    labs.do("POST", "/robot-groups", {"name": "own"}, who="root@lab2")
     asked = [
         ("GET", "/users/{mole}/programs", None),
         ("POST", "/users/{mole}/programs", {}),
@@ -191,10 +165,12 @@ def test_what_is_in_another_realm_is_nowhere(labs: Labs) -> None:
     full = {name: value if name == "key" else f"{value}@lab1" for name, value in there.items()}
     nowhere = dict.fromkeys(there, "nobody")
     for method, path, body in asked:
-        said = [labs.ask("lab2", method, path.format(**names), body) for names in (there, full, nowhere)]
+        said = [labs.ask("root@lab2", method, path.format(**names), body) for names in (there, full, nowhere)]
         assert len({(each.status, each.body) for each in said}) == 1, path
         assert said[0].status == 404, path
-    assert labs.do("GET", "/robot-groups", who="lab2")["robot_groups"] == [{"group": "own", "robots": []}]
+    assert labs.do("GET", "/robot-groups", who="root@lab2")["robot_groups"] == [
+        {"group": "own", "robots": []}
+    ]
     assert labs.token_for(program).status_code == 200
     assert labs.do("GET", "/robot-groups/diggers")["robots"] == ["digger"]
 
@@ -203,7 +179,7 @@ def test_nobody_makes_a_program_that_acts_as_a_guest(labs: Labs) -> None:
     """By it the administrator where he is a guest would be him in his own realm, too."""
     labs.do("POST", "/users", {"name": "dora"})
     labs.relay.cli("user", "join", "dora@lab1", "lab2")
-    refused = labs.ask("lab2", "POST", "/users/dora/programs", {})
+    refused = labs.ask("root@lab2", "POST", "/users/dora/programs", {})
     assert (refused.status, refused.json["code"]) == (403, "refused")
     program = labs.do("POST", "/users/dora/programs", {})
     token = labs.token_for(program, realm="lab2").json()["access_token"]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from switchboard_http import Answer, ask, log_in
+from switchboard_http import ROBOT_BODIES, Answer, ask, log_in
 from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_small_robot import SmallRobot
@@ -133,16 +133,6 @@ def _form(port: int, path: str, body: str, headers: dict[str, str]) -> Answer:
 
 # --- nothing crosses --------------------------------------------------------------------------------------
 
-BODIES: dict[str, Any] = {
-    "topics/{name}": {"value": {"data": "x"}},
-    "params/{name}": {"value": 1},
-    "suppress": {"resource": "/mode", "ms": 100},
-    "inhibit": {"resource": "/mode", "ms": 100},
-    "hold": {"resource": "/mode", "ms": 100},
-    "recordings": {"topics": ["/mode"]},
-}
-"""What is sent, by the end of the path, where it is not an empty object."""
-
 SAID_TO_ALL = {
     ("get", "/robots/{robot}"),
     ("get", "/robots/{robot}/video/ws"),
@@ -170,7 +160,7 @@ def test_a_robot_of_another_realm_is_none(labs: Labs, method: str, path: str) ->
         at = path.replace("{robot}", name).replace("{name}", "mode").replace("{id}", "0" * 32)
         query = "?topic=/camera" if path.startswith("/robots/") else ""
         end = path.partition("{robot}/")[2]
-        body = None if method == "get" else BODIES.get(end, {})
+        body = None if method == "get" else ROBOT_BODIES.get(end, {})
         return labs.ask("root@lab1", method.upper(), at + query, body, switchboard_moment=moment)
 
     others, nobodys, own = (answer(name) for name in ("secret", "nobody", "mobile"))

@@ -40,11 +40,7 @@ PREFIXES = """@prefix own: <{base}/api/v1/vocabulary/switchboard#> .
 @pytest.fixture
 def client(world: Any) -> Iterator[httpx.Client]:
     """Requests of who may drive."""
-    with httpx.Client(
-        base_url=f"http://127.0.0.1:{world.relay.http_port}{ROBOT}",
-        headers={"Authorization": f"Bearer {world.operator}"},
-        timeout=90,
-    ) as client:
+    with world.over_http() as client:
         yield client
 
 

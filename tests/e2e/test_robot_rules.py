@@ -107,6 +107,7 @@ def test_goals_arrive_whenever_they_are_given(place: Place) -> None:
                 return [each for each in place.goals() if each.startswith(name)] == given
 
             with Pulse() as pulse:
+                # What is proved is that a goal comes at whatever time it is given.
                 for each in given:
                     time.sleep(PAUSE_SECONDS)
                     ann.send(op="publish", topic="/go", msg={"data": each})

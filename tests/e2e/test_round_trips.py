@@ -66,11 +66,7 @@ EMPTY: dict[str, dict[str, Any]] = {"nested": {"header": {"stamp": {"sec": 1}}},
 @pytest.fixture
 def client(world: Any) -> Iterator[httpx.Client]:
     """Requests of who may drive."""
-    with httpx.Client(
-        base_url=f"http://127.0.0.1:{world.relay.http_port}{ROBOT}",
-        headers={"Authorization": f"Bearer {world.operator}"},
-        timeout=90,
-    ) as client:
+    with world.over_http() as client:
         yield client
 
 

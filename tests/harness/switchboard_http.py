@@ -7,6 +7,16 @@ import json
 import ssl
 from typing import Any
 
+ROBOT_BODIES: dict[str, Any] = {
+    "topics/{name}": {"value": {"data": "x"}},
+    "params/{name}": {"value": 1},
+    "suppress": {"resource": "/mode", "ms": 100},
+    "inhibit": {"resource": "/mode", "ms": 100},
+    "hold": {"resource": "/mode", "ms": 100},
+    "recordings": {"topics": ["/mode"]},
+}
+"""What is sent to the addresses of a robot, by their ends, where it is not an empty object."""
+
 
 class Answer:
     """What came back for an HTTP request."""

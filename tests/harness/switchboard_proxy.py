@@ -35,7 +35,7 @@ class _Line:
                 if rate:
                     self._free_at += len(packet) / rate
                 free_at = self._free_at
-            # A packet is there when its last bit is.
+            # A packet is there when its last bit is: after as long as a link of this rate takes for all before it.
             time.sleep(max(0.0, free_at - time.monotonic()))
             sink.sendall(packet)
             rest = rest[len(packet) :]

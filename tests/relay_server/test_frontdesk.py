@@ -9,9 +9,9 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_server import closing, limiter
-from relay_server.access import IN_STEP_SECONDS, BadCredentials
+from relay_server.access import IN_STEP_SECONDS, NO_ROBOT, BadCredentials
 from relay_server.auth import Opening, TooManyTries
-from relay_server.frontdesk import LOOKUP_SECONDS, NO_ROBOT, NOT_LOOKED_UP
+from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP
 from relay_server.video import Picture
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import hangs

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import pytest_twisted
 from sqlalchemy import event
-from switchboard_http import Answer, ask
+from switchboard_http import ROBOT_BODIES, Answer, ask
 from twisted.internet import reactor
 from twisted.internet.task import deferLater
 from twisted.internet.threads import deferToThread
@@ -39,16 +39,6 @@ UNKNOWN = {"root@lab1": ("secret",), "toad@lab1": ("secret", "hidden")}
 HEX = "0123456789abcdef"
 IDS = {"secret": HEX * 2, "hidden": HEX[::-1] * 2, NOBODYS: "0" * 32}
 """Of directory entries and recordings, by the robot they are about."""
-
-BODIES: dict[str, Any] = {
-    "topics/{name}": {"value": {"data": "x"}},
-    "params/{name}": {"value": 1},
-    "suppress": {"resource": "/mode", "ms": 100},
-    "inhibit": {"resource": "/mode", "ms": 100},
-    "hold": {"resource": "/mode", "ms": 100},
-    "recordings": {"topics": ["/mode"]},
-}
-"""What is sent, by the end of the path, where it is not an empty object."""
 
 UPGRADE = {
     "Connection": "Upgrade",
@@ -241,7 +231,7 @@ async def test_robots_that_one_may_not_know_of_ask_as_much_as_those_there_are_no
 
     def request(method: str, path: str) -> Callable[[str], tuple[Any, ...]]:
         query = "?topic=/camera" if path.startswith("/robots/") else ""
-        body = None if method == "get" else BODIES.get(path.partition("{robot}/")[2], {})
+        body = None if method == "get" else ROBOT_BODIES.get(path.partition("{robot}/")[2], {})
 
         def made(robot: str) -> tuple[Any, ...]:
             at = path.replace("{robot}", robot).replace("{name}", "mode").replace("{id}", IDS[robot])

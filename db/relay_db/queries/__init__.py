@@ -9,7 +9,6 @@ from relay_db.queries.administration import (
     RightPlace,
     count_live_keys,
     count_patterns,
-    describe_robot,
     find_token,
     group_names,
     groups_of,
@@ -127,6 +126,7 @@ from relay_db.queries.robot_groups import (
 from relay_db.queries.robots import (
     LIVE_KEYS,
     add_robot,
+    describe_robot,
     enrolled_robots,
     find_robot,
     issue_enrolment_code,

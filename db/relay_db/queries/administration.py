@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, func, literal, or_, select, update
+from sqlalchemy import ColumnElement, func, literal, or_, select
 from sqlalchemy.orm import Session
 
 from relay_db.base import JsonText
@@ -25,12 +25,10 @@ from relay_db.models import (
     RobotRealm,
     User,
 )
-from relay_db.names import findable, findable_hex, label
+from relay_db.names import findable, findable_hex
 from relay_db.queries.records import TokenRecord
-from relay_db.queries.rights import holders_realm, of_user
-from relay_db.queries.state import bump
+from relay_db.queries.rights import of_user, with_holders
 from relay_db.queries.tokens import list_tokens
-from relay_protocol.errors import NotFound
 from relay_protocol.realms import full_name
 
 _TOKEN_NAME = 16
@@ -75,12 +73,7 @@ def realm_size(s: Session, realm: str) -> RealmSize:
         .join(Group, Group.id == Membership.group_id)
         .join(Realm, Realm.id == Group.realm_id)
     )
-    rights = (
-        select(func.count(Right.id))
-        .outerjoin(User, User.id == Right.user_id)
-        .outerjoin(Group, Group.id == Right.group_id)
-        .join(Realm, Realm.id == holders_realm())
-    )
+    rights = with_holders(select(func.count(Right.id)))
     programs = (
         select(func.count(Program.id))
         .join(User, User.id == Program.user_id)
@@ -99,12 +92,8 @@ def realm_size(s: Session, realm: str) -> RealmSize:
 def count_patterns(s: Session, *, realm: str, robot_id: int | None = None) -> int:
     """How many patterns the rights that are held in a realm have, or those of them on a robot."""
     none: Any = literal([], JsonText)
-    query = (
-        select(Right.allow, Right.deny)
-        .outerjoin(User, User.id == Right.user_id)
-        .outerjoin(Group, Group.id == Right.group_id)
-        .join(Realm, Realm.id == holders_realm())
-        .where(Realm.name == findable(realm), or_(Right.allow != none, Right.deny != none))
+    query = with_holders(select(Right.allow, Right.deny)).where(
+        Realm.name == findable(realm), or_(Right.allow != none, Right.deny != none)
     )
     if robot_id is not None:
         query = query.where(Right.robot_id == robot_id)
@@ -115,14 +104,10 @@ def right_places(
     s: Session, realm: str, *, robot_id: int | None = None, user_id: int | None = None
 ) -> list[RightPlace]:
     """Where the rights that are held in a realm stand, without what they say; of a user also those by its groups."""
-    query = (
-        select(Right.id, Robot.name, User.name, Group.name)
-        .join(Robot, Robot.id == Right.robot_id)
-        .outerjoin(User, User.id == Right.user_id)
-        .outerjoin(Group, Group.id == Right.group_id)
-        .join(Realm, Realm.id == holders_realm())
-        .where(Realm.name == findable(realm))
+    query = with_holders(select(Right.id, Robot.name, User.name, Group.name)).where(
+        Realm.name == findable(realm)
     )
+    query = query.join(Robot, Robot.id == Right.robot_id)
     if robot_id is not None:
         query = query.where(Right.robot_id == robot_id)
     if user_id is not None:
@@ -158,20 +143,6 @@ def group_names(s: Session, realm: str) -> dict[str, int]:
         .where(Realm.name == findable(realm))
     )
     return {row.name: row.id for row in rows}
-
-
-def describe_robot(s: Session, robot_id: int, description: str) -> None:
-    """Change what a robot is said to be.
-
-    :raises Invalid: the description can't be kept
-    :raises NotFound: no such robot
-    """
-    text = label(description, "description of a robot")
-    # Relays remember whom they show which robots.
-    bump(s)
-    changed = update(Robot).where(Robot.id == robot_id).values(description=text).returning(Robot.id)
-    if s.scalar(changed) is None:
-        raise NotFound("there is no such robot")
 
 
 def count_live_keys(s: Session, robot_ids: Collection[int]) -> dict[int, int]:

@@ -9,12 +9,13 @@ from collections.abc import Collection
 from fnmatch import fnmatchcase
 from typing import Any
 
-from sqlalchemy import ColumnElement, delete, exists, func, insert, select, update
+from sqlalchemy import ColumnElement, delete, func, insert, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import DirectoryEntry, Realm, Robot, RobotRealm, User
+from relay_db.models import DirectoryEntry, Realm, Robot, User
 from relay_db.names import findable, findable_hex
 from relay_db.queries.directory_records import EntryAsk, EntryPlace, EntryRecord, Leases, NewEntry
+from relay_db.queries.realms import robot_is_of
 from relay_db.queries.state import bump
 from relay_protocol.errors import NotFound, Refused
 
@@ -51,8 +52,7 @@ def register_entry(
     realm = s.scalar(select(Realm.id).where(Realm.name == findable(new.realm)).with_for_update())
     if realm is None:
         raise NotFound("there is no such realm")
-    of = (RobotRealm.robot_id == new.robot_id) & (RobotRealm.realm_id == realm)
-    if new.robot_id is not None and not s.scalar(select(exists().where(of))):
+    if new.robot_id is not None and not robot_is_of(s, new.robot_id, realm):
         raise NotFound("there is no such robot")
     live = (DirectoryEntry.realm_id == realm, DirectoryEntry.expires > now)
     about = (

@@ -77,6 +77,12 @@ def realm_id(s: Session, name: str) -> int:
     return found
 
 
+def robot_is_of(s: Session, robot_id: int, realm_id: int) -> bool:
+    """Whether a robot is of a realm: it is its own, or it is shared with that."""
+    of = (RobotRealm.robot_id == robot_id) & (RobotRealm.realm_id == realm_id)
+    return bool(s.scalar(select(exists().where(of))))
+
+
 def keep_events(s: Session, name: str, days: float | None) -> None:
     """Say how long a realm's memory keeps events.
 

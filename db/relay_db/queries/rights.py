@@ -6,10 +6,11 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable
 from typing import Any
 
-from sqlalchemy import ColumnElement, delete, exists, func, insert, or_, select
+from sqlalchemy import ColumnElement, delete, func, insert, or_, select
 from sqlalchemy.orm import Session
 
 from relay_db.models import Group, Membership, Realm, Right, Robot, RobotRealm, User
+from relay_db.queries.realms import robot_is_of
 from relay_db.queries.records import RightRecord, RobotRecord
 from relay_db.queries.state import bump
 from relay_db.queries.users import live_user
@@ -82,7 +83,7 @@ def list_rights(
 
     :param ids: only of these numbers
     """
-    query = (
+    query = with_holders(
         select(
             Right.id,
             Right.robot_id,
@@ -95,9 +96,6 @@ def list_rights(
             Right.deny,
         )
         .join(Robot, Robot.id == Right.robot_id)
-        .outerjoin(User, User.id == Right.user_id)
-        .outerjoin(Group, Group.id == Right.group_id)
-        .join(Realm, Realm.id == holders_realm())
         .order_by(Robot.name, User.name, Group.name)
     )
     if robot_id is not None:
@@ -189,9 +187,13 @@ def of_user(user_id: int) -> ColumnElement[bool]:
     return or_(Right.user_id == user_id, Right.group_id.in_(groups))
 
 
-def holders_realm() -> ColumnElement[int]:
-    """The number of the realm of who holds a right, where both tables of holders are joined."""
-    return func.coalesce(User.realm_id, Group.realm_id)
+def with_holders(query: Any) -> Any:
+    """Rights with the users or groups who hold them, and the realms of these."""
+    return (
+        query.outerjoin(User, User.id == Right.user_id)
+        .outerjoin(Group, Group.id == Right.group_id)
+        .join(Realm, Realm.id == func.coalesce(User.realm_id, Group.realm_id))
+    )
 
 
 def _held(robot_id: int, user_id: int | None, group_id: int | None) -> Any:
@@ -214,8 +216,7 @@ def _check_realms(s: Session, robot_id: int, user_id: int | None, group_id: int 
         holder_realm = s.scalar(select(Group.realm_id).where(Group.id == group_id))
     if holder_realm is None:
         raise NotFound("there is no such user or group")
-    of = (RobotRealm.robot_id == robot_id) & (RobotRealm.realm_id == holder_realm)
-    if not s.scalar(select(exists().where(of))):
+    if not robot_is_of(s, robot_id, holder_realm):
         raise Invalid("the robot is not of the realm of the holder of the right")
 
 

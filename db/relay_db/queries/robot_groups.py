@@ -8,9 +8,9 @@ from collections.abc import Collection
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
-from relay_db.models import Realm, Robot, RobotGroup, RobotMembership, RobotRealm
+from relay_db.models import Realm, Robot, RobotGroup, RobotMembership
 from relay_db.names import findable, normal_name
-from relay_db.queries.realms import realm_id
+from relay_db.queries.realms import realm_id, robot_is_of
 from relay_db.queries.records import RobotGroupRecord
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.realms import DEFAULT_REALM, full_name
@@ -82,10 +82,9 @@ def add_to_robot_group(s: Session, group_id: int, robot_id: int) -> None:
     :raises Invalid: they are of different realms
     """
     group_realm = s.scalar(select(RobotGroup.realm_id).where(RobotGroup.id == group_id))
-    robot_realms = s.scalars(select(RobotRealm.realm_id).where(RobotRealm.robot_id == robot_id)).all()
-    if group_realm is None or not robot_realms:
+    if group_realm is None or s.scalar(select(Robot.id).where(Robot.id == robot_id)) is None:
         raise NotFound("there is no such group or robot")
-    if group_realm not in robot_realms:
+    if not robot_is_of(s, robot_id, group_realm):
         raise Invalid("the robot is not of the realm of the group")
     pair = (RobotMembership.group_id == group_id) & (RobotMembership.robot_id == robot_id)
     if s.scalar(select(RobotMembership.robot_id).where(pair)) is None:

@@ -72,6 +72,20 @@ def add_robot(s: Session, name: str, description: str = "", realm: str = DEFAULT
     return RobotRecord(robot_id, name, realm, description)
 
 
+def describe_robot(s: Session, robot_id: int, description: str) -> None:
+    """Change what a robot is said to be.
+
+    :raises Invalid: the description can't be kept
+    :raises NotFound: no such robot
+    """
+    text = label(description, "description of a robot")
+    # Relays remember whom they show which robots.
+    bump(s)
+    changed = update(Robot).where(Robot.id == robot_id).values(description=text).returning(Robot.id)
+    if s.scalar(changed) is None:
+        raise NotFound("there is no such robot")
+
+
 def remove_robot(s: Session, robot_id: int) -> None:
     """Remove a robot with its keys, codes and all rights on it.
 

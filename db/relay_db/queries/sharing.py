@@ -27,7 +27,7 @@ from relay_db.names import findable
 from relay_db.queries.realms import realm_id
 from relay_db.queries.records import UserRecord
 from relay_db.queries.state import bump
-from relay_db.queries.users import add_user, get_user
+from relay_db.queries.users import add_user, get_user, home_of
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.realms import full_name
 
@@ -116,7 +116,7 @@ def add_guest(s: Session, user_id: int, realm: str) -> UserRecord:
     if user is None:
         raise NotFound("there is no such user")
     guest = add_user(s, user.name, None, realm=findable(realm))
-    s.execute(insert(GuestAccount).values(user_id=guest.id, home_id=_home(s, user_id)))
+    s.execute(insert(GuestAccount).values(user_id=guest.id, home_id=home_of(s, user_id)))
     made = get_user(s, guest.id)
     assert made is not None
     return made
@@ -124,7 +124,7 @@ def add_guest(s: Session, user_id: int, realm: str) -> UserRecord:
 
 def account_in(s: Session, user_id: int, realm: str) -> UserRecord | None:
     """The account that a user has in a realm, if it is of that."""
-    home = _home(s, user_id)
+    home = home_of(s, user_id)
     query = (
         select(User.id)
         .join(Realm, Realm.id == User.realm_id)
@@ -133,8 +133,3 @@ def account_in(s: Session, user_id: int, realm: str) -> UserRecord | None:
     )
     found = s.scalar(query)
     return None if found is None else get_user(s, found)
-
-
-def _home(s: Session, user_id: int) -> int:
-    """The account whose password is good for a user: another's, or its own."""
-    return s.scalar(select(GuestAccount.home_id).where(GuestAccount.user_id == user_id)) or user_id

@@ -92,8 +92,7 @@ def set_password(
         raise Refused(f"the password of {user.full} is that of {user.home}; change it there")
     bump(s)
     _change_user(s, user_id, password_hash=password_hash)
-    guests = select(GuestAccount.user_id).where(GuestAccount.home_id == user_id)
-    accounts = [user_id, *s.scalars(guests)]
+    accounts = [user_id, *_guests(s, user_id)]
     s.execute(
         delete(AccessToken).where(
             AccessToken.user_id.in_(accounts),
@@ -125,7 +124,7 @@ def remove_user(s: Session, user_id: int) -> None:
     :raises NotFound: no such user
     """
     bump(s)
-    guests = list(s.scalars(select(GuestAccount.user_id).where(GuestAccount.home_id == user_id)))
+    guests = _guests(s, user_id)
     # In the order in which who logs in does it.
     s.execute(select(User.id).where(User.id.in_([user_id, *guests])).order_by(User.id).with_for_update())
     s.execute(delete(User).where(User.id.in_(guests)))
@@ -136,6 +135,16 @@ def remove_user(s: Session, user_id: int) -> None:
 def user_is_live(s: Session, user_id: int) -> bool:
     """Whether the user is there and not disabled."""
     return _holds(s, (User.id == user_id) & live_user())
+
+
+def home_of(s: Session, user_id: int) -> int:
+    """The account whose password is good for a user: another's, or its own."""
+    return s.scalar(select(GuestAccount.home_id).where(GuestAccount.user_id == user_id)) or user_id
+
+
+def _guests(s: Session, home_id: int) -> list[int]:
+    """The accounts that are guests of one."""
+    return list(s.scalars(select(GuestAccount.user_id).where(GuestAccount.home_id == home_id)))
 
 
 def live_user() -> ColumnElement[bool]:
@@ -154,7 +163,7 @@ def check_unchanged(s: Session, user_id: int, password_hash: str | None) -> None
     :param password_hash: what was stored when the user was proved
     :raises Refused: another is stored now, or the user was disabled or removed
     """
-    home = s.scalar(select(GuestAccount.home_id).where(GuestAccount.user_id == user_id)) or user_id
+    home = home_of(s, user_id)
     standing = (
         select(User.id, User.password_hash, User.disabled)
         .where(User.id.in_({user_id, home}))

@@ -23,10 +23,10 @@ from relay_server.alerts.delivery import (
     TOLD,
     UNJUDGED,
     Delivery,
-    Office,
 )
 from relay_server.alerts.kinds import Event
 from relay_server.alerts.message import Message, Undelivered
+from relay_server.alerts.office import Office
 from tests.relay_server.alerts.made_up import alert, rule
 
 NIGHT = {"from": "22:00", "to": "07:00", "zone": "UTC", "least": "error"}

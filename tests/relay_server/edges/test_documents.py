@@ -92,7 +92,7 @@ def test_the_bodies_described_are_those_that_are_validated() -> None:
     read = set()
     for module in modules():
         for node in ast.walk(ast.parse(inspect.getsource(module))):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("body_of", "_body"):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("body_of", "_body", "self._added"):
                 name = ast.unparse(node.args[1])
                 # In such a helper it is the parameter.
                 if name != "kind":

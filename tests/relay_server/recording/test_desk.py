@@ -18,8 +18,8 @@ from relay_db.queries import RobotRecord
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.realms import DEFAULT_REALM
-from relay_server.access import Access, Principal
-from relay_server.frontdesk import NO_ROBOT, Admission
+from relay_server.access import NO_ROBOT, Access, Principal
+from relay_server.frontdesk import Admission
 from relay_server.journal import Journal
 from relay_server.recording import Ask, Library, RecordingDesk, Recordings
 from relay_server.recording import recordings as module
