@@ -14,6 +14,8 @@ from relay_protocol.rights import Operation, Rules
 FIELDS = {
     "motion.begun": "topic",
     "publication.begun": "topic",
+    "robot.suppressed": "resource",
+    "robot.inhibited": "resource",
     "param.set": "param",
     "video.joined": "camera",
     "video.left": "camera",
@@ -49,6 +51,7 @@ def _may(rules: Rules, operation: Operation, name: str) -> bool:
 
 _WAYS: Mapping[str, Callable[[Rules, str], bool]] = {
     "topic": _topic,
+    "resource": _topic,
     "camera": _camera,
     "service": _call,
     "action": _call,

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import click
 
 from robot_client.apps.clock import now as since_start
-from robot_client.apps.line import Line, Lost, in_words, token
+from robot_client.apps.line import Line, Pulse, in_words, token
 from robot_client.apps.memory import Memory, Unanswered
 from robot_client.apps.status import StatusLine
 from robot_client.apps.staying import Ending, stay
@@ -140,13 +140,11 @@ class Greeting:
         self._tell = tell
         self._clock = clock
         self._attention = Attention()
-        self._line: Line
-        self._heard_at = self._beat_at = 0.0
+        self._pulse: Pulse
 
     def begin(self, line: Line) -> None:
         """There is a line."""
-        self._line = line
-        self._heard_at = self._beat_at = self._clock()
+        self._pulse = Pulse(line, self._clock, BEAT, SILENT)
         line.say(op="set_level", level="error")
         line.say(op="subscribe", topic=self._faces, type="std_msgs/msg/String", queue_length=1)
         self._tell("looking for people")
@@ -157,16 +155,9 @@ class Greeting:
         :raises Lost: nothing has come for long
         :raises Refused: the relay says no, and will until a person has done something
         """
-        message = self._line.hear(LOOK)
+        message = self._pulse.hear(LOOK)
         if message is not None:
             self._take(message)
-            self._heard_at = self._clock()
-        now = self._clock()
-        if now - self._heard_at > SILENT:
-            raise Lost(f"the relay has not answered for {SILENT:g} s")
-        if now - self._beat_at >= BEAT:
-            self._beat_at = now
-            self._line.call("/relay/ping")
         return True
 
     def leave(self) -> None:

@@ -6,9 +6,7 @@ import contextlib
 import itertools
 import json
 import os
-import signal
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import click
@@ -60,6 +58,39 @@ class Line:
             return None
 
 
+class Pulse:
+    """Whether the relay still answers by a line. It is asked now and then, for a network may swallow all in silence.
+
+    :param line: to the robot
+    :param clock: seconds, suspends included
+    :param beat: seconds from one question to the next
+    :param silent: seconds without a word of the relay after which there is no connection
+    """
+
+    def __init__(self, line: Line, clock: Callable[[], float], beat: float, silent: float) -> None:
+        self._line = line
+        self._clock = clock
+        self._beat = beat
+        self._silent = silent
+        self._heard_at = self._asked_at = clock()
+
+    def hear(self, seconds: float) -> dict[str, Any] | None:
+        """The next message that comes within this time.
+
+        :raises Lost: nothing has come for long
+        """
+        message = self._line.hear(seconds)
+        now = self._clock()
+        if message is not None:
+            self._heard_at = now
+        if now - self._heard_at > self._silent:
+            raise Lost(f"the relay has not answered for {self._silent:g} s")
+        if now - self._asked_at >= self._beat:
+            self._asked_at = now
+            self._line.call("/relay/ping")
+        return message
+
+
 def token() -> str:
     """What proves to the relay who this is.
 
@@ -108,12 +139,6 @@ def _meaning(code: int) -> str:
         404: "there is no such robot, or no right on it",
     }
     return f": {words[code]}" if code in words else ""
-
-
-def end_by_signal() -> None:
-    """Have SIGINT and SIGTERM end the program by ``SystemExit``, so that what it has open is closed."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: sys.exit(0))
 
 
 @contextlib.contextmanager

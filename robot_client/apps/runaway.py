@@ -11,17 +11,19 @@ the right to subscribe to the scanner's topic, and to suppress that of the comma
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import math
-import time
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import click
 
-from robot_client.apps.driver import STILL, Command, twist
-from robot_client.apps.line import Line, Refused, connected, end_by_signal, in_words
+from robot_client.apps.clock import now as since_start
+from robot_client.apps.driver import SILENT, STILL, Command, twist
+from robot_client.apps.line import Line, Pulse, Refused, in_words, token
+from robot_client.apps.status import StatusLine
+from robot_client.apps.staying import Ending, stay
 
 REACH = 1.5
 """Metres beyond which nothing pushes."""
@@ -34,6 +36,10 @@ BLIND = 0.5
 RENEW = 0.1
 """Seconds between two suppressions, at most."""
 SUPPRESS_MS = 200
+SCANS, COMMANDS = "scans", "commands"
+"""By these the relay names what it refuses. Of a command alone, as to a robot that is away, it may be done again."""
+BEAT = 1.0
+"""Seconds from one question to the relay to the next."""
 FACING = math.cos(math.radians(60))
 """Of the angle between heading and force from which the robot moves off."""
 
@@ -142,31 +148,38 @@ class Link:
     :param line: to the robot
     :param scan: topic of the scanner
     :param command: topic of the commands
+    :param clock: seconds, suspends included
     """
 
-    def __init__(self, line: Line, scan: str, command: str) -> None:
+    def __init__(
+        self, line: Line, scan: str, command: str, clock: Callable[[], float] = since_start
+    ) -> None:
         self._line = line
+        self._pulse = Pulse(line, clock, BEAT, SILENT)
+        self._clock = clock
         self._command = command
+        self._asked: set[str] = set()
         self._waiting = ""
         self.has_it = False
         """Whether the relay has said that the robot obeys this program."""
         line.say(op="set_level", level="error")
-        line.say(op="advertise", topic=command, type="geometry_msgs/msg/Twist")
-        line.say(op="subscribe", topic=scan, type="sensor_msgs/msg/LaserScan", queue_length=1)
+        line.say(op="advertise", id=COMMANDS, topic=command, type="geometry_msgs/msg/Twist")
+        line.say(op="subscribe", id=SCANS, topic=scan, type="sensor_msgs/msg/LaserScan", queue_length=1)
 
     def scan(self, seconds: float) -> Scan | None:
         """The next scan that comes within this time.
 
+        :raises Lost: the relay has not answered for long
         :raises Refused: the relay says that it must not do what it does
         """
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            message = self._line.hear(left)
+        end = self._clock() + seconds
+        while (left := end - self._clock()) > 0:
+            message = self._pulse.hear(left)
             if message is None:
                 return None
             if message["op"] == "service_response":
                 self._answered(message)
-            elif message["op"] == "status" and not self.has_it:
+            elif message["op"] == "status" and message.get("id") in (SCANS, COMMANDS):
                 raise Refused(message["msg"])
             elif message["op"] == "publish":
                 seen = message["msg"]
@@ -190,27 +203,61 @@ class Link:
         self._ask(0)
 
     def _ask(self, ms: int) -> str:
-        return self._line.call("/relay/suppress", resource=self._command, ms=ms)
+        number = self._line.call("/relay/suppress", resource=self._command, ms=ms)
+        self._asked.add(number)
+        return number
 
     def _answered(self, message: dict[str, Any]) -> None:
+        number = message["id"]
+        if number not in self._asked:
+            return  # of a question whether anybody is there
+        self._asked.discard(number)
         if not message["result"]:
             raise Refused(str(message["values"]))
-        if message["id"] == self._waiting:
+        if number == self._waiting:
             self.has_it = bool(message["values"]["success"])
 
 
 class Program:
-    """Sees, decides, drives."""
+    """Sees, decides, drives.
 
-    def __init__(self, link: Link, runaway: Runaway, clock: Any = time.monotonic) -> None:
-        self._link = link
+    :param scan: topic of the scanner
+    :param command: topic of the commands
+    :param tell: takes what happens, in a few words
+    :param clock: seconds, suspends included
+    """
+
+    def __init__(
+        self,
+        scan: str,
+        command: str,
+        runaway: Runaway,
+        tell: Callable[[str], None],
+        clock: Callable[[], float] = since_start,
+    ) -> None:
+        self._scan = scan
+        self._command = command
         self._runaway = runaway
+        self._tell = tell
         self._clock = clock
+        self._link: Link
         self._wanted: Command | None = None
         self._seen = self._asked = clock()
 
-    def step(self) -> None:
-        """Take what comes within a moment, and act on it."""
+    def begin(self, line: Line) -> None:
+        """There is a line. Nothing of what was seen by another counts."""
+        self._link = Link(line, self._scan, self._command, self._clock)
+        self._runaway.rest()
+        self._wanted = None
+        self._seen = self._clock()
+        self._tell("READY")
+
+    def step(self) -> bool:
+        """Take what comes within a moment, and act on it.
+
+        :raises robot_client.apps.line.Lost: the relay has not answered for long
+        :raises robot_client.apps.line.Refused: the relay says no, and will until a person has done something
+        """
         scan = self._link.scan(RENEW / 2)
         now = self._clock()
         if scan is not None:
@@ -224,19 +271,26 @@ class Program:
                 self._asked = now
                 self._link.suppress()
             self._link.drive(self._wanted)
+        return True
+
+    def leave(self) -> None:
+        """Let go of the robot, if it has it."""
+        self._follow(None)
+
+    def lost(self, why: str, seconds: float) -> None:
+        """Say so. The robot was its driver's again within a moment."""
+        self._tell(f"{why}; again in {seconds:.1f} s")
 
     def _follow(self, wanted: Command | None) -> None:
         if wanted is None and self._wanted is not None:
-            click.echo("clear: given back")
+            # Before it is said: the line may break in saying it.
+            self._wanted = None
+            self._tell("clear: given back")
             self._link.give_back()
         elif wanted is not None and self._wanted is None:
-            click.echo("too near: turning away")
+            self._tell("too near: turning away")
             self._asked = -math.inf
         self._wanted = wanted
-
-    def stop(self) -> None:
-        """Let go of what it has."""
-        self._follow(None)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -252,19 +306,24 @@ class Program:
 def main(url: str, scan: str, command: str, near: float, clear: float) -> None:
     """Keep the robot at URL (ws://relay/robots/NAME) away from what is in its way.
 
-    The token comes from the variable SWITCHBOARD_TOKEN. Prints READY when it watches. SIGINT and SIGTERM end it.
+    The token comes from the variable SWITCHBOARD_TOKEN. Prints READY when it watches, and connects anew when the
+    connection is lost. SIGINT and SIGTERM end it.
+
+    \b
+    Examples:
+      ROBOT=ws://127.0.0.1:9090/robots/robot-one
+      python -m robot_client.apps.runaway $ROBOT
+      python -m robot_client.apps.runaway $ROBOT --near 0.6 --clear 0.7
     """
     if clear <= near:
         raise click.BadParameter(f"--clear ({clear:g}) must be more than --near ({near:g})")
-    runaway = Runaway(Manners(near=near, clear=clear))
-    end_by_signal()
-    with in_words(), connected(url) as line:
-        program = Program(Link(line, scan, command), runaway)
-        with contextlib.ExitStack() as leaving:
-            leaving.callback(program.stop)
-            click.echo("READY")
-            while True:
-                program.step()
+    token()
+    ending = Ending()
+    status = StatusLine(sys.stdout, since_start)
+    program = Program(scan, command, Runaway(Manners(near=near, clear=clear)), status.tell)
+    with in_words():
+        stay(url, program, ending)
+    status.end("ended")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from switchboard_client import Client
+from switchboard_drive import LET_GO_SECONDS, understood
 from switchboard_processes import Process, running
 from switchboard_relay import Relay
 from switchboard_robot import Robot
@@ -116,3 +117,23 @@ def test_a_driver_who_leans_on_a_wall_follows_it(room: Room) -> None:
     assert max(np.ptp(path.places, axis=0)) > 1.5
     assert min(distances) > 0.25
     assert np.quantile(distances, 0.9) < 1.0
+
+
+def test_a_relay_that_is_killed_costs_it_time_alone(room: Room) -> None:
+    """It connects anew, and keeps the robot from the next wall for whoever drives then."""
+    with room.driven(AHEAD, 0.0) as runaway:
+        room.relay.kill()
+        room.relay.start()
+        room.robot.wait_online()
+        wait_for("it watches again", lambda: runaway.said().count("READY") == 2)
+        before = runaway.said().count("turning away")
+        with room.relay.connect("rover", room.driver) as client:
+            assert client.call("/relay/take_control")["values"]["success"]
+            driver = Driver(client, AHEAD, 0.0)
+            driver.begin_with_a_pause(LET_GO_SECONDS)
+            with running(driver):
+                driver.start()
+                understood(driver, room.robot)
+                wait_for("it turns away", lambda: runaway.said().count("turning away") > before, 60)
+                wait_for("it gives back", lambda: runaway.said().splitlines()[-1] == "clear: given back")
+    assert room.robot.events("bump") == []

@@ -12,11 +12,12 @@ from click.testing import CliRunner
 from switchboard_socket import Socket
 
 from robot_client.apps.driver import Command
-from robot_client.apps.line import Line, Refused
+from robot_client.apps.line import Line, Lost, Refused
 from robot_client.apps.runaway import (
     BLIND,
+    COMMANDS,
     FLAT,
-    Link,
+    SCANS,
     Manners,
     Phase,
     Program,
@@ -30,6 +31,7 @@ from robot_client.sim.robot import SCAN_BEGIN, SCAN_RAYS, SCAN_STEP, Robot
 from robot_client.sim.worlds import WORLDS
 
 STEP = 0.02
+SUPPRESS = "/relay/suppress"
 LEANING = Command(0.25, -0.15)
 """A circle that the room is too small for."""
 
@@ -164,10 +166,15 @@ class Scanner(Socket):
 class Scene:
     def __init__(self) -> None:
         self.now = 100.0
+        self.told: list[str] = []
+        self.program = Program("/scan", "/cmd_vel", Runaway(Manners()), self.told.append, lambda: self.now)
+        self.connect()
+
+    def connect(self) -> None:
+        """A new line."""
         self.socket = Scanner()
-        self.program = Program(
-            Link(Line(self.socket), "/scan", "/cmd_vel"), Runaway(Manners()), lambda: self.now
-        )
+        self.socket.reached = True
+        self.program.begin(Line(self.socket))
         self.socket.sent.clear()
 
     def step(self, scan: Scan | None = None, seconds: float = 0.11) -> list[dict[str, Any]]:
@@ -182,7 +189,7 @@ class Scene:
 
 def suppressed(said: list[dict[str, Any]]) -> list[int]:
     """For how long, by each call."""
-    return [each["args"]["ms"] for each in said if each["op"] == "call_service"]
+    return [each["args"]["ms"] for each in said if each.get("service") == "/relay/suppress"]
 
 
 def speeds(said: list[dict[str, Any]]) -> list[float]:
@@ -195,7 +202,7 @@ def test_it_commands_only_when_the_robot_obeys_it() -> None:
     assert scene.step(wall(1.0, 0.0)) == []
     said = scene.step(wall(0.4, 0.1))
     assert (suppressed(said), speeds(said)) == ([200], [])
-    scene.socket.answer()
+    scene.socket.answer(service=SUPPRESS)
     said = scene.step(wall(0.4, 0.1))
     assert (suppressed(said), speeds(said)) == ([200], [-1.2])
 
@@ -204,11 +211,11 @@ def test_it_gives_the_robot_back_with_zero() -> None:
     """Then it says nothing more."""
     scene = Scene()
     scene.step(wall(0.4, 0.1))
-    scene.socket.answer()
+    scene.socket.answer(service=SUPPRESS)
     scene.step()
     said = scene.step(wall(1.0, 0.0))
     assert (suppressed(said), speeds(said)) == ([0], [0.0])
-    scene.socket.answer()
+    scene.socket.answer(service=SUPPRESS)
     assert scene.step(wall(1.0, 0.0)) == []
     assert scene.step() == []
 
@@ -217,7 +224,7 @@ def test_who_sees_nothing_lets_go() -> None:
     """A scanner that falls silent ends it; until then the robot is held for moments only."""
     scene = Scene()
     scene.step(wall(0.4, 0.1))
-    scene.socket.answer()
+    scene.socket.answer(service=SUPPRESS)
     assert suppressed(scene.step()) == [200]
     said = scene.step(seconds=BLIND)
     assert (suppressed(said), speeds(said)) == ([0], [0.0])
@@ -227,7 +234,7 @@ def test_an_answer_that_comes_late_gives_nothing() -> None:
     """The robot was given back meanwhile: it must not be driven by what was true before."""
     scene = Scene()
     scene.step(wall(0.4, 0.1))
-    scene.socket.answer()
+    scene.socket.answer(service=SUPPRESS)
     late = scene.socket.coming.pop()
     scene.step(wall(1.0, 0.0))
     scene.socket.coming.append(late)
@@ -240,16 +247,64 @@ def test_a_relay_that_refuses_is_believed() -> None:
     """In its own words."""
     scene = Scene()
     scene.step(wall(0.4, 0.1))
-    scene.socket.answer(result=False)
+    scene.socket.answer(result=False, service=SUPPRESS)
     with pytest.raises(Refused, match="you may not"):
         scene.step()
+
+
+def test_a_command_that_came_too_late_ends_nothing() -> None:
+    """The robot may be away: what is refused of a command alone may be done again when it is back."""
+    scene = Scene()
+    scene.socket.coming.append({"op": "status", "level": "error", "msg": "the robot is offline"})
+    assert scene.step() == []
+    assert suppressed(scene.step(wall(0.4, 0.1))) == [200]
+
+
+@pytest.mark.parametrize("id", [SCANS, COMMANDS])
+def test_who_may_not_hear_or_command_is_told_so(id: str) -> None:
+    """In the relay's words."""
+    scene = Scene()
+    scene.socket.coming.append({"op": "status", "id": id, "level": "error", "msg": "no right to it"})
+    with pytest.raises(Refused, match="no right"):
+        scene.step()
+
+
+def test_a_relay_that_is_silent_is_asked_and_then_given_up() -> None:
+    """A network may swallow all; an answer is enough to go on."""
+    scene = Scene()
+    for _ in range(100):
+        scene.step(seconds=0.5)
+    scene.socket.reached = False
+    with pytest.raises(Lost, match="6 s"):
+        for _ in range(20):
+            scene.step(seconds=0.5)
+
+
+def test_by_a_new_line_it_begins_anew() -> None:
+    """What it had by the line before is not its any more, nor near any more."""
+    scene = Scene()
+    scene.step(wall(0.4, 0.1))
+    scene.socket.answer(service=SUPPRESS)
+    scene.step(wall(0.4, 0.1))
+    scene.program.lost("the cable", 1.0)
+    scene.connect()
+    assert scene.step() == []
+    said = scene.step(wall(0.4, 0.1))
+    assert (suppressed(said), speeds(said)) == ([200], [])
+    assert scene.told == [
+        "READY",
+        "too near: turning away",
+        "the cable; again in 1.0 s",
+        "READY",
+        "too near: turning away",
+    ]
 
 
 @pytest.mark.parametrize(
     ("arguments", "token", "words"),
     [
         (["ws://127.0.0.1:1/robots/r"], "", "SWITCHBOARD_TOKEN"),
-        (["ws://127.0.0.1:1/robots/r"], "t", "is lost"),
+        (["http://127.0.0.1:1/robots/r"], "t", "no address of a robot"),
         (["ws://127.0.0.1:1/robots/r", "--near", "0.6", "--clear", "0.5"], "t", "--clear"),
     ],
 )
