@@ -18,7 +18,7 @@ from relay_server.channel import resolve
 from relay_server.clock import Clock, within
 from relay_server.control import Actor, Answer, Client, Desk, Desks, NotDone, acts_for, view
 from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP, Admission, FrontDesk
-from relay_server.inside import Guests, take_control
+from relay_server.inside import Guests, Wishes, take_control
 from relay_server.registry import Presence, Registry
 from relay_server.store import Store
 
@@ -92,6 +92,7 @@ class Console:
         self._registry = registry
         self._store = store
         self._guests = guests
+        self._wishes = Wishes()
 
     # --- by HTTP ------------------------------------------------------------------------------------------
 
@@ -112,9 +113,10 @@ class Console:
         :raises NotFound: as :meth:`control`
         :raises SwitchboardError: as :func:`relay_server.inside.take_control`, or there is no room for him
         """
-        async with self._guests.at(principal, robot, address) as guest:
-            answer = await take_control(self._clock, guest, why, seconds)
-            return Taken(answer, _shown(guest.session.desk, guest.session.permit))
+        with self._wishes.made(principal, robot) as wish:
+            async with self._guests.at(principal, robot, address) as guest:
+                answer = await take_control(self._clock, guest, wish, why, seconds)
+                return Taken(answer, _shown(guest.session.desk, guest.session.permit))
 
     async def let_go(self, principal: Principal, robot: str, address: str) -> None:
         """Give back what that connection has of control, or asks for. Where it has nothing, nothing is done.
@@ -122,13 +124,13 @@ class Console:
         :raises NotFound: as :meth:`control`
         :raises Unavailable: nobody can say whether he has a right on the robot
         """
+        self._wishes.withdraw(principal, robot)
         there = self._guests.there(principal, robot)
         if there is None:
             await self._stoppable(principal, robot, address)
             return
         guest, leave = there
         try:
-            guest.gave_back += 1
             guest.session.desk.release(guest.session, "")
         finally:
             leave()

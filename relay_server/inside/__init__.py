@@ -2,6 +2,15 @@
 
 from relay_server.inside.client import Answer, InsideClient, MaybeDone
 from relay_server.inside.guests import LINGER_SECONDS, Guest, Guests
-from relay_server.inside.holding import take_control
+from relay_server.inside.holding import Wishes, take_control
 
-__all__ = ["LINGER_SECONDS", "Answer", "Guest", "Guests", "InsideClient", "MaybeDone", "take_control"]
+__all__ = [
+    "LINGER_SECONDS",
+    "Answer",
+    "Guest",
+    "Guests",
+    "InsideClient",
+    "MaybeDone",
+    "Wishes",
+    "take_control",
+]

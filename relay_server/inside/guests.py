@@ -33,6 +33,15 @@ GUESTS = 16
 """Connections of one user, over all robots and tokens, with those that follow a topic."""
 
 
+Key = tuple[int, str, str]
+"""Which connection: the number of the token, the realm, the robot's name there."""
+
+
+def key_of(principal: Principal, robot: str) -> Key:
+    """That of a principal's connection to a robot."""
+    return principal.token_id, principal.realm, robot
+
+
 class Guest:
     """One principal at one robot.
 
@@ -46,8 +55,6 @@ class Guest:
         self._clock = clock
         self._feeds: dict[str, Feed] = {}
         self._doing: set[Deferred[Any]] = set()
-        self.gave_back = 0
-        """How often it was said that control is not wanted any more."""
 
     def feed(self, topic: str, type_name: str = "") -> Feed:
         """What is said on a topic, from now on.
@@ -109,7 +116,7 @@ class Guests:
         self._clock = clock
         self._front = front
         self._clock_ns = clock_ns
-        self._here: dict[tuple[int, str, str], _Stay] = {}
+        self._here: dict[Key, _Stay] = {}
         self._counted: Counter[int] = Counter()
 
     @asynccontextmanager
@@ -130,7 +137,7 @@ class Guests:
 
         :raises SwitchboardError: as :meth:`at`
         """
-        key = (principal.token_id, principal.realm, robot)
+        key = key_of(principal, robot)
         stay = self._here.get(key)
         if stay is None:
             stay = await self._arrive(key, principal, robot, address)
@@ -138,7 +145,7 @@ class Guests:
 
     def there(self, principal: Principal, robot: str) -> tuple[Guest, Callable[[], None]] | None:
         """What :meth:`keep` gives, where it is kept already: nobody comes in by this, and nothing is looked up."""
-        stay = self._here.get((principal.token_id, principal.realm, robot))
+        stay = self._here.get(key_of(principal, robot))
         return None if stay is None else (stay.guest, stay.enter())
 
     @asynccontextmanager
@@ -147,7 +154,7 @@ class Guests:
 
         :raises NotFound: no such robot, or no right on it
         """
-        stay = self._here.get((principal.token_id, principal.realm, robot))
+        stay = self._here.get(key_of(principal, robot))
         if stay is not None:
             yield stay.guest.session.permit
             return
@@ -201,9 +208,7 @@ class Guests:
         self._counted[user] -= 1
         self._counted += Counter()
 
-    async def _arrive(
-        self, key: tuple[int, str, str], principal: Principal, robot: str, address: str
-    ) -> _Stay:
+    async def _arrive(self, key: Key, principal: Principal, robot: str, address: str) -> _Stay:
         admission = await self._front.admit(principal, robot, address)
         there = self._here.get(key)
         if there is not None:
@@ -215,7 +220,7 @@ class Guests:
         self._counted[principal.user_id] += 1
         return stay
 
-    def _left(self, key: tuple[int, str, str]) -> Callable[[], None]:
+    def _left(self, key: Key) -> Callable[[], None]:
         def left() -> None:
             stay = self._here.pop(key, None)
             if stay is not None:

@@ -2,19 +2,98 @@
 
 from __future__ import annotations
 
-from twisted.internet.defer import Deferred
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 
+from twisted.internet.defer import CancelledError, Deferred
+
+from relay_server.access import Principal
 from relay_server.clock import Clock, cancel
 from relay_server.control import Answer, Desk, NotDone
-from relay_server.inside.guests import Guest
+from relay_server.inside.guests import Guest, Key, key_of
 
 OVER = "your request for control is over: it was refused, withdrawn, not answered in time, or others came before you"
 
 GIVEN_BACK = "control was given back meanwhile, or the request for it withdrawn"
 
 
-async def take_control(clock: Clock, guest: Guest, why: str, seconds: float) -> Answer:
+@dataclass(eq=False)
+class _Wanting:
+    """What one connection wants by requests that are not answered yet.
+
+    :ivar open: these requests
+    :ivar told: whether the caller knows by an earlier answer that control is his, or asked for; ``None`` before the
+        connection is there
+    """
+
+    open: set[Wish] = field(default_factory=set)
+    told: bool | None = None
+
+
+@dataclass(eq=False)
+class Wish:
+    """A request for control that is not answered yet."""
+
+    wanting: _Wanting
+    _withdrawn: bool = False
+
+    def withdraw(self) -> None:
+        """The caller does not want it any more."""
+        self._withdrawn = True
+
+    def stands(self) -> bool:
+        """Whether the caller still wants it."""
+        return not self._withdrawn
+
+    def there(self, has_or_asks: bool) -> None:
+        """The connection is there.
+
+        :param has_or_asks: whether control is its, or asked for by it
+        """
+        if self.wanting.told is None:
+            self.wanting.told = has_or_asks
+
+    def answered(self) -> None:
+        """The caller is told what he has."""
+        self.wanting.told = True
+
+    def alone(self) -> bool:
+        """Whether no other request wants what this one does."""
+        return not any(each.stands() for each in self.wanting.open if each is not self)
+
+
+class Wishes:
+    """Requests for control from when they come until they are answered, also before their connections are there."""
+
+    def __init__(self) -> None:
+        self._wanted: dict[Key, _Wanting] = {}
+
+    @contextmanager
+    def made(self, principal: Principal, robot: str) -> Iterator[Wish]:
+        """One, while it is not answered."""
+        key = key_of(principal, robot)
+        wanting = self._wanted.setdefault(key, _Wanting())
+        wish = Wish(wanting)
+        wanting.open.add(wish)
+        try:
+            yield wish
+        finally:
+            wanting.open.discard(wish)
+            if not wanting.open:
+                del self._wanted[key]
+
+    def withdraw(self, principal: Principal, robot: str) -> None:
+        """The caller wants control no more: what he asked for before gives him nothing."""
+        wanting = self._wanted.get(key_of(principal, robot))
+        for wish in () if wanting is None else wanting.open:
+            wish.withdraw()
+
+
+async def take_control(clock: Clock, guest: Guest, wish: Wish, why: str, seconds: float) -> Answer:
     """Take control of a free robot, or ask who has it for it; who has it keeps it.
+
+    Who leaves while he waits is given nothing, and asks nobody any more.
 
     :param seconds: an answer to a request is waited for so long
     :returns: without success when a request has no answer yet
@@ -22,18 +101,33 @@ async def take_control(clock: Clock, guest: Guest, why: str, seconds: float) -> 
     :raises Unavailable: the robot is offline, or does not agree
     :raises NotDone: somebody else asks for it already, or his request is over; or the robot can't do it
     """
-    return await guest.while_here(_taken(clock, guest, why, seconds))
+    return await guest.while_here(_wanted(clock, guest, wish, why, seconds))
 
 
-async def _taken(clock: Clock, guest: Guest, why: str, seconds: float) -> Answer:
+async def _wanted(clock: Clock, guest: Guest, wish: Wish, why: str, seconds: float) -> Answer:
+    session = guest.session
+    lease = session.desk.lease
+    wish.there(lease.held_by(session) or lease.coming_to(session) or lease.requested_by(session))
+    try:
+        answer = await _taken(clock, guest, wish, why, seconds)
+    except CancelledError:
+        if wish.alone() and not wish.wanting.told:
+            session.desk.release(session, "")
+        raise
+    wish.answered()
+    return answer
+
+
+async def _taken(clock: Clock, guest: Guest, wish: Wish, why: str, seconds: float) -> Answer:
     session, until = guest.session, clock.seconds() + seconds
-    desk, gave_back = session.desk, guest.gave_back
-    while True:
+    desk = session.desk
+    while wish.stands():
         answer = await desk.take(session, why)
-        if guest.gave_back != gave_back:
+        if not wish.stands():
             # Said while the robot was being told of it.
-            desk.release(session, "")
-            raise NotDone(GIVEN_BACK)
+            if wish.alone():
+                desk.release(session, "")
+            break
         if answer.success:
             return answer
         if not desk.lease.requested_by(session):
@@ -43,12 +137,11 @@ async def _taken(clock: Clock, guest: Guest, why: str, seconds: float) -> Answer
             if left <= 0:
                 return answer
             await _change(clock, desk, left)
-        if guest.gave_back != gave_back:
-            raise NotDone(GIVEN_BACK)
         moving = (desk.lease.holder, desk.lease.coming)
-        if any(each is not None and each.client is not session for each in moving):
+        if wish.stands() and any(each is not None and each.client is not session for each in moving):
             raise NotDone(OVER)
         # It is his, or nobody's any more, and he still waits for it.
+    raise NotDone(GIVEN_BACK)
 
 
 async def _change(clock: Clock, desk: Desk, seconds: float) -> None:

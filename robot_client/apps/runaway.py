@@ -151,9 +151,7 @@ class Link:
     :param clock: seconds, suspends included
     """
 
-    def __init__(
-        self, line: Line, scan: str, command: str, clock: Callable[[], float] = since_start
-    ) -> None:
+    def __init__(self, line: Line, scan: str, command: str, clock: Callable[[], float] = since_start) -> None:
         self._line = line
         self._pulse = Pulse(line, clock, BEAT, SILENT)
         self._clock = clock

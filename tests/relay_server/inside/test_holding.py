@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import pytest_twisted
+from twisted.internet.defer import CancelledError, Deferred
 
 from relay_db import queries
 from relay_protocol import link
@@ -261,3 +262,67 @@ async def test_who_is_cut_while_he_takes_gets_nothing(place: Place) -> None:
     place.desk.told(link.Done(id=last.id, ok=True))
     place.passes(1)
     assert place.desk.lease.holder is None and place.desk.lease.coming is None
+
+
+def asks(place: Place, who: Principal, seconds: float = 60.0) -> Deferred[Any]:
+    """Somebody asks for control and waits; cancelled when he hangs up."""
+    asked = Deferred.fromCoroutine(place.console.take(who, ROBOT, "let me", HERE, seconds))
+    asked.addErrback(lambda failure: failure.trap(CancelledError))
+    return asked
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_leaves_while_he_waits_asks_nobody_any_more(place: Place) -> None:
+    """At once, not when his connection ends; what is granted then is given to nobody."""
+    held, ann = await place.holding("bob"), await place.principal("ann")
+    async with place.guests.at(ann, ROBOT, HERE):
+        waits = asks(place, ann)
+        assert place.desk.lease.request is not None
+        waits.cancel()
+        assert place.desk.lease.request is None
+    place.desk.grant(held, "")
+    assert place.holder == "bob"
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_leaves_while_the_robot_is_told_has_no_control(place: Place) -> None:
+    """Neither then nor when the robot has answered."""
+    ann = await place.principal("ann")
+    async with place.guests.at(ann, ROBOT, HERE):
+        place.world.control.obeys = None
+        waits = asks(place, ann)
+        coming = place.desk.lease.coming
+        assert coming is not None and coming.client.name == "ann"
+        waits.cancel()
+        for order in place.world.control.all(link.Control):
+            place.desk.told(link.Done(id=order.id, ok=True))
+        place.passes(1)
+        assert place.holder is None and place.desk.lease.coming is None
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_asks_again_is_not_undone_by_what_he_left(place: Place) -> None:
+    """Nor by leaving is anything lost of which he was told before."""
+    await place.holding("bob")
+    ann = await place.principal("ann")
+    async with place.guests.at(ann, ROBOT, HERE):
+        first, again = asks(place, ann), asks(place, ann, 5.0)
+        first.cancel()
+        assert place.desk.lease.request is not None
+        place.passes(5)
+        assert not (await again).answer.success
+        later = asks(place, ann)
+        later.cancel()
+        assert place.desk.lease.request is not None
+
+
+@pytest_twisted.ensureDeferred
+async def test_who_lets_go_before_he_is_let_in_gets_nothing(place: Place) -> None:
+    """The database is slow; his request to give control back overtakes the one for it."""
+    ann = await place.principal("ann")
+    asked = Deferred.fromCoroutine(place.console.take(ann, ROBOT, "", HERE))
+    assert place.guests.there(ann, ROBOT) is None
+    await place.console.let_go(ann, ROBOT, HERE)
+    with pytest.raises(NotDone, match="given back"):
+        await asked
+    assert place.holder is None and place.desk.lease.coming is None
