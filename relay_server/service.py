@@ -204,7 +204,7 @@ class Relay:
             self._reactor, desk, self._access, self._registry, self._desks, self._store, self._journal
         )
         meanings = vocabulary.Meanings(self._access, self._registry, self._workshop)
-        realms = RealmDesk(self._store, self._auth, self._recordings, self.refresh)
+        realms = RealmDesk(self._store, self._auth, self._recordings, self.refresh, lambda: self.robots_port)
         beside = {
             "alerts": partial(alerts.beside, self._alerts.desk),
             "directory": partial(directory_edge.beside, self._reactor, self._directory.desk),

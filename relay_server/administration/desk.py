@@ -51,6 +51,7 @@ class RealmDesk:
     """See the module's text. The functions it carries out are those of ``people`` and ``machines``.
 
     :param take_up: has the relay look at the database; what was revoked is cut then
+    :param robots_port: where robots dial
     :param wall: Unix time in seconds
     :param seconds: a monotonic clock
     """
@@ -63,6 +64,7 @@ class RealmDesk:
         hashing: Hashing,
         recordings: Recordings,
         take_up: Callable[[], Awaitable[None]],
+        robots_port: Callable[[], int],
         wall: Callable[[], float] = time.time,
         seconds: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -70,6 +72,7 @@ class RealmDesk:
         self._hashing = hashing
         self._recordings = recordings
         self._take_up = take_up
+        self._robots_port = robots_port
         self._wall = wall
         self._passwords = 0
         self._realms = Buckets(CHANGES_A_SECOND, CHANGES_AT_ONCE, REALMS, seconds)
@@ -152,6 +155,16 @@ class RealmDesk:
             return work(OwnChange(session, principal, origin, self._wall), *args, **kwargs)
 
         return await to_the_end(Deferred.fromCoroutine(self._changed(carry_out)))
+
+    def enrolling(
+        self, work: Callable[Concatenate[OwnChange, P], dict[str, Any]]
+    ) -> Callable[Concatenate[OwnChange, P], dict[str, Any]]:
+        """Work that gives a robot a code; told with it is at which port of the relay it enrols."""
+
+        def carry_out(change: OwnChange, /, *args: P.args, **kwargs: P.kwargs) -> dict[str, Any]:
+            return {**work(change, *args, **kwargs), "robots_port": self._robots_port()}
+
+        return carry_out
 
     async def _changed(self, work: Callable[[Session], T]) -> T:
         result = await self._store.write(work)

@@ -246,7 +246,7 @@ class RealmPages:
     @app.route("/robots", methods=["POST"])
     @described(operations.NEW_ROBOT)
     def add_robot(self, request: Request) -> Any:
-        return self._added(request, NewRobot, machines.add_robot, "robots", "robot")
+        return self._added(request, NewRobot, self._desk.enrolling(machines.add_robot), "robots", "robot")
 
     @app.route("/robots/<name>", methods=["GET"])
     @described(operations.ROBOT)
@@ -283,7 +283,8 @@ class RealmPages:
 
     async def _new_code(self, request: Request, name: str) -> Any:
         principal = await self._admitted(request, changes=True)
-        told = await self._desk.change(principal, _address(request), machines.new_code, name)
+        work = self._desk.enrolling(machines.new_code)
+        told = await self._desk.change(principal, _address(request), work, name)
         request.setResponseCode(201)
         return told
 

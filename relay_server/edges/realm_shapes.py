@@ -197,6 +197,7 @@ class RealmNewRobot(TypedDict):
 
     :param enrolment_code: is told this once
     :param expires_in: seconds for which the code is good
+    :param robots_port: the port of the relay at which robots dial
     """
 
     robot: str
@@ -205,6 +206,7 @@ class RealmNewRobot(TypedDict):
     guest: bool
     enrolment_code: str
     expires_in: float
+    robots_port: int
 
 
 class RealmCode(TypedDict):
@@ -212,11 +214,13 @@ class RealmCode(TypedDict):
 
     :param enrolment_code: is told this once
     :param expires_in: seconds for which the code is good
+    :param robots_port: the port of the relay at which robots dial
     """
 
     robot: str
     enrolment_code: str
     expires_in: float
+    robots_port: int
 
 
 class RealmRobotGroup(TypedDict):

@@ -120,18 +120,20 @@ def test_a_robot_is_added_and_enrols_by_the_command_that_is_shown(
     seen(page, "robot-add-sure").click()
     expect(seen(page, "realm-problem")).to_contain_text("There is a robot 'mower' already")
     seen(page, "robot-name").fill("rover-one")
+    # Robots that are not shown enrol as well.
+    seen(page, "realm-search").fill("nothing like it")
+    expect(row(page, "robot", "mower")).to_have_count(0)
     seen(page, "robot-add-sure").click()
 
     expect(seen(page, "realm-code-until")).to_contain_text(re.compile(r"Good until .+, for 15 minutes"))
-    expect(row(page, "robot", "rover-one")).to_contain_text("Not enrolled yet")
     command = shlex.split(seen(page, "realm-command").inner_text())
-    # Another port than is assumed, and a folder of this test.
-    command[command.index("--relay") + 1] = f"127.0.0.1:{house.relay.robots_port}"
     command[command.index("--state") + 1] = str(tmp_path / "state")
     done = run_command(command, stdin=seen(page, "realm-code-text").inner_text() + "\n")
     assert done.returncode == 0, done.stderr
     expect(seen(page, "realm-code-until")).to_contain_text("has enrolled")
+    seen(page, "realm-code-done").click()
 
+    seen(page, "realm-search").fill("")
     robot = row(page, "robot", "rover-one")
     expect(robot).to_contain_text("1 live key")
     inside(robot, "robot-show-keys").click()
@@ -139,6 +141,33 @@ def test_a_robot_is_added_and_enrols_by_the_command_that_is_shown(
     inside(robot, "realm-sure").click()
     expect(inside(robot, "realm-key")).to_contain_text("retired")
     expect(inside(robot, "robot-keys")).to_have_text("Not enrolled yet")
+
+
+def test_each_enrolment_is_seen(house: House, open_page: OpenPage, tmp_path: Path) -> None:
+    """Also the third, by which the oldest of two live keys is retired and there are as many as before."""
+    house.relay.cli("robot", "add", "veteran")
+    page = open_page("/realm/robots")
+    robot = row(page, "robot", "veteran")
+    for number in range(3):
+        inside(robot, "robot-code").click()
+        command = shlex.split(inside(robot, "realm-command").inner_text())
+        command[command.index("--state") + 1] = str(tmp_path / f"state-{number}")
+        done = run_command(command, stdin=inside(robot, "realm-code-text").inner_text() + "\n")
+        assert done.returncode == 0, done.stderr
+        expect(inside(robot, "realm-code-until")).to_contain_text("has enrolled")
+        inside(robot, "realm-code-done").click()
+    expect(inside(robot, "robot-keys")).to_have_text("2 live keys")
+
+
+def test_rights_that_can_not_be_asked_for_are_told_to_be_old(house: House, open_page: OpenPage) -> None:
+    """Who looks for somebody's rights is not to take those of another for them."""
+    house.relay.user("daisy")
+    house.relay.cli("right", "grant", "daisy", "mower", "viewer")
+    page = open_page("/realm/rights")
+    expect(right(page, "mower", "daisy")).to_be_visible()
+    page.route("**/api/v1/realm/rights?*", lambda route: route.abort())
+    seen(page, "rights-who").fill("toad")
+    expect(seen(page, "realm-problem")).to_be_visible()
 
 
 def test_a_robot_is_removed_after_it_was_said_what_goes_with_it(house: House, open_page: OpenPage) -> None:

@@ -40,6 +40,7 @@ class Office:
             self,
             cast(Any, SimpleNamespace(library=library)),
             self.take_up,
+            lambda: 9091,
             lambda: 1000.0,
             lambda: self.seconds,
         )

@@ -126,16 +126,18 @@ describe('who there is to choose from', () => {
 })
 
 describe('a code', () => {
+  const TOLD = { robot: 'rover', enrolment_code: 'X', expires_in: 900, robots_port: 9091 }
+
   it('comes with the command that takes it, and does not stand in it', () => {
-    expect(enrolCommand('rover', 'default', { hostname: 'relay', protocol: 'http:' })).toBe(
+    expect(enrolCommand({ ...TOLD, robot: 'rover' }, 'default', { hostname: 'relay', protocol: 'http:' })).toBe(
       'switchboard-robot enroll --relay relay:9091 --robot rover --code - --state /var/lib/switchboard-robot/state',
     )
-    const command = enrolCommand('mobile', 'lab1', { hostname: 'relay', protocol: 'https:' })
-    expect(command).toContain('--relay relay:9091 --tls --robot mobile@lab1 ')
+    const command = enrolCommand({ ...TOLD, robot: 'mobile', robots_port: 9191 }, 'lab1', { hostname: 'relay', protocol: 'https:' })
+    expect(command).toContain('--relay relay:9191 --tls --robot mobile@lab1 ')
   })
 
   it('is good for a time', () => {
-    const { until } = dated({ robot: 'rover', enrolment_code: 'X', expires_in: 900 }, 1000)
+    const { until } = dated(TOLD, 1000)
     expect(goodFor(until, 1000)).toBe('15 minutes')
     expect(goodFor(until, 1801)).toBe('2 minutes')
     expect(goodFor(until, 1850)).toBe('less than a minute')

@@ -136,19 +136,17 @@ export function rightWords({ level, allow, deny }: RealmRight): string {
 }
 
 const DEFAULT_REALM = 'default'
-/** Where robots dial, unless the relay was started otherwise. */
-const ROBOTS_PORT = 9091
 const STATE = '/var/lib/switchboard-robot/state'
 
 /** What brings a robot online once it has enrolled. */
 export const RUN_COMMAND = `switchboard-robot run --state ${STATE}`
 
 /** What enrols a robot, run on it. The code is typed in: as an argument all users of the machine could see it. */
-export function enrolCommand(robot: string, realm: string, page: Pick<Location, 'hostname' | 'protocol'>): string {
+export function enrolCommand({ robot, robots_port }: Enrolment, realm: string, page: Pick<Location, 'hostname' | 'protocol'>): string {
   const full = realm === DEFAULT_REALM ? robot : `${robot}@${realm}`
   const tls = page.protocol === 'https:' ? ' --tls' : ''
   return (
-    `switchboard-robot enroll --relay ${page.hostname}:${ROBOTS_PORT}${tls} --robot ${full} --code - ` +
+    `switchboard-robot enroll --relay ${page.hostname}:${robots_port}${tls} --robot ${full} --code - ` +
     `--state ${STATE}`
   )
 }

@@ -40,6 +40,8 @@ export interface Enrolment {
   enrolment_code: string
   /** For how many seconds the code is good. */
   expires_in: number
+  /** The port of the relay at which robots dial. */
+  robots_port: number
 }
 
 export interface RealmKey {
@@ -155,6 +157,12 @@ export const robots = (asked: Asked) => part<RealmRobot>('robots', path('robots'
 export const rights = (asked: Asked) => part<RealmRight>('rights', path('rights'), asked)
 export const keys = (robot: string, asked: Asked) => part<RealmKey>('keys', path('robots', robot, 'keys'), asked)
 export const tokens = (user: string, asked: Asked) => part<RealmToken>('tokens', path('users', user, 'tokens'), asked)
+
+/** Which keys a robot ever handed in. */
+export async function fingerprints(robot: string): Promise<Set<string>> {
+  const { items } = await gather((asked) => keys(robot, asked), AT_ONCE)
+  return new Set(items.map(({ fingerprint }) => fingerprint))
+}
 
 export const addRobot = (name: string, description: string) => told<Enrolment>('POST', path('robots'), { name, description })
 export const newCode = (robot: string) => told<Enrolment>('POST', path('robots', robot, 'code'))
