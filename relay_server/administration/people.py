@@ -30,13 +30,15 @@ def about(s: Session, realm: str) -> dict[str, Any]:
     }
 
 
-def keep_events(change: OwnChange, days: float | None) -> dict[str, Any]:
+def keep_events(change: OwnChange, days: float | None, seen: Seen = ANYTHING) -> dict[str, Any]:
     """Say how long the realm's memory keeps events; ``None``: as long as the relay's.
 
     :raises Refused: by a token for less than all
+    :raises NotAsBefore: the realm is not as was seen
     :raises Invalid: not more than 0 days, or too many
     """
     change.needs_whole()
+    seen.check(about(change.session, change.realm))
     change.keep_events(change.realm, days)
     return about(change.session, change.realm)
 

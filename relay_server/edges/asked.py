@@ -10,6 +10,7 @@ from werkzeug.http import parse_dict_header, parse_etags
 
 from relay_protocol.errors import Invalid
 from relay_server.openapi import header, query
+from relay_server.resources.forms import EVENTS, JSON, preferred
 from relay_server.resources.listing import LONGEST, PAGE
 
 WAIT = 60.0
@@ -61,23 +62,34 @@ def number_in(query: dict[str, str], name: str, least: float, most: float) -> fl
     return number
 
 
+def field(request: Request, name: str) -> str | None:
+    """A header whose value is a list: all lines of it as one (RFC 9110 section 5.3)."""
+    lines = request.requestHeaders.getRawHeaders(name)
+    return None if lines is None else ", ".join(lines)
+
+
 def known_tags(request: Request) -> frozenset[str]:
     """The entity tags that the asker has already (``If-None-Match``)."""
-    tags = parse_etags(request.getHeader("if-none-match"))
+    tags = parse_etags(field(request, "if-none-match"))
     return frozenset(f'"{each}"' for each in tags.as_set(include_weak=True))
 
 
-def wait_preferred(request: Request) -> float:
+def wait_preferred(request: Request, least: float = 0.0) -> float | None:
     """How long an answer may be waited for, seconds, as ``Prefer: wait`` says (RFC 7240 section 4.3).
 
-    The answer is told that it is so. What is no number is passed over, as preferences are, and no wait is longer than
-    :data:`WAIT`.
+    The answer is told that it is so. What is no number or less than the least is passed over, as preferences are
+    (``None``), and no wait is longer than :data:`WAIT`.
+
+    :raises Invalid: the header is not in UTF-8
     """
-    said = parse_dict_header(", ".join(request.requestHeaders.getRawHeaders("prefer", [])))
+    try:
+        said = parse_dict_header(field(request, "prefer") or "")
+    except UnicodeDecodeError as error:
+        raise Invalid(f"'prefer' is not in UTF-8: {error.reason}") from None
     text = next((text for name, text in said.items() if name.lower() == "wait"), None)
     seconds = _number((text or "").partition(";")[0])
-    if not seconds >= 0:
-        return 0.0
+    if not seconds >= least:
+        return None
     seconds = min(seconds, WAIT)
     request.setHeader(APPLIED, f"wait={seconds:g}")
     return seconds
@@ -85,7 +97,7 @@ def wait_preferred(request: Request) -> float:
 
 def streams(request: Request) -> bool:
     """Whether what happens is wanted as server-sent events."""
-    return "text/event-stream" in (request.getHeader("accept") or "")
+    return preferred(field(request, "accept"), (JSON, EVENTS)) is EVENTS
 
 
 def _number(text: str) -> float:

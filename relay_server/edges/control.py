@@ -14,7 +14,7 @@ from werkzeug.exceptions import HTTPException
 from werkzeug.exceptions import NotFound as NothingHere
 
 from relay_protocol import jsontext
-from relay_protocol.errors import Invalid, SwitchboardError
+from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import NAME, WORDS
 from relay_server.access import Principal
 from relay_server.console import Outcome, Taken
@@ -264,10 +264,7 @@ class RobotControl:
         principal, robot, address = await self._asked(request)
         why = _body(request, Why).why
         # Before it is asked for: what can't be read of a request keeps it from being done.
-        try:
-            seconds = wait_preferred(request)
-        except UnicodeDecodeError as error:
-            raise Invalid(f"'prefer' is not in UTF-8: {error.reason}") from None
+        seconds = wait_preferred(request) or 0.0
         taken = await self._desk.take(principal, robot, why, address, seconds)
         if not taken.answer.success:
             request.setResponseCode(202)

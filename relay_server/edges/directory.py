@@ -20,7 +20,7 @@ from relay_server.directory.desk import DirectoryDesk, Kept
 from relay_server.directory.entries import Ask, Registration, ask_of, place_text
 from relay_server.edges import directory_operations as operations
 from relay_server.edges.api import STREAMED, Api, body_of
-from relay_server.edges.asked import query_of, streams
+from relay_server.edges.asked import field, query_of, streams
 from relay_server.edges.once import see_no_key
 from relay_server.edges.outflow import Outflow
 from relay_server.edges.sse import news_within, sent
@@ -91,7 +91,7 @@ class DirectoryPages:
 
     async def _put(self, request: Request, id: str) -> Any:
         principal = await self._api.principal(request)
-        new, match = _said(request), request.getHeader("if-match")
+        new, match = _said(request), field(request, "if-match")
         return _kept(request, await self._desk.put(principal, id, new, match, _address(request)))
 
     @app.route("/<path:id>", methods=["DELETE"])
@@ -101,7 +101,7 @@ class DirectoryPages:
 
     async def _remove(self, request: Request, id: str) -> Any:
         principal = await self._api.principal(request)
-        await self._desk.remove(principal, id, request.getHeader("if-match"), _address(request))
+        await self._desk.remove(principal, id, field(request, "if-match"), _address(request))
 
     # --- streams ------------------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_server.clock import Clock
 from relay_server.edges.api import STREAMED, Api, body_of
-from relay_server.edges.asked import query_of
+from relay_server.edges.asked import field, query_of
 from relay_server.edges.once import KEYED, once, send
 from relay_server.edges.outflow import Outflow
 from relay_server.edges.sse import news_within, sent
@@ -28,10 +28,13 @@ from relay_server.memory.limits import LONGEST, SEVERAL
 from relay_server.openapi import JSON, Answer, Operation, described, query
 from relay_server.openapi.told import Event, EventCount, EventPage, EventsKept
 from relay_server.resources import Idempotency, Reply
+from relay_server.resources.forms import EVENTS, Form, preferred
+from relay_server.resources.forms import JSON as JSON_FORM
 
-STREAM = "text/event-stream"
+STREAM = EVENTS.media
 CSV = "text/csv"
 LINES = ("application/jsonl", "application/x-ndjson")
+FORMS_THERE = (JSON_FORM, EVENTS, *(Form(each) for each in (CSV, *LINES)))
 
 CHUNK = 500
 """Events of an export that are looked up and sent at a time."""
@@ -214,8 +217,8 @@ def beside(clock: Clock, desk: MemoryDesk, keys: Idempotency, api: Api) -> IReso
 
 def _form(request: Request) -> str:
     """The form that is asked for; empty for a page in JSON."""
-    accepted = (request.getHeader("accept") or "").lower()
-    return next((form for form in (STREAM, CSV, *LINES) if form in accepted), "")
+    form = preferred(field(request, "accept"), FORMS_THERE)
+    return "" if form is JSON_FORM else form.media
 
 
 def _see_none(query: dict[str, str], *names: str) -> None:

@@ -12,7 +12,7 @@ from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
-from relay_protocol.errors import Invalid, SwitchboardError
+from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import NAME
 from relay_protocol.rights import Operation
 from relay_server.clock import Clock
@@ -99,10 +99,7 @@ class Giving:
         wish = body_of(request, Wish)
         ask = Ask(bytes(wish.goal), wish.type, wish.unwatched)
         # Before the goal is given: what can't be read of a request keeps it from being done.
-        try:
-            seconds = wait_preferred(request)
-        except UnicodeDecodeError as error:
-            raise Invalid(f"'prefer' is not in UTF-8: {error.reason}") from None
+        seconds = wait_preferred(request) or 0.0
 
         async def work() -> Reply:
             goal = await self._desk.give(asker, name, ask, moment)

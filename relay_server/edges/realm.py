@@ -20,7 +20,7 @@ from relay_server.administration.desk import RealmDesk
 from relay_server.administration.own import Seen
 from relay_server.edges import realm_operations as operations
 from relay_server.edges.api import Api, body_of
-from relay_server.edges.asked import query_of
+from relay_server.edges.asked import field, query_of
 from relay_server.edges.once import see_no_key
 from relay_server.edges.realm_operations import PAGED
 from relay_server.edges.realm_shapes import (
@@ -126,7 +126,10 @@ class RealmPages:
     async def _change(self, request: Request) -> Any:
         principal = await self._admitted(request, changes=True)
         days = body_of(request, RealmChange).events_days
-        return await self._desk.change(principal, _address(request), people.keep_events, days)
+        told = await self._desk.change(
+            principal, _address(request), people.keep_events, days, seen=_seen(request)
+        )
+        return changed(request, told)
 
     # --- users --------------------------------------------------------------------------------------------
 
@@ -385,7 +388,7 @@ def _made(request: Request, told: Any, *names: str) -> Any:
 
 def _seen(request: Request) -> Seen:
     """What who changes something says that he has seen of it."""
-    return Seen(request.getHeader("if-match"), request.getHeader("if-none-match"))
+    return Seen(field(request, "if-match"), field(request, "if-none-match"))
 
 
 def _address(request: Request) -> str:

@@ -107,9 +107,11 @@ CHANGE = _operation(
     "PATCH",
     "",
     "Say how long the realm's memory keeps events",
-    {200: Answer("the realm", RealmAbout)},
+    {200: Answer("the realm", RealmAbout, headers=TAGGED)},
     more="Takes a token without a scope. The relay goes by it within ten minutes.",
     body=RealmChange,
+    parameters=(_MATCH,),
+    errors=(412,),
 )
 
 USERS = _page("users", "Users", RealmUsers)

@@ -16,10 +16,11 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, Unavailable
 from relay_protocol.limits import NAME
 from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.asked import field
 from relay_server.resources import Asker, ResourceDesk
 from relay_server.resources.describing import Place, members_graph, param_graph, state_graph
 from relay_server.resources.forms import FORMS, JSON, Form, sent, tags_of, wanted
-from relay_server.resources.states import Param, State, tag_of
+from relay_server.resources.states import Param, State, tag_of, weak
 from relay_server.resources.syntax import read, write
 from relay_server.resources.values import Meant, message_in, value_in
 from relay_server.store import Threads
@@ -96,15 +97,16 @@ class Representing:
         :raises NotAcceptable: the request takes none
         """
         request.setHeader(b"vary", b"Accept")
-        return wanted(request.getHeader("accept"), (*FORMS, *more))
+        return wanted(field(request, "accept"), (*FORMS, *more))
 
     async def state(self, request: Request, asker: Asker, state: State, form: Form) -> Any:
         """What a topic says."""
+        tag = weak(form.tag(state.etag))
         if form is JSON:
-            return _tagged(request, state.etag, state.json())
+            return _tagged(request, tag, state.json())
         background = await self._desk.background(asker, state)
         make = partial(state_graph, state, background, self._place(request))
-        return await self._written(request, asker, make, form, state.etag)
+        return await self._written(request, asker, make, form, tag)
 
     async def param(self, request: Request, asker: Asker, param: Param, form: Form) -> Any:
         """A parameter."""
@@ -113,7 +115,7 @@ class Representing:
         if form is JSON:
             return _tagged(request, param.etag, param.json())
         return await self._written(
-            request, asker, partial(param_graph, param, self._place(request)), form, param.etag
+            request, asker, partial(param_graph, param, self._place(request)), form, form.tag(param.etag)
         )
 
     async def members(self, request: Request, asker: Asker, page: Mapping[str, Any], form: Form) -> Any:
@@ -139,7 +141,7 @@ class Representing:
         if form is JSON:
             return _tagged(request, etag, body)
         make = partial(graph, facts, self._place(request))
-        return await self._written(request, asker, make, form, etag)
+        return await self._written(request, asker, make, form, form.tag(etag))
 
     async def message(self, request: Request, asker: Asker, name: str) -> Message:
         """The message in a request's body.
@@ -172,16 +174,16 @@ class Representing:
         return await self._desk.made(asker, lambda: find(read(body, form, address), urlsplit(address).path))
 
     async def _written(
-        self, request: Request, asker: Asker, make: Callable[[], Graph], form: Form, etag: str
+        self, request: Request, asker: Asker, make: Callable[[], Graph], form: Form, tag: str
     ) -> bytes:
         body = await self._desk.made(asker, lambda: write(make(), form))
-        request.setHeader(b"etag", form.tag(etag).encode())
+        request.setHeader(b"etag", tag.encode())
         request.setHeader(b"content-type", f"{form.media}; charset=utf-8".encode())
         return body
 
     def _known(self, request: Request, tag: str) -> bool:
         """Whether who asks has it already, which he is told then."""
-        if tag not in tags_of(request.getHeader("if-none-match")):
+        if tag not in tags_of(field(request, "if-none-match")):
             return False
         request.setHeader(b"etag", tag.encode())
         request.setResponseCode(304)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from relay_server.edges.asked import LISTING, WAIT
 from relay_server.edges.goals import GOAL_HEADERS, PREFER, Wish
@@ -51,16 +51,22 @@ _ASKING = (409, 504)
 """What can be wrong with asking a node of the robot."""
 
 
+TIMEOUT = 10.0
+"""Seconds that a service may take where nothing is said of it."""
+
+LEAST_TIMEOUT = 0.1
+
+
 class Call(msgspec.Struct, forbid_unknown_fields=True):
     """A call of a service.
 
     :param args: an object, or a list in the order of the fields
-    :param timeout: seconds
+    :param timeout: seconds; without it ``Prefer: wait``, else 10
     """
 
     args: msgspec.Raw = raw(b"{}")
     type: TypeName = ""
-    timeout: Annotated[float, Meta(ge=0.1, le=300.0)] = 10.0
+    timeout: Annotated[float, Meta(ge=LEAST_TIMEOUT, le=300.0)] | UnsetType = UNSET
 
 
 def members_of(

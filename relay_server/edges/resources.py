@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 from klein import Klein
+from msgspec import UNSET
 from twisted.internet.defer import DeferredList
 from twisted.internet.task import LoopingCall
 from twisted.web.resource import IResource
@@ -22,14 +23,14 @@ from relay_server.clock import Clock, as_twisted
 from relay_server.edges import cameras, goals, modules
 from relay_server.edges import resource_operations as operations
 from relay_server.edges.api import STREAMED, Api, body_of
-from relay_server.edges.asked import WAIT, known_tags, number_in, query_of
+from relay_server.edges.asked import WAIT, field, known_tags, number_in, query_of, wait_preferred
 from relay_server.edges.dated import dated_in_form
 from relay_server.edges.flow import Flow
 from relay_server.edges.goals import Giving
 from relay_server.edges.methods import not_taken
 from relay_server.edges.once import Once, send
 from relay_server.edges.representing import Representing
-from relay_server.edges.resource_operations import THROTTLE_MS, Call
+from relay_server.edges.resource_operations import LEAST_TIMEOUT, THROTTLE_MS, TIMEOUT, Call
 from relay_server.frontdesk import FrontDesk
 from relay_server.inside import Guests, MaybeDone
 from relay_server.openapi import described
@@ -50,6 +51,7 @@ from relay_server.resources import (
 )
 from relay_server.resources.describing import member_graph
 from relay_server.resources.forms import EVENTS, Form, of_any_form
+from relay_server.resources.states import weak
 from relay_server.session.calling import URGENT
 from relay_server.store import Threads
 
@@ -138,7 +140,7 @@ class RobotResources:
             return STREAMED
         state, known = await self._desk.state(asker, name, _wanted(request, form))
         if known:
-            request.setHeader("etag", form.tag(state.etag))
+            request.setHeader("etag", weak(form.tag(state.etag)))
             request.setResponseCode(304)
             return STREAMED
         return await self._forms.state(request, asker, state, form)
@@ -199,7 +201,7 @@ class RobotResources:
 
     async def _publish(self, request: Request, name: str) -> Any:
         asker, moment = await self._asker(request), self._moment(request)
-        if request.getHeader("if-match") is not None:
+        if field(request, "if-match") is not None:
             raise Invalid(NO_MATCH)
         body = await self._forms.message(request, asker, name)
 
@@ -212,9 +214,11 @@ class RobotResources:
     async def _call(self, request: Request, name: str) -> Any:
         asker = await self._asker(request, passes=resolve(name) in URGENT)
         body, moment = body_of(request, Call), self._moment(request)
+        seconds = wait_preferred(request, LEAST_TIMEOUT) if body.timeout is UNSET else body.timeout
+        timeout = TIMEOUT if seconds is None else seconds
 
         async def work() -> Reply:
-            values = await self._desk.call(asker, name, body.args, body.type, body.timeout, moment)
+            values = await self._desk.call(asker, name, body.args, body.type, timeout, moment)
             return Reply(200, jsontext.encode({"values": msgspec.Raw(values)}))
 
         return send(request, await self._once.reply(request, asker, Operation.CALL, name, work))
@@ -225,10 +229,10 @@ class RobotResources:
     async def _set(self, request: Request, name: str) -> Any:
         asker = await self._asker(request)
         value = await self._forms.value(request, asker, name)
-        await self._desk.set_param(asker, name, value, of_any_form(request.getHeader("if-match")))
+        await self._desk.set_param(asker, name, value, of_any_form(field(request, "if-match")))
 
     async def _remove(self, request: Request, name: str) -> Any:
-        match = of_any_form(request.getHeader("if-match"))
+        match = of_any_form(field(request, "if-match"))
         await self._desk.remove_param(await self._asker(request), name, match)
 
     # --- requests and answers -----------------------------------------------------------------------------

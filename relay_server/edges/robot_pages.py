@@ -8,12 +8,13 @@ from twisted.web.server import Request
 
 from relay_protocol import jsontext
 from relay_server.edges.api import STREAMED, Api
-from relay_server.edges.asked import query_of
+from relay_server.edges.asked import field, query_of
 from relay_server.edges.tagged import known, told
 from relay_server.resources import Listing
 from relay_server.resources.describing import Place, robot_graph
 from relay_server.resources.forms import JSON, wanted
 from relay_server.resources.robots import Overview, RobotDesk, robot_tag, robots_tag
+from relay_server.resources.states import weak
 from relay_server.resources.syntax import write
 from relay_server.resources.turns import Turns
 from relay_server.store import Threads
@@ -37,7 +38,7 @@ class RobotPages:
         """
         principal = await api.principal(request)
         page = await self._desk.members(principal, Listing.of(query_of(request), typed=False))
-        return told(request, jsontext.encode(page), f"W/{robots_tag(page)}")
+        return told(request, jsontext.encode(page), weak(robots_tag(page)))
 
     async def one(self, api: Api, request: Request, name: str) -> Any:
         """One of them, in the form that the request wants.
@@ -48,9 +49,9 @@ class RobotPages:
         """
         principal = await api.principal(request)
         request.setHeader(b"vary", b"Accept")
-        form = wanted(request.getHeader("accept"))
+        form = wanted(field(request, "accept"))
         robot = await self._desk.robot(principal, name)
-        etag = f"W/{form.tag(robot_tag(robot))}"
+        etag = weak(form.tag(robot_tag(robot)))
         if form is JSON:
             return told(request, jsontext.encode(robot), etag)
         if known(request, etag):

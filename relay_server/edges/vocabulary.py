@@ -14,6 +14,7 @@ from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.ros.definition import Definition, normalise
 from relay_server.access import Access, Principal
 from relay_server.edges.api import STREAMED, Api
+from relay_server.edges.asked import field
 from relay_server.local.catalogue import TYPES
 from relay_server.openapi import PROBLEM, Answer, Credential, Operation, Parameter, described, header
 from relay_server.openapi.told import Available
@@ -155,13 +156,13 @@ def beside(meanings: Meanings, api: Api) -> IResource:
 def _form(request: Request) -> Form:
     """:raises NotAcceptable: the request takes none of the forms there are"""
     request.setHeader(b"vary", b"Accept")
-    return wanted(request.getHeader("accept"), DOCUMENTS)
+    return wanted(field(request, "accept"), DOCUMENTS)
 
 
 def _told(request: Request, body: bytes, form: Form) -> Any:
     tag = form.tag(tag_of(body))
     request.setHeader(b"etag", tag.encode())
-    if tag in tags_of(request.getHeader("if-none-match")):
+    if tag in tags_of(field(request, "if-none-match")):
         request.setResponseCode(304)
         return STREAMED
     request.setHeader(b"content-type", f"{form.media}; charset=utf-8".encode())

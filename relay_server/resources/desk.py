@@ -6,9 +6,10 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from typing import Any, NamedTuple, TypeVar
+from weakref import WeakValueDictionary
 
 import msgspec
-from twisted.internet.defer import CancelledError, Deferred
+from twisted.internet.defer import CancelledError, Deferred, DeferredLock
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
@@ -28,7 +29,7 @@ from relay_server.resources import params
 from relay_server.resources.background import Background, background
 from relay_server.resources.following import Following
 from relay_server.resources.listing import Listing
-from relay_server.resources.states import Param, State, see_match
+from relay_server.resources.states import NotAsBefore, Param, State, see_match
 from relay_server.resources.turns import Turns
 from relay_server.session import Session
 from relay_server.session.calling import RESUME, moves_by
@@ -88,6 +89,7 @@ class ResourceDesk:
         self._clock_ns = clock_ns
         self._wall = wall
         self._turns = Turns()
+        self._changing: WeakValueDictionary[tuple[int, str], DeferredLock] = WeakValueDictionary()
 
     async def members(self, asker: Asker, kind: str, listing: Listing) -> dict[str, Any]:
         """A page of one of :data:`KINDS`.
@@ -317,20 +319,33 @@ class ResourceDesk:
         :raises NotAsBefore: it has another
         :raises NotDone: its node says why not
         """
-        async with self._guests.at(*asker) as guest:
+        async with self._guests.at(*asker) as guest, self._alone_with(guest, name):
             await self._see_same(guest, name, match)
             await params.set_value(guest, name, json)
 
     async def remove_param(self, asker: Asker, name: str, match: str | None) -> None:
         """Delete a parameter; see :meth:`set_param`."""
-        async with self._guests.at(*asker) as guest:
+        async with self._guests.at(*asker) as guest, self._alone_with(guest, name):
             await self._see_same(guest, name, match)
             await params.remove(guest, name)
 
+    def _alone_with(self, guest: Guest, name: str) -> DeferredLock:
+        """While it is held nobody else changes that parameter by HTTP: what was seen of it still holds.
+
+        Nodes, and clients of ``/rosapi/set_param``, are not kept from it.
+        """
+        key = guest.session.robot.robot_id, name.lstrip("/")
+        return self._changing.setdefault(key, DeferredLock())
+
     @staticmethod
     async def _see_same(guest: Guest, name: str, match: str | None) -> None:
-        if match is not None:
-            see_match(Param(name, await params.value(guest, name)).etag, match)
+        if match is None:
+            return
+        try:
+            found = Param(name, await params.value(guest, name))
+        except NotFound as error:
+            raise NotAsBefore(str(error)) from None
+        see_match(found.etag, match)
 
     def dated(self, guest: Guest, moment: int | None) -> int:
         """When something that moves the robot can have been asked for at the earliest.

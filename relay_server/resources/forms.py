@@ -83,6 +83,14 @@ def wanted(accept: str | None, there: Sequence[Form] = FORMS) -> Form:
     return best
 
 
+def preferred(accept: str | None, there: Sequence[Form]) -> Form:
+    """The same where the first is for everybody, whatever he says he takes (RFC 9110 section 12.1)."""
+    try:
+        return wanted(accept, there)
+    except NotAcceptable:
+        return there[0]
+
+
 def sent(content_type: str | None) -> Form:
     """The form a request's body is in.
 

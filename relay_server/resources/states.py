@@ -20,6 +20,9 @@ class NotAsBefore(Refused):
 class State(NamedTuple):
     """What a topic says.
 
+    Said twice it is the same state, and is told as known: a map that comes anew each time somebody listens is not sent
+    again to who has it. Its time differs, so the entity tag is a weak one (RFC 9110 section 8.8.1).
+
     :param at: Unix seconds at which the relay got it
     :param value: JSON
     """
@@ -62,6 +65,11 @@ class Param(NamedTuple):
 def tag_of(value: bytes) -> str:
     """A strong entity tag (RFC 9110 section 8.8.3)."""
     return f'"{hashlib.sha256(value).hexdigest()[:24]}"'
+
+
+def weak(etag: str) -> str:
+    """The tag of a representation that differs in what does not count."""
+    return f"W/{etag}"
 
 
 def see_match(etag: str, match: str) -> None:

@@ -34,6 +34,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ask]:
 @pytest.mark.parametrize(
     ("path", "mine", "theirs"),
     [
+        ("", {"events_days": 7}, {"events_days": 5}),
         ("/users/wario", {"disabled": True}, {"admin": True}),
         ("/robots/cart", {"description": "mine"}, {"description": "theirs"}),
         ("/rights/cart/wario", {"level": "owner"}, {"level": "operator", "deny": ["call:/x"]}),

@@ -153,6 +153,20 @@ def test_an_export_has_all(world: World, desk: Desk) -> None:
     assert not any(uses for _, _, uses in desk.asked)
 
 
+@pytest.mark.parametrize(
+    ("accept", "type"),
+    [
+        ("application/json, text/csv;q=0.1", "application/json"),
+        ("text/event-stream;q=0, */*", "application/json"),
+        ("text/html, image/png", "application/json"),
+        ("TEXT/CSV", "text/csv"),
+    ],
+)
+def test_the_form_that_is_wanted_most_is_given(world: World, accept: str, type: str) -> None:
+    """By the qualities of 'Accept'; a page of JSON to whoever takes none that there is."""
+    assert world.ask("GET", HERE, **ANN, Accept=accept).headers["content-type"].partition(";")[0] == type
+
+
 def test_an_export_that_can_not_go_on_breaks_off(world: World, desk: Desk) -> None:
     """What is not whole must not look so: the last chunk is missing."""
     desk.error = Unavailable("the disk is full")

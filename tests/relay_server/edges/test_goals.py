@@ -235,18 +235,20 @@ def test_a_preference_that_cannot_be_read_gives_no_goal(world: World) -> None:
 @pytest.mark.parametrize(
     ("preferred", "seconds", "applied"),
     [
-        ([], 0.0, None),
+        ([], None, None),
         (["wait=10"], 10.0, "wait=10"),
         (['respond-async, WAIT="2.5"'], 2.5, "wait=2.5"),
         (["respond-async", "wait=3; for=me"], 3.0, "wait=3"),
         (["wait=3600"], 60.0, "wait=60"),
-        (["wait"], 0.0, None),
-        (["wait=soon"], 0.0, None),
-        (["wait=-1"], 0.0, None),
-        (["wait=nan"], 0.0, None),
+        (["wait"], None, None),
+        (["wait=soon"], None, None),
+        (["wait=-1"], None, None),
+        (["wait=nan"], None, None),
     ],
 )
-def test_how_long_is_preferred_to_wait(preferred: list[str], seconds: float, applied: str | None) -> None:
+def test_how_long_is_preferred_to_wait(
+    preferred: list[str], seconds: float | None, applied: str | None
+) -> None:
     """What can't be done is passed over; what is done is said to be."""
     request: Any = DummyRequest([b""])
     request.requestHeaders.setRawHeaders("prefer", preferred)

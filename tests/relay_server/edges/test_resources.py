@@ -14,6 +14,7 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
 from relay_server.edges import resources as module
+from relay_server.edges.once import Once
 from relay_server.edges.resources import RobotResources
 from relay_server.inside import MaybeDone
 from relay_server.resources import HEADER, Asker, Listing, Moments, Wanted
@@ -75,6 +76,12 @@ class Desk:
         if self.cut is not None:
             raise self.cut
 
+    async def call(
+        self, asker: Asker, name: str, args: Any, type_name: str, seconds: float, moment: int | None
+    ) -> bytes:
+        """How long it may take."""
+        return str(seconds).encode()
+
     async def background(self, asker: Asker, state: State) -> Background:
         """Nothing."""
         return Background({}, False)
@@ -108,7 +115,7 @@ def world(tmp_path: Path, desk: Any) -> World:
             made.clock,
             desk,
             moments,
-            unused,  # type: ignore[arg-type]
+            Once(unused, desk),  # type: ignore[arg-type]
             unused,  # type: ignore[arg-type]
             part,
             api,
@@ -118,6 +125,26 @@ def world(tmp_path: Path, desk: Any) -> World:
 
     made.below.update({part: partial(below, part) for part in module.PARTS})
     return made
+
+
+@pytest.mark.parametrize(
+    ("body", "prefer", "seconds", "applied"),
+    [
+        ({}, {}, 10.0, None),
+        ({}, {"Prefer": "wait=25"}, 25.0, "wait=25"),
+        ({}, {"Prefer": "wait=900"}, 60.0, "wait=60"),
+        ({}, {"Prefer": "wait=0"}, 10.0, None),
+        ({"timeout": 200}, {"Prefer": "wait=25"}, 200.0, None),
+        ({"timeout": 0.5}, {}, 0.5, None),
+    ],
+)
+def test_a_call_takes_as_long_as_is_said(
+    world: World, body: dict[str, float], prefer: dict[str, str], seconds: float, applied: str | None
+) -> None:
+    """By the body, else by what is preferred; and what of that is so is said."""
+    answer = world.ask("POST", f"{HERE}/services/reset", body, **prefer, **ANN)
+    assert answer.json == {"values": seconds}
+    assert answer.headers.get("preference-applied") == applied
 
 
 @pytest.mark.parametrize("media", MEDIA)

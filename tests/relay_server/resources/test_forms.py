@@ -15,6 +15,7 @@ from relay_server.resources.forms import (
     NotAcceptable,
     UnknownForm,
     of_any_form,
+    preferred,
     sent,
     tags_of,
     wanted,
@@ -52,6 +53,23 @@ def test_who_takes_no_form_is_told_those_there_are(accept: str) -> None:
     with pytest.raises(NotAcceptable, match="text/turtle") as refused:
         wanted(accept)
     assert refused.value.available == [each.media for each in FORMS]
+
+
+@pytest.mark.parametrize(
+    ("accept", "form"),
+    [
+        (None, JSON),
+        ("text/html, */*;q=0.8", JSON),
+        ("text/html", JSON),
+        ("application/json;q=0", JSON),
+        ("application/json, text/event-stream", JSON),
+        ("text/event-stream;q=0, */*", JSON),
+        ("application/json;q=0.5, Text/Event-Stream", EVENTS),
+    ],
+)
+def test_where_the_first_form_is_for_everybody(accept: str | None, form: Form) -> None:
+    """Whoever takes none of those there are gets it."""
+    assert preferred(accept, (JSON, EVENTS)) is form
 
 
 def test_a_body_says_its_form() -> None:
