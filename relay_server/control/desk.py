@@ -14,6 +14,7 @@ from relay_protocol.errors import Refused, SwitchboardError, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.bucket import Buckets
 from relay_server.clock import Clock
+from relay_server.control.comeback import Comeback, held_on
 from relay_server.control.lease import Client, Request, Tenure, owns
 from relay_server.control.record import WHY, Actor, Record
 from relay_server.control.steering import Steering
@@ -53,8 +54,7 @@ class Desk(Steering):
         super().__init__(clock, robot, record, rules, changed, wall, clock_ns)
         self._takes = Buckets(TAKES_A_SECOND, TAKES_AT_ONCE, USERS, clock.seconds)
         """By user, how often he may take control still."""
-        self._cut_off: OrderedDict[int, float] = OrderedDict()
-        """By user, the moment of the latest command of a connection that ended before he had let go."""
+        self._comeback = Comeback(clock)
         self._resting: OrderedDict[int, tuple[int, float]] = OrderedDict()
         """By user, the connection that refused him control the last time, and until when he does not ask it again."""
 
@@ -76,8 +76,12 @@ class Desk(Steering):
         if lease.coming_to(client):
             return False
         self._judge(client)
-        self._see_let_go(client)
         tenure = lease.holder or lease.coming
+        if tenure is not None and self._deserted(client):
+            # A link that swallows all is known to be lost later than its user comes back by another.
+            since = tenure.client.commanding_since()
+            self._comeback.note(client.user, since, held_on=held_on(tenure.client, since))
+        self._see_let_go(client)
         if tenure is not None and (self.rules.explicit or not self._deserted(client)):
             raise self._held_by(tenure)
         if not lease.settled:
@@ -88,6 +92,7 @@ class Desk(Steering):
                 "portal"
             )
         self._count_take(client)
+        self._comeback.forget(client.user)
         lost = "the same user commands from another connection"
         self._succeed(client, IMPLICIT, "taken", lost, implicit=True)
         return False
@@ -122,8 +127,10 @@ class Desk(Steering):
 
         :raises Refused: he has not let go since
         """
-        # By another connection he goes on as he did by that which has ended.
-        since = self._bereft.pop(client, self._cut_off.get(client.user))
+        since = self._bereft.pop(client, None)
+        if since is None:
+            # By another connection he goes on as he did by that which has ended.
+            since = self._comeback.silent_since(client)
         if since is None:
             return
         now = self._clock.seconds()
@@ -210,7 +217,7 @@ class Desk(Steering):
             return self._request(client, why)
         # Who goes on as before is held back by his session then.
         self._bereft.pop(client, None)
-        self._cut_off.pop(client.user, None)
+        self._comeback.forget(client.user)
         how = "taken" if lease.holder is None else "taken over"
         error = await self._succeed(client, why, how, f"{client.name} has taken over")
         if error is not None:
@@ -337,21 +344,19 @@ class Desk(Steering):
 
     # --- what ends it -------------------------------------------------------------------------------------
 
-    def left(self, client: Client) -> None:
-        """A connection has ended."""
+    def left(self, client: Client, *, orderly: bool = False) -> None:
+        """A connection has ended.
+
+        :param orderly: its user has closed it
+        """
         self.pushing.forget(client)
         # Not the moment at which the connection ended: who did not command any more has let go.
         since = max(self._bereft.get(client, 0.0), client.commanding_since())
+        lost = not orderly and held_on(client, since)
         self._lose(client, "the connection has ended")
         if self._bereft.pop(client, None) is not None:
-            self._remember_cut_off(client.user, since)
+            self._comeback.note(client.user, since, held_on=lost)
         self.subsuming.ends(client, lambda topic: False)
-
-    def _remember_cut_off(self, user: int, since: float) -> None:
-        self._cut_off[user] = max(since, self._cut_off.get(user, 0.0))
-        self._cut_off.move_to_end(user)
-        while len(self._cut_off) > USERS:
-            self._cut_off.popitem(last=False)
 
     def rights_changed(self, client: Client) -> None:
         """Whoever may not control the robot any more does not; with another level other limits count."""

@@ -67,9 +67,11 @@ class Client(Hashable, Protocol):
     :ivar name: its user's
     :ivar user: that user's number
     :ivar address: where it is, for people
+    :ivar opened: the relay's clock when it came
     """
 
     number: int
+    opened: float
     permit: Permit
     address: str
 

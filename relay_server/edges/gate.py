@@ -56,8 +56,11 @@ class Occupant(Protocol):
     def close(self, code: int, reason: str) -> None:
         """Close the websocket with a code, and end."""
 
-    def end(self) -> None:
-        """The websocket is gone, or goes."""
+    def end(self, *, orderly: bool = False) -> None:
+        """The websocket is gone, or goes.
+
+        :param orderly: the client has closed it
+        """
 
 
 class Gate(Protocol):

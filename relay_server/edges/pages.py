@@ -163,7 +163,7 @@ class PageClient:
         self._transport.close(code, reason)
         self.end()
 
-    def end(self) -> None:
+    def end(self, *, orderly: bool = False) -> None:
         """The websocket is gone, or goes."""
         self._pinging.stop()
         self.outbox.close()

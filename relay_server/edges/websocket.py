@@ -41,6 +41,7 @@ class ClientProtocol(BoundedProtocol):
 
     log = Logger()
     factory: ClientFactory
+    vouches = True
     takes = limits.CLIENT_MESSAGE
     """Bytes a message may have once a session has begun."""
 
@@ -261,7 +262,7 @@ class ClientProtocol(BoundedProtocol):
         session, self._session = self._session, None
         self.takes_text = None
         if session is not None:
-            session.end()
+            session.end(orderly=wasClean and not self.closedByMe)
 
     def nothing_more(self) -> None:
         """Hold off what the session sends, which goes to the writer without a look at the state."""

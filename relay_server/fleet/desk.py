@@ -323,7 +323,7 @@ class FleetDesk:
             client.begin(session)
             return await Errand(self._clock, session, client, plan.order, young).run()
         finally:
-            session.end()
+            session.end(orderly=True)
 
     async def _admit(self, plan: Plan, record: RobotRecord) -> Admission:
         if not _is_local(plan.asker):

@@ -91,6 +91,8 @@ class InsideClient:
         monotonic nanoseconds; ``None`` for now. Who speaks for others must not make what they say young
     """
 
+    vouches = False
+
     def __init__(self, undated: int | None = None) -> None:
         self._undated = undated
         self._session: Session | None = None

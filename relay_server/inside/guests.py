@@ -181,7 +181,7 @@ class Guests:
             try:
                 yield session, client
             finally:
-                session.end()
+                session.end(orderly=True)
         finally:
             self._uncount(principal.user_id)
 
@@ -269,7 +269,8 @@ class _Stay:
     def _end(self) -> None:
         self._timer = None
         self._left()
-        self.guest.session.end()
+        # A request that is followed by none is no connection that was lost.
+        self.guest.session.end(orderly=True)
         # What it still waits for does not come any more.
         self.guest.client.close(closing.GOING_AWAY, OVER)
 

@@ -102,6 +102,7 @@ class Session:
         self.notice: Notice = unnoticed
         self.share = Share(self)
         self._clock = clock
+        self.opened = clock.seconds()
         self._transport = transport
         self._freshness = freshness
         self._ended = ended
@@ -165,15 +166,18 @@ class Session:
             robot=self.robot.full,
         )
 
-    def end(self) -> None:
-        """The transport is gone; give everything back."""
+    def end(self, *, orderly: bool = False) -> None:
+        """The transport is gone; give everything back.
+
+        :param orderly: the client has closed it
+        """
         if self._closed:
             return
         self._closed = True
         self.outbox.close()
         self._pinging.end()
         # Before what it asked for is given back: nothing of this client moves the robot any more.
-        self.desk.left(self)
+        self.desk.left(self, orderly=orderly)
         self.incoming.end()
         self.listening.end()
         self.calling.end()
@@ -357,8 +361,11 @@ class Session:
 
     def heard_driving(self) -> float:
         """The clock's time at which it last answered a ping; endless if it let go of all it commanded."""
-        silence = self._freshness.silence() / 1e9 if self.publishing.holds_on else -float("inf")
-        return self._clock.seconds() - silence
+        if not self.publishing.holds_on:
+            return float("inf")
+        if not self._transport.vouches:
+            return self.driving_since()
+        return self._clock.seconds() - self._freshness.silence() / 1e9
 
     def _ago(self, nanoseconds: int) -> float:
         return self._clock.seconds() - (0 if self.pursuing.moving else nanoseconds / 1e9)

@@ -11,7 +11,12 @@ if TYPE_CHECKING:
 
 
 class ClientTransport(Protocol):
-    """The websocket under a session."""
+    """The websocket under a session.
+
+    :ivar vouches: whether an answer to a ping shows that who commands is still there
+    """
+
+    vouches: bool
 
     def send(self, frames: bytes) -> None:
         """One or more whole websocket frames, see :mod:`relay_server.wsframe`."""

@@ -10,12 +10,14 @@ from typing import Any
 import httpx
 import pytest
 from switchboard_drive import LET_GO_SECONDS
+from switchboard_http import ask
 from switchboard_waiting import wait_for
 
 from relay_server.inside import LINGER_SECONDS
 from relay_server.resources import HEADER
 
 ROBOT = "/api/v1/robots/rover"
+STAND: Any = {"value": {}}
 GO = {"value": {"linear": {"x": 0.2}, "angular": {"z": 0.3}}}
 
 
@@ -40,9 +42,9 @@ class Hand:
         """Take control, or ask for it."""
         return self._dated(self.client.put("control", json={"why": why}, headers=headers))
 
-    def drive(self) -> httpx.Response:
+    def drive(self, command: Any = GO) -> httpx.Response:
         """One command."""
-        return self._dated(self.client.post("topics/cmd_vel", json=GO, headers={HEADER: self._moment}))
+        return self._dated(self.client.post("topics/cmd_vel", json=command, headers={HEADER: self._moment}))
 
     def moves(self) -> None:
         """Drive until the robot moves, by its own record."""
@@ -163,8 +165,8 @@ def test_who_asks_waits_for_the_answer(world: Any, tokens: dict[str, str], hal: 
         assert "your request for control is over" in refused.json()["detail"]
 
 
-def test_who_falls_silent_loses_it(hal: Hand, world: Any) -> None:
-    """The robot stands by its own watch; somewhat later nobody has control, and whoever comes may take it."""
+def test_who_falls_silent_loses_it(hal: Hand, world: Any, tokens: dict[str, str]) -> None:
+    """The robot stands by its own watch; later nobody has control, which is told, and whoever comes has it."""
     assert hal.take().status_code == 200
     hal.moves()
     hal.stands()
@@ -173,7 +175,26 @@ def test_who_falls_silent_loses_it(hal: Hand, world: Any) -> None:
     lost = [each for each in world.relay.cli("audit", "list") if each["action"] == "control.lost"]
     assert any(each["data"]["why"] == "the connection has ended" for each in lost)
     assert not world.robot.moving()
+
+    def told() -> list[str]:
+        """Alerts of control that was lost by somebody who had not let go."""
+        found = ask(world.relay.http_port, "GET", "/api/v1/alerts?robot=rover&open=true", token=tokens["hal"])
+        return [each["text"] for each in found.json["alerts"] if each["kind"] == "control"]
+
+    (text,) = wait_for("it is told", told)
+    assert text.startswith("hal lost control while")
     assert hal.take().status_code == 200
+    wait_for("somebody has control again", lambda: not told())
+
+
+def test_who_has_said_zero_is_no_matter_of_an_alert(hal: Hand, world: Any, tokens: dict[str, str]) -> None:
+    """He has let go; that his control ends with his silence is as it should be."""
+    assert hal.take().status_code == 200
+    hal.moves()
+    wait_for("zero is said", lambda: hal.drive(STAND).status_code == 204)
+    wait_for("nobody has control", lambda: hal.holder() is None)
+    found = ask(world.relay.http_port, "GET", "/api/v1/alerts?robot=rover&open=true", token=tokens["hal"])
+    assert [each for each in found.json["alerts"] if each["kind"] == "control"] == []
 
 
 def test_a_revoked_token_loses_it(world: Any, tokens: dict[str, str], hal: Hand) -> None:

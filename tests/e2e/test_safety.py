@@ -89,6 +89,30 @@ def test_who_drives_on_across_a_lost_robot_link_moves_nothing_before_he_lets_go(
     drive.again()
 
 
+@pytest.mark.parametrize("away", [0.0, 1.5])
+def test_who_drives_on_across_a_loss_of_his_connection_moves_nothing_before_he_lets_go(
+    drive: Drive, away: float
+) -> None:
+    """Also where he was away for longer than letting go takes: as long as he was not there he let go of nothing."""
+    lost = 0
+
+    def connect() -> Client:
+        if lost:
+            time.sleep(away)  # so long a library waits before it connects anew
+        return drive.relay.connect_by(drive.client_side.port, "rover", drive.token)
+
+    driver = Returning(connect)
+    drive.start_driving(driver)
+    lost = time.monotonic_ns()
+    drive.client_side.reset()
+    drive.stands_within_limit(lost)
+    stood = time.monotonic_ns()
+    drive.client_side.heal()
+    wait_for("the driver is back", lambda: driver.connections > 1)
+    moves_only_after_letting_go(drive, driver, stood)
+    drive.again()
+
+
 @pytest.mark.parametrize("who_is_first", ["driver", "robot"])
 def test_who_drives_on_across_a_restart_of_the_relay_moves_nothing_before_he_lets_go(
     drive: Drive, who_is_first: str

@@ -155,6 +155,8 @@ class MemoryLink:
 class MemoryClient:
     """A client's websocket as a session writes to it."""
 
+    vouches = True
+
     def __init__(self) -> None:
         self.sent: list[bytes] = []
         self.pings: list[bytes] = []

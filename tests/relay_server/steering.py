@@ -72,6 +72,7 @@ class Connection:
         self.permit = Permit(Principal(self.number, name, "main", False, 1, None), 1, Rules())
         self.permit.rules = Rules([Grant(level, (), deny)])
         self.address = "192.0.2.7"
+        self.opened = clock.seconds()
         self.told: list[str] = []
         self.commanded = 0.0
         self.alive = inf

@@ -185,7 +185,7 @@ class VideoClient:
             self._transport.close(code, reason)
             self.end()
 
-    def end(self) -> None:
+    def end(self, *, orderly: bool = False) -> None:
         """The websocket is gone; give everything back."""
         self._ended = True
         self.outbox.close()

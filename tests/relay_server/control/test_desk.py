@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
 from relay_protocol import link
 from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.control import ControlRules, State
+from relay_server.control import ControlRules, State, comeback
 from relay_server.control import desk as module
 from relay_server.control.orders import WAITING
 from relay_server.control.record import Actor
@@ -691,9 +691,101 @@ def test_who_comes_back_by_another_connection_lets_go_first(place: Place) -> Non
     assert place.desk.lease.held_by(again), "the latest command of ann was long ago"
 
 
+class Returning(NamedTuple):
+    """Somebody whose connection is gone, and who may come back."""
+
+    place: Place
+    gone: Connection
+
+    def back(self, after: float) -> Connection:
+        """His new connection, so many seconds later."""
+        self.place.clock.advance(after)
+        again = self.place.connection(self.gone.name)
+        again.permit = self.gone.permit
+        return again
+
+
+def driving(place: Place) -> Returning:
+    """Somebody who commands, and is there."""
+    ann = place.holding("ann")
+    ann.commanded = ann.alive = place.clock.seconds()
+    return Returning(place, ann)
+
+
+@pytest.mark.parametrize("after", [0.0, 1.0, 4.9])
+def test_to_connect_anew_is_no_letting_go(place: Place, after: float) -> None:
+    """What was lost says nothing of the stick; who lets go by the new connection, or asks for control, has it."""
+    ann = driving(place)
+    place.desk.left(ann.gone)
+    again = ann.back(after)
+    for _ in range(20):
+        with pytest.raises(Refused, match="let go for"):
+            place.desk.claim(again)
+        place.clock.advance(0.2)
+    place.clock.advance(0.5)
+    place.desk.claim(again)
+    assert place.desk.lease.held_by(again)
+
+
+def test_who_asks_for_control_by_a_new_connection_has_it(place: Place) -> None:
+    """His session holds back what he goes on commanding."""
+    ann = driving(place)
+    place.desk.left(ann.gone)
+    again = ann.back(1.0)
+    with pytest.raises(Refused, match="let go for"):
+        place.desk.claim(again)
+    assert result(place.desk.take(again, "")).success
+
+
+def test_who_closes_his_connection_or_had_let_go_comes_back_as_he_came_first(place: Place) -> None:
+    """A program that is run again, and a hand that had been off the stick for a while."""
+    ann = driving(place)
+    place.desk.left(ann.gone, orderly=True)
+    again = ann.back(0.6)
+    place.desk.claim(again)
+    assert place.desk.lease.held_by(again)
+    again.commanded = place.clock.seconds()
+    again.alive = again.commanded + 1.5
+    place.clock.advance(2.0)
+    place.desk.left(again)
+    last = ann.back(0.1)
+    place.desk.claim(last)
+    assert place.desk.lease.held_by(last)
+
+
+def test_what_may_have_waited_for_a_new_connection_moves_nothing(place: Place) -> None:
+    """Libraries send it at once; who comes back so late is no driver any more, and begins a moment later."""
+    ann = driving(place)
+    place.desk.left(ann.gone)
+    again = ann.back(60.0)
+    with pytest.raises(Refused, match="may have waited"):
+        place.desk.claim(again)
+    place.clock.advance(0.5)
+    place.desk.claim(again)
+    assert place.desk.lease.held_by(again)
+    again.commanded = again.alive = place.clock.seconds()
+    place.desk.left(again)
+    late = ann.back(301.0)
+    place.desk.claim(late)
+    assert place.desk.lease.held_by(late)
+
+
+def test_who_comes_back_before_his_connection_is_known_to_be_lost_lets_go_first(place: Place) -> None:
+    """The one that has control says nothing any more; the other opens while the first still counts."""
+    ann = driving(place)
+    again = ann.back(3.0)
+    for _ in range(5):
+        with pytest.raises(Refused, match="let go for"):
+            place.desk.claim(again)
+        place.clock.advance(0.2)
+    place.clock.advance(0.5)
+    place.desk.claim(again)
+    assert place.desk.lease.held_by(again)
+
+
 def test_users_who_are_remembered_are_bounded(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest are forgotten first."""
-    monkeypatch.setattr(module, "USERS", 2)
+    monkeypatch.setattr(comeback, "USERS", 2)
     gone = [place.connection(name) for name in ("ann", "bob", "eve")]
     for each in gone:
         place.desk.unheard(each)

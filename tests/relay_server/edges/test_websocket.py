@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from twisted.internet.defer import Deferred
-from twisted.internet.error import ConnectionDone
+from twisted.internet.error import ConnectionDone, ConnectionLost
 from twisted.python.failure import Failure
 
 from relay_protocol import limits
@@ -403,6 +403,23 @@ def test_a_message_in_frames_is_as_old_as_the_first_of_them(gate: MemoryGate) ->
     assert session.got[-1] == b'{"op":"x"}'
     assert session.since == [1_000_000_000]
     assert session.not_before == 2_000_000_000
+
+
+@pytest.mark.parametrize("how", ["by the client", "by the relay", "by the network"])
+def test_who_has_closed_a_connection_is_known(gate: MemoryGate, how: str) -> None:
+    """A client that leaves means to; one that is cut or lost may hold on to the stick."""
+    client = Client(gate, Authorization="Bearer good")
+    (session,) = gate.sessions
+    if how == "by the client":
+        client.core.send_close(1000)
+        client.run()
+    elif how == "by the relay":
+        client.end.close(closing.FORBIDDEN, "your right was revoked")
+        client.run()
+    else:
+        client.end.connectionLost(Failure(ConnectionLost()))
+    assert session.got[-1] == "end"
+    assert session.orderly is (how == "by the client")
 
 
 @pytest.mark.parametrize("payload", [b"", b"{}"])

@@ -56,9 +56,10 @@ class MemorySession:
         """Not full any more."""
         self.got.append("resume")
 
-    def end(self) -> None:
+    def end(self, *, orderly: bool = False) -> None:
         """Gone."""
         self.got.append("end")
+        self.orderly = orderly
 
     def close(self, code: int, reason: str) -> None:
         """As a session does."""
