@@ -33,6 +33,9 @@ REOPEN_SECONDS = 0.5
 MOST_REOPEN_SECONDS = 5.0
 """Pause before a broken link is asked for anew; it doubles each time, until a picture comes."""
 
+INHIBITED_SECONDS = 0.2
+"""How often it is looked whether a camera of which somebody is owed a picture may be seen again."""
+
 TELL_SECONDS = 0.1
 """Viewers are told no more often what is sent; the newest counts, and a robot could say it a thousand times at once."""
 
@@ -164,13 +167,20 @@ class Stream:
         self._patience.ends(viewer)
 
     def _greet(self, viewer: Viewer) -> None:
-        """Who comes later is told what the others know.
-
-        Who wanted to is shown the newest picture of a slow camera, too, as everybody is one that its publisher keeps;
-        its stamp tells how old it is.
-        """
+        """Who comes later is told what the others know."""
         if viewer in self.viewers and self.told is not None:
             viewer.playing(self.told)
+        self._show_newest(viewer)
+
+    def _show_newest(self, viewer: Viewer) -> None:
+        """He sees the newest picture, if it is not old.
+
+        Who wanted to is shown that of a slow camera, too, as everybody is one that its publisher keeps; its stamp tells
+        how old it is. While the camera is inhibited nobody is shown any.
+        """
+        if viewer in self.viewers and self._inhibited():
+            self._clock.callLater(INHIBITED_SECONDS, self._show_newest, viewer)
+            return
         newest, now = self.newest, self._clock.seconds()
         if viewer not in self.viewers or newest is None or not newest.key or not self._keys.waits(viewer):
             return
@@ -358,11 +368,20 @@ class Stream:
 
     def _named(self) -> link.Camera | None:
         """The camera as the robot tells of it."""
+        names = self._names()
+        return next((each for each in self.robot.cameras if each.name in names), None)
+
+    def _names(self) -> set[str]:
         names = {self.camera}
         if self.settings.transport == "compressed":
             # Some cameras publish nothing else; image_transport's users name them by their raw topic all the same.
             names.add(link.compressed_of(self.camera))
-        return next((each for each in self.robot.cameras if each.name in names), None)
+        return names
+
+    def _inhibited(self) -> bool:
+        """Whether nobody is to get pictures of the camera now, not even its last one (SPEC section 1.7)."""
+        names = self._names()
+        return any(each.resource in names and not each.hold for each in self.robot.safety.inhibited)
 
     def _open_later(self, event: Event) -> None:
         pause = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec import structs
 
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, Unavailable
@@ -105,6 +106,24 @@ def test_what_the_network_held_up_is_good_for_less_long(world: World) -> None:
         shows(world, stream, number, late=late)
     left = [picture.good_until - world.clock.seconds() for picture in watcher.pictures]
     assert left == pytest.approx([STALE_SECONDS, STALE_SECONDS - 0.3, STALE_SECONDS - 2.0])
+
+
+def test_who_comes_while_a_camera_is_inhibited_sees_nothing_of_it(world: World) -> None:
+    """Not even the picture that its publisher keeps; that comes when it is over. One that is held is shown."""
+    stream, _, _ = watched(world)
+    stream.message(structs.replace(PLAYING, latched=True))
+    shows(world, stream, 1)
+    inhibited = link.Inhibited(resource=stream.camera, ms=5000, by="olga")
+    world.robot.safety = structs.replace(world.robot.safety, inhibited=[inhibited])
+    late = Watcher()
+    late.watch(world)
+    world.clock.pump([0.2] * 15)
+    assert late.played and late.numbers == []
+    world.robot.safety = structs.replace(
+        world.robot.safety, inhibited=[structs.replace(inhibited, hold=True)]
+    )
+    world.clock.advance(1)
+    assert late.numbers == [1]
 
 
 def test_who_comes_later_is_told_what_the_others_know(world: World) -> None:
