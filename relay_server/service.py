@@ -191,11 +191,13 @@ class Relay:
         guests = Guests(self._reactor, desk, now_ns)
         offices = self._access, self._desks, self._registry, self._store
         self._console = Console(self._reactor, desk, *offices, guests)
-        keys = Idempotency(self._reactor)
+        # What is written down often is not to crowd out what robots have been asked to do.
+        keys, robots_keys = Idempotency(self._reactor), Idempotency(self._reactor)
+        making = robots_keys, self._workshop, moments, now_ns, time.time
         below = {
             "recordings": partial(recordings.below, self._reactor, keeper, keys),
             "people": partial(presence.below, desk.overview),
-            **resources.parts(self._reactor, desk, guests, keys, self._workshop, moments, now_ns, time.time),
+            **resources.parts(self._reactor, desk, guests, *making),
             **{
                 part: partial(control_edge.below, self._console, moments, part) for part in control_edge.PARTS
             },

@@ -12,6 +12,7 @@ from urllib.parse import unquote_plus
 from sqlalchemy.orm import Session
 
 from relay_db import queries
+from relay_db.names import findable
 from relay_db.queries import IssuedRecord, ProgramRecord
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.realms import full_name
@@ -159,7 +160,8 @@ class OAuthDesk:
         if program is None:
             raise BadCredentials("prove the program by its key and secret: Digest, or Basic over TLS")
         scope = _scope(ask.scope, program.scope)
-        if ask.realm not in (None, program.realm) and scope is not None and not scope.anywhere:
+        another = ask.realm is not None and findable(ask.realm) != program.realm
+        if another and scope is not None and not scope.anywhere:
             raise OAuthError(
                 "invalid_scope",
                 "in another realm a token is for a scope that names no robots and has no 'admin': those meant are of "

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
@@ -56,6 +57,33 @@ def test_check_constraints_match_the_migrations(database: Database) -> None:
     assert meant
 
 
+def test_an_older_relay_names_no_robot_that_was_shared(empty_url: str) -> None:
+    """Who goes back leaves nothing of it in groups, rights and the directory of other realms."""
+    database = Database(empty_url)
+    database.upgrade()
+    with database.begin() as s:
+        queries.add_realm(s, "lab2")
+        robot = queries.add_robot(s, "rover")
+        queries.share_robot(s, robot.id, "lab2")
+        for realm in ("default", "lab2"):
+            user = queries.add_user(s, "ann", None, realm=realm)
+            queries.grant_right(s, robot.id, "viewer", user_id=user.id)
+            queries.add_to_robot_group(s, queries.add_robot_group(s, "all", realm).id, robot.id)
+    with database.connection() as connection:
+        config = Config()
+        config.set_main_option("script_location", str(FOLDER))
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0008")
+        for table in ("robot_right", "robot_membership"):
+            assert connection.execute(text(f"SELECT count(*) FROM {table}")).scalar() == 1
+        kept = (
+            "SELECT realm.name FROM robot_membership JOIN robot_group ON robot_group.id = group_id "
+            "JOIN realm ON realm.id = realm_id"
+        )
+        assert connection.execute(text(kept)).scalars().all() == ["default"]
+    database.close()
+
+
 def test_the_head_in_the_code_is_the_newest_migration() -> None:
     """The quick look at the version compares with the right one."""
     assert _scripts().get_heads() == [schema.HEAD]
@@ -87,8 +115,6 @@ def test_a_newer_schema_is_refused_in_words(database: Database) -> None:
 
 def test_a_failing_migration_leaves_nothing(empty_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Migrations run in one transaction on both databases: half a schema is never seen."""
-    from alembic import command
-
     run = command.upgrade
 
     def run_and_fail(*args: object) -> None:

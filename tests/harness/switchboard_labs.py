@@ -36,7 +36,7 @@ class TwoRealms:
         :param headers: with ``_`` for ``-``
         """
         sent = {name.replace("_", "-"): value for name, value in headers.items()}
-        port, token = self.relay.http_port, self.tokens.get(who, "")
+        port, token = self.relay.http_port, self.tokens[who] if who else ""
         return ask(port, method, f"{REALM}{path}", body, headers=sent, token=token)
 
     def do(self, method: str, path: str, body: Any = None, who: str = "root@lab1") -> Any:

@@ -347,7 +347,8 @@ async def test_a_scope_that_names_robots_is_for_those_of_ones_own_realm(
     """In another one other robots have these names; nor does anybody administer there by it."""
     await there.fill(scope)
     await there.joins("lab2")
-    assert (await there.by_secret(asked))["access_token"]
+    for own in (None, "Default"):
+        assert (await there.by_secret(asked, own))["access_token"]
     if error:
         assert await there.error(there.by_secret(asked, "lab2")) == error
     else:

@@ -62,5 +62,11 @@ def downgrade() -> None:
         "<> (SELECT realm_id FROM robot WHERE id = robot_right.robot_id)"
     )
     op.execute(other)
+    # Nor is a robot of another realm to be named by groups and entries that were made while it was shared.
+    home = "(SELECT realm_id FROM robot WHERE id = robot_id)"
+    op.execute(
+        f"DELETE FROM robot_membership WHERE (SELECT realm_id FROM robot_group WHERE id = group_id) <> {home}"
+    )
+    op.execute(f"DELETE FROM directory_entry WHERE robot_id IS NOT NULL AND realm_id <> {home}")
     op.drop_table("guest_account")
     op.drop_table("robot_realm")
