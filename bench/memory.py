@@ -56,6 +56,10 @@ ASKS: dict[str, dict[str, str]] = {
     "a user": {"user": "user5"},
     "a field, the last hour": {"kind": "k3", "data.person": "p3", "last": "3600"},
     "counted, the last minute": {"kind": "k3", "data.person": "p3", "last": "60", "count": "true"},
+    "a field alone, of none": {"data.person": "nobody"},
+    "kinds that begin so, of none": {"kind": "zz*"},
+    "all counted": {"count": "true"},
+    "a field counted": {"data.person": "p3", "count": "true"},
     "a page a day back": {"until": "{yesterday}", "kind": "k9"},
 }
 

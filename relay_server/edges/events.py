@@ -13,7 +13,7 @@ from twisted.web.resource import IResource
 from twisted.web.server import Request
 from werkzeug.exceptions import HTTPException
 
-from relay_db.queries import MemoryRecord
+from relay_db.queries import MemoryPlace, MemoryRecord
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_server.clock import Clock
@@ -136,12 +136,10 @@ class EventPages:
         if form:
             return await self._export(request, ask, form)
         if ask.counts:
-            return {"count": await self._desk.count(principal, ask)}
+            count, more = await self._desk.count(principal, ask)
+            return {"count": count, "next": _next(more)}
         events, forms, more = await self._desk.page(principal, ask, ask.limit)
-        return {
-            "events": [forms.json(each) for each in events],
-            "next": None if more is None else place_text(more),
-        }
+        return {"events": [forms.json(each) for each in events], "next": _next(more)}
 
     # --- exports ------------------------------------------------------------------------------------------
 
@@ -219,6 +217,10 @@ def _form(request: Request) -> str:
     """The form that is asked for; empty for a page in JSON."""
     form = preferred(field(request, "accept"), FORMS_THERE)
     return "" if form is JSON_FORM else form.media
+
+
+def _next(place: MemoryPlace | None) -> str | None:
+    return None if place is None else place_text(place)
 
 
 def _see_none(query: dict[str, str], *names: str) -> None:

@@ -25,7 +25,7 @@ from relay_protocol.rights import Rules
 from relay_server.access import NO_ROBOT, Access, Principal
 from relay_server.memory import guarding
 from relay_server.memory.asks import Ask, Forms, chosen
-from relay_server.memory.limits import ASKED, ASKED_EACH, DATA, LOOKS, RECENT, SEVERAL
+from relay_server.memory.limits import ASKED, ASKED_EACH, COUNTED_USED, DATA, LOOKS, RECENT, SEVERAL
 from relay_server.memory.quota import Quota
 from relay_server.memory.writer import Writer
 from relay_server.store import Store
@@ -260,19 +260,24 @@ class MemoryDesk:
             rules,
         )
 
-    async def count(self, principal: Principal, ask: Ask) -> int:
-        """How many events there are.
+    async def count(self, principal: Principal, ask: Ask) -> tuple[int, MemoryPlace | None]:
+        """How many events there are, and the place behind which there may be more: one count takes :data:`LOOKS` reads.
+
+        Who asks whether something has happened uses it by that as who reads it does.
 
         :raises Unavailable: the database does not answer, or too many ask
         """
         sight, place = await self.sight(principal, ask), ask.after
         count = 0
-        while not sight.empty:
+        for _ in range(0 if sight.empty else LOOKS):
             more, place = await self._read(principal, queries.count_memories, sight.ask, place)
             count += int(more)
             if place is None:
                 break
-        return count
+        if place is None and 0 < count <= COUNTED_USED:
+            page: MemoryPage = await self._read(principal, queries.recall, sight.ask, ask.after, count)
+            self._quota.used(page.events)
+        return count, None if sight.empty else place
 
     async def page(
         self, principal: Principal, ask: Ask, limit: int, *, uses: bool = True

@@ -52,8 +52,11 @@ ASKED = 64
 ASKED_EACH = 16
 """Queries that wait for the database: of all, and of one user."""
 
-LOOKS = 10
-"""Times that the database is asked for one page; what was not found by then is on the next one."""
+LOOKS = 5
+"""Times that the database is asked for one page, or one count; what was not found by then is on the next one."""
+
+COUNTED_USED = 100
+"""So many events that were counted, and no more, count as used by that."""
 
 USES = 20_000
 """Events of which uses wait to be written; of more they are not counted."""

@@ -198,9 +198,13 @@ class EventsKept(TypedDict):
 
 
 class EventCount(TypedDict):
-    """How many events match."""
+    """How many events match.
+
+    :param next: there may be more, to be counted by what has this as its ``after``
+    """
 
     count: int
+    next: str | None
 
 
 class Group(TypedDict):

@@ -51,9 +51,9 @@ class Desk:
         if self.error is not None:
             raise self.error
 
-    async def count(self, principal: Principal, ask: Ask) -> int:
-        """Always the same."""
-        return 7
+    async def count(self, principal: Principal, ask: Ask) -> tuple[int, MemoryPlace | None]:
+        """Always the same; there may be more behind what is not asked from a place on."""
+        return 7, MemoryPlace(3.0, 5) if ask.after is None else None
 
     async def page(
         self, principal: Principal, ask: Ask, limit: int, *, uses: bool = True
@@ -139,7 +139,10 @@ def test_a_page_says_where_the_next_one_begins(world: World, desk: Desk) -> None
         after = page["next"]
     assert numbers == [3, 2, 1]
     assert all(uses and limit == 1 for _, limit, uses in desk.asked)
-    assert world.ask("GET", f"{HERE}?count=true", **ANN).json == {"count": 7}
+    counted = world.ask("GET", f"{HERE}?count=true", **ANN).json
+    assert counted["count"] == 7
+    rest = world.ask("GET", f"{HERE}?count=true&after={counted['next']}", **ANN).json
+    assert rest == {"count": 7, "next": None}
 
 
 def test_an_export_has_all(world: World, desk: Desk) -> None:
