@@ -60,6 +60,7 @@ ASKS: dict[str, dict[str, str]] = {
     "kinds that begin so, of none": {"kind": "zz*"},
     "all counted": {"count": "true"},
     "a field counted": {"data.person": "p3", "count": "true"},
+    "a user and a field, of none": {"user": "user5", "data.person": "nobody"},
     "a page a day back": {"until": "{yesterday}", "kind": "k9"},
 }
 

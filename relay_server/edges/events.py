@@ -116,7 +116,9 @@ class EventPages:
                     Annotated[int, Meta(ge=1, le=LONGEST)],
                 ),
                 query("after", "`next` of an earlier answer: what comes behind that"),
-                query("count", "how many there are is wanted, and nothing else", Literal["true", "false"]),
+                query(
+                    "count", "how many there are is wanted, and where to count on", Literal["true", "false"]
+                ),
             ),
             answers={200: Answer("events", (EventPage, EventCount), media=(JSON, *LINES, CSV, STREAM))},
         )

@@ -16,7 +16,7 @@ from twisted.python.failure import Failure
 from relay_db import queries
 from relay_db.base import canonical_json
 from relay_db.models import NAME, SOURCE
-from relay_db.queries import MemoryAsk, MemoryPage, MemoryPlace, MemoryRecord, NewMemory
+from relay_db.queries import MemoryAsk, MemoryPage, MemoryPlace, MemoryRecord, MemoryTally, NewMemory
 from relay_db.queries.recalling import LOGIN, OURS
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
@@ -268,15 +268,16 @@ class MemoryDesk:
         :raises Unavailable: the database does not answer, or too many ask
         """
         sight, place = await self.sight(principal, ask), ask.after
-        count = 0
+        count, numbers = 0, list[int]()
         for _ in range(0 if sight.empty else LOOKS):
-            more, place = await self._read(principal, queries.count_memories, sight.ask, place)
-            count += int(more)
+            few = COUNTED_USED - len(numbers)
+            part: MemoryTally = await self._read(principal, queries.count_memories, sight.ask, place, few)
+            count, numbers, place = count + part.size, numbers + part.numbers, part.place
             if place is None:
                 break
-        if place is None and 0 < count <= COUNTED_USED:
-            page: MemoryPage = await self._read(principal, queries.recall, sight.ask, ask.after, count)
-            self._quota.used(page.events)
+        # Of a part that had too many the numbers are not told.
+        if place is None and count == len(numbers):
+            self._quota.used(principal.realm, numbers)
         return count, None if sight.empty else place
 
     async def page(
@@ -301,7 +302,7 @@ class MemoryDesk:
                 break
         told = found[:limit]
         if uses:
-            self._quota.used(told)
+            self._quota.used(principal.realm, [each.number for each in told])
         if len(found) > limit:
             place = MemoryPlace(told[-1].at, told[-1].number)
         return told, sight.forms, None if sight.empty else place

@@ -52,7 +52,7 @@ ASKED = 64
 ASKED_EACH = 16
 """Queries that wait for the database: of all, and of one user."""
 
-LOOKS = 5
+LOOKS = 2
 """Times that the database is asked for one page, or one count; what was not found by then is on the next one."""
 
 COUNTED_USED = 100

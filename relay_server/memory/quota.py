@@ -91,10 +91,10 @@ class Quota:
         self._sizes.pop(realm, None)
         self._uses = Counter({each: times for each, times in self._uses.items() if each[0] != realm})
 
-    def used(self, events: Iterable[MemoryRecord]) -> None:
-        """A query has given these."""
-        for each in events:
-            key = (each.realm, each.number)
+    def used(self, realm: str, numbers: Iterable[int]) -> None:
+        """A query has given these of a realm, or counted them."""
+        for number in numbers:
+            key = (realm, number)
             if len(self._uses) < USES or key in self._uses:
                 self._uses[key] += 1
 

@@ -17,8 +17,9 @@ SECONDS = 5.0
 """How long an answer is waited for."""
 LONGEST = 4_000_000
 """Bytes of an answer that are read."""
-PAGES = 10
-"""Pages of events that are asked for."""
+PAGES = 100
+MOST = 10_000
+"""Pages of events that are asked for, many of which may be short or empty, and events that are taken."""
 
 
 class Unanswered(Exception):
@@ -83,7 +84,9 @@ class Memory:
                 if answer["next"] is None:
                     return found
                 query["after"] = str(answer["next"])
-        raise Unanswered(f"there are more than {PAGES} pages of events")
+            if len(found) >= MOST:
+                break
+        raise Unanswered(f"there are more than {PAGES} pages of events, or {MOST:,} events")
 
     def write(self, kind: str, **data: str) -> int:
         """Keep an event about the robot; its number, by which later ones have greater ones.

@@ -31,7 +31,7 @@ from sqlalchemy.orm import Session
 
 from relay_db.base import canonical_json
 from relay_db.models import Memory, MemoryCount, Realm
-from relay_db.queries.records import MemoryAsk, MemoryPage, MemoryPlace, MemoryRecord
+from relay_db.queries.records import MemoryAsk, MemoryPage, MemoryPlace, MemoryRecord, MemoryTally
 
 OURS = "relay"
 """Sources that begin so are the relay's own."""
@@ -40,7 +40,8 @@ LOGIN = "login"
 """Kinds that begin so are for administrators, where they are about no robot."""
 
 LOOKED_AT = 10_000
-"""Rows one call looks at, at most."""
+SCATTERED = 5_000
+"""Rows one call looks at, at most: by time alone, and by an index whose rows lie apart, so that each takes longer."""
 
 _SLICES = (256, 2048, LOOKED_AT)
 """Rows of one look: small first, since most askers want what came last."""
@@ -58,15 +59,15 @@ _COLUMNS = (
 
 
 def recall(s: Session, ask: MemoryAsk, place: MemoryPlace | None, limit: int) -> MemoryPage:
-    """Events, the newest first: as many as were found among :data:`LOOKED_AT` rows.
+    """Events, the newest first: as many as were found among :data:`LOOKED_AT` or :data:`SCATTERED` rows.
 
     :param place: only those that come after this one
     :param limit: most events
     """
     found: list[MemoryRecord] = []
-    values, looked = _values(s, ask), 0
+    values, most, looked = _values(s, ask), _most(ask), 0
     for size in _SLICES:
-        size = min(size, LOOKED_AT - looked)
+        size = min(size, most - looked)
         looked += size
         room = limit - len(found)
         asked = _asked(_shape(s, ask, place))
@@ -80,21 +81,26 @@ def recall(s: Session, ask: MemoryAsk, place: MemoryPlace | None, limit: int) ->
     return MemoryPage(found, place)
 
 
-def count_memories(s: Session, ask: MemoryAsk, place: MemoryPlace | None) -> tuple[int, MemoryPlace | None]:
-    """How many there are among :data:`LOOKED_AT` rows, and where to go on.
+def count_memories(s: Session, ask: MemoryAsk, place: MemoryPlace | None, few: int) -> MemoryTally:
+    """How many there are among as many rows as :func:`recall` looks at, and where to go on.
 
     :param place: only those that come after this one
+    :param few: of so many, and of no more, the numbers are told
     """
     asked = _asked(_shape(s, ask, place))
-    now = {**_values(s, ask), **_place_values(place), "size": LOOKED_AT}
-    return _count(s, ask, asked, now), _end(s, asked, now)
+    now = {**_values(s, ask), **_place_values(place), "size": _most(ask), "room": few + 1}
+    if ask.data:
+        numbers = [row.number for row in s.execute(asked.data, now) if _fits(ask, row.data)]
+    else:
+        numbers = list(s.scalars(asked.numbers, now))
+    count = len(numbers)
+    if count > few:
+        count, numbers = count if ask.data else s.scalar(asked.size, now) or 0, []
+    return MemoryTally(count, numbers, _end(s, asked, now))
 
 
-def _count(s: Session, ask: MemoryAsk, asked: Asked, values: dict[str, Any]) -> int:
-    """How many rows of a part are wanted; only what is in the data has to be read."""
-    if not ask.data:
-        return s.scalar(asked.size, values) or 0
-    return sum(_fits(ask, data) for data in s.scalars(asked.data, values))
+def _most(ask: MemoryAsk) -> int:
+    return SCATTERED if _index(ask) else LOOKED_AT
 
 
 def memories_since(s: Session, realm: str, number: int, limit: int) -> list[MemoryRecord]:
@@ -138,9 +144,16 @@ class Shape(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """Statements of one shape: rows of a part, what these hold, how many there are, and the last row that was seen."""
+    """Statements of one shape.
+
+    :param rows: of a part, some; ``numbers`` are those of some
+    :param data: what all of them hold, with their numbers
+    :param size: how many there are
+    :param end: the last row that was looked at, and the one behind it
+    """
 
     rows: Select[Any]
+    numbers: Select[Any]
     data: Select[Any]
     size: Select[Any]
     end: Select[Any]
@@ -201,12 +214,14 @@ def _place_values(place: MemoryPlace | None) -> dict[str, Any]:
 def _asked(shape: Shape) -> Asked:
     part, size = _part(shape), bindparam("size", type_=Integer)
     wanted, order = _wanted(shape, part), (part.c.at.desc(), part.c.number.desc())
+    room = bindparam("room", type_=Integer)
     return Asked(
-        select(part).where(*wanted).order_by(*order).limit(bindparam("room", type_=Integer)),
-        select(part.c.data).where(*wanted),
+        select(part).where(*wanted).order_by(*order).limit(room),
+        select(part.c.number).where(*wanted).limit(room),
+        select(part.c.number, part.c.data).where(*wanted),
         select(func.count()).select_from(part).where(*wanted),
         # Of the index alone: to read the rows of a source that is spread over a large memory takes far longer.
-        _rows(shape, Memory.at, Memory.number).limit(1).offset(size - 1),
+        _rows(shape, Memory.at, Memory.number).limit(2).offset(size - 1),
     )
 
 
@@ -272,8 +287,8 @@ def _visible(shape: Shape, part: Subquery) -> ColumnElement[bool]:
 
 def _end(s: Session, asked: Asked, values: dict[str, Any]) -> MemoryPlace | None:
     """Where a part ends; ``None`` when there is nothing behind it."""
-    last = s.execute(asked.end, values).first()
-    return None if last is None else MemoryPlace(*last)
+    last = s.execute(asked.end, values).all()
+    return MemoryPlace(*last[0]) if len(last) == 2 else None
 
 
 def realm_number(s: Session, name: str) -> int:

@@ -332,6 +332,14 @@ class MemoryPage(NamedTuple):
     place: MemoryPlace | None
 
 
+class MemoryTally(NamedTuple):
+    """How many events there are, their numbers where they are few, and where to go on as in :class:`MemoryPage`."""
+
+    size: int
+    numbers: list[int]
+    place: MemoryPlace | None
+
+
 class AuditRecord(NamedTuple):
     """Who did what when from where."""
 

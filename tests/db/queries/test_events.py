@@ -48,7 +48,8 @@ def counted(database: Database, **ask: Any) -> int:
     with database.reading() as s:
         place, count = None, 0
         while True:
-            more, place = queries.count_memories(s, ALL._replace(**ask), place)
+            more, numbers, place = queries.count_memories(s, ALL._replace(**ask), place, 3)
+            assert len(numbers) == (more if more <= 3 else 0)
             count += more
             if place is None:
                 return count
@@ -189,6 +190,28 @@ def test_one_look_is_at_a_bounded_number_of_rows(database: Database, monkeypatch
     assert found(database, data=(("n", "6"),)) == [200 - each for each in range(200) if (199 - each) % 7 == 6]
     assert counted(database, data=(("n", "6"),)) == 28
     assert counted(database) == 200
+
+
+def test_rows_that_lie_apart_are_looked_at_by_fewer(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them takes longer. Where a part ends with the last of them there is nothing more."""
+    monkeypatch.setattr(recalling, "LOOKED_AT", 8)
+    monkeypatch.setattr(recalling, "SCATTERED", 4)
+    monkeypatch.setattr(recalling, "_SLICES", (1, 2, 8))
+    rows = [new(float(n), f"s{n % 2}", f"k{n % 2}", user=f"u{n % 2}", robot_id=1 + n % 2) for n in range(16)]
+    remembered(database, *rows)
+    with database.reading() as s:
+        one_robot = {"robots": frozenset({1}), "general": False}
+        for ask in ({"source": NameIs("s0")}, {"kind": NameIs("k0")}, {"user": "u0"}, one_robot):
+            first = queries.count_memories(s, ALL._replace(**ask), None, 4)
+            assert first == (4, [15, 13, 11, 9], MemoryPlace(8.0, 9)), ask
+            assert queries.recall(s, ALL._replace(**ask), None, 10).place == first.place, ask
+            assert queries.count_memories(s, ALL._replace(**ask), first.place, 3) == (4, [], None), ask
+        for whole in ({}, {"kind": NameIs("k", prefix=True)}, {"source": NameIs("s", prefix=True)}):
+            first = queries.count_memories(s, ALL._replace(**whole), None, 0)
+            assert first == (8, [], MemoryPlace(8.0, 9)), whole
+            assert queries.recall(s, ALL._replace(**whole), first.place, 100).place is None, whole
 
 
 def test_the_least_used_go_first_then_the_oldest_and_the_newest_are_spared(database: Database) -> None:

@@ -13,7 +13,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
 from relay_db import queries
-from relay_db.queries import recalling
+from relay_db.queries import MemoryTally, recalling
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.scopes import Scope
 from relay_server.access import Access, Principal
@@ -375,10 +375,10 @@ async def test_who_leaves_does_not_make_room_for_another_read_while_his_goes_on(
     await counting(room, "bob")
     with pytest.raises(Unavailable):
         await (await counting(room, "cleo"))
-    slow.reads[0].callback((1, None))
+    slow.reads[0].callback(MemoryTally(1, [1], None))
     assert len(slow.reads) == 2
-    slow.reads[1].callback((700, None))
-    assert await third == (700, None)
+    slow.reads[1].callback(MemoryTally(7, [], None))
+    assert await third == (7, None)
     assert len(slow.reads) == 3
 
 
@@ -389,8 +389,8 @@ async def test_a_read_that_fails_is_not_the_end_of_reading(room: Room, slow: Slo
     slow.reads[0].errback(Unavailable("locked"))
     with pytest.raises(Unavailable, match="locked"):
         await first
-    slow.reads[1].callback((0, None))
-    assert await second == (0, None)
+    slow.reads[1].callback(MemoryTally(1, [1], None))
+    assert await second == (1, None)
 
 
 @pytest_twisted.ensureDeferred
@@ -404,11 +404,11 @@ async def test_nobody_takes_the_places_of_all(
         await (await counting(room, "ann"))
     other = await counting(room, "bob")
     for at in range(3):
-        slow.reads[at].callback((200 + at, None))
-    assert [(await each)[0] for each in (*mine, other)] == [200, 201, 202]
+        slow.reads[at].callback(MemoryTally(at, [], None))
+    assert [(await each)[0] for each in (*mine, other)] == [0, 1, 2]
     again = await counting(room, "ann")
-    slow.reads[3].callback((0, None))
-    assert await again == (0, None)
+    slow.reads[3].callback(MemoryTally(5, [], None))
+    assert await again == (5, None)
 
 
 @pytest_twisted.ensureDeferred
@@ -448,6 +448,25 @@ async def test_a_page_looks_at_so_much_and_says_where_the_next_one_begins(
         count, place = await room.desk.count(ann, ask_of({"data.n": "0"}, 0.0)._replace(after=place))
         counts.append(count)
     assert counts == [0, 1, 0, 1]
+
+
+@pytest_twisted.ensureDeferred
+async def test_few_that_were_counted_are_used_wherever_they_were_found(
+    room: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind the first look, too, and by several; not where there may be more, nor where they are too many."""
+    monkeypatch.setattr(module, "LOOKS", 4)
+    monkeypatch.setattr(module, "COUNTED_USED", 2)
+    monkeypatch.setattr(recalling, "LOOKED_AT", 4)
+    await room.write("ann", *({"kind": "k", "data": {"n": n, "of7": n % 7, "of8": n % 8}} for n in range(15)))
+    ann = room.people["ann"]
+    for query, count in (({"data.n": "4"}, 1), ({"data.of8": "0"}, 2), ({"data.of7": "0"}, 3), ({}, 15)):
+        assert await room.desk.count(ann, ask_of(query, 0.0)) == (count, None)
+    monkeypatch.setattr(module, "LOOKS", 2)
+    assert (await room.desk.count(ann, ask_of({"data.n": "13"}, 0.0)))[1] == queries.MemoryPlace(1000.0, 8)
+    await room.quota.look()
+    found, _, _ = await room.desk.page(ann, ask_of({"kind": "k"}, 0.0), 20, uses=False)
+    assert {each.number for each in found if each.used} == {1, 5, 9}
 
 
 async def emptied(room: Room) -> None:

@@ -12,7 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from robot_client.apps.line import Refused
-from robot_client.apps.memory import PAGES, Memory, Place, Unanswered, place
+from robot_client.apps.memory import MOST, PAGES, Memory, Place, Unanswered, place
 
 
 class Server(ThreadingHTTPServer):
@@ -137,6 +137,9 @@ def test_events_without_an_end_are_not_known(server: Server, memory: Memory) -> 
     """Rather than read for ever."""
     server.answers = [(200, {"events": [], "next": "more"})] * PAGES
     with pytest.raises(Unanswered, match="pages"):
+        memory.events("greet*", 60.0)
+    server.answers = [(200, {"events": [{}] * (MOST // 10), "next": "more"})] * 10
+    with pytest.raises(Unanswered, match="10,000 events"):
         memory.events("greet*", 60.0)
 
 
