@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -11,8 +12,9 @@ from typing import Any
 
 import httpx
 import pytest
-from switchboard_processes import ros_environment
+from switchboard_processes import ros_environment, running
 from switchboard_relay import Relay
+from switchboard_robot import Robot
 from switchboard_waiting import PATIENCE, wait_for
 
 from tests.robot_client.ros import Peer
@@ -179,8 +181,47 @@ def test_what_robots_have_is_where_the_directory_says(world: Any, peer: Peer) ->
         assert client.post(DIRECTORY, json=body).status_code == 404
 
 
-def test_robots_find_each_others_services(world: Any) -> None:
-    """One registers what it does; who sees the robot finds it, and nobody else registers in its name."""
+@pytest.fixture
+def partner(world: Any) -> Iterator[Robot]:
+    """Another robot, of which the operator of the first one may call services."""
+    robot = Robot(world.relay, "partner")
+    with running(robot):
+        world.relay.cli("right", "grant", "operator", "partner", "operator")
+        yield robot
+    # Who sees it would see it in all tests that follow.
+    world.relay.cli("robot", "remove", "partner", "--yes")
+
+
+def test_a_program_at_one_robot_finds_and_calls_a_service_of_another(world: Any, partner: Robot) -> None:
+    """By what the directory says of it alone, as long as it is registered; who has no right there finds nothing."""
+    body = {"kind": "service", "name": "start-over", "robot": "partner", "ttl": 3}
+    body["address"] = "/api/v1/robots/partner/services/reset"
+    with (
+        client_of(world.relay, world.relay.user("partners-program")) as own,
+        client_of(world.relay, world.operator) as rovers,
+        client_of(world.relay, world.viewer) as other,
+    ):
+        world.relay.cli("right", "grant", "partners-program", "partner", "owner")
+        place = own.post(DIRECTORY, json=body).raise_for_status().headers["location"]
+
+        def called() -> Any:
+            """It has to be found again each time: it is registered for moments."""
+            own.put(place).raise_for_status()
+            (service,) = found(rovers, kind="service", name="start*")
+            assert (service["robot"], service["user"]) == ("partner", "partners-program")
+            answer = rovers.post(service["address"], json={})
+            return answer.json()["values"] if answer.status_code == 200 else None
+
+        since = time.monotonic_ns()
+        assert wait_for("the other robot does it", called)["success"] is True
+        assert partner.events("reset", since) and not world.robot.events("reset", since)
+        assert found(other, kind="service", name="start*") == []
+        wait_for("it is registered no more", lambda: found(rovers, kind="service", name="start*") == [])
+        assert own.put(place).status_code == 404
+
+
+def test_nobody_registers_in_another_robots_name(world: Any) -> None:
+    """What one does is found by who sees the robot, who neither takes it out nor adds to it."""
     body = {"kind": "service", "name": "speech", "robot": "rover", "ttl": 3600}
     body["address"] = "/api/v1/robots/rover/services/say"
     with client_of(world.relay, world.operator) as client:

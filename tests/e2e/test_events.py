@@ -134,7 +134,9 @@ def test_what_is_watched_recorded_and_published_leaves_events(operator: httpx.Cl
     def latest(kind: str) -> dict[str, Any] | None:
         return next(iter(asked(operator, kind=kind, robot="rover", since=begun)), None)
 
-    camera = wait_for("a camera is known", lambda: operator.get(f"{own}/cameras").json()["cameras"])[0]["name"]
+    camera = wait_for("a camera is known", lambda: operator.get(f"{own}/cameras").json()["cameras"])[0][
+        "name"
+    ]
     with operator.stream("GET", "/robots/rover/video/stream", params={"topic": camera}) as answer:
         next(answer.iter_bytes())
     wait_for("he has left", lambda: latest("video.left"))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 from switchboard_client import Client
 from switchboard_http import Answer, ask
 from switchboard_processes import running
@@ -152,6 +152,44 @@ def test_the_nearest_obstacle_of_the_scan_is_read(site: Site, tmp_path: Path) ->
         assert min(filter(None, rays)) == pytest.approx(measured, abs=0.1)
         body = {"value": {"data": False}}
         site.refuses("PUT", "topics/obstacles/near", body, 403, "viewer")
+
+
+def test_the_nearest_obstacle_of_a_picture_of_depth_is_read(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second camera measures depth: a post on the right of its picture, as far away as it is, before a wall."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    onlooker = Onlooker(site.robot.domain)
+    try:
+        depths = onlooker.node.create_publisher(Image, "/front/depth", qos_profile_sensor_data)
+        infos = onlooker.node.create_publisher(CameraInfo, "/front/camera_info", qos_profile_sensor_data)
+        pixels = np.full((48, 64), 3000, np.uint16)
+        pixels[:, 50:] = 800
+        message = picture(pixels, "16UC1", "front_optical_frame")
+        lens = CameraInfo(height=48, width=64, k=[60.0, 0, 31.5, 0, 60.0, 23.5, 0, 0, 1.0])
+
+        def show() -> None:
+            infos.publish(lens)
+            depths.publish(message)
+
+        words = ("obstacles", "--depth", "/front/depth", "--sectors", "3", "--near", "1")
+        with service(site.robot.domain, tmp_path, *words):
+
+            def told() -> Any:
+                answer = site.ask(site.viewer, "GET", "topics/obstacles?wait=0.2")
+                value = answer.json["value"] if answer.status == 200 else {}
+                # Another test's node may have said something on that topic before.
+                return value if value.get("header", {}).get("frame_id") == "front_frame" else None
+
+            rays = onlooker.until("the depth is read", told, repeated(show, 0.1))["ranges"]
+            post = 0.8 * math.hypot(1, 18.5 / 60)
+            assert rays == pytest.approx([post, 3.0, 3.02], rel=0.02)
+            near = onlooker.until(
+                "it is near", lambda: site.reads("obstacles/near")["data"], repeated(show, 0.1)
+            )
+            assert near is True
+    finally:
+        onlooker.close()
 
 
 def test_the_marker_of_the_charger_is_found_by_turning(site: Site, tmp_path: Path) -> None:
