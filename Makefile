@@ -34,7 +34,7 @@ robot-conformance: ## check a robot that dials LISTEN=0.0.0.0:9091 (docs/conform
 	@scripts/setup.sh python
 	@$(CASES) tests/conformance/robot_link --listen='$(LISTEN)'
 
-bench: ## measure beside alternatives, about 15 minutes (options: BENCH='hop fanout', BENCH='--quick')
+bench: ## measure beside alternatives, all of it in two hours (options: BENCH='hop fanout', BENCH='--quick')
 	@scripts/setup.sh python web interfaces browser bench
 	$(BIN)/python -m bench $(BENCH)
 
