@@ -101,12 +101,14 @@ class TimedDriver(threading.Thread):
 
     :param client: connected
     :param pauses: whether he lets go once after his first command, as who drove before the robot's link broke must
+    :param asks: whether he asks for control; a program that knows nothing of control just commands
     """
 
-    def __init__(self, client: Client, pauses: bool = False) -> None:
+    def __init__(self, client: Client, pauses: bool = False, asks: bool = True) -> None:
         super().__init__(daemon=True)
         self._client = client
         self._pauses = pauses
+        self._asks = asks
         self._end = threading.Event()
         self._silent = threading.Event()
         self.broken = ""
@@ -114,7 +116,8 @@ class TimedDriver(threading.Thread):
     def run(self) -> None:
         """Send, and read what comes so that nothing piles up."""
         try:
-            take_control(self._client)
+            if self._asks:
+                take_control(self._client)
             self._client.send(op="advertise", topic=TOPIC, type=TWIST)
             if self._pauses:
                 self._client.drive(AHEAD, stamped_turn(time.monotonic_ns()), TOPIC)

@@ -4,7 +4,8 @@ A real relay, daemon and simulated robot, driven in circles through proxies that
 it was sent, so the record tells as well whether any was carried out too late. After each fault everything heals, and
 what was held up arrives: the robot must not move by it. A client that was frozen goes on commanding when it is thawed,
 and may; what it said before must not be carried out any more. A tab that was away for more than half a second finds its
-key still held: that moves nothing until it is pressed anew.
+key still held: that moves nothing until it is pressed anew. A program whose connection broke connects anew and goes on
+commanding, as libraries do: that moves nothing before it lets go.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ from bench.tab import Tab, struck
 
 HELD_BACK = 0.6
 """Seconds until what is held up by a fault is older than any command may be."""
+
+COMES_BACK = 1.5
+"""Seconds for which a driver commands who has come back."""
 
 Strike = Callable[[Drive, Any], None]
 Heal = Callable[[Drive], None]
@@ -54,6 +58,7 @@ class Fault:
     :param process: whether the driver must be a process of its own
     :param goes_on: whether the driver may rightly go on when it is mended
     :param parts: whether robot and relay part by it, after which who drove lets go first
+    :param returns: whether the driver comes back by another connection, and commands at once
     """
 
     name: str
@@ -62,11 +67,12 @@ class Fault:
     process: bool = False
     goes_on: bool = False
     parts: bool = False
+    returns: bool = False
 
 
 FAULTS = (
     Fault("client goes silent", lambda drive, driver: driver.fall_silent()),
-    Fault("client killed (SIGKILL)", lambda drive, driver: driver.popen.kill(), process=True),
+    Fault("client killed (SIGKILL)", lambda drive, driver: driver.popen.kill(), process=True, returns=True),
     Fault(
         "client frozen (SIGSTOP)",
         lambda drive, driver: driver.popen.send_signal(signal.SIGSTOP),
@@ -84,7 +90,7 @@ FAULTS = (
         lambda drive, driver: drive.client_side.forward_down.clear(),
         _client_heals,
     ),
-    Fault("client link: reset", lambda drive, driver: drive.client_side.reset()),
+    Fault("client link: reset", lambda drive, driver: drive.client_side.reset(), returns=True),
     Fault(
         "robot link: black hole",
         lambda drive, driver: drive.robot_side.black_hole(),
@@ -140,6 +146,7 @@ class Tally:
     :ivar moved: those of them in which it did
     :ivar frozen: runs among them in which the driver went on commanding anew
     :ivar held: runs among them in which a key was held in a tab all the time
+    :ivar returned: runs among them in which the driver came back and commanded
     """
 
     ages: list[float]
@@ -147,6 +154,7 @@ class Tally:
     moved: int = 0
     frozen: int = 0
     held: int = 0
+    returned: int = 0
 
     def look(self, name: str, moved: bool) -> None:
         """One more run in which it was looked, after the fault of this name."""
@@ -205,7 +213,8 @@ def _sum(tally: Tally) -> list[Row]:
             bar=0,
             note=f"looked at when all had healed, {HELD_BACK} s after the standstill or later, and what was held up "
             f"had come; in {tally.frozen} runs by commands from before the client was frozen, which goes on with new "
-            f"ones, in {tally.held} with a key that was held in the tab all the time",
+            f"ones, in {tally.held} with a key that was held in the tab all the time, in {tally.returned} by a driver "
+            f"who came back {HELD_BACK} s later and commanded for {COMES_BACK} s",
         ),
     ]
 
@@ -230,6 +239,9 @@ def _once(drive: Drive, fault: Fault, tally: Tally) -> float:
     if fault.goes_on:
         driver.popen.send_signal(signal.SIGCONT)
     _settle(drive)
+    if fault.returns:
+        tally.returned += 1
+        _come_back(drive)
     if fault.goes_on:
         tally.frozen += 1
         tally.look(fault.name, sent_before(thawed, drive.robot.events("command", thawed)))
@@ -239,6 +251,14 @@ def _once(drive: Drive, fault: Fault, tally: Tally) -> float:
     drive.stands()
     tally.ages += ages_ms(drive.robot.events("command", begun))
     return took
+
+
+def _come_back(drive: Drive) -> None:
+    """By another connection, with the stick where it was."""
+    driver = TimedDriver(connected(drive.client_side.port, "rover", drive.token), asks=False)
+    driver.start()
+    time.sleep(COMES_BACK)
+    driver.stop()
 
 
 def _settle(drive: Drive) -> None:
