@@ -194,7 +194,7 @@ def partner(world: Any) -> Iterator[Robot]:
 
 def test_a_program_at_one_robot_finds_and_calls_a_service_of_another(world: Any, partner: Robot) -> None:
     """By what the directory says of it alone, as long as it is registered; who has no right there finds nothing."""
-    body = {"kind": "service", "name": "start-over", "robot": "partner", "ttl": 3}
+    body = {"kind": "service", "name": "start-over", "robot": "partner", "ttl": 3600}
     body["address"] = "/api/v1/robots/partner/services/reset"
     with (
         client_of(world.relay, world.relay.user("partners-program")) as own,
@@ -203,12 +203,11 @@ def test_a_program_at_one_robot_finds_and_calls_a_service_of_another(world: Any,
     ):
         world.relay.cli("right", "grant", "partners-program", "partner", "owner")
         place = own.post(DIRECTORY, json=body).raise_for_status().headers["location"]
+        (service,) = found(rovers, kind="service", name="start*")
+        assert (service["robot"], service["user"]) == ("partner", "partners-program")
 
         def called() -> Any:
-            """It has to be found again each time: it is registered for moments."""
-            own.put(place).raise_for_status()
-            (service,) = found(rovers, kind="service", name="start*")
-            assert (service["robot"], service["user"]) == ("partner", "partners-program")
+            """The relay finds out by and by what a robot has."""
             answer = rovers.post(service["address"], json={})
             return answer.json()["values"] if answer.status_code == 200 else None
 
@@ -216,7 +215,13 @@ def test_a_program_at_one_robot_finds_and_calls_a_service_of_another(world: Any,
         assert wait_for("the other robot does it", called)["success"] is True
         assert partner.events("reset", since) and not world.robot.events("reset", since)
         assert found(other, kind="service", name="start*") == []
+        assert other.get(f"{DIRECTORY}/{service['id']}").status_code == 404
+        assert other.post(service["address"], json={}).status_code == 404
+        assert [each["id"] for each in found(rovers, kind="service", name="start*")] == [service["id"]]
+        # Registered once more, for moments.
+        assert own.post(DIRECTORY, json={**body, "ttl": 2}).headers["location"] == place
         wait_for("it is registered no more", lambda: found(rovers, kind="service", name="start*") == [])
+        assert rovers.get(place).status_code == 404
         assert own.put(place).status_code == 404
 
 

@@ -157,37 +157,37 @@ def test_the_nearest_obstacle_of_the_scan_is_read(site: Site, tmp_path: Path) ->
 def test_the_nearest_obstacle_of_a_picture_of_depth_is_read(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second camera measures depth: a post on the right of its picture, as far away as it is, before a wall."""
+    """A second camera measures depth: first a wall, then a post before it on the right, as far away as it is."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     onlooker = Onlooker(site.robot.domain)
     try:
         depths = onlooker.node.create_publisher(Image, "/front/depth", qos_profile_sensor_data)
         infos = onlooker.node.create_publisher(CameraInfo, "/front/camera_info", qos_profile_sensor_data)
         pixels = np.full((48, 64), 3000, np.uint16)
-        pixels[:, 50:] = 800
-        message = picture(pixels, "16UC1", "front_optical_frame")
         lens = CameraInfo(height=48, width=64, k=[60.0, 0, 31.5, 0, 60.0, 23.5, 0, 0, 1.0])
 
         def show() -> None:
             infos.publish(lens)
-            depths.publish(message)
+            depths.publish(picture(pixels, "16UC1", "front_optical_frame"))
+
+        def front(message: Any) -> bool:
+            """Another test's node may have said something on that topic before."""
+            return bool(message["header"]["frame_id"] == "front_frame")
 
         words = ("obstacles", "--depth", "/front/depth", "--sectors", "3", "--near", "1")
         with service(site.robot.domain, tmp_path, *words):
-
-            def told() -> Any:
-                answer = site.ask(site.viewer, "GET", "topics/obstacles?wait=0.2")
-                value = answer.json["value"] if answer.status == 200 else {}
-                # Another test's node may have said something on that topic before.
-                return value if value.get("header", {}).get("frame_id") == "front_frame" else None
-
-            rays = onlooker.until("the depth is read", told, repeated(show, 0.1))["ranges"]
-            post = 0.8 * math.hypot(1, 18.5 / 60)
-            assert rays == pytest.approx([post, 3.0, 3.02], rel=0.02)
-            near = onlooker.until(
-                "it is near", lambda: site.reads("obstacles/near")["data"], repeated(show, 0.1)
+            assert site.reads("obstacles", front, show)["ranges"] == pytest.approx(
+                [3.02, 3.0, 3.02], rel=0.02
             )
-            assert near is True
+            site.reads("obstacles/near", lambda each: not each["data"], show)
+            pixels[:, 50:] = 800
+            site.reads("obstacles/near", lambda each: each["data"], show)
+            post = 0.8 * math.hypot(1, 18.5 / 60)
+            rays = site.reads("obstacles", lambda each: front(each) and each["ranges"][0] < 1, show)["ranges"]
+            assert rays == pytest.approx([post, 3.0, 3.02], rel=0.02)
+            places = site.reads("obstacles/places", lambda each: front(each) and each["poses"], show)
+            nearest = places["poses"][0]["position"]
+            assert (nearest["x"], nearest["y"]) == pytest.approx((0.8, -0.8 * 18.5 / 60), rel=0.02)
     finally:
         onlooker.close()
 

@@ -712,12 +712,8 @@ def driving(place: Place) -> Returning:
     return Returning(place, ann)
 
 
-@pytest.mark.parametrize("after", [0.0, 1.0, 4.9])
-def test_to_connect_anew_is_no_letting_go(place: Place, after: float) -> None:
-    """What was lost says nothing of the stick; who lets go by the new connection, or asks for control, has it."""
-    ann = driving(place)
-    place.desk.left(ann.gone)
-    again = ann.back(after)
+def lets_go_first(place: Place, again: Connection) -> None:
+    """However long he commands, he has the robot only after he has been silent."""
     for _ in range(20):
         with pytest.raises(Refused, match="let go for"):
             place.desk.claim(again)
@@ -725,6 +721,15 @@ def test_to_connect_anew_is_no_letting_go(place: Place, after: float) -> None:
     place.clock.advance(0.5)
     place.desk.claim(again)
     assert place.desk.lease.held_by(again)
+
+
+@pytest.mark.parametrize("after", [0.0, 1.0, 4.9])
+def test_to_connect_anew_is_no_letting_go(place: Place, after: float) -> None:
+    """What was lost says nothing of the stick; who lets go by the new connection, or asks for control, has it."""
+    ann = driving(place)
+    place.desk.left(ann.gone)
+    again = ann.back(after)
+    lets_go_first(place, again)
 
 
 def test_who_asks_for_control_by_a_new_connection_has_it(place: Place) -> None:
@@ -774,13 +779,7 @@ def test_who_comes_back_before_his_connection_is_known_to_be_lost_lets_go_first(
     """The one that has control says nothing any more; the other opens while the first still counts."""
     ann = driving(place)
     again = ann.back(3.0)
-    for _ in range(5):
-        with pytest.raises(Refused, match="let go for"):
-            place.desk.claim(again)
-        place.clock.advance(0.2)
-    place.clock.advance(0.5)
-    place.desk.claim(again)
-    assert place.desk.lease.held_by(again)
+    lets_go_first(place, again)
 
 
 def test_users_who_are_remembered_are_bounded(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
