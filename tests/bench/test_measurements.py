@@ -24,6 +24,7 @@ LEAST_ROWS = {
     "soak": 7,
     "video": 16,
     "browser": 6,
+    "thin": 8,
     "standstill": 3,
     "control": 6,
     "stopping": 4,
