@@ -66,7 +66,7 @@ class Comeback:
             self._gone.popitem(last=False)
 
     def forget(self, user: int) -> None:
-        """The user has asked for control in so many words."""
+        """The user has asked for control in so many words, or has let go: what comes from now on he means."""
         self._gone.pop(user, None)
 
     def silent_since(self, client: Client) -> float | None:
