@@ -1,6 +1,7 @@
 """Close codes of a client's websocket (RFC 6455 section 7.4; 4000–4999 are for applications)."""
 
 GOING_AWAY = 1001
+NOT_UTF8 = 1007
 TOO_BIG = 1009
 INTERNAL = 1011
 INVALID = 4400

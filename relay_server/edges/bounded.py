@@ -5,9 +5,11 @@ Autobahn speaks RFC 6455; here is what it leaves open or does otherwise.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Protocol
 
 from autobahn.websocket.protocol import TrafficStats
+from autobahn.websocket.utf8validator import Utf8Validator
 from twisted.internet.protocol import connectionDone
 
 from relay_server.clock import Clock, Timer, cancel
@@ -23,8 +25,9 @@ HANDSHAKE_ATTRIBUTES = (
     "http_request_uri",
     "http_response_data",
     "http_status_line",
+    "utf8validator",
 )
-"""What Autobahn has read and answered; a websocket that is open needs none of it."""
+"""Attributes of Autobahn that an open websocket does not need; its validator is made again for the first fragment."""
 
 PIECES = 16_384
 """Frames of one message, and chunks they came in: also the empty ones take memory."""
@@ -56,6 +59,11 @@ class BoundedProtocol(FastProtocol):
         self._full = False
         self._unanswered: bytes | None = None
 
+    @functools.cached_property
+    def utf8validator(self) -> Utf8Validator:
+        """The state of a fragmented text message; most connections never send one."""
+        return Utf8Validator()
+
     def connectionMade(self) -> None:
         """The site has handed over a connection that asked to become a websocket."""
         self._writer = writer_for(self.transport, self.factory.turns)
@@ -75,10 +83,10 @@ class BoundedProtocol(FastProtocol):
         # Kilobytes for every client that nobody reads any more.
         for name in HANDSHAKE_ATTRIBUTES:
             self.__dict__.pop(name, None)
-        # Of these every connection has its own: figures nobody asks for, a queue for writes that are held back (they
-        # go through the writer) and a validator for text that is checked elsewhere.
+        # Of these every connection has its own: figures nobody asks for, and a queue for writes that are held back
+        # (they go through the writer).
         self.trafficStats = self.factory.traffic
-        self.send_queue = self.utf8validator = None
+        self.send_queue = None
         # Twisted's HTTP channel was the producer of this transport until now.
         self.transport.unregisterProducer()
         self.transport.registerProducer(Flow(self), True)
@@ -100,6 +108,14 @@ class BoundedProtocol(FastProtocol):
         if pieces > PIECES and not self.failedByMe:
             self.wasMaxMessagePayloadSizeExceeded = True
             self._max_message_size_exceeded(pieces, PIECES, f"a message came in more than {PIECES} pieces")
+
+    def _invalid_payload(self, reason: str) -> bool:
+        """Fail the connection once a message, so that the client can answer the close frame.
+
+        Autobahn finds the end of invalid text invalid too. It drops the connection for that, and the close frame with
+        it, if the kernel still holds unread bytes of the client.
+        """
+        return bool(self.state == self.STATE_OPEN and super()._invalid_payload(reason))
 
     def onPing(self, payload: bytes) -> None:
         """A ping of the client. One that takes nothing gets the latest answered when it does again.

@@ -265,7 +265,9 @@ class ClientProtocol(BoundedProtocol):
             session.end(orderly=wasClean and not self.closedByMe)
 
     def nothing_more(self) -> None:
-        """Hold off what the session sends, which goes to the writer without a look at the state."""
+        """Hold off what the session sends, which goes to the writer without a look at the state. None begins now."""
+        self._open = False
+        self._stop_deadline()
         if self._session is not None:
             self._session.outbox.close()
 
@@ -330,8 +332,8 @@ class ClientFactory(WebSocketServerFactory):
         self.traffic = TrafficStats()
         self.setProtocolOptions(
             webStatus=False,
-            # Text is checked once, as a whole, by relay_protocol.jsontext.
-            utf8validateIncoming=False,
+            # Text that is not UTF-8 fails the connection with 1007 (RFC 6455 section 8.1).
+            utf8validateIncoming=True,
             requireMaskedClientFrames=True,
             failByDrop=False,
             # The protocol's own deadline and limits of size, which change when a session begins.

@@ -227,7 +227,6 @@ def test_bytes_that_are_no_frames_end_a_robots_link_in_words(
 # --- messages from clients --------------------------------------------------------------------------------
 
 BAD_ROSBRIDGE = {
-    "invalid UTF-8": (b'{"op":"unsubscribe","topic":"\xff"}', "UTF-8"),
     "100,000 deep": (b'{"op":"publish","topic":"/cmd_vel","msg":' + DEEP, "deeper than 64"),
     "NaN": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":NaN}}}', "not JSON"),
     "Infinity": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":Infinity}}}', "not JSON"),
@@ -303,6 +302,35 @@ def test_a_binary_message_ends_the_connection(world: Any) -> None:
         assert closed.code == 4403
         assert "text" in closed.reason
     logs(world, "binary messages are not taken", since)
+
+
+WEBSOCKETS = {
+    "rosbridge": "/robots/rover",
+    "page": "/api/v1/robots/stream",
+    "video": "/robots/rover/video/ws?topic=/camera",
+}
+
+
+@pytest.mark.parametrize(
+    ("address", "proved"), [*((each, False) for each in WEBSOCKETS), ("rosbridge", True), ("page", True)]
+)
+@pytest.mark.parametrize(
+    "fragments", [[b'{"op":"\xff"}'], [b'{"op":"\xe2', b"\x28", b'"}']], ids=["one frame", "fragments"]
+)
+def test_text_that_is_not_utf8_closes_every_websocket(
+    world: Any, address: str, proved: bool, fragments: list[bytes]
+) -> None:
+    """RFC 6455 section 8.1: 1007, before and after authentication."""
+    url = f"ws://127.0.0.1:{world.relay.http_port}{WEBSOCKETS[address]}"
+    headers = {"Authorization": f"Bearer {world.viewer}"} if proved else {}
+    with connect(url, additional_headers=headers) as websocket:
+        websocket.send(fragments[0] if len(fragments) == 1 else iter(fragments), text=True)
+        with pytest.raises(ConnectionClosed) as closed:
+            while True:
+                websocket.recv(10)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1007
+    assert "UTF-8" in closed.value.rcvd.reason
 
 
 @pytest.mark.parametrize("fragments", [1, 4], ids=["one frame", "fragments"])

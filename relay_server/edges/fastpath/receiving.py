@@ -2,7 +2,8 @@
 
 A text message in one frame and a pong are read here when they are whole, all those of a chunk at once. Every other
 frame that is in order is passed on to Autobahn as it comes, and no byte beyond it. From the first frame that is not in
-order, Autobahn gets every byte as it comes: it fails the connection.
+order, Autobahn gets every byte as it comes: it fails the connection. Text that is not UTF-8 is not in order (section
+8.1). A fragmented message fails at its first bad byte, a message in one frame when the frame is complete.
 
 No client has more than its share of a turn of the reactor: when its time is up, the rest of its bytes waits until the
 others have had their turn, and nothing more is read from it until then.
@@ -112,6 +113,9 @@ class FastProtocol(WebSocketServerProtocol):
                     return
                 payload = data[start:end] if length <= _COPIED else memoryview(data)[start:end]
                 payload = apply_mask(payload, data[start - 4 : start])
+                if first != _PONG and not payload.isascii() and not _is_utf8(payload):
+                    self._all_to_autobahn(data, at)
+                    return
                 at = end
                 if first == _PONG:
                     self.onPong(payload)
@@ -165,8 +169,7 @@ class FastProtocol(WebSocketServerProtocol):
         if not self._passing:
             size = _frame(data, at, inside=self.inside_message)
             if size == _BROKEN:
-                self._verbatim = True
-                super().dataReceived(data[at:])
+                self._all_to_autobahn(data, at)
                 return len(data)
             if size < 0:
                 self._wait(data, at, -size)
@@ -176,6 +179,19 @@ class FastProtocol(WebSocketServerProtocol):
         self._passing -= len(piece)
         super().dataReceived(piece)
         return at + len(piece)
+
+    def _all_to_autobahn(self, data: bytes, at: int) -> None:
+        """Autobahn fails the connection for the frame at ``at``, and reads the client's close."""
+        self._verbatim = True
+        super().dataReceived(data[at:])
+
+
+def _is_utf8(payload: bytes) -> bool:
+    try:
+        str(payload, "utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _frame(data: bytes, at: int, *, inside: bool) -> int:

@@ -146,6 +146,16 @@ def test_a_page_has_nothing_to_say(size: int, code: int) -> None:
     assert tab.gone()
 
 
+@pytest.mark.parametrize("headers", [TOKEN, {"X-Any": "thing"}])
+@pytest.mark.parametrize("fin", [True, False])
+def test_text_that_is_not_utf8_closes_with_1007(headers: dict[str, str], fin: bool) -> None:
+    """RFC 6455 section 8.1, before and after the proof."""
+    tab = Tab(**headers)
+    tab.client.core.send_text(b"\xff", fin)
+    tab.client.run()
+    assert tab.client.closed == closing.NOT_UTF8
+
+
 def test_binary_messages_are_not_taken() -> None:
     """As everywhere."""
     tab = Tab()

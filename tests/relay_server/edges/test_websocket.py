@@ -9,6 +9,7 @@ import pytest
 from twisted.internet.defer import Deferred
 from twisted.internet.error import ConnectionDone, ConnectionLost
 from twisted.python.failure import Failure
+from websockets.frames import Frame, Opcode
 
 from relay_protocol import limits
 from relay_server import closing, wsframe
@@ -420,6 +421,88 @@ def test_who_has_closed_a_connection_is_known(gate: MemoryGate, how: str) -> Non
         client.end.connectionLost(Failure(ConnectionLost()))
     assert session.got[-1] == "end"
     assert session.orderly is (how == "by the client")
+
+
+@pytest.mark.parametrize("when", ["before auth", "while the token is looked up", "in a session"])
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [(b'{"op":"\xff"}', True)],
+        [(b"x" * 5_000 + b"\xe2\x82", True)],
+        [(b"\xc3", False), (b"(", False)],
+        [(b"whole", False), (b"cut \xf0\x9f", True)],
+    ],
+)
+def test_text_that_is_not_utf8_closes_with_1007(
+    gate: MemoryGate, when: str, frames: list[tuple[bytes, bool]]
+) -> None:
+    """RFC 6455 section 8.1. A fragmented message fails before its end, and the session takes nothing more."""
+    client = Client(gate, **({"Authorization": "Bearer good"} if when == "in a session" else {}))
+    if when == "while the token is looked up":
+        gate.wait = Deferred()
+        client.says(AUTH)
+    client.core.send_text(*frames[0])
+    for payload, fin in frames[1:]:
+        client.core.send_continuation(payload, fin)
+    client.run()
+    assert client.closed == closing.NOT_UTF8
+    assert not client.transport.connected
+    assert [session.got for session in gate.sessions] == [["start", "end"]] * len(gate.sessions)
+    if gate.wait is not None:
+        gate.wait.callback(None)
+    assert len(gate.sessions) == (when == "in a session")
+    assert gate.admitted == 0
+
+
+def test_no_session_begins_on_a_connection_that_has_failed(gate: MemoryGate) -> None:
+    """The token may be found good while the client has not yet answered the close frame."""
+    gate.wait = Deferred()
+    client = Client(gate)
+    client.says(AUTH)
+    client.core.send_text(b"\xff")
+    client.end.dataReceived(b"".join(client.core.data_to_send()))
+    gate.wait.callback(None)
+    client.run()
+    assert client.closed == closing.NOT_UTF8
+    assert not gate.sessions
+    assert gate.admitted == 0
+
+
+def test_the_close_for_text_that_is_not_utf8_waits_for_the_clients(gate: MemoryGate) -> None:
+    """Without that, bytes that the relay has not read reset the connection, and the client reads no code."""
+    client = Client(gate, Authorization="Bearer good")
+    for send in (client.core.send_text, client.core.send_continuation):
+        send(b"\xff", fin=False)
+    client.end.dataReceived(b"".join(client.core.data_to_send()))
+    assert client.transport.connected
+    client.run()
+    assert client.closed == closing.NOT_UTF8
+    assert gate.sessions[0].got == ["start", "end"]
+
+
+@pytest.mark.parametrize(
+    ("payload", "code"),
+    [
+        (b"\x03\xe8bye \xff", 1007),
+        (b"\x03\xe8\xe2\x82", 1007),
+        (b"\x00\x00", 1002),
+        (b"\x03\xe7", 1002),
+        (b"\x03\xed", 1002),
+        (b"\x03\xee", 1002),
+        (b"\x0b\xb7", 1002),
+        (b"\x13\x88", 1002),
+        (b"\x03", 1002),
+    ],
+)
+def test_a_close_frame_of_the_client_is_checked(gate: MemoryGate, payload: bytes, code: int) -> None:
+    """RFC 6455 sections 5.5.1, 7.4.1 and 8.1: its reason is UTF-8, and its code may be sent."""
+    client = Client(gate, Authorization="Bearer good")
+    client.core.writes.append(Frame(Opcode.CLOSE, payload).serialize(mask=True))
+    client.run()
+    assert client.closed == code
+    client.clock.advance(2)
+    assert gate.sessions[0].got == ["start", "end"]
+    assert not client.transport.connected
 
 
 @pytest.mark.parametrize("payload", [b"", b"{}"])
