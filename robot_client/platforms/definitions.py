@@ -135,7 +135,7 @@ def full_text(name: str, lookup: Lookup) -> str:
         raise NotFound(f"the type {name} is not installed on this robot")
     parts = [main.rstrip("\n") + "\n"]
     known = {name}
-    waiting = contained(main, name.split("/")[0])
+    waiting = contained(main, name.split("/")[0], lookup)
     while waiting:
         each = waiting.pop(0)
         if each in known:
@@ -146,29 +146,32 @@ def full_text(name: str, lookup: Lookup) -> str:
             raise NotFound(f"{name} contains {each}, which is not installed on this robot")
         package, _, short = each.split("/")
         parts.append(f"{RULE}\nMSG: {package}/{short}\n{text.rstrip(chr(10))}\n")
-        waiting += contained(text, package)
+        waiting += contained(text, package, lookup)
     whole = "".join(parts)
     if len(whole.encode()) > TYPE_DEFINITION:
         raise Invalid(f"the definition of {name} is larger than {TYPE_DEFINITION} bytes")
     return whole
 
 
-def contained(text: str, package: str) -> list[str]:
-    """Full names of the messages a text has fields of, in order."""
+def contained(text: str, package: str, lookup: Lookup) -> list[str]:
+    """Full names of the messages a text has fields of, in order.
+
+    :param package: of the text
+    :param lookup: as in :func:`full_text`
+    """
     found: dict[str, None] = {}
     for line in text.splitlines():
         match = _FIELD.match(line.split("#", 1)[0])
         if match is None or match[1] in _PRIMITIVES:
             continue
-        found[_full(match[1], package)] = None
+        found[_full(match[1], package, lookup)] = None
     return list(found)
 
 
-def _full(name: str, package: str) -> str:
+def _full(name: str, package: str, lookup: Lookup) -> str:
     parts = name.split("/")
-    if len(parts) == 1:
-        # ROS 1 left a short form that is still written: Header of std_msgs.
-        return (
-            "std_msgs/msg/Header" if name == "Header" and package != "std_msgs" else f"{package}/msg/{name}"
-        )
-    return f"{parts[0]}/msg/{parts[-1]}"
+    if len(parts) > 1:
+        return f"{parts[0]}/msg/{parts[-1]}"
+    own = f"{package}/msg/{name}"
+    # As in rosidl a name alone is of the same package. ROS 1 had one exception, which is still written.
+    return "std_msgs/msg/Header" if name == "Header" and lookup(own) is None else own

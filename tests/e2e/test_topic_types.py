@@ -16,6 +16,7 @@ from switchboard_waiting import wait_for
 
 TALKING = Path(__file__).parent / "clients" / "talking.py"
 STRING, BOOL = "std_msgs/msg/String", "std_msgs/msg/Bool"
+HEADED = "switchboard_test_interfaces/msg/Headed"
 
 Talking = Callable[..., AbstractContextManager[None]]
 
@@ -105,3 +106,17 @@ def test_publishers_that_come_back_with_another_qos(talking: Talking, clients: l
         first.until(op="publish", topic="/settling")
         second.send(op="subscribe", topic="/settling", type=STRING)
         second.until(op="publish", topic="/settling")
+
+
+def test_a_package_with_a_header_of_its_own(talking: Talking, clients: list[Client]) -> None:
+    """A name without a package means the message of the same package, as in rosidl."""
+    client = clients[0]
+    with talking("/headed", HEADED):
+        client.send(op="subscribe", topic="/headed", type=HEADED)
+        message = client.until(op="publish", topic="/headed")["msg"]
+        assert message["header"] == {"number": 0, "note": ""}
+        assert message["stamped"]["frame_id"] == ""
+        details = client.call("/rosapi/message_details", {"type": HEADED})["values"]["typedefs"]
+        assert details[0]["fieldtypes"] == [
+            "switchboard_test_interfaces/Header", "switchboard_test_interfaces/Header", "std_msgs/Header"
+        ]  # fmt: skip

@@ -13,6 +13,7 @@ from __future__ import annotations
 import enum
 import re
 import struct
+from collections.abc import Container
 from typing import Any, NamedTuple
 
 from relay_protocol.errors import Invalid
@@ -125,6 +126,7 @@ _LINE = re.compile(
 )
 _QUOTED = re.compile(r"""[ \t]*(?:"((?:[^"\\]|\\.)*)"|'((?:[^'\\]|\\.)*)')[ \t]*""")
 _ITEM = re.compile(r"""(?:[ \t]*(?:"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')[ \t]*|[^,"']*)(?:,|\Z)""")
+HEADER = "std_msgs/msg/Header"
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 _BUILT_IN = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
@@ -173,7 +175,7 @@ def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) 
     :param top: the type whose text it is
     :param definitions: what :func:`parse` made of it
     """
-    main, *contained = _sections(text.split("\n"))
+    main, *contained = _sections(text.splitlines())
     bodies = {each: body.split("\n") for each, body in _BUILT_IN.items()}
     for lines in reversed(contained):
         bodies[normalise(lines[0].strip()[4:].strip())] = lines[1:]
@@ -192,20 +194,17 @@ def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) 
 
 
 def _parse_all(type_name: str, text: str) -> dict[str, Definition]:
-    main, *contained = _sections(text.split("\n"))
+    main, *contained = _sections(text.splitlines())
     names = parts_of(type_name)
-    bodies = _split_parts(main, len(names))
-    found = {name: _parse_one(name, body) for name, body in zip(names, bodies, strict=True)}
+    bodies = dict(zip(names, _split_parts(main, len(names)), strict=True))
     for lines in contained:
         title = lines[0].strip() if lines else ""
         if not title.startswith("MSG:"):
             raise Invalid(f"after a line of '=' comes 'MSG: package/msg/Name', not {_quote(title)}")
-        name = normalise(title[4:].strip())
-        if name not in found:
-            found[name] = _parse_one(name, lines[1:])
+        bodies.setdefault(normalise(title[4:].strip()), lines[1:])
     for name, body in _BUILT_IN.items():
-        if name not in found:
-            found[name] = _parse_one(name, body.split("\n"))
+        bodies.setdefault(name, body.split("\n"))
+    found = {name: _parse_one(name, body, bodies) for name, body in bodies.items()}
     if sum(len(each.fields) + len(each.constants) for each in found.values()) > MAX_FIELDS:
         raise Invalid(f"more than {MAX_FIELDS} fields")
     return found
@@ -233,7 +232,7 @@ def _split_parts(lines: list[str], wanted: int) -> list[list[str]]:
     return parts
 
 
-def _parse_one(name: str, lines: list[str]) -> Definition:
+def _parse_one(name: str, lines: list[str], known: Container[str]) -> Definition:
     fields: dict[str, Field] = {}
     constants: dict[str, Constant] = {}
     for line in lines:
@@ -243,7 +242,7 @@ def _parse_one(name: str, lines: list[str]) -> Definition:
         match = _LINE.match(line)
         if match is None:
             raise Invalid(f"{_quote(line)} is no field")
-        kind = _field_type(match, name.split("/")[0])
+        kind = _field_type(match, name.split("/")[0], known)
         label, rest = match["name"], match["rest"].lstrip()
         if label in fields or label in constants:
             raise Invalid(f"{name} has two fields '{label}'")
@@ -255,10 +254,10 @@ def _parse_one(name: str, lines: list[str]) -> Definition:
     return Definition(name, tuple(fields.values()), tuple(constants.values()))
 
 
-def _field_type(match: re.Match[str], package: str) -> FieldType:
+def _field_type(match: re.Match[str], package: str, known: Container[str]) -> FieldType:
     base = match["base"]
     if base not in PRIMITIVES:
-        base = normalise(base if "/" in base else f"{package}/msg/{base}")
+        base = _full_name(base, package, known)
     bound = int(match["bound"] or 0)
     if bound and base not in ("string", "wstring"):
         raise Invalid(f"{base} can't have a bound; only strings have")
@@ -270,6 +269,18 @@ def _field_type(match: re.Match[str], package: str) -> FieldType:
             raise Invalid(f"'{match['name']}' is an array of length 0")
         return FieldType(base, bound, Shape.ARRAY, length)
     return FieldType(base, bound, Shape.SEQUENCE, length)
+
+
+def _full_name(base: str, package: str, known: Container[str]) -> str:
+    """The full name of a message a field names.
+
+    As in rosidl a name without a package is of the same package. ``Header`` alone is ``std_msgs/Header`` where the
+    package has none, as in ROS 1.
+    """
+    if "/" in base:
+        return normalise(base)
+    own = normalise(f"{package}/msg/{base}")
+    return HEADER if base == "Header" and own not in known else own
 
 
 def _literal(kind: FieldType, text: str, label: str) -> Any:

@@ -12,10 +12,9 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from relay_protocol.limits import MIB
-from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, Shape
+from relay_protocol.ros.definition import BYTES, HEADER, Definition, Field, FieldType, Shape
 from relay_protocol.ros.source import MAX_STEPS, TooLarge
 
-HEADER = "std_msgs/msg/Header"
 _DEFAULTS = 20_000
 """Most elements in the default arrays of all structs of one type."""
 _MEMORY = 32 * MIB

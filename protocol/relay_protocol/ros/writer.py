@@ -19,7 +19,7 @@ import pybase64
 
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import COMMAND_FRAME
-from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, Primitive, Shape
+from relay_protocol.ros.definition import BYTES, HEADER, Definition, Field, FieldType, Primitive, Shape
 from relay_protocol.ros.reader import Run, group_numbers, layouts
 
 Write = Callable[[bytearray, Any, int], None]
@@ -27,7 +27,6 @@ Write = Callable[[bytearray, Any, int], None]
 
 _U32 = struct.Struct("<I").pack
 _PADDING = (b"", b"\0", b"\0\0", b"\0\0\0", b"\0" * 4, b"\0" * 5, b"\0" * 6, b"\0" * 7)
-_HEADER = "std_msgs/msg/Header"
 _ROS1_TIME = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
 _ROS1_NAMES = {"secs": "sec", "nsecs": "nanosec"}
 _NUMBERS = {
@@ -83,7 +82,7 @@ class WriterFactory:
             for each in group_numbers(definition.fields)
         ]
         ros1 = definition.name in _ROS1_TIME
-        header = definition.name == _HEADER and "stamp" in known
+        header = definition.name == HEADER and "stamp" in known
 
         def write(out: bytearray, value: Any, now: int) -> None:
             if type(value) is not dict:

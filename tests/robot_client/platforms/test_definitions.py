@@ -54,7 +54,7 @@ def test_service_has_both_halves() -> None:
 
 def test_comments_and_constants_contain_nothing() -> None:
     """Words in comments and constants are no types."""
-    assert contained(TEXTS["a/msg/Deep"], "a") == []
+    assert contained(TEXTS["a/msg/Deep"], "a", TEXTS.get) == []
 
 
 def test_missing_part_is_named() -> None:
