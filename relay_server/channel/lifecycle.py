@@ -200,9 +200,9 @@ class Channel:
             self._happen(Event.LINK_LOST)
 
     def sample(self, number: int, body: bytes, stamp: int = 0) -> None:
-        """A sample came over the channel's link.
+        """Take a sample from the channel's link; this is the only entry for samples.
 
-        :param stamp: when it reached the robot, nanoseconds since 1970
+        :param stamp: the robot's wall clock when it came, nanoseconds since 1970; simulated time replaces it
         """
         if self.robot.description.sim_time:
             stamp = self.now_ns()

@@ -362,7 +362,6 @@ class ChannelEnd(Role):
     def __init__(self, channel: Channel, connection: RobotConnection) -> None:
         self._channel = channel
         self._connection = connection
-        self._subscriptions = channel.subscriptions
 
     def message(self, body: bytes) -> None:
         """An answer, or a definition."""
@@ -380,7 +379,7 @@ class ChannelEnd(Role):
 
     def sample(self, frame: SampleFrame) -> None:
         """A sample of a subscribed topic."""
-        self._subscriptions.sample(frame.number, frame.body, frame.stamp)
+        self._channel.sample(frame.number, frame.body, frame.stamp)
 
     def lost(self, reason: str) -> None:
         """The link has ended."""

@@ -30,7 +30,8 @@ AGAIN_SECONDS = 5.0
 
 HELD = 100
 HELD_BYTES = 8 * MIB
-"""Samples that wait until it is on record that their topics carry pictures. What comes then is dropped, and counted."""
+"""Most samples that wait: until it is on record that their topics carry pictures, or until a simulated clock tells the
+time. What comes beyond is dropped, and counted."""
 
 PROBLEMS = 20
 """Most that is kept of what was not as it should be."""
@@ -107,7 +108,9 @@ class Recorder:
         self._unsaved: set[str] = set()
         """Topics of pictures that are not on record as such."""
         self._held: list[tuple[str, Sample, int]] = []
-        """What came of them, as :meth:`keep` has it."""
+        """Samples that wait, as :meth:`keep` takes them."""
+        self._timeless = False
+        """Whether samples wait for the time of a simulation."""
         self._tracks: dict[str, tuple[Converter, Track]] = {}
         self._eyes = [_Eye(clock, self, camera) for camera in entry.cameras]
         self._lost = 0
@@ -214,10 +217,14 @@ class Recorder:
             self._save_timer = self._clock.callLater(AGAIN_SECONDS, self._put_on_record)
             return
         self._unsaved -= topics
+        self._keep_held()
+        self._put_on_record()
+
+    def _keep_held(self) -> None:
+        self._timeless = False
         held, self._held = self._held, []
         for each in held:
             self.keep(*each)
-        self._put_on_record()
 
     def _judge(self) -> None:
         reason = why_denied(self.permit, self.entry)
@@ -230,6 +237,13 @@ class Recorder:
     def now_ns(self) -> int:
         """The robot's time, nanoseconds."""
         return self._channel.now_ns()
+
+    def not_before(self, stamp: int) -> int:
+        """The robot's time now; a wall clock may be ahead of ours, a simulation's is ours too.
+
+        :param stamp: nanoseconds
+        """
+        return self.now_ns if self._simulated else max(stamp, self.now_ns)
 
     def tell(self, level: str, text: str, id: rosbridge.Id = None) -> None:
         """What a client would be told is kept with the recording."""
@@ -248,8 +262,14 @@ class Recorder:
     def keep(self, topic: str, sample: Sample, log_time: int) -> None:
         """Have a sample written.
 
-        :param log_time: nanoseconds
+        :param log_time: nanoseconds; 0 while a simulation has not told the time
         """
+        if not self._knows_time():
+            self._timeless = True
+            self._hold(topic, sample, log_time)
+            return
+        if self._timeless:
+            self._keep_held()
         if topic in self._unsaved:
             self._hold(topic, sample, log_time)
             return
@@ -276,9 +296,11 @@ class Recorder:
 
     def saw(self, camera: str, picture: Picture) -> None:
         """Have a picture written."""
+        if not self._knows_time():
+            self._lost += 1
+            return
         # A robot whose time is simulated has no other for its pictures either.
-        simulated = self._channel.robot.description.sim_time
-        stamp = self.now_ns if simulated else self._lawful(camera, round(picture.stamp * 1e9))
+        stamp = self.now_ns if self._simulated else self._lawful(camera, round(picture.stamp * 1e9))
 
         def make(body: bytes) -> bytes:
             return compressed.message(body, stamp, picture.codec)
@@ -286,11 +308,28 @@ class Recorder:
         track = Track(compressed.topic_of(camera), compressed.TYPE, "cdr", compressed.TEXT)
         self._put(Message(track, stamp, stamp, picture.body, make))
 
+    @property
+    def _simulated(self) -> bool:
+        return self._channel.robot.description.sim_time
+
+    def _knows_time(self) -> bool:
+        """Whether the recording's clock is known: wall clock stamps must not stand beside simulated ones."""
+        known = not self._simulated or self.now_ns > 0
+        if not known:
+            self.tell(
+                "warning",
+                "the robot's time is simulated, and its /clock says nothing; what comes meanwhile waits for it",
+            )
+        return known
+
     def _lawful(self, name: str, stamp: int) -> int:
         """A robot's stamp, or now where no message of ROS could hold it: its clock is broken, or it lies.
 
         :param stamp: nanoseconds
         """
+        if stamp == 0 and self._simulated:
+            # It came before the simulation told the time.
+            return self.now_ns
         if 0 <= stamp < STAMPS_END:
             return stamp
         self.tell(
@@ -317,7 +356,7 @@ class _Ear(Listener):
 
     def replay(self, sample: Sample) -> None:
         """A latched sample that came long ago: a recording must not seem to have begun then."""
-        self._recorder.keep(self.topic, sample, max(sample.stamp, self._recorder.now_ns))
+        self._recorder.keep(self.topic, sample, self._recorder.not_before(sample.stamp))
 
 
 class _Eye:

@@ -1,0 +1,116 @@
+"""Samples that enter by the robot's link: whose time they carry."""
+
+from __future__ import annotations
+
+import cbor2
+import msgspec
+
+from relay_server.channel.robot_clock import TYPE
+from relay_server.recording.recorder import HELD
+from tests.relay_server.channel.robot_link import RobotLink
+from tests.relay_server.channel.test_robot_clock import tick
+from tests.relay_server.memory import MOTION, TEXTS, World, text
+from tests.relay_server.recording.test_recorder import Desk
+
+TEXTS.setdefault(TYPE, "builtin_interfaces/Time clock\n")
+SIMULATED = msgspec.structs.replace(MOTION, sim_time=True)
+WALL = 1_700_000_000 * 10**9 + 7
+SECOND = 10**9
+
+
+def simulated(world: World) -> RobotLink:
+    """A robot whose time is simulated; its ``/clock`` is subscribed."""
+    robot = RobotLink(world)
+    world.registry.described(world.robot, SIMULATED)
+    return robot
+
+
+def test_sample_frames_carry_the_simulated_time(world: World) -> None:
+    """The stamp of the frame is the robot's wall clock; ``cbor-raw`` tells what ``/clock`` said last."""
+    robot = simulated(world)
+    person = world.person()
+    robot.joins()
+    clock = robot.subscribed("/clock", TYPE)
+    person.says("subscribe", topic="/chatter", compression="cbor-raw")
+    chatter = robot.subscribed("/chatter")
+    robot.sample(chatter, text("early"), WALL)
+    robot.sample(clock, tick(77, 9), WALL)
+    robot.sample(chatter, text("simulated"), WALL + 1)
+    world.registry.described(world.robot, MOTION)
+    robot.sample(chatter, text("real"), WALL)
+    told = [cbor2.loads(each)["msg"] for each in person.client.sent]
+    assert [(each["secs"], each["nsecs"]) for each in told] == [(0, 0), (77, 9), (1_700_000_000, 7)]
+    assert [each["bytes"] for each in told] == [text(word) for word in ("early", "simulated", "real")]
+
+
+def recording(world: World) -> tuple[RobotLink, Desk, int, int]:
+    """A recording of a robot whose time is simulated, with the numbers of ``/clock`` and ``/chatter``."""
+    robot = simulated(world)
+    desk = Desk(world)
+    desk.starts()
+    robot.joins()
+    return robot, desk, robot.subscribed("/clock", TYPE), robot.subscribed("/chatter")
+
+
+def test_a_recording_has_one_clock(world: World) -> None:
+    """Samples from before ``/clock`` said anything wait for it, also when the robot was away meanwhile."""
+    robot, desk, clock, chatter = recording(world)
+    robot.sample(chatter, text("early"), WALL)
+    robot.sample(clock, tick(5, 0), WALL)
+    robot.sample(chatter, text("a"), WALL + SECOND)
+    robot.sample(clock, tick(6, 0), WALL)
+    robot.sample(chatter, text("b"), WALL + 2 * SECOND)
+    robot.leaves()
+    world.clock.advance(1)
+    robot.joins()
+    clock, chatter = robot.subscribed("/clock", TYPE), robot.subscribed("/chatter")
+    robot.sample(chatter, text("back"), WALL + 3 * SECOND)
+    robot.sample(clock, tick(7, 0), WALL)
+    robot.sample(chatter, text("c"), WALL + 4 * SECOND)
+    assert desk.paper.bodies == [text(word) for word in ("early", "a", "b", "back", "c")]
+    times = [(each.log_time // SECOND, each.publish_time // SECOND) for each in desk.paper.written]
+    assert times == [(5, 5), (5, 5), (6, 6), (7, 7), (7, 7)]
+
+
+def test_a_clock_that_says_nothing_is_told_and_costs_bounded_memory(world: World) -> None:
+    """The recording says why it is empty, and counts what it lacks."""
+    robot, desk, _, chatter = recording(world)
+    for _ in range(HELD + 7):
+        robot.sample(chatter, text("x"), WALL)
+    assert desk.paper.bodies == []
+    desk.recorder.count()
+    assert desk.entry.drops == 7
+    assert any("/clock" in each for each in desk.entry.problems)
+    desk.recorder.stop("enough")
+    desk.recorder.count()
+    assert desk.entry.drops == HELD + 7
+
+
+def test_latched_samples_of_a_simulation_begin_the_recording(world: World) -> None:
+    """By their log time, which is simulated like that of all others."""
+    robot = simulated(world)
+    person = world.person()
+    robot.joins()
+    clock = robot.subscribed("/clock", TYPE)
+    person.says("subscribe", topic="/chatter")
+    chatter = robot.subscribed("/chatter", latched=True, publishers=1)
+    robot.sample(clock, tick(3, 0), WALL)
+    robot.sample(chatter, text("map"), WALL)
+    robot.sample(clock, tick(9, 0), WALL)
+    desk = Desk(world)
+    desk.starts()
+    (message,) = desk.paper.written
+    assert (message.log_time, message.publish_time) == (9 * SECOND, 3 * SECOND)
+
+
+def test_wall_clock_robots_keep_their_stamps(world: World) -> None:
+    """Without simulated time the stamp of the frame is the robot's time."""
+    robot = RobotLink(world)
+    desk = Desk(world)
+    desk.starts()
+    robot.joins()
+    chatter = robot.subscribed("/chatter")
+    robot.sample(chatter, text("a"), WALL)
+    (message,) = desk.paper.written
+    assert (message.log_time, message.publish_time) == (WALL, WALL)
+    assert robot.asked("subscribe", topic="/clock") == []
