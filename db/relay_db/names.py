@@ -7,6 +7,7 @@ import unicodedata
 
 from relay_db.models import LABEL, NAME
 from relay_protocol.errors import Invalid
+from relay_protocol.limits import NAME_BYTES
 from relay_protocol.realms import full_name, parted
 
 _HEX = re.compile(r"[0-9a-f]{1,64}\Z")
@@ -18,6 +19,9 @@ def normal_name(text: str, what: str = "name") -> str:
     :param what: whose name it is, for the error
     :raises Invalid: empty, over 63 characters, not printable, with blanks or ``@``, or beginning with ``-``
     """
+    # Normalising takes quadratic time where many marks stand on one letter.
+    if len(text) > NAME_BYTES or len(text.encode("utf-8", "surrogatepass")) > NAME_BYTES:
+        raise Invalid(f"the {what} must have 1 to {NAME} characters, and {NAME_BYTES} bytes at most")
     name = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
     if not 0 < len(name) <= NAME:
         raise Invalid(f"the {what} must have 1 to {NAME} characters")

@@ -81,6 +81,9 @@ TYPE_DEFINITION = 256 * KIB
 NAME = 255
 """Longest name of a topic, service, type or node, in characters (as in DDS)."""
 
+NAME_BYTES = 256
+"""Longest name of a user, group, realm, OAuth client or header field that is read at all."""
+
 ROBOT_NAME = 63
 """Longest name of a robot, in characters (a DNS label)."""
 

@@ -16,12 +16,17 @@ from werkzeug.exceptions import HTTPException
 
 from relay_protocol import jsontext, limits
 from relay_server.clock import Timer, cancel
+from relay_server.edges import head
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.problems import problem, problem_body
 from relay_server.openapi import Answer, Credential, Operation, described
 from relay_server.openapi.answers import About
 
 BODY_BYTES = limits.UNPROVEN_BYTES
+CHUNKS = 1024
+"""Chunks of one body, and pieces they come in: each costs as much as a large one."""
+
+_TOO_LARGE = b"413 Content Too Large"
 IDLE_SECONDS = 60.0
 CLOSE_SECONDS = 2.0
 """What a refused client has to take the answer."""
@@ -51,8 +56,10 @@ class DeadlineChannel(HTTPChannel):
     """
 
     log = Logger()
+    maxHeaders = head.FIELDS
     _deadline: Timer | None = None
     _address = ""
+    _refused = False
 
     def connectionMade(self) -> None:
         super().connectionMade()
@@ -63,6 +70,45 @@ class DeadlineChannel(HTTPChannel):
             )
             return
         self._start_deadline(limits.UNPROVEN_SECONDS, self._too_late)
+
+    def dataReceived(self, data: bytes) -> None:
+        """Bytes of a head or body. Errors of Twisted's parsers are the sender's fault, and answered with 400."""
+        if self._refused:
+            return
+        try:
+            super().dataReceived(data)
+        except head.BadHead as error:
+            self.refuse(error.status, str(error))
+        except Exception as error:
+            self.log.info(
+                "a request from {address} can't be read: {error!r}",
+                address=self._address,
+                error=error,
+            )
+            self._respondToBadRequestAndDisconnect()
+
+    def lineReceived(self, line: bytes) -> None:
+        """One line of a head."""
+        head.check_line(line)
+        super().lineReceived(line)
+
+    def lineLengthExceeded(self, line: bytes) -> None:
+        """A line longer than all lines of a head together may be."""
+        raise head.BadHead(
+            b"431 Request Header Fields Too Large",
+            f"request line and header may have at most {self.totalHeadersSize} bytes together",
+        )
+
+    def headerReceived(self, line: bytes) -> bool:
+        """One field, whole."""
+        head.check_field(line)
+        return bool(super().headerReceived(line))
+
+    def allHeadersReceived(self) -> None:
+        """The head is here; from now on parsers read it."""
+        head.check_target(self._path)
+        head.check_fields(self.requests[-1].requestHeaders)
+        super().allHeadersReceived()
 
     def allContentReceived(self) -> None:
         self._stop_deadline()
@@ -81,6 +127,9 @@ class DeadlineChannel(HTTPChannel):
 
     def refuse(self, status: bytes, reason: str, headers: bytes = b"") -> None:
         """Answer whatever is being sent here with a status and words, and end the connection."""
+        if self._refused or self.transport is None:
+            return
+        self._refused = True
         self._stop_deadline()
         self.log.info("a request from {address} is refused: {reason}", address=self._address, reason=reason)
         number, _, title = status.decode().partition(" ")
@@ -119,17 +168,22 @@ class BoundedRequest(Request):
     """A request whose body may not grow beyond :data:`BODY_BYTES`, announced or not."""
 
     log = Logger()
+    _chunks: int | None = None
 
     def gotLength(self, length: int | None) -> None:
-        if length is not None and length > BODY_BYTES:
-            self._too_big()
-            return
+        if length is None:
+            self._chunks = 0
+        elif length > BODY_BYTES:
+            raise head.BadHead(_TOO_LARGE, f"a request may carry at most {BODY_BYTES} bytes")
         super().gotLength(length)
 
     def handleContentChunk(self, data: bytes) -> None:
+        if self._chunks is not None:
+            self._chunks += 1
+            if self._chunks > CHUNKS:
+                raise head.BadHead(_TOO_LARGE, f"a body may come in at most {CHUNKS} chunks")
         if self.content.tell() + len(data) > BODY_BYTES:
-            self._too_big()
-            return
+            raise head.BadHead(_TOO_LARGE, f"a request may carry at most {BODY_BYTES} bytes")
         super().handleContentChunk(data)
 
     def process(self) -> None:
@@ -147,7 +201,8 @@ class BoundedRequest(Request):
     def processingFailed(self, reason: Failure) -> Failure:
         """Something failed before anybody could say why: Twisted would answer with a page of its own."""
         error = reason.value
-        if self.startedWriting:
+        if self.startedWriting or self.channel is None or self.channel.transport is None:
+            # An answer is under way, or Autobahn has the connection.
             self.transport.abortConnection()
             return reason
         if isinstance(error, HTTPException) and error.code is not None:
@@ -161,9 +216,6 @@ class BoundedRequest(Request):
         self.finish()
         return reason
 
-    def _too_big(self) -> None:
-        self.channel.refuse(b"413 Content Too Large", f"a request may carry at most {BODY_BYTES} bytes")
-
 
 class RelaySite(Site):
     """The site of a relay: no access log (URLs may carry tickets), headers that close what browsers leave open."""
@@ -172,7 +224,14 @@ class RelaySite(Site):
     noisy = False
 
     def __init__(self, root: IResource, reactor: Any, cap: AddressCap, tls: bool) -> None:
-        super().__init__(root, requestFactory=self._request, timeout=IDLE_SECONDS, reactor=reactor)
+        super().__init__(
+            root,
+            requestFactory=self._request,
+            timeout=IDLE_SECONDS,
+            reactor=reactor,
+            # Handlers read bodies themselves, after they know how large they are and who sent them.
+            parsePOSTFormSubmission=False,
+        )
         self.cap = cap
         self._headers = dict(SECURITY_HEADERS)
         if tls:

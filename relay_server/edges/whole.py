@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from autobahn.twisted.resource import WebSocketResource
-
 import relay_server
 from relay_server.config import Settings
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.documents import Documents
+from relay_server.edges.handshake import Handshake
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.oauth import resource
 from relay_server.edges.pages import PageFactory, PageGate
@@ -41,9 +40,9 @@ def site_of(
     :param cookie: name of the session cookie
     """
     cap, rounds = AddressCap(settings.connections_per_address), Rounds(reactor)
-    clients = WebSocketResource(ClientFactory(reactor, clock_ns, desk, cap))
-    pictures = WebSocketResource(VideoFactory(reactor, clock_ns, desk, cap, rounds))
-    told = WebSocketResource(PageFactory(reactor, clock_ns, pages, cap))
+    clients = Handshake(ClientFactory(reactor, clock_ns, desk, cap))
+    pictures = Handshake(VideoFactory(reactor, clock_ns, desk, cap, rounds))
+    told = Handshake(PageFactory(reactor, clock_ns, pages, cap))
     video = Video(reactor, rounds, desk, api.principal, pictures)
     robots = Robots(clients, video, relay_server.VERSION)
     documents = Documents(limits, relay_server.VERSION, cookie).app.resource()

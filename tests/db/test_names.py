@@ -36,6 +36,7 @@ def test_a_name_has_one_form(written: str, name: str) -> None:
         "a\uff20b",
         "-x",
         "a" * 64,
+        "a" + "\u0316\u0300" * 64,
     ],
 )
 def test_a_name_that_cannot_be_is_refused(name: str) -> None:

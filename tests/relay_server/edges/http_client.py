@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from autobahn.twisted.resource import WebSocketResource
 from prometheus_client import CollectorRegistry
 from twisted.internet.address import IPv4Address
 from twisted.internet.task import Clock
@@ -21,6 +20,7 @@ from relay_server.auth import Opening, TooManyTries
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.documents import Documents
+from relay_server.edges.handshake import Handshake
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.pages import PageFactory, PageGate
 from relay_server.edges.robot_pages import RobotPages
@@ -204,10 +204,10 @@ class World:
         limits = RequestLimits(rate, self.clock.seconds)
         parts = self.below, self.beside, self.events
         api = api_of(self.clock, self.desk, origins, *parts, tls=tls, limits=limits)
-        websocket = WebSocketResource(ClientFactory(self.clock, lambda: 0, self.desk, self.cap))  # type: ignore[arg-type]
+        websocket = Handshake(ClientFactory(self.clock, lambda: 0, self.desk, self.cap))  # type: ignore[arg-type]
         sources = ChainMap(self.events, {"robots": self.desk.robots})
         self.pages = PageGate(self.clock, self.desk, origins, "sb", sources)
-        told = WebSocketResource(PageFactory(self.clock, lambda: 0, self.pages, self.cap))
+        told = Handshake(PageFactory(self.clock, lambda: 0, self.pages, self.cap))
         robots = Robots(websocket, Missing(), "1.2.3")
         documents = Documents(limits, "1.2.3", "sb").app.resource() if documented else None
         root = Root(robots, api.app.resource(), Missing(), Portal(folder), told, documents)

@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from autobahn.twisted.resource import WebSocketResource
 from switchboard_waiting import PATIENCE
 from twisted.internet import reactor, task
 from twisted.internet.task import LoopingCall
@@ -28,6 +27,7 @@ from relay_server.auth import Authenticator
 from relay_server.channel import Channels
 from relay_server.control import ControlRules, Desks
 from relay_server.edges.caps import AddressCap
+from relay_server.edges.handshake import Handshake
 from relay_server.edges.site import Missing, RelaySite, Robots, Root
 from relay_server.edges.video import Video, VideoFactory
 from relay_server.edges.websocket import ClientFactory
@@ -99,8 +99,8 @@ class Show:
         )
         api = api_of(clock, self.desk, origins)
         cap, rounds = AddressCap(100), Rounds(clock)
-        websocket = WebSocketResource(ClientFactory(clock, time.monotonic_ns, self.desk, cap))
-        pictures = WebSocketResource(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds))
+        websocket = Handshake(ClientFactory(clock, time.monotonic_ns, self.desk, cap))
+        pictures = Handshake(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds))
         video = Video(clock, rounds, self.desk, api.principal, pictures)
         robots = Robots(websocket, video, "1.2.3")
         root = Root(robots, api.app.resource(), Missing(), Missing(), Missing())
