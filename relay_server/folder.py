@@ -7,8 +7,19 @@ import fcntl
 import os
 import secrets
 from pathlib import Path
+from typing import BinaryIO
 
 from relay_protocol.errors import Invalid, Unavailable
+
+
+def private(path: Path) -> BinaryIO:
+    """Open a file for writing, empty; its mode is 0600 whatever the umask.
+
+    :raises OSError: it can't be made
+    """
+    descriptor = os.open(path, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+    os.fchmod(descriptor, 0o600)
+    return os.fdopen(descriptor, "wb")
 
 
 class DataFolder:
@@ -46,7 +57,8 @@ class DataFolder:
             return path.read_text().strip()
         except FileNotFoundError:
             name = f"relay-{secrets.token_hex(8)}"
-            path.write_text(name + "\n")
+            with private(path) as stream:
+                stream.write(f"{name}\n".encode())
             return name
         except OSError as error:
             raise Invalid(f"the relay's name can't be read from {path.name}: {error.strerror}") from None

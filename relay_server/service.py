@@ -27,6 +27,7 @@ from relay_server import VERSION, invitation, passwords
 from relay_server.access import Access
 from relay_server.administration.desk import RealmDesk
 from relay_server.alerts import AlertHouse
+from relay_server.audit_log import AuditLog
 from relay_server.auth import Authenticator
 from relay_server.channel import Channels
 from relay_server.config import Endpoint, Settings
@@ -109,7 +110,8 @@ class Relay:
         library = Library(settings.data / FOLDER, settings.recordings, settings.recordings_reserve)
         self._recordings = Recordings(reactor, reactor, library, self._channels, self._videos, time.time)
         self._journal = Journal(self._store, time.time)
-        record = DatabaseRecord(self._store, self._journal, time.time)
+        self._audit = AuditLog(reactor, self._store, settings.data, self._journal.tell)
+        record = DatabaseRecord(self._store, self._journal, self._audit, time.time)
         self._desks = Desks(reactor, record, ControlRules.of(settings), self._registry.changed, time.time)
         judged = self._store, self._access, self._registry
         self._alerts = AlertHouse(reactor, *judged, self._channels, self._desks, self._journal, settings)
@@ -143,6 +145,7 @@ class Relay:
         for each in (self._store, self._workshop, self._auth):
             each.start()
         self._recordings.open()
+        self._audit.restore()
         await self._taking_up.begin()
         await sweep(self._recordings, self._store, self._journal)
         self._recordings.recover()
@@ -186,7 +189,7 @@ class Relay:
         )
         desk, moments = self._desk, Moments(now_ns)
         collector = RelayCollector(self._registry, self._channels, self._videos, lambda: desk)
-        metrics = registry_of(collector, self._memory)
+        metrics = registry_of(collector, self._memory, self._audit)
         keeper = RecordingDesk(desk, self._recordings, self._store, self._journal, time.time)
         guests = Guests(self._reactor, desk, now_ns)
         offices = self._access, self._desks, self._registry, self._store
@@ -203,7 +206,14 @@ class Relay:
             },
         }
         self._fleet = FleetDesk(
-            self._reactor, desk, self._access, self._registry, self._desks, self._store, self._journal
+            self._reactor,
+            desk,
+            self._access,
+            self._registry,
+            self._desks,
+            self._store,
+            self._journal,
+            self._audit,
         )
         meanings = vocabulary.Meanings(self._access, self._registry, self._workshop)
         realms = RealmDesk(self._store, self._auth, self._recordings, self.refresh, lambda: self.robots_port)
@@ -387,5 +397,6 @@ class Relay:
         await self._alerts.keep()
         await self._memory.keep()
         await recorded
+        await self._audit.close()
         # The farewells are on their way; a moment lets slow networks take them.
         await deferLater(self._reactor, 0.2)

@@ -110,6 +110,8 @@ class Alerts:
             "robot.alerts_told": self._all_told,
             "control.lost": self._control_lost,
             "control.taken": self._control_taken,
+            "audit.lost": self._audit_lost,
+            "audit.written": lambda robot, data: self.over(robot, kinds.AUDIT),
         }
         journal.listen(self._happened)
 
@@ -265,6 +267,10 @@ class Alerts:
         self._steered.add(robot.robot_id)
         self.over(robot, kinds.CONTROL)
 
+    def _audit_lost(self, robot: Presence, data: dict[str, Any]) -> None:
+        text = "audit entries about this robot are lost: the database could not be written for too long"
+        self.tell(robot, kinds.AUDIT, "", "error", text)
+
     def _was_bereft(self, robot: Presence, text: str) -> None:
         """The robot says that its driver lost it: only of an earlier relay's time is that anything new."""
         if robot.robot_id not in self._steered:
@@ -347,7 +353,7 @@ class Alerts:
             batch, changed = changed[:BATCH], changed[BATCH:]
             try:
                 await self._store.write(queries.save_alerts, batch)
-            except SwitchboardError:
+            except BaseException:  # also an error nobody has foreseen, and a flush that is given up
                 self.book.put_back([*batch, *changed])
                 raise
             changed = changed or self.book.take_changed()

@@ -14,13 +14,14 @@ CONTROL = "control"
 STALE = "stale"
 ROBOT = "robot"
 FLOOD = "flood"
+AUDIT = "audit"
 
-KINDS = (OFFLINE, BATTERY, DIAGNOSTICS, STOP, MODULE, CONTROL, STALE, ROBOT, FLOOD)
+KINDS = (OFFLINE, BATTERY, DIAGNOSTICS, STOP, MODULE, CONTROL, STALE, ROBOT, FLOOD, AUDIT)
 
-OURS = frozenset({OFFLINE, BATTERY, STOP, CONTROL, STALE, FLOOD})
+OURS = frozenset({OFFLINE, BATTERY, STOP, CONTROL, STALE, FLOOD, AUDIT})
 """What only the relay tells: a robot's word of such a kind is one of kind :data:`ROBOT`."""
 
-SINGLE = frozenset({OFFLINE, BATTERY, STOP, CONTROL})
+SINGLE = frozenset({OFFLINE, BATTERY, STOP, CONTROL, AUDIT})
 """What a robot can have one of at most: no flood of others hides it."""
 
 RESERVED = frozenset({MODULE})

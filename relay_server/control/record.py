@@ -6,24 +6,19 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
-from sqlalchemy.orm import Session
-from twisted.internet.defer import Deferred
-from twisted.logger import Logger
 
 from relay_db import queries
 from relay_db.queries import StopRecord
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.realms import full_name
+from relay_server.audit_log import AuditLog, Entry
 from relay_server.journal import Journal
 from relay_server.registry import Presence
 from relay_server.store import Store
 
 WHY = 500
 """Characters that are kept of a reason somebody gives."""
-
-WAITING = 256
-"""Audit entries that wait for the database at a time; what is not taken then is in the relay's log."""
 
 
 def reason_of(value: Any) -> str:
@@ -71,7 +66,7 @@ class Record(Protocol):
         """Something has happened; nobody waits for it to be written."""
 
     async def ordered(self, robot: Presence, order: StopRecord, actor: Actor, *, audit: bool = True) -> None:
-        """Keep an order to stop until it is told, with its audit entry.
+        """Keep an order to stop until it is told, and write its audit entry.
 
         :param audit: false for one of many that need no entry of their own
         :raises SwitchboardError: it can't be kept
@@ -98,44 +93,24 @@ class DatabaseRecord:
     :param wall: Unix time in seconds
     """
 
-    log = Logger()
-
-    def __init__(self, store: Store, journal: Journal, wall: Callable[[], float]) -> None:
+    def __init__(self, store: Store, journal: Journal, audit: AuditLog, wall: Callable[[], float]) -> None:
         self._store = store
         self._journal = journal
+        self._audit = audit
         self._wall = wall
-        self._waiting = 0
 
     def note(
         self, kind: str, robot: Presence, actor: Actor, why: str = "", *, audit: bool = True, **data: Any
     ) -> None:
         """An event, as far as one user may cause them, and an entry of the audit log in any case."""
         self._event(kind, robot, actor, why, **data)
-        if not audit:
-            return
-        if self._waiting >= WAITING:
-            self.log.error(
-                "'{kind}' of {robot} by {source} is not on record: the database does not keep up",
-                kind=kind,
-                robot=robot.full,
-                source=actor.source,
-            )
-            return
-        self._waiting += 1
-        writing = self._store.write(
-            queries.append_audit, **self._entry(kind, robot, actor, {"why": why, **data})
-        )
-        Deferred.fromCoroutine(writing).addErrback(
-            lambda failure: self.log.error(
-                "'{kind}' is not on record: {reason}", kind=kind, reason=failure.value
-            )
-        ).addBoth(self._written)
+        if audit:
+            self._audit.append(self._entry(kind, robot, actor, {"why": why, **data}))
 
     async def ordered(self, robot: Presence, order: StopRecord, actor: Actor, *, audit: bool = True) -> None:
-        """The order and its audit entry, both or neither."""
-        self._event("robot.stopped", robot, actor, order.why)
-        entry = self._entry("robot.stopped", robot, actor, {"why": order.why})
-        await self._store.write(_order, order, entry if audit else None)
+        """The entry waits where the database does not take it; so it is written also for an order that is not kept."""
+        self.note("robot.stopped", robot, actor, order.why, audit=audit)
+        await self._store.write(queries.order_stop, order.robot_id, order.by, order.why, order.at)
 
     async def told(self, robot: Presence, at: float | None = None) -> bool:
         """See :class:`Record`."""
@@ -161,27 +136,13 @@ class DatabaseRecord:
             **data,
         )
 
-    def _entry(self, kind: str, robot: Presence, actor: Actor, data: dict[str, Any]) -> dict[str, Any]:
-        return {
-            "at": self._wall(),
-            "actor": _full(actor, robot),
-            "action": kind,
-            "target": robot.full,
-            "origin": actor.address,
-            "data": {"connection": actor.connection, **data},
-        }
-
-    def _written(self, _: object) -> None:
-        self._waiting -= 1
+    def _entry(self, kind: str, robot: Presence, actor: Actor, data: dict[str, Any]) -> Entry:
+        data = {"connection": actor.connection, **data}
+        who, robots = _full(actor, robot), (robot.robot_id,)
+        return Entry(self._wall(), who, kind, robot.full, actor.address, data, robots)
 
 
 def _full(actor: Actor, robot: Presence) -> str:
     """Who it is for the whole relay: without a realm users are those of the robot's own."""
     name, at, realm = actor.source.partition("@")
     return actor.source if actor.user is None else full_name(name, realm if at else robot.realm)
-
-
-def _order(s: Session, order: StopRecord, entry: dict[str, Any] | None) -> None:
-    queries.order_stop(s, order.robot_id, order.by, order.why, order.at)
-    if entry is not None:
-        queries.append_audit(s, **entry)

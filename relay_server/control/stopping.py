@@ -211,6 +211,7 @@ class Stopping:
 
     async def _keep(self, order: StopRecord, actor: Actor, audit: bool) -> None:
         if len(self._keeping) >= KEEPING:
+            self._record.note("robot.stopped", self._robot, actor, order.why, audit=audit)
             raise Unavailable(f"{KEEPING} orders to stop {self._robot.name} are being written already")
         self._keeping.append(order)
         try:

@@ -21,6 +21,7 @@ from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailab
 from relay_protocol.realms import DEFAULT_REALM, full_name
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Access, Permit, Principal
+from relay_server.audit_log import AuditLog, Entry
 from relay_server.bucket import Buckets
 from relay_server.clock import Clock, as_twisted, within
 from relay_server.control import Actor, Desks
@@ -125,6 +126,7 @@ class FleetDesk:
         desks: Desks,
         store: Store,
         journal: Journal,
+        audit: AuditLog,
         *,
         clock_ns: Callable[[], int] = now_ns,
         wall: Callable[[], float] = time.time,
@@ -136,6 +138,7 @@ class FleetDesk:
         self._halting = Halting(desks, registry)
         self._store = store
         self._journal = journal
+        self._audit = audit
         self._clock_ns = clock_ns
         self._wall = wall
         self._orders: Counter[int] = Counter()
@@ -255,10 +258,7 @@ class FleetDesk:
         stopping = Deferred.fromCoroutine(side_by_side(told, one, at_once=len(told)))
         try:
             if self._stops.take(plan.asker.user_id):
-                await self._record(plan)
-        except SwitchboardError as error:
-            # Each stop is on record by itself, too.
-            self.log.error("an order to stop is not on record: {reason}", reason=str(error))
+                self._audit.append(self._entry(plan))
         finally:
             # Who has hung up by now has had them told all the same.
             await stopping
@@ -350,16 +350,32 @@ class FleetDesk:
             self._orders += Counter()
 
     async def _record(self, plan: Plan) -> None:
-        """Put on record what is ordered, before it is done; never what services are given, which may be secret."""
-        order = plan.order
+        """Put on record what is ordered, before it is done.
+
+        :raises Unavailable: it can't be
+        """
+        entry = self._entry(plan)
         await self._store.write(
             queries.append_audit,
-            at=self._wall(),
-            actor=plan.asker.name if _is_local(plan.asker) else f"user:{plan.asker.full}",
-            action=f"fleet.{order.do}",
-            target=", ".join(full_name(each, plan.asker.realm) for each in order.robots),
-            origin=plan.address,
-            data={"robots": len(plan.robots), "what": order.subject, "why": order.why},
+            at=entry.at,
+            actor=entry.actor,
+            action=entry.action,
+            target=entry.target,
+            origin=entry.origin,
+            data=entry.data,
+        )
+
+    def _entry(self, plan: Plan) -> Entry:
+        """What the audit log says of an order; never what services are given, which may be secret."""
+        order = plan.order
+        return Entry(
+            self._wall(),
+            plan.asker.name if _is_local(plan.asker) else f"user:{plan.asker.full}",
+            f"fleet.{order.do}",
+            ", ".join(full_name(each, plan.asker.realm) for each in order.robots),
+            plan.address,
+            {"robots": len(plan.robots), "what": order.subject, "why": order.why},
+            tuple(each.id for each in plan.robots.values()),
         )
 
     def _tell_of_end(self, plan: Plan, counted: Counter[bool]) -> None:

@@ -86,7 +86,8 @@ class MemoryHouse(Collector):
         try:
             await within(self._clock, KEEP_SECONDS, self._writer.flush(), late)
         except SwitchboardError as error:
-            self.log.error("the latest events could not be kept: {reason}", reason=str(error))
+            count = self._writer.waiting
+            self.log.error("the latest {count} events are lost: {reason}", count=count, reason=str(error))
 
     def collect(self) -> Iterator[Metric]:
         """One reading."""

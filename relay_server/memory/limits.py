@@ -26,6 +26,9 @@ QUEUE = 5000
 OWN_QUEUE = 2000
 """Of these the relay's own fill no more."""
 
+RETRY_SECONDS = 1.0
+"""Pause after a write that the database refused, while events of the relay's own wait."""
+
 AGAIN_SECONDS = 1.0
 """When who found the queue full should come again."""
 

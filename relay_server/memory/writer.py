@@ -20,7 +20,15 @@ from relay_db.queries.recalling import OURS
 from relay_protocol.errors import NotFound, SwitchboardError, Unavailable
 from relay_protocol.realms import DEFAULT_REALM
 from relay_server.clock import Clock, Timer
-from relay_server.memory.limits import AGAIN_SECONDS, BATCH, DROPS_SECONDS, GATHER_SECONDS, OWN_QUEUE, QUEUE
+from relay_server.memory.limits import (
+    AGAIN_SECONDS,
+    BATCH,
+    DROPS_SECONDS,
+    GATHER_SECONDS,
+    OWN_QUEUE,
+    QUEUE,
+    RETRY_SECONDS,
+)
 from relay_server.store import Store
 
 DROPPED = f"{OURS}.dropped"
@@ -64,6 +72,8 @@ class Writer:
         self._lots: deque[_Lot] = deque()
         self._timer: Timer | None = None
         self._writing = False
+        self._retry: Timer | None = None
+        """Runs while the database has refused the last events of the relay's own, which wait."""
         self._idle: list[Deferred[None]] = []
         self._untold: Counter[str] = Counter()
         """By realm, the relay's own events that were dropped and of which nobody has been told."""
@@ -121,6 +131,9 @@ class Writer:
         if self._writing or self._lots:
             idle: Deferred[None] = Deferred()
             self._idle.append(idle)
+            if self._retry is not None:
+                self._retry.cancel()
+                self._again()
             await idle
 
     # --- writing ------------------------------------------------------------------------------------------
@@ -132,7 +145,7 @@ class Writer:
 
     def _go_on(self) -> None:
         """Write at once what fills a transaction, and soon what does not."""
-        if self._writing:
+        if self._writing or self._retry is not None:
             return
         if self.waiting >= BATCH:
             if self._timer is not None:
@@ -170,10 +183,7 @@ class Writer:
             if not isinstance(error, SwitchboardError):
                 raise
             return
-        finally:
-            own = sum(lot.waiting is None for lot in lots)
-            self.own_waiting -= own
-            self.waiting -= sum(len(lot.events) for lot in lots)
+        self._taken_out(lots)
         self._due |= dict.fromkeys(untold, self._clock.seconds() + DROPS_SECONDS)
         at = 0
         for lot in lots:
@@ -191,12 +201,28 @@ class Writer:
         self._told(safe)
 
     def _failed(self, lots: list[_Lot], error: Exception) -> None:
-        words = str(error) if isinstance(error, SwitchboardError) else "the relay failed; its log tells more"
-        for lot in lots:
+        """The relay's own events wait until the database is back; others are refused, so their senders know."""
+        known = isinstance(error, SwitchboardError)
+        words = str(error) if known else "the relay failed; its log tells more"
+        kept = [lot for lot in lots if lot.waiting is None and known]
+        if kept:
+            self._lots.extendleft(reversed(kept))
+            self._retry = self._clock.callLater(RETRY_SECONDS, self._again)
+        gone = [lot for lot in lots if lot.waiting is not None or not known]
+        self._taken_out(gone)
+        for lot in gone:
             if lot.waiting is None:
                 self.drop(lot.events[0].realm)
             elif not lot.waiting.called:
                 lot.waiting.errback(Unavailable(words))
+
+    def _taken_out(self, lots: list[_Lot]) -> None:
+        self.own_waiting -= sum(lot.waiting is None for lot in lots)
+        self.waiting -= sum(len(lot.events) for lot in lots)
+
+    def _again(self) -> None:
+        self._retry = None
+        self._write()
 
     def _saved(self, _: object) -> None:
         self._writing = False
@@ -204,7 +230,8 @@ class Writer:
         if not self._lots and not self._writing:
             idle, self._idle = self._idle, []
             for each in idle:
-                each.callback(None)
+                if not each.called:
+                    each.callback(None)
 
     def _tellable(self) -> Counter[str]:
         """How many were dropped, of realms where that was not told a moment ago."""

@@ -58,6 +58,8 @@ from relay_db.queries.events import (
 )
 from relay_db.queries.history import (
     append_audit,
+    audit_key,
+    audited_lately,
     list_audit,
     list_events,
     purge_events,
@@ -225,6 +227,8 @@ __all__ = [
     "add_user",
     "all_entries",
     "append_audit",
+    "audit_key",
+    "audited_lately",
     "bound_leases",
     "change_entry",
     "consume_login",

@@ -121,6 +121,28 @@ def append_audit(
     return entry
 
 
+AuditKey = tuple[float, str, str, str]
+
+_LATELY = 20_000
+"""Entries, from the newest, among which one that may be there already is looked for."""
+
+
+def audit_key(at: float, actor: str, action: str, target: str) -> AuditKey:
+    """What tells an entry from others: time in Unix seconds, actor, action and target as they are stored."""
+    return float(at), recorded(actor), recorded(action, NAME), recorded(target)
+
+
+def audited_lately(s: Session, since: float) -> frozenset[AuditKey]:
+    """Keys of the newest entries, of what happened at or after a time.
+
+    :param since: Unix seconds
+    """
+    newest = select(Revision.audit_id).scalar_subquery()
+    columns = AuditEntry.at, AuditEntry.actor, AuditEntry.action, AuditEntry.target
+    query = select(*columns).where(AuditEntry.id > newest - _LATELY, AuditEntry.at >= since)
+    return frozenset((row.at, row.actor, row.action, row.target) for row in s.execute(query))
+
+
 def removed_robots(s: Session, names: Collection[str]) -> dict[str, float]:
     """When robots of these names were removed the last time, Unix seconds; those that never were are left out."""
     query = (

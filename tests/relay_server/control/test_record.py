@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
-import pytest
 import pytest_twisted
-from twisted.logger import LogLevel, capturedLogs, formatEvent
+from twisted.internet.task import Clock
 
 from relay_db import queries
 from relay_db.queries import StopRecord
+from relay_server.audit_log import AuditLog
 from relay_server.control import Actor, DatabaseRecord
-from relay_server.control import record as module
 from relay_server.journal import BURST, Journal
 from relay_server.registry import Presence
 from relay_server.store import Store
@@ -23,12 +23,16 @@ ANN = Actor("ann", "user:ann", None, "192.0.2.7", 3)
 async def made(store: Store, time: Time) -> tuple[DatabaseRecord, Presence]:
     """A record, and a robot the database knows."""
     robot = await store.write(queries.add_robot, "rover")
-    return DatabaseRecord(store, Journal(store, time), time), Presence(robot.id, robot.name, robot.realm)
+    journal = Journal(store, time)
+    folder = Path(store.database.url.removeprefix("sqlite:///")).parent
+    audit = AuditLog(Clock(), store, folder, journal.tell)
+    return DatabaseRecord(store, journal, audit, time), Presence(robot.id, robot.name, robot.realm)
 
 
 async def written(store: Store) -> tuple[list[Any], list[Any]]:
     """Events and audit entries, oldest first, once all is written that waits now."""
-    await store.write(queries.revision)
+    for _ in range(5):
+        await store.write(queries.revision)
     return (await store.read(queries.list_events))[::-1], (await store.read(queries.list_audit))[::-1]
 
 
@@ -68,22 +72,6 @@ async def test_who_causes_much_is_on_record_with_all_of_it(store: Store, time: T
     events, audit = await written(store)
     assert len(events) == BURST
     assert len(audit) == 3 * BURST
-
-
-@pytest_twisted.ensureDeferred
-async def test_what_the_database_does_not_take_is_in_the_log(
-    store: Store, time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With who did what to which robot; what waits is bounded."""
-    monkeypatch.setattr(module, "WAITING", 2)
-    record, robot = await made(store, time)
-    with capturedLogs() as told:
-        for _ in range(3):
-            record.note("control.taken", robot, ANN)
-    (line,) = [formatEvent(each) for each in told if each["log_level"] is LogLevel.error]
-    assert line == "'control.taken' of rover by user:ann is not on record: the database does not keep up"
-    _, audit = await written(store)
-    assert len(audit) == 2
 
 
 @pytest_twisted.ensureDeferred

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -16,6 +17,7 @@ from relay_db.queries import RobotRecord
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_server.access import Principal
+from relay_server.audit_log import AuditLog
 from relay_server.control import Actor
 from relay_server.fleet import FleetDesk, Order, Result
 from relay_server.fleet import desk as module
@@ -63,6 +65,8 @@ class Fleet:
         self.front = front
         self.world = front.world
         self.journal = Journal(front.store, front.wall)
+        folder = Path(front.store.database.url.removeprefix("sqlite:///")).parent
+        self.audit = AuditLog(self.world.clock, front.store, folder, self.journal.tell)
         self.desk = self.new_desk()
 
     def new_desk(self) -> FleetDesk:
@@ -75,6 +79,7 @@ class Fleet:
             self.world.desks,
             self.front.store,
             self.journal,
+            self.audit,
             clock_ns=self.world.now_ns,
             wall=self.front.wall,
         )
@@ -497,6 +502,7 @@ async def test_who_stops_all_again_and_again_does_not_fill_the_record(
     for _ in range(5):
         given = await fleet.give(LOCAL, order("stop", "rover"))
         await until(lambda given=given: given.running.called)
+    await fleet.audit.flush()
     audit = await fleet.front.store.read(queries.list_audit)
     assert [each.action for each in audit].count("fleet.stop") == 2
     assert len(fleet.world.control.all(link.Stop)) == 5

@@ -15,7 +15,7 @@ from twisted.logger import capturedLogs
 from relay_db.queries import MemoryRecord, NewMemory
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.memory import writer as module
-from relay_server.memory.limits import DROPS_SECONDS, GATHER_SECONDS
+from relay_server.memory.limits import DROPS_SECONDS, GATHER_SECONDS, RETRY_SECONDS
 from relay_server.memory.writer import Full, Writer
 
 
@@ -196,17 +196,37 @@ def test_that_something_was_dropped_is_not_told_all_the_time(scene: Scene) -> No
 
 
 def test_a_database_that_fails_is_told_to_who_waits(scene: Scene) -> None:
-    """The relay's own are counted as dropped, and what comes later is written."""
+    """The relay's own wait, and are written in their order when the database is back."""
     waiting = scene.write()
-    scene.writer.note(new())
+    scene.writer.note(new(kind="own"))
     scene.gather()
     with fails(waiting, Unavailable):
         scene.paper.fail(Unavailable("the disk is full"))
-    assert (scene.writer.waiting, scene.writer.own_waiting, scene.writer.dropped) == (0, 0, 1)
+    assert (scene.writer.waiting, scene.writer.own_waiting, scene.writer.dropped) == (1, 1, 0)
     following = scene.write()
+    scene.writer.note(new(kind="later"))
     scene.gather()
-    assert [each.kind for each in scene.paper.commit()] == ["x", "events.dropped"]
-    assert len(following.result) == 1
+    assert scene.paper.asked == []
+    scene.clock.advance(RETRY_SECONDS)
+    with fails(following, Unavailable):
+        scene.paper.fail(Unavailable("the disk is full"))
+    scene.clock.advance(RETRY_SECONDS)
+    assert [each.kind for each in scene.paper.commit()] == ["own", "later"]
+    assert (scene.writer.waiting, scene.writer.own_waiting, scene.writer.dropped) == (0, 0, 0)
+
+
+def test_events_that_wait_for_the_database_are_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Further ones are dropped, and counted in what is written next."""
+    monkeypatch.setattr(module, "OWN_QUEUE", 3)
+    for number in range(3):
+        scene.writer.note(new(kind=f"own{number}"))
+    scene.gather()
+    scene.paper.fail(Unavailable("the disk is full"))
+    for _ in range(4):
+        scene.writer.note(new(kind="late"))
+    assert (scene.writer.waiting, scene.writer.dropped) == (3, 4)
+    scene.clock.advance(RETRY_SECONDS)
+    assert [each.kind for each in scene.paper.commit()] == ["own0", "own1", "own2", "events.dropped"]
 
 
 def test_what_nobody_has_foreseen_is_not_the_end_of_writing(scene: Scene) -> None:

@@ -1,0 +1,250 @@
+"""Audit entries of what has happened outlast a database that can't be written."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_twisted
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.task import Clock, deferLater
+from twisted.logger import LogLevel, capturedLogs, formatEvent
+
+from relay_db import queries, sqlite
+from relay_db.queries import AuditRecord
+from relay_server import audit_log as module
+from relay_server.audit_log import BATCH, FILE, KEEP_SECONDS, RETRY_SECONDS, AuditLog, Entry
+from relay_server.store import Store
+
+ROVER = 7
+
+
+class Scene:
+    """An audit log on a real SQLite file; its retries wait for the test."""
+
+    def __init__(self, store: Store, folder: Path) -> None:
+        self.store, self.folder = store, folder
+        self.clock = Clock()
+        self.told: list[tuple[str, int]] = []
+        self.audit = self.another()
+
+    def another(self) -> AuditLog:
+        """That of the next relay."""
+        return AuditLog(
+            self.clock, self.store, self.folder, lambda kind, robot: self.told.append((kind, robot))
+        )
+
+    def append(self, *numbers: int) -> None:
+        """What happened at these moments."""
+        for number in numbers:
+            self.audit.append(Entry(number, "user:ann", "control.taken", "rover", data={}, robots=(ROVER,)))
+
+    async def settled(self, audit: AuditLog | None = None) -> None:
+        """Until no write is under way."""
+        while (audit or self.audit)._writing:
+            await deferLater(reactor, 0.01)  # type: ignore[arg-type]  # to mypy it is a module
+
+    async def tries_again(self) -> None:
+        """The pause after a failure is over."""
+        self.clock.advance(RETRY_SECONDS)
+        await self.settled()
+
+    async def kept(self) -> list[AuditRecord]:
+        """What the database has; its chain is whole."""
+        assert await self.store.read(queries.verify_audit) is None
+        return (await self.store.read(queries.list_audit, limit=10_000))[::-1]
+
+    async def times(self) -> list[float]:
+        """When those happened."""
+        return [each.at for each in await self.kept()]
+
+
+@pytest.fixture
+def scene(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """Nothing written yet. A locked file is given up soon."""
+    monkeypatch.setattr(sqlite, "BUSY_SECONDS", 0.05)
+    return Scene(store, tmp_path)
+
+
+@contextmanager
+def locked(scene: Scene) -> Iterator[None]:
+    """Another process holds the lock of the file."""
+    other = sqlite3.connect(scene.folder / "switchboard.db", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+    finally:
+        other.execute("ROLLBACK")
+        other.close()
+
+
+@contextmanager
+def full(scene: Scene) -> Iterator[None]:
+    """SQLite may not make the file any larger, on each connection."""
+
+    def limit(on: bool) -> None:
+        with scene.store.database.connection() as connection:
+            pages = connection.exec_driver_sql("PRAGMA page_count").scalar() if on else 1_000_000
+            connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
+
+    limit(True)
+    try:
+        yield
+    finally:
+        limit(False)
+
+
+@pytest_twisted.ensureDeferred
+async def test_entries_of_a_locked_database_are_written_in_order_with_their_time(scene: Scene) -> None:
+    """However often the writing fails; later ones stand behind them."""
+    with locked(scene):
+        scene.append(1, 2)
+        await scene.settled()
+        scene.append(3)
+        await scene.tries_again()
+        assert await scene.times() == []
+    scene.append(4)
+    await scene.tries_again()
+    assert await scene.times() == [1, 2, 3, 4]
+    assert scene.told == []
+
+
+@pytest_twisted.ensureDeferred
+async def test_entries_of_a_full_disk_are_written_when_there_is_room(scene: Scene) -> None:
+    """SQLITE_FULL: what is too much for the last page waits as a whole."""
+    with full(scene):
+        for first in range(0, 1000, 50):
+            scene.append(*range(first, first + 50))
+            await scene.settled()
+            if scene.audit._retry is not None:
+                break
+        assert scene.audit._retry is not None
+        before = await scene.times()
+        assert len(before) < first + 50
+    await scene.tries_again()
+    assert await scene.times() == list(range(first + 50))
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_finds_no_room_is_one_entry_and_told(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands where the lost ones would, and says how many they were and until when."""
+    monkeypatch.setattr(module, "WAITING", 3)
+    with locked(scene), capturedLogs() as logs:
+        scene.append(1, 2, 3, 4, 5)
+        await scene.settled()
+        assert scene.told == [("audit.lost", ROVER)] * 2
+    lines = [formatEvent(each) for each in logs if each["log_level"] is LogLevel.error]
+    assert (
+        lines == ["'control.taken' of rover by user:ann is not on record: the database does not keep up"] * 2
+    )
+    await scene.tries_again()
+    scene.append(6)
+    await scene.settled()
+    kept = await scene.kept()
+    assert [each.at for each in kept] == [1, 2, 3, 4, 6]
+    assert (kept[3].actor, kept[3].action, kept[3].data) == ("relay", "audit.lost", {"count": 2, "until": 5})
+    assert scene.told[2:] == [("audit.written", ROVER)]
+    assert scene.audit.lost == 2
+
+
+@pytest_twisted.ensureDeferred
+async def test_many_are_written_in_several_transactions(scene: Scene) -> None:
+    """In order."""
+    numbers = list(range(3 * BATCH + 1))
+    with locked(scene):
+        scene.append(*numbers)
+        await scene.settled()
+    await scene.tries_again()
+    assert await scene.times() == numbers
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_entry_that_can_not_be_written_at_all_holds_up_no_other(scene: Scene) -> None:
+    """It is in the log, and its robot's owners are told."""
+    with locked(scene), capturedLogs() as logs:
+        scene.append(1)
+        scene.audit.append(Entry(2, "user:ann", "x", "rover", data={"bad": float("nan")}, robots=(ROVER,)))
+        scene.append(3)
+        await scene.settled()
+    with capturedLogs() as logs:
+        await scene.tries_again()
+    assert await scene.times() == [1, 3]
+    assert any("not on record" in str(formatEvent(each)) for each in logs)
+    assert scene.told == [("audit.lost", ROVER)]
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_waits_when_the_relay_stops_is_written_by_the_next(scene: Scene) -> None:
+    """From a file for its owner's eyes, which is gone afterwards."""
+    before = os.umask(0)
+    try:
+        with locked(scene):
+            scene.append(1, 2)
+            await scene.settled()
+            closing = Deferred.fromCoroutine(scene.audit.close())
+            await scene.settled()
+            scene.clock.advance(KEEP_SECONDS)
+            await closing
+    finally:
+        os.umask(before)
+    path = scene.folder / FILE
+    assert path.stat().st_mode & 0o777 == 0o600
+    following = scene.another()
+    following.restore()
+    await scene.settled(following)
+    assert await scene.times() == [1, 2]
+    assert not path.exists()
+
+
+@pytest_twisted.ensureDeferred
+async def test_an_entry_of_that_file_that_is_in_the_database_already_is_not_written_twice(
+    scene: Scene,
+) -> None:
+    """A commit may have been done though the relay did not learn of it."""
+    scene.append(1, 2)
+    await scene.settled()
+    line = b'{"at":%d,"actor":"user:ann","action":"control.taken","target":"rover"}\n'
+    (scene.folder / FILE).write_bytes(line % 2 + line % 3 + b"{broken\n")
+    following = scene.another()
+    following.restore()
+    await scene.settled(following)
+    assert await scene.times() == [1, 2, 3]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_relay_that_stops_in_order_leaves_no_file(scene: Scene) -> None:
+    """All is written before it is gone, also what waited for the next attempt."""
+    with locked(scene):
+        scene.append(1)
+        await scene.settled()
+    await scene.audit.close()
+    assert await scene.times() == [1]
+    assert not (scene.folder / FILE).exists()
+
+
+@pytest_twisted.ensureDeferred
+async def test_what_can_be_kept_nowhere_is_in_the_log(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all that the entry says."""
+
+    def no_space(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with locked(scene), capturedLogs() as logs:
+        scene.append(1)
+        await scene.settled()
+        closing = Deferred.fromCoroutine(scene.audit.close())
+        await scene.settled()
+        scene.clock.advance(KEEP_SECONDS)
+        await closing
+    (line,) = [formatEvent(each) for each in logs if each["log_level"] is LogLevel.critical]
+    assert line.startswith("not on record, No space left on device: Entry(at=1")
+    assert "control.taken" in line and "user:ann" in line
