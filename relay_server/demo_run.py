@@ -31,7 +31,7 @@ def run_demo(folder: Path, http: Endpoint, robots: Endpoint) -> int:
     """
     url = f"sqlite:///{folder / 'switchboard.db'}"
     log = (folder / "relay.log").open("a")
-    logs.begin(as_json=False, out=log)
+    logs.begin(as_json=False, out=log, later=logs.later)
     reactor = monotonic_reactor()
     database = Database(url)
     logins = prepare(database)

@@ -225,7 +225,7 @@ def serve(
             battery_critical / 100,
         ),
     )
-    logs.begin(log_json, debug)
+    logs.begin(log_json, debug, later=logs.later)
     sys.exit(run(settings, _ready))
 
 

@@ -207,7 +207,10 @@ class RobotConnection(TwistedProtocol):
         """Say no in words and end the connection."""
         if self._role is not None:
             self.log.info(
-                "a robot at {address} is refused: {reason}", address=self.address, reason=refusal.reason
+                "a robot at {address} is refused: {reason}",
+                address=self.address,
+                reason=refusal.reason,
+                limited="robot refused",
             )
             self.send(refusal)
             self._hang_up(refusal.reason)
@@ -327,7 +330,10 @@ class RobotConnection(TwistedProtocol):
 
     def _break(self, error: PeerError) -> None:
         self.log.warn(
-            "the robot at {address} broke the protocol: {reason}", address=self.address, reason=str(error)
+            "the robot at {address} broke the protocol: {reason}",
+            address=self.address,
+            reason=str(error),
+            limited="robot broke the protocol",
         )
         self.send(link.Refused(reason=str(error), code=error.code))
         self._hang_up(str(error))

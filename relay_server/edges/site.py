@@ -84,6 +84,7 @@ class DeadlineChannel(HTTPChannel):
                 "a request from {address} can't be read: {error!r}",
                 address=self._address,
                 error=error,
+                limited="unreadable",
             )
             self._respondToBadRequestAndDisconnect()
 
@@ -131,8 +132,13 @@ class DeadlineChannel(HTTPChannel):
             return
         self._refused = True
         self._stop_deadline()
-        self.log.info("a request from {address} is refused: {reason}", address=self._address, reason=reason)
         number, _, title = status.decode().partition(" ")
+        self.log.info(
+            "a request from {address} is refused: {reason}",
+            address=self._address,
+            reason=reason,
+            limited=number,
+        )
         body = problem_body(int(number), reason, title=title)
         self.transport.write(
             b"HTTP/1.1 %b\r\n%bContent-Type: application/problem+json\r\nContent-Length: %d\r\n"

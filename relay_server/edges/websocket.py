@@ -80,7 +80,9 @@ class ClientProtocol(BoundedProtocol):
             super().dataReceived(data)
 
     def _drop(self, reason: str) -> None:
-        self.log.info("a client at {address} is cut: {reason}", address=self._address(), reason=reason)
+        self.log.info(
+            "a client at {address} is cut: {reason}", address=self._address(), reason=reason, limited="cut"
+        )
         self._stop_deadline()
         self.dropConnection(abort=True)
 
@@ -115,9 +117,7 @@ class ClientProtocol(BoundedProtocol):
         if self._failure is not None and not request.origin:
             # Programs read the status; browsers can't, so they get a close code after the handshake.
             reason = str(self._failure)
-            self.log.info(
-                "a client at {address} is refused: {reason}", address=self._address(), reason=reason
-            )
+            self._log_refused(reason, self._failure.code)
             raise ConnectionDeny(status_of(self._failure), reason)
         return chosen
 
@@ -288,10 +288,16 @@ class ClientProtocol(BoundedProtocol):
         if self._open:
             self._open = False
             if self._session is None:
-                self.log.info(
-                    "a client at {address} is refused: {reason}", address=self._address(), reason=reason
-                )
+                self._log_refused(reason, code)
             self.say_close(code, reason)
+
+    def _log_refused(self, reason: str, kind: str | int) -> None:
+        self.log.info(
+            "a client at {address} is refused: {reason}",
+            address=self._address(),
+            reason=reason,
+            limited=kind,
+        )
 
     def pause(self) -> None:
         """The transport's buffer is full."""

@@ -17,13 +17,15 @@ HOSTILE = "\x1b[2Jrover\u202e\u009b31m\x7f\u2028\r\ud800\x00"
 class Log:
     """What was given to Twisted as observer, and what it writes."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, as_json: bool, debug: bool = False) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, as_json: bool, debug: bool = False, later: Any = None
+    ) -> None:
         self.text = ""
         observers: list[Any] = []
         monkeypatch.setattr(
             logs.globalLogBeginner, "beginLoggingTo", lambda given, **more: observers.extend(given)
         )
-        logs.begin(as_json, debug, out=self)  # type: ignore[arg-type]
+        logs.begin(as_json, debug, out=self, later=later)  # type: ignore[arg-type]
         self._observe = observers[0]
 
     def write(self, text: str) -> None:
@@ -97,3 +99,54 @@ def test_a_failure_shows_its_words_and_only_a_crash_its_traceback(monkeypatch: p
     failure = Failure(ValueError("no good"))
     assert log.event("it failed", LogLevel.error, log_failure=failure).endswith("it failed: no good\n")
     assert "ValueError" in log.event("it failed", LogLevel.critical, log_failure=failure)
+
+
+def test_lines_that_strangers_cause_are_few_and_the_rest_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """30 a minute of one kind; others are written all the same; one line says how many were left out."""
+    log = Log(monkeypatch, False)
+    lines = [log.event(f"refused {number}", limited="401") for number in range(50)]
+    assert [bool(each) for each in lines] == [True] * 30 + [False] * 20
+    assert log.event("refused otherwise", limited="403")
+    told, own = log.event("hello", log_time=60.5).splitlines()
+    assert told.endswith("20 more lines like this one were left out in 60 s: refused 0")
+    assert own.endswith("hello")
+    assert log.event("refused again", limited="401", log_time=61.0)
+
+
+@pytest.mark.parametrize("namespace", ["autobahn.twisted.websocket", "twisted.internet.tcp"])
+def test_warnings_of_libraries_are_few(monkeypatch: pytest.MonkeyPatch, namespace: str) -> None:
+    """However different they are."""
+    log = Log(monkeypatch, False)
+    lines = [
+        log.event("", LogLevel.warn, log_format=f"peer {number}", log_namespace=namespace)
+        for number in range(50)
+    ]
+    assert sum(map(bool, lines)) == 30
+
+
+def test_tracebacks_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of one kind of error; another kind has its own."""
+    log = Log(monkeypatch, False)
+
+    def failed(error: Exception) -> str:
+        return log.event("it failed", LogLevel.critical, log_failure=Failure(error))
+
+    assert sum(bool(failed(ValueError(str(number)))) for number in range(50)) == 30
+    assert failed(KeyError("x"))
+
+
+def test_the_count_is_written_when_the_window_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where nothing else is logged."""
+    waiting: list[tuple[float, Any]] = []
+    log = Log(monkeypatch, False, later=lambda seconds, work: waiting.append((seconds, work)))
+    for _ in range(50):
+        log.event("refused", limited="401")
+    [(seconds, work)] = waiting
+    assert seconds == 61
+    work()
+    assert "20 more lines" in log.text
+
+
+def test_a_line_has_a_longest_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever was sent."""
+    assert len(Log(monkeypatch, False).event("x" * 100_000)) < 2100
