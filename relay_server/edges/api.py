@@ -139,6 +139,7 @@ class Api:
             if not passes:
                 self._limits.of_network(request)
             raise
+        request.known = True
         if not passes:
             self._limits.of_user(request, found.user_id)
         return found
@@ -194,6 +195,7 @@ class Api:
             principal, token = await self._desk.password(body.user, body.password, address)
         else:
             raise Invalid("send 'user' and 'password', or 'code' from a login link")
+        request.known = True
         self._set_cookie(request, token, SESSION_SECONDS)
         return _me(principal)
 

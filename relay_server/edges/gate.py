@@ -10,6 +10,7 @@ from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailab
 from relay_server import closing
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth import Opening
+from relay_server.edges.limiting import TooManyRequests
 from relay_server.frontdesk import Admission, GoingDown
 from relay_server.outbox import Outbox
 from relay_server.session import ClientTransport
@@ -19,6 +20,7 @@ HANDSHAKE_STATUS = {
     closing.INVALID: 400,
     closing.UNAUTHENTICATED: 401,
     closing.NOT_FOUND: 403,
+    closing.TOO_MANY_ERRORS: 429,
     closing.UNAVAILABLE: 503,
     closing.GOING_AWAY: 503,
 }
@@ -119,6 +121,8 @@ def code_of(error: SwitchboardError) -> int:
         return closing.INVALID
     if isinstance(error, BadCredentials):
         return closing.UNAUTHENTICATED
+    if isinstance(error, TooManyRequests):
+        return closing.TOO_MANY_ERRORS
     if isinstance(error, NotFound):
         return closing.NOT_FOUND
     if isinstance(error, GoingDown):

@@ -59,6 +59,17 @@ class RequestLimits:
         network = network_of(getattr(request.getClientAddress(), "host", "local"))
         self._count(request, self._networks, network, "network", "your network")
 
+    def handshake(self, address: str, user: int | None) -> None:
+        """Count a websocket's handshake as a request of the user, or of the network of an unknown client.
+
+        :raises TooManyRequests: too many came from there
+        """
+        if self._rate <= 0:
+            return
+        bucket = self._networks.of(network_of(address)) if user is None else self._users.of(user)
+        if not bucket.take():
+            raise TooManyRequests("your network" if user is None else "yours", bucket.wait)
+
     def _count(self, request: Request, buckets: Buckets, who: Hashable, name: str, words: str) -> None:
         if self._rate <= 0 or request.__dict__.get("counted"):
             # Whoever reads a stream is proved again and again.

@@ -18,7 +18,8 @@ from relay_protocol import jsontext, limits
 from relay_server.clock import Timer, cancel
 from relay_server.edges import head
 from relay_server.edges.caps import AddressCap
-from relay_server.edges.problems import problem, problem_body
+from relay_server.edges.limiting import RequestLimits, TooManyRequests
+from relay_server.edges.problems import problem, problem_body, problem_of
 from relay_server.openapi import Answer, Credential, Operation, described
 from relay_server.openapi.answers import About
 
@@ -60,6 +61,7 @@ class DeadlineChannel(HTTPChannel):
     _deadline: Timer | None = None
     _address = ""
     _refused = False
+    _known = False
 
     def connectionMade(self) -> None:
         super().connectionMade()
@@ -118,7 +120,8 @@ class DeadlineChannel(HTTPChannel):
     def requestDone(self, request: Request) -> None:
         super().requestDone(request)
         # The next request on this connection gets the same: its time begins when the last answer is out.
-        self._start_deadline(IDLE_SECONDS, self._idle)
+        self._known = self._known or request.known
+        self._start_deadline(IDLE_SECONDS if self._known else limits.UNPROVEN_SECONDS, self._idle)
 
     def connectionLost(self, reason: Any) -> None:
         # Not called for a websocket, which takes the transport away: its protocol counts itself out.
@@ -174,6 +177,8 @@ class BoundedRequest(Request):
     """A request whose body may not grow beyond :data:`BODY_BYTES`, announced or not."""
 
     log = Logger()
+    known = False
+    """Whether a user or an OAuth client proved with this request who they are."""
     _chunks: int | None = None
 
     def gotLength(self, length: int | None) -> None:
@@ -229,7 +234,9 @@ class RelaySite(Site):
     requestFactory = BoundedRequest
     noisy = False
 
-    def __init__(self, root: IResource, reactor: Any, cap: AddressCap, tls: bool) -> None:
+    def __init__(
+        self, root: IResource, reactor: Any, cap: AddressCap, tls: bool, request_limits: RequestLimits
+    ) -> None:
         super().__init__(
             root,
             requestFactory=self._request,
@@ -239,6 +246,7 @@ class RelaySite(Site):
             parsePOSTFormSubmission=False,
         )
         self.cap = cap
+        self.limits = request_limits
         self._headers = dict(SECURITY_HEADERS)
         if tls:
             self._headers[b"strict-transport-security"] = HSTS
@@ -324,12 +332,16 @@ def _is_text(path: bytes) -> bool:
 
 
 class ReadOnly(Resource):
-    """What is there to be read."""
+    """What is there to be read, by anybody; requests count for their network."""
 
     def render(self, request: Request) -> bytes | int:
         if request.method not in (b"GET", b"HEAD"):
             request.setHeader(b"allow", b"GET, HEAD")
             return problem(request, 405, "This address does not take that method.")
+        try:
+            request.site.limits.of_network(request)
+        except TooManyRequests as error:
+            return problem_of(request, error)
         answer: bytes | int = self.render_GET(request)
         return answer
 

@@ -21,13 +21,14 @@ from twisted.logger import Logger
 from relay_protocol import limits, rosbridge
 from relay_protocol.errors import PeerError, SwitchboardError, Unavailable
 from relay_server import closing, wsframe
-from relay_server.access import Principal
+from relay_server.access import BadCredentials, Principal
 from relay_server.auth import Opening
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.bounded import BoundedProtocol
 from relay_server.edges.caps import AddressCap, Place
 from relay_server.edges.fastpath import Turns
 from relay_server.edges.gate import HANDSHAKE_STATUS, Gate, Occupant, code_of, identify, status_of
+from relay_server.edges.limiting import RequestLimits, TooManyRequests
 from relay_server.frontdesk import Admission
 
 T = TypeVar("T")
@@ -106,7 +107,7 @@ class ClientProtocol(BoundedProtocol):
                 raise Unavailable("the relay is going down; connect again in a moment")
             if self._place is None:
                 raise Unavailable("too many clients connect at the same time; try again in a moment")
-            principal, chosen = await identify(self.factory.gate, request, asked)
+            principal, chosen = await self._identify(request, asked)
             if principal is not None:
                 self._admission = await self._admit(principal)
         except SwitchboardError as error:
@@ -114,12 +115,29 @@ class ClientProtocol(BoundedProtocol):
         if self.state == self.STATE_CLOSED:
             self._turn_away()
             raise ConnectionDeny(HANDSHAKE_STATUS[closing.UNAVAILABLE], "the client has left")
-        if self._failure is not None and not request.origin:
-            # Programs read the status; browsers can't, so they get a close code after the handshake.
+        if self._failure is not None and (not request.origin or isinstance(self._failure, TooManyRequests)):
+            # Programs read the status; browsers can't, so they get a close code after the handshake, unless that is
+            # what there are too many of.
             reason = str(self._failure)
             self._log_refused(reason, self._failure.code)
             raise ConnectionDeny(status_of(self._failure), reason)
         return chosen
+
+    async def _identify(
+        self, request: ConnectionRequest, asked: Opening
+    ) -> tuple[Principal | None, str | None]:
+        """Find out who asks, and count the handshake as a request of theirs.
+
+        :raises TooManyRequests: they have sent too many
+        """
+        count = self.factory.limits.handshake
+        try:
+            principal, chosen = await identify(self.factory.gate, request, asked)
+        except BadCredentials:
+            count(self._address(), None)
+            raise
+        count(self._address(), None if principal is None else principal.user_id)
+        return principal, chosen
 
     def _asked_for(self, request: ConnectionRequest) -> Opening:
         """What a handshake wants to open.
@@ -324,13 +342,22 @@ class ClientFactory(WebSocketServerFactory):
     """Builds a :class:`ClientProtocol` for each websocket. Autobahn's open defaults are all closed here.
 
     :param cap: where the site has counted the connections that become websockets
+    :param request_limits: handshakes count as requests
     """
 
     protocol = ClientProtocol
 
-    def __init__(self, clock: Clock, clock_ns: Callable[[], int], gate: Gate, cap: AddressCap) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        clock_ns: Callable[[], int],
+        gate: Gate,
+        cap: AddressCap,
+        request_limits: RequestLimits,
+    ) -> None:
         super().__init__(reactor=clock)
         self.cap = cap
+        self.limits = request_limits
         self.clock = clock
         self.clock_ns = clock_ns
         self.gate = gate

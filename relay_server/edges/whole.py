@@ -40,12 +40,12 @@ def site_of(
     :param cookie: name of the session cookie
     """
     cap, rounds = AddressCap(settings.connections_per_address), Rounds(reactor)
-    clients = Handshake(ClientFactory(reactor, clock_ns, desk, cap))
-    pictures = Handshake(VideoFactory(reactor, clock_ns, desk, cap, rounds))
-    told = Handshake(PageFactory(reactor, clock_ns, pages, cap))
+    clients = Handshake(ClientFactory(reactor, clock_ns, desk, cap, limits))
+    pictures = Handshake(VideoFactory(reactor, clock_ns, desk, cap, rounds, limits))
+    told = Handshake(PageFactory(reactor, clock_ns, pages, cap, limits))
     video = Video(reactor, rounds, desk, api.principal, pictures)
     robots = Robots(clients, video, relay_server.VERSION)
     documents = Documents(limits, relay_server.VERSION, cookie).app.resource()
     portal = Portal(relay_server.PORTAL)
     root = Root(robots, api.app.resource(), resource(oauth, limits), portal, told, documents)
-    return RelaySite(root, reactor, cap, settings.tls)
+    return RelaySite(root, reactor, cap, settings.tls, limits)

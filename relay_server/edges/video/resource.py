@@ -284,6 +284,7 @@ class Video(Resource):
         if not (request.getHeader("authorization") or "").lower().startswith("bearer "):
             ticket = request.args.get(b"ticket")
             if ticket:
+                request.site.limits.of_network(request)
                 # Who asks for the head wants the rest as well.
                 spend = request.method != b"HEAD"
                 principal = await self._desk.ticket(ticket[0].decode("ascii", "replace"), opens, spend=spend)

@@ -23,6 +23,7 @@ from relay_server.auth import Opening
 from relay_server.clock import Clock
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.gate import Gate, code_of
+from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.video.parameters import Asked, asked
 from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Progress, Waiting, narrow
 from relay_server.edges.websocket import ClientFactory, ClientProtocol
@@ -301,8 +302,14 @@ class VideoFactory(ClientFactory):
     gate: VideoGate
 
     def __init__(
-        self, clock: Clock, clock_ns: Callable[[], int], gate: VideoGate, cap: AddressCap, rounds: Rounds
+        self,
+        clock: Clock,
+        clock_ns: Callable[[], int],
+        gate: VideoGate,
+        cap: AddressCap,
+        rounds: Rounds,
+        request_limits: RequestLimits,
     ) -> None:
-        super().__init__(clock, clock_ns, gate, cap)
+        super().__init__(clock, clock_ns, gate, cap, request_limits)
         self.rounds = rounds
         self.frames = Made(framed)

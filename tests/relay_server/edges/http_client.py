@@ -204,14 +204,14 @@ class World:
         limits = RequestLimits(rate, self.clock.seconds)
         parts = self.below, self.beside, self.events
         api = api_of(self.clock, self.desk, origins, *parts, tls=tls, limits=limits)
-        websocket = Handshake(ClientFactory(self.clock, lambda: 0, self.desk, self.cap))  # type: ignore[arg-type]
+        websocket = Handshake(ClientFactory(self.clock, lambda: 0, self.desk, self.cap, limits))  # type: ignore[arg-type]
         sources = ChainMap(self.events, {"robots": self.desk.robots})
         self.pages = PageGate(self.clock, self.desk, origins, "sb", sources)
-        told = Handshake(PageFactory(self.clock, lambda: 0, self.pages, self.cap))
+        told = Handshake(PageFactory(self.clock, lambda: 0, self.pages, self.cap, limits))
         robots = Robots(websocket, Missing(), "1.2.3")
         documents = Documents(limits, "1.2.3", "sb").app.resource() if documented else None
         root = Root(robots, api.app.resource(), Missing(), Portal(folder), told, documents)
-        self.site = RelaySite(root, self.clock, self.cap, tls)
+        self.site = RelaySite(root, self.clock, self.cap, tls, limits)
 
     def connect(self) -> Transport:
         """A connection."""

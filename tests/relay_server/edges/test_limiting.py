@@ -6,13 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from twisted.internet.task import Clock
 from twisted.web.resource import IResource
 
 from relay_server.console import Outcome
 from relay_server.edges import control
 from relay_server.edges.api import Api
+from relay_server.edges.limiting import RequestLimits
 from relay_server.moments import Moments
 from tests.relay_server.edges.http_client import World
+from tests.relay_server.edges.websocket_client import Client, MemoryGate
 
 RATE = 2.0
 BURST = 20
@@ -34,6 +37,7 @@ class Stopping:
 @pytest.fixture
 def world(tmp_path: Path) -> World:
     """A site on which two requests a second are allowed in the long run."""
+    (tmp_path / "index.html").write_text("<!doctype html>")
     return World(tmp_path, rate=RATE, documented=True)
 
 
@@ -63,7 +67,16 @@ def test_who_asks_too_much_is_refused_until_there_is_some_left(world: World) -> 
 
 @pytest.mark.parametrize(
     ("path", "status"),
-    [("/healthz", 200), ("/api/v1/session", 401), ("/api/openapi.json", 200), ("/api/docs", 200)],
+    [
+        ("/healthz", 200),
+        ("/api/v1/session", 401),
+        ("/api/openapi.json", 200),
+        ("/api/docs", 200),
+        ("/robots/rover", 200),
+        ("/index.html", 200),
+        ("/login", 200),
+        ("/nothing", 404),
+    ],
 )
 def test_who_is_not_known_counts_for_his_network(world: World, path: str, status: int) -> None:
     """Whatever he asks; who is known there has a share of his own."""
@@ -114,3 +127,24 @@ def test_without_a_limit_nothing_is_counted(tmp_path: Path) -> None:
         answer = world.ask("GET", "/api/v1/session", **ANN)
         assert answer.status == 200
         assert "ratelimit" not in answer.headers
+
+
+def test_a_handshake_counts_as_a_request_of_its_user_or_network() -> None:
+    """Over the limit it is refused by 429 at once, also where a browser asks."""
+    gate = MemoryGate()
+    clock = Clock()
+    limits = RequestLimits(RATE, clock.seconds)
+
+    def status(**headers: str) -> int:
+        return Client(gate, clock=clock, request_limits=limits, **headers).status
+
+    for _ in range(BURST):
+        assert status(Authorization="Bearer wrong") == 401
+    assert status(Authorization="Bearer wrong") == 429
+    assert status() == 429
+    assert status(Origin="http://127.0.0.1:9090") == 429
+    for _ in range(BURST):
+        assert status(Authorization="Bearer good") == 101
+    assert status(Authorization="Bearer good") == 429
+    clock.advance(1)
+    assert status(Authorization="Bearer good") == 101

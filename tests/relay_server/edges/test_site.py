@@ -59,11 +59,26 @@ def test_a_request_that_trickles_is_cut_by_an_absolute_deadline(world: World, se
 def test_a_kept_connection_is_dropped_when_it_idles(world: World) -> None:
     """Its next request gets a deadline of its own, which is absolute too."""
     transport = world.connect()
-    world.send(transport, GET + b"\r\n")
+    world.send(
+        transport,
+        b"GET /api/v1/session HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer ann\r\n\r\n" + GET + b"\r\n",
+    )
     world.clock.advance(module.IDLE_SECONDS - 1)
     assert transport.connected
     world.send(transport, b"GET /healthz HTTP/1.1\r\nHo")
     world.clock.advance(1.1)
+    assert not transport.connected
+    assert not world.cap._counts
+
+
+def test_a_connection_of_a_stranger_is_dropped_as_soon_after_an_answer_as_before_one(world: World) -> None:
+    """10 s, as for its first request."""
+    transport = world.connect()
+    for _ in range(3):
+        world.send(transport, GET + b"\r\n")
+        world.clock.advance(limits.UNPROVEN_SECONDS - 0.1)
+        assert transport.connected
+    world.clock.advance(0.2)
     assert not transport.connected
     assert not world.cap._counts
 

@@ -17,6 +17,7 @@ from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth import Opening
 from relay_server.edges.caps import AddressCap
+from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.websocket import ClientFactory
 from relay_server.outbox import Outbox
 
@@ -169,13 +170,15 @@ class Client:
         cap: AddressCap | None = None,
         clock: Clock | None = None,
         factory: type[ClientFactory] = ClientFactory,
+        request_limits: RequestLimits | None = None,
         **headers: str,
     ) -> None:
         self.eof = False
         self.clock = clock or Clock()
         self.cap = cap or AddressCap(5)
         self.cap.enter("192.168.1.1")
-        made = factory(self.clock, lambda: round(self.clock.seconds() * 1e9), gate, self.cap)
+        counted = request_limits or RequestLimits(0.0, self.clock.seconds)
+        made = factory(self.clock, lambda: round(self.clock.seconds() * 1e9), gate, self.cap, counted)
         self.transport = Transport()
         protocols = [headers.pop("subprotocol")] if "subprotocol" in headers else None
         self.core = ClientProtocol(parse_uri(f"ws://relay:9090{path}"), subprotocols=protocols)  # type: ignore[arg-type]

@@ -28,6 +28,7 @@ from relay_server.channel import Channels
 from relay_server.control import ControlRules, Desks
 from relay_server.edges.caps import AddressCap
 from relay_server.edges.handshake import Handshake
+from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.site import Missing, RelaySite, Robots, Root
 from relay_server.edges.video import Video, VideoFactory
 from relay_server.edges.websocket import ClientFactory
@@ -99,12 +100,13 @@ class Show:
         )
         api = api_of(clock, self.desk, origins)
         cap, rounds = AddressCap(100), Rounds(clock)
-        websocket = Handshake(ClientFactory(clock, time.monotonic_ns, self.desk, cap))
-        pictures = Handshake(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds))
+        limits = RequestLimits(0.0, time.monotonic)
+        websocket = Handshake(ClientFactory(clock, time.monotonic_ns, self.desk, cap, limits))
+        pictures = Handshake(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds, limits))
         video = Video(clock, rounds, self.desk, api.principal, pictures)
         robots = Robots(websocket, video, "1.2.3")
         root = Root(robots, api.app.resource(), Missing(), Missing(), Missing())
-        site = RelaySite(root, clock, cap, tls is not None)
+        site = RelaySite(root, clock, cap, tls is not None, limits)
         self._listening = (
             clock.listenTCP(0, site, interface="127.0.0.1")
             if tls is None
