@@ -1,4 +1,4 @@
-"""Strict JSON at the edge: valid UTF-8, bounded depth, no NaN, and errors that name the fault.
+"""Strict JSON at the edge: valid UTF-8, bounded depth, no NaN, no key twice, and errors that name the fault.
 
 msgspec skips values it does not need without looking into them: neither their UTF-8 nor their depth is
 checked there. So the text is checked once, as a whole, before anything is decoded.
@@ -15,6 +15,7 @@ from typing import Any, TypeVar, get_args
 import msgspec
 
 from relay_protocol.errors import MalformedMessage
+from relay_protocol.json_keys import check_keys
 from relay_protocol.limits import JSON_DEPTH
 
 T = TypeVar("T")
@@ -59,13 +60,16 @@ _STEPS = bytes.maketrans(b"[{]}", b"\x01\x01\xff\xff")
 def decode(decoder: msgspec.json.Decoder[T], data: bytes) -> T:
     """Decode one checked message.
 
-    :raises MalformedMessage: not JSON, not of the type the decoder wants, or refused by :func:`check_text`
+    :raises MalformedMessage: not JSON, not of the type the decoder wants, or refused by :func:`check_text` or
+        :func:`relay_protocol.json_keys.check_keys`
     """
     check_text(data)
     try:
-        return decoder.decode(data)
+        message = decoder.decode(data)
     except FAULTS as error:
         raise malformed(error, decoder.type) from None
+    check_keys(data)
+    return message
 
 
 FAULTS = (msgspec.DecodeError, RecursionError, ValueError)

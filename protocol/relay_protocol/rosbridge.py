@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from relay_protocol import jsontext
+from relay_protocol.json_keys import check_keys
 from relay_protocol.limits import JSON_DEPTH
 from relay_protocol.message import Body, Message
 from relay_protocol.qos import QoS
@@ -193,16 +194,21 @@ _decode: Callable[[bytes], ClientOp] = msgspec.json.Decoder(ClientOp).decode
 def decode(data: bytes) -> ClientOp:
     """One client message.
 
-    :raises MalformedMessage: not strict JSON, an unknown ``op``, a field missing or of the wrong type
+    :raises MalformedMessage: not strict JSON, a key twice, an unknown ``op``, a field missing or of the wrong type
     """
     # As jsontext.decode, with fewer calls: this is done for every message of every client. What is ASCII, without a
     # list, and too short for many objects in each other has passed all that check_text looks for.
     if _LIST in data or len(data) > _SHALLOW or not data.isascii():
         jsontext.check_text(data)
     try:
-        return _decode(data)
+        message = _decode(data)
     except jsontext.FAULTS as error:
-        fault = error
+        message = _decode_as_meant(data, error)
+    check_keys(data)
+    return message
+
+
+def _decode_as_meant(data: bytes, fault: Exception) -> ClientOp:
     if any(words in str(fault) for words in _MAY_BE_MEANT):
         try:
             return _decode(_as_meant(data))

@@ -137,6 +137,7 @@ BAD_JSON = {
     "NaN": (b'{"op":"bye","reason":"","t":NaN}', ""),
     "a huge number": (b'{"op":"ping","t":' + b"9" * 5000 + b"}", ""),
     "a number beyond doubles": (b'{"op":"health","cpu":1e999}', ""),
+    "a key twice": (b'{"op":"bye","reason":"x","reason":"y"}', "'reason' twice"),
     "no object": (b"[1,2,3]", "object"),
     "an unknown op": (b'{"op":"rm -rf"}', "unknown op"),
     "nothing": (b"", ""),
@@ -178,7 +179,28 @@ def test_bad_json_from_a_proved_robot_ends_its_link_in_words(
     logs(world, "broke the protocol", since)
 
 
-@pytest.mark.parametrize("what", [each for each in BAD_JSON if "100,000" not in each])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b'{"op":"hello","version":1,"robot":"a","robot":"rover","key":"k","encodings":[]}', "'robot' twice"),
+        (
+            b'{"op":"hello","version":1,"robot":"a","key":"k","encodings":[],"y":[{"z":1,"\\u007a":2}]}',
+            "'z' twice",
+        ),
+    ],
+    ids=["a field", "a field of what nobody reads"],
+)
+def test_a_robots_message_with_a_key_twice_ends_the_connection_in_words(
+    world: Any, text: bytes, words: str
+) -> None:
+    """Two readers could take different values."""
+    with FakeRobot(world.relay.robots_port) as robot:
+        robot.send_bytes(encode_json(text))
+        assert words in robot.until("refused")["reason"]
+        assert robot.ended()
+
+
+@pytest.mark.parametrize("what", [each for each in BAD_JSON if "100,000" not in each and "twice" not in each])
 def test_bad_json_before_the_proof_ends_the_connection_in_words(world: Any, what: str) -> None:
     """Who has proved nothing is told the same."""
     text, words = BAD_JSON[what]
@@ -230,6 +252,11 @@ BAD_ROSBRIDGE = {
     "100,000 deep": (b'{"op":"publish","topic":"/cmd_vel","msg":' + DEEP, "deeper than 64"),
     "NaN": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":NaN}}}', "not JSON"),
     "Infinity": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":Infinity}}}', "not JSON"),
+    "a key twice": (b'{"op":"publish","topic":"/cmd_vel","topic":"/x","msg":{}}', "'topic' twice"),
+    "a key twice in a body": (
+        b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":0,"x":1}}}',
+        "'x' twice",
+    ),
     "no object": (b'"hello"', "object"),
     "an unknown op": (b'{"op":"shutdown"}', "unknown op"),
     "no op": (b"{}", "op"),

@@ -68,7 +68,9 @@ def test_a_form_of_another_page_is_no_login(world: World, kind: str) -> None:
     assert kind.startswith("multipart") or answer.json["detail"] == "send the body as application/json"
 
 
-@pytest.mark.parametrize("raw", [b"{", b"\xff", b'{"code":"a","code":', b"[" * 200])
+@pytest.mark.parametrize(
+    "raw", [b"{", b"\xff", b'{"code":"once","code":"once"}', b'{"code":"a","code":', b"[" * 200]
+)
 def test_a_body_that_is_no_json_is_told(world: World, raw: bytes) -> None:
     """In words."""
     assert world.ask("POST", SESSION, raw=raw).status == 400

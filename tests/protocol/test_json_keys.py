@@ -1,0 +1,164 @@
+"""No JSON object has a key twice, whichever way that is found out."""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+from typing import Any
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from relay_protocol import json_keys, jsontext, rosbridge
+from relay_protocol.errors import MalformedMessage
+
+KEYS = st.text('xX1:"\\ e{}ß', max_size=2)
+
+
+def pairs_of(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    """Objects that may have keys twice, with any spelling of a key and spaces anywhere."""
+    space = st.sampled_from(["", " ", "\n"])
+    key = st.builds(spelled, KEYS, st.booleans(), st.randoms(use_true_random=False))
+    pair = st.builds("{}{}{}:{}{}".format, space, key, space, space, inner)
+    return st.lists(pair, max_size=4).map(lambda pairs: "{" + ",".join(pairs) + "}")
+
+
+def spelled(key: str, escaped: bool, choice: random.Random) -> str:
+    """A key in JSON, with characters escaped by chance."""
+    if not escaped:
+        return json.dumps(key, ensure_ascii=choice.random() < 0.5)
+    return '"' + "".join(f"\\u{ord(each):04x}" for each in key) + '"'
+
+
+TEXTS = st.recursive(
+    st.sampled_from(
+        ["null", "true", "1", "-1.5", "2E+9", '""', '":"', '"a\\"b:"', '"\\u003a"', '"x1"', '"1"']
+    ),
+    lambda inner: pairs_of(inner) | st.lists(inner, max_size=3).map(lambda each: "[" + ", ".join(each) + "]"),
+    max_leaves=20,
+)
+
+
+def distinct(text: str) -> bool:
+    """By counting the pairs of each object."""
+    doubled = []
+
+    def look(pairs: list[tuple[str, Any]]) -> None:
+        doubled.append(len(dict(pairs)) != len(pairs))
+
+    json.loads(text, object_pairs_hook=look)
+    return not any(doubled)
+
+
+def accepted(text: str) -> bool:
+    """As the relay judges it."""
+    try:
+        json_keys.check_keys(text.encode())
+    except MalformedMessage as error:
+        assert "twice" in str(error)
+        return False
+    return True
+
+
+@given(TEXTS, st.sampled_from([0, json_keys.SHORT, 40 * json_keys.SHORT]))
+@example('{"x":1,"\\u0078":2}', 0)
+@example('{"x1":1,"x2":2}', 0)
+@example('{"a":"\\u003a","b":1,"b":2}', 0)
+@example('{"v":"val",":a":1,":a":2}', 0)
+@example('{"v":":","w":{}}', 0)
+@settings(deadline=None, max_examples=500)
+def test_a_text_is_refused_just_when_an_object_has_a_key_twice(text: str, padding: int) -> None:
+    """Whatever its length and its escapes, and however often it came before."""
+    padded = f'[{text},"{"y" * padding}"]'
+    assert [accepted(padded) for _ in range(4)] == [distinct(text)] * 4
+
+
+@given(TEXTS, st.sampled_from("0123456789eE.+-"))
+@settings(deadline=None, max_examples=300)
+def test_other_numbers_make_no_difference(text: str, character: str) -> None:
+    """A text that was good before does not make one good that differs by characters of numbers, in keys too."""
+    accepted(text), accepted(text), accepted(text)
+    other = text.replace("1", character)
+    try:
+        expected = distinct(other)
+    except ValueError:
+        return
+    assert accepted(other) is expected
+
+
+def test_a_key_that_differs_by_a_digit_is_another() -> None:
+    """Both before and after the shape is known."""
+    for _ in range(4):
+        assert accepted('{"x1":1,"x2":2}')
+        assert not accepted('{"x1":1,"x1":2}')
+        assert accepted('{"x":1,"y":2}')
+        assert not accepted('{"x":1,"x":2}')
+
+
+def test_shapes_that_are_kept_are_bounded() -> None:
+    """A client can't fill the memory with texts that never come again."""
+    for number in range(3 * json_keys.SHAPES):
+        name = "".join(chr(ord("a") + int(digit)) for digit in str(number))
+        for _ in range(3):
+            assert accepted(f'{{"{name}":1}}')
+    assert len(json_keys._seen) <= json_keys.SHAPES
+    assert len(json_keys._distinct) <= json_keys.SHAPES
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "9" * 5000, "1e999"])
+def test_numbers_are_not_judged_here(number: str) -> None:
+    """Also those that other checks refuse."""
+    assert accepted(f'{{"x":{number},"y":1}}')
+    assert not accepted(f'{{"x":{number},"x":1}}')
+
+
+@pytest.mark.parametrize(
+    "unit",
+    ['{"a":{"x":1,"y":2}}', '"text"', '{"":1}', "0.125", '"\\u0061"', '{"\\u0061":[]}', "[[],[]]", "key"],
+)
+def test_the_time_grows_with_the_text_and_no_faster(unit: str) -> None:
+    """Processor time for four times the text, with a wide margin."""
+
+    def seconds(count: int) -> float:
+        units = [f'"{number}":0' for number in range(count)] if unit == "key" else [unit] * count
+        text = ",".join(units)
+        data = (f"{{{text}}}" if unit == "key" else f"[{text}]").encode()
+        times = []
+        for _ in range(5):
+            begun = time.process_time()
+            json_keys.check_keys(data)
+            times.append(time.process_time() - begun)
+        return min(times)
+
+    assert seconds(80_000) < 12 * seconds(20_000) + 0.01
+
+
+REPEATED = {
+    "op": '{"op":"unsubscribe","topic":"/a","op":"unsubscribe"}',
+    "another op": '{"op":"unsubscribe","topic":"/a","op":"subscribe"}',
+    "topic": '{"op":"publish","topic":"/a","topic":"/b","msg":{}}',
+    "with an escape": '{"op":"unsubscribe","topic":"/a","\\u0074opic":"/b"}',
+    "unknown": '{"op":"unsubscribe","topic":"/a","colour":1,"colour":1}',
+    "msg": '{"op":"publish","topic":"/a","msg":{},"msg":{"x":1}}',
+    "in msg": '{"op":"publish","topic":"/a","msg":{"x":1,"x":1}}',
+    "deep in a list": '{"op":"call_service","service":"/a","args":[[{"y":{"x":[1],"x":[2]}}]]}',
+    "beside null": '{"op":"subscribe","topic":"/a","type":null,"type":"std_msgs/String"}',
+    "long": '{"op":"publish","topic":"/a","msg":{"data":"%s","data":""}}' % ("x" * 10_000),
+}
+
+
+@pytest.mark.parametrize("name", REPEATED)
+def test_a_client_message_with_a_key_twice_is_refused(name: str) -> None:
+    """Also one that nobody reads, and in the body."""
+    with pytest.raises(MalformedMessage, match="twice"):
+        rosbridge.decode(REPEATED[name].encode())
+
+
+def test_the_key_is_named() -> None:
+    """As far as it is short."""
+    with pytest.raises(MalformedMessage, match=r"the key 'ranges' twice in one object; send each key once"):
+        jsontext.decode_any(b'{"ranges":1,"ranges":2}')
+    with pytest.raises(MalformedMessage, match=r"'x{37}\.\.\.' twice"):
+        jsontext.decode_any(b'{"%s":1,"%s":2}' % (b"x" * 1000, b"x" * 1000))
