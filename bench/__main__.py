@@ -31,6 +31,7 @@ MEASUREMENTS = {
     "stopping": "from anybody's stop to standstill, under full load",
     "alerts": "from a robot's unplugging to the webhook",
     "apps": "from a word, a stick, a tilt and a scan to what the robot does",
+    "unproven": "memory of a connection nobody has proved",
     "memory": "a million events: asked, written by the thousand, killed",
 }
 

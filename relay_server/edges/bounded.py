@@ -15,6 +15,7 @@ from twisted.internet.protocol import connectionDone
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.fastpath import FastProtocol, Turns, Writer, writer_for
 from relay_server.edges.flow import Flow
+from relay_server.edges.tcp import tcp_of
 
 HANDSHAKE_ATTRIBUTES = (
     "http_headers",
@@ -87,7 +88,10 @@ class BoundedProtocol(FastProtocol):
         # (they go through the writer).
         self.trafficStats = self.factory.traffic
         self.send_queue = None
-        # Twisted's HTTP channel was the producer of this transport until now.
+        # Twisted's HTTP channel was the producer of this transport until now, and its buffer was that of a stranger.
+        tcp = tcp_of(self.transport)
+        if tcp is not None:
+            vars(tcp).pop("bufferSize", None)
         self.transport.unregisterProducer()
         self.transport.registerProducer(Flow(self), True)
 

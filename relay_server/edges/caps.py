@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
+from typing import Any
 
+from relay_protocol.limits import MIB
 from relay_server.limiter import network_of
 
 STRANGERS = 2000
 """Connections of all the world that have not proved who they are."""
+
+UNSENT_BYTES = 32 * MIB
+"""Answers that clients of one network do not take may have so many bytes together."""
 
 
 class Place:
@@ -61,3 +66,31 @@ class AddressCap:
 
     def _back(self) -> None:
         self._strangers += 1
+
+
+class Unsent:
+    """Counts bytes of answers that wait for their clients, per network.
+
+    :param most: bytes of one network; beyond that its connection that has waited longest is cut
+    """
+
+    def __init__(self, most: int = UNSENT_BYTES) -> None:
+        self._most = most
+        self._waiting: defaultdict[str, dict[Any, int]] = defaultdict(dict)
+
+    def add(self, address: str, channel: Any, size: int) -> None:
+        """A connection that takes nothing has so many bytes to take; it had none before, or they were removed."""
+        waiting = self._waiting[network_of(address)]
+        waiting[channel] = size
+        while sum(waiting.values()) > self._most:
+            oldest = next(iter(waiting))
+            del waiting[oldest]
+            oldest.transport.abortConnection()
+
+    def remove(self, address: str, channel: Any) -> None:
+        """It takes them, or has gone."""
+        network = network_of(address)
+        waiting = self._waiting.get(network, {})
+        waiting.pop(channel, None)
+        if not waiting:
+            self._waiting.pop(network, None)

@@ -5,7 +5,6 @@ What they say is no secret, so nobody needs to log in to read it.
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 from klein import Klein
@@ -15,7 +14,6 @@ from werkzeug.exceptions import HTTPException, MethodNotAllowed
 from relay_protocol import jsontext
 from relay_server.edges.alerts import AlertPages
 from relay_server.edges.api import Api
-from relay_server.edges.asked import known_tags
 from relay_server.edges.cameras import RobotCameras
 from relay_server.edges.control import RobotControl
 from relay_server.edges.directory import DirectoryPages
@@ -31,6 +29,7 @@ from relay_server.edges.realm import RealmPages
 from relay_server.edges.recordings import RobotRecordings
 from relay_server.edges.resources import RobotResources
 from relay_server.edges.site import Robots
+from relay_server.edges.static_files import StaticFile
 from relay_server.edges.video.resource import Video
 from relay_server.edges.vocabulary import VocabularyPages
 from relay_server.openapi import Answer, Credential, Operation, described, document, operations_in, page
@@ -56,7 +55,7 @@ SERVED = (
 )
 """Whose operations are described."""
 
-_CACHED = {"ETag": "names this document"}
+_CACHED = {"ETag": "names this document in this encoding", "Vary": "`Accept-Encoding`: it may be compressed"}
 
 
 class Documents:
@@ -71,8 +70,8 @@ class Documents:
     def __init__(self, limits: RequestLimits, version: str, cookie: str) -> None:
         self._limits = limits
         made = document(operations(), version, cookie)
-        self._json = jsontext.encode(made)
-        self._page = page(made).encode()
+        self._json = StaticFile(jsontext.encode(made), "application/json")
+        self._page = StaticFile(page(made).encode(), "text/html")
 
     @app.route("/api/openapi.json", methods=["GET"])
     @described(
@@ -89,7 +88,7 @@ class Documents:
         )
     )
     def openapi(self, request: Request) -> bytes:
-        return self._send(request, self._json, b"application/json")
+        return self._send(request, self._json)
 
     @app.route("/api/docs", methods=["GET"])
     @described(
@@ -106,22 +105,15 @@ class Documents:
         )
     )
     def docs(self, request: Request) -> bytes:
-        return self._send(request, self._page, b"text/html; charset=utf-8")
+        return self._send(request, self._page)
 
-    def _send(self, request: Request, body: bytes, kind: bytes) -> bytes:
+    def _send(self, request: Request, file: StaticFile) -> bytes:
         try:
             self._limits.of_network(request)
         except TooManyRequests as error:
             return problem_of(request, error)
-        tag = f'"{hashlib.sha256(body).hexdigest()[:24]}"'
-        request.setHeader("etag", tag)
-        # It changes with the relay: whoever has it asks whether it still is the same.
-        request.setHeader("cache-control", "no-cache")
-        if tag in known_tags(request):
-            request.setResponseCode(304)
-            return b""
-        request.setHeader("content-type", kind)
-        return body
+        # It changes with the relay: a client that has it asks whether it still is the same.
+        return file.answer(request)
 
     @app.handle_errors(HTTPException)
     def unrouted(self, request: Request, failure: Any) -> bytes:

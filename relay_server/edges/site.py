@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import mimetypes
-from collections.abc import Callable
-from pathlib import Path
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from twisted.logger import Logger
@@ -17,9 +16,10 @@ from werkzeug.exceptions import HTTPException
 from relay_protocol import jsontext, limits
 from relay_server.clock import Timer, cancel
 from relay_server.edges import head
-from relay_server.edges.caps import AddressCap
+from relay_server.edges.caps import AddressCap, Unsent
 from relay_server.edges.limiting import RequestLimits, TooManyRequests
 from relay_server.edges.problems import problem, problem_body, problem_of
+from relay_server.edges.tcp import tcp_of
 from relay_server.openapi import Answer, Credential, Operation, described
 from relay_server.openapi.answers import About
 
@@ -31,6 +31,15 @@ _TOO_LARGE = b"413 Content Too Large"
 IDLE_SECONDS = 60.0
 CLOSE_SECONDS = 2.0
 """What a refused client has to take the answer."""
+
+PIECE_BYTES = 16 * limits.KIB
+"""An answer is copied to the transport in pieces of this size, as the client takes them."""
+
+AHEAD_BYTES = 8 * limits.KIB
+"""Pipelined requests that are read while one before them is answered; up to another piece may come with the last."""
+
+STALL_SECONDS = 30.0
+"""A client that takes nothing of an answer for so long is cut."""
 
 SECURITY_HEADERS = {
     b"content-security-policy": (
@@ -51,9 +60,13 @@ ROUTED = (b"api", b"oauth", b"healthz", b"metrics")
 
 
 class DeadlineChannel(HTTPChannel):
-    """HTTP/1.1 whose requests must be here whole within an absolute time.
+    """HTTP/1.1 whose requests must arrive whole within an absolute time, and whose answers must be taken.
 
-    Twisted's own timeout starts anew with each byte, so a slow trickle would hold a connection for ever.
+    Twisted's own timeout starts again with each byte, so a slow trickle would hold a connection for ever.
+
+    Twisted also answers pipelined requests as fast as it reads them, whether or not the client takes the answers. Here
+    the next request is looked at only when the transport has passed the answer before it on to the kernel. Bodies reach
+    the transport in pieces, so what many connections are sent alike is held once for all of them.
     """
 
     log = Logger()
@@ -62,8 +75,24 @@ class DeadlineChannel(HTTPChannel):
     _address = ""
     _refused = False
     _known = False
+    _finished: Request | None = None
+    """A request that is answered, and whose answer is not taken yet."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pieces: deque[memoryview] = deque()
+        """Parts of the answer that the transport does not have yet."""
+        self._stalled: Timer | None = None
+        self._pouring: Timer | None = None
+        self._resumed = False
+        """Whether the transport takes bytes again, and producers do not know yet."""
+        self._next: Timer | None = None
 
     def connectionMade(self) -> None:
+        tcp = tcp_of(self.transport)
+        if tcp is not None:
+            # Both what is read at a time, and what may wait to be sent before producers are paused.
+            tcp.bufferSize = PIECE_BYTES
         super().connectionMade()
         self._address = getattr(self.transport.getPeer(), "host", "local")
         if not self.site.cap.enter(self._address):
@@ -117,17 +146,99 @@ class DeadlineChannel(HTTPChannel):
         self._stop_deadline()
         super().allContentReceived()
 
+    def rawDataReceived(self, data: bytes) -> None:
+        super().rawDataReceived(data)
+        # Twisted reads on without a bound while an answer waits for the transport.
+        if self._handlingRequest and sum(map(len, self._dataBuffer)) > AHEAD_BYTES:
+            self._networkProducer.pauseProducing()
+
     def requestDone(self, request: Request) -> None:
-        super().requestDone(request)
-        # The next request on this connection gets the same: its time begins when the last answer is out.
-        self._known = self._known or request.known
-        self._start_deadline(IDLE_SECONDS if self._known else limits.UNPROVEN_SECONDS, self._idle)
+        self._finished = request
+        # In a turn of its own: a client that pipelines must not keep others waiting.
+        self._next = self.site.reactor.callLater(0, self._answered)
 
     def connectionLost(self, reason: Any) -> None:
         # Not called for a websocket, which takes the transport away: its protocol counts itself out.
         self.site.cap.leave(self._address)
         self._stop_deadline()
+        self._pieces.clear()
+        self._takes()
+        cancel(self._pouring)
+        cancel(self._next)
         super().connectionLost(reason)
+
+    # --- answers ------------------------------------------------------------------------------------------
+
+    def write(self, data: bytes) -> None:
+        if len(data) <= PIECE_BYTES and not self._pieces:
+            self.transport.write(data)
+        else:
+            self._pieces.append(memoryview(data))
+            self._pour()
+
+    def writeSequence(self, iovec: Iterable[bytes]) -> None:
+        for each in iovec:
+            self.write(each)
+
+    def pauseProducing(self) -> None:
+        super().pauseProducing()
+        self._stall()
+
+    def resumeProducing(self) -> None:
+        self._waitingForTransport = False
+        self._resumed = True
+        self._pour()
+
+    def _pour(self) -> None:
+        """Give the transport the next pieces, until it has enough or all."""
+        cancel(self._pouring)
+        while self._pieces and not self._waitingForTransport:
+            whole = self._pieces[0]
+            piece, self._pieces[0] = whole[:PIECE_BYTES], whole[PIECE_BYTES:]
+            if not self._pieces[0]:
+                self._pieces.popleft()
+            self.transport.write(bytes(piece))
+            if self._pieces and self.isSecure():
+                # Twisted's TLS says only a turn later that the connection below it is full.
+                self._pouring = self.site.reactor.callLater(0, self._pour)
+                return
+        if self._waitingForTransport:
+            return
+        if self._resumed:
+            self._resumed = False
+            self._takes()
+            super().resumeProducing()
+        self._answered()
+
+    def _answered(self) -> None:
+        """Go on with the next request, if the answer to the last is complete and taken."""
+        request = self._finished
+        if request is None:
+            return
+        if self._pieces or self._waitingForTransport:
+            if self._stalled is None:
+                self._stall()
+            return
+        self._finished = None
+        self._takes()
+        # The next request gets the same: its time begins when the last answer is out. It may be here already.
+        self._known = self._known or request.known
+        self._start_deadline(IDLE_SECONDS if self._known else limits.UNPROVEN_SECONDS, self._idle)
+        super().requestDone(request)
+
+    def _stall(self) -> None:
+        """The client has that long to take something. Streams have limits of their own, and say why they end."""
+        self._takes()
+        if self._requestProducer is None:
+            self._stalled = self.site.reactor.callLater(STALL_SECONDS, self._idle)
+            self.site.unsent.add(self._address, self, sum(map(len, self._pieces)))
+
+    def _takes(self) -> None:
+        cancel(self._stalled)
+        self._stalled = None
+        self.site.unsent.remove(self._address, self)
+
+    # --- refusing -----------------------------------------------------------------------------------------
 
     def refuse(self, status: bytes, reason: str, headers: bytes = b"") -> None:
         """Answer whatever is being sent here with a status and words, and end the connection."""
@@ -247,6 +358,7 @@ class RelaySite(Site):
         )
         self.cap = cap
         self.limits = request_limits
+        self.unsent = Unsent()
         self._headers = dict(SECURITY_HEADERS)
         if tls:
             self._headers[b"strict-transport-security"] = HSTS
@@ -405,40 +517,3 @@ class Missing(Resource):
 
     def render(self, request: Request) -> bytes:
         return problem(request, self._status, self._detail)
-
-
-class Portal(ReadOnly):
-    """The built portal: its files, and its page for every address the portal itself routes."""
-
-    isLeaf = True
-    PAGES = frozenset({b"", b"login", b"fleet", b"cockpit", b"alerts", b"realm"})
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__()
-        self._folder = folder.resolve()
-
-    def render_GET(self, request: Request) -> bytes | int:
-        first = request.postpath[0] if request.postpath else b""
-        if first in self.PAGES:
-            return self._send(request, self._folder / "index.html")
-        try:
-            path = (self._folder / b"/".join(request.postpath).decode()).resolve()
-        except (UnicodeDecodeError, ValueError):
-            return problem(request, 404, "There is nothing at this address.")
-        if not path.is_relative_to(self._folder) or not path.is_file():
-            return problem(request, 404, "There is nothing at this address.")
-        return self._send(request, path)
-
-    def _send(self, request: Request, path: Path) -> bytes:
-        try:
-            content = path.read_bytes()
-        except OSError:
-            return problem(request, 503, "The portal is not built; run 'make web'.")
-        kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
-        request.setHeader(
-            b"content-type", kind.encode() + (b"; charset=utf-8" if kind.startswith("text/") else b"")
-        )
-        # Names under assets/ carry a hash of their content.
-        hashed = path.parent.name == "assets"
-        request.setHeader(b"cache-control", b"public, max-age=31536000, immutable" if hashed else b"no-cache")
-        return content

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from typing import Any
 
-from relay_server.edges.video.viewing import tcp_of
+from relay_server.edges.tcp import tcp_of
 
 NOTICED_SECONDS = 6
 """An end that has vanished is noticed within so long, also while nothing is sent."""

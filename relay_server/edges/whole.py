@@ -14,7 +14,8 @@ from relay_server.edges.handshake import Handshake
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.oauth import resource
 from relay_server.edges.pages import PageFactory, PageGate
-from relay_server.edges.site import Portal, RelaySite, Robots, Root
+from relay_server.edges.site import RelaySite, Robots, Root
+from relay_server.edges.static_files import Portal
 from relay_server.edges.video import Video, VideoFactory
 from relay_server.edges.websocket import ClientFactory
 from relay_server.frontdesk import FrontDesk

@@ -9,13 +9,15 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import httpx
 import psutil
 import pytest
 from switchboard_client import Client
 from switchboard_fake_robot import FakeRobot
-from switchboard_waiting import wait_for
+from switchboard_waiting import PATIENCE, wait_for
 from switchboard_watchers import Watcher, undisturbed
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
@@ -24,7 +26,7 @@ from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json
-from relay_server import passwords
+from relay_server import PORTAL, passwords
 
 
 @pytest.fixture(autouse=True)
@@ -494,3 +496,27 @@ def test_too_many_connections_of_one_address_are_refused_in_words(world: Any) ->
             return plain.recv(100).startswith(b"HTTP/1.0 200")
 
     wait_for("the address is served again", served)
+
+
+@pytest.mark.parametrize("path", ["the largest file of the portal", "/api/openapi.json", "/nothing"])
+def test_answers_that_nobody_takes_use_little_memory(world: Any, path: str) -> None:
+    """Thousands of pipelined requests on twenty connections that read nothing: the next waits for the one before."""
+    if not path.startswith("/"):
+        assets = Path(PORTAL) / "assets"
+        path = f"/assets/{max(assets.iterdir(), key=lambda each: each.stat().st_size).name}"
+    one = f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode()
+    relay = psutil.Process(world.relay.process.popen.pid)
+    before = relay.memory_info().rss
+    highest = 0
+    with contextlib.ExitStack() as stack:
+        for _ in range(20):
+            plain = stack.enter_context(socket.socket())
+            plain.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            plain.connect(("127.0.0.1", world.relay.http_port))
+            plain.settimeout(0.2)
+            with contextlib.suppress(TimeoutError):
+                plain.sendall(one * (203_000 // len(one)))
+            # Once the relay answers this one it has done with what came before.
+            httpx.get(f"http://127.0.0.1:{world.relay.http_port}/robots/rover", timeout=PATIENCE)
+            highest = max(highest, relay.memory_info().rss)
+    assert highest - before < 16 * limits.MIB

@@ -27,6 +27,8 @@ from switchboard_threads import Driver
 from switchboard_waiting import PATIENCE, wait_for
 from websockets.sync.client import connect
 
+from relay_server import PORTAL
+
 DAY = datetime.timedelta(days=1)
 
 
@@ -173,6 +175,22 @@ def test_pages_and_websockets_come_over_tls(house: House) -> None:
     assert "secure" in login.headers["Set-Cookie"].lower()
     with house.client() as client:
         assert client.call("/relay/ping", {"robot": True})["result"]
+
+
+def test_pipelined_requests_are_answered_in_order_over_tls(house: House) -> None:
+    """Answers of many pieces, taken slowly, arrive whole."""
+    assets = Path(PORTAL) / "assets"
+    file = max(assets.iterdir(), key=lambda each: each.stat().st_size)
+    request = f"GET /assets/{file.name} HTTP/1.1\r\nHost: x\r\n"
+    received = b""
+    with (
+        socket.create_connection(("127.0.0.1", house.relay.http_port), timeout=PATIENCE) as plain,
+        house.context.wrap_socket(plain, server_hostname="127.0.0.1") as secure,
+    ):
+        secure.sendall((f"{request}\r\n" * 3 + f"{request}Connection: close\r\n\r\n").encode())
+        while data := secure.recv(5000):
+            received += data
+    assert received.count(file.read_bytes()) == 4
 
 
 def test_who_does_not_trust_the_ca_does_not_connect(house: House) -> None:

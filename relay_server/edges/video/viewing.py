@@ -19,6 +19,7 @@ from urllib.parse import urlencode
 from twisted.web.server import Request
 
 from relay_protocol.limits import KIB, MIB
+from relay_server.edges.tcp import tcp_of
 from relay_server.video import Picture
 
 CONTENT_TYPES = {"jpeg": b"image/jpeg", "png": b"image/png"}
@@ -239,13 +240,3 @@ def unsent(tcp: Any) -> int:
         # Closed meanwhile.
         return left
     return left + int(struct.unpack("i", answer)[0])
-
-
-def tcp_of(transport: Any) -> Any:
-    """The connection itself, through TLS; ``None`` in memory."""
-    while transport is not None:
-        handle = getattr(transport, "getHandle", lambda: None)()
-        if isinstance(handle, socket.socket):
-            return transport
-        transport = getattr(transport, "transport", None)
-    return None

@@ -24,7 +24,8 @@ from relay_server.edges.handshake import Handshake
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.pages import PageFactory, PageGate
 from relay_server.edges.robot_pages import RobotPages
-from relay_server.edges.site import Missing, Portal, RelaySite, Robots, Root
+from relay_server.edges.site import Missing, RelaySite, Robots, Root
+from relay_server.edges.static_files import Portal
 from relay_server.edges.websocket import ClientFactory
 from relay_server.origins import Origins
 from relay_server.session import Timing

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import random
 from pathlib import Path
 
 import pytest
@@ -63,6 +65,7 @@ def test_a_kept_connection_is_dropped_when_it_idles(world: World) -> None:
         transport,
         b"GET /api/v1/session HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer ann\r\n\r\n" + GET + b"\r\n",
     )
+    world.clock.advance(0)
     world.clock.advance(module.IDLE_SECONDS - 1)
     assert transport.connected
     world.send(transport, b"GET /healthz HTTP/1.1\r\nHo")
@@ -76,6 +79,7 @@ def test_a_connection_of_a_stranger_is_dropped_as_soon_after_an_answer_as_before
     transport = world.connect()
     for _ in range(3):
         world.send(transport, GET + b"\r\n")
+        world.clock.advance(0)
         world.clock.advance(limits.UNPROVEN_SECONDS - 0.1)
         assert transport.connected
     world.clock.advance(0.2)
@@ -176,7 +180,10 @@ def test_the_portals_page_is_served_for_the_addresses_it_routes(world: World) ->
 def test_a_portal_that_was_not_built_is_told(tmp_path: Path) -> None:
     """With what to do."""
     answer = World(tmp_path / "none").ask("GET", "/")
-    assert (answer.status, answer.json["detail"]) == (503, "The portal is not built; run 'make web'.")
+    assert (answer.status, answer.json["detail"]) == (
+        503,
+        "The portal is not built; run 'make web' and start the relay again.",
+    )
 
 
 def test_a_plain_get_of_a_robot_tells_what_speaks_there(world: World) -> None:
@@ -248,3 +255,72 @@ def test_what_is_no_request_is_told(world: World) -> None:
 def test_a_slash_too_many_means_nothing(world: World, path: str) -> None:
     """Names of ROS begin with one, also where it is escaped; nobody is sent about for it."""
     assert world.ask("GET", path, Authorization="Bearer ann").json["user"] == "ann"
+
+
+ENCODINGS = {
+    "gzip": "gzip",
+    "deflate, gzip;q=1.0, *;q=0.5": "gzip",
+    "*": "gzip",
+    "GZIP": "gzip",
+    "gzip;q=0.5, identity;q=0.5": "gzip",
+    "gzip;q=0": None,
+    "gzip;q=0.000, *": None,
+    "gzip;q=0.3, identity;q=0.5": None,
+    "br, zstd": None,
+    "*;q=0": None,
+    "identity": None,
+    "": None,
+    "gzip" + ", br" * 100: None,
+    "gzip;q=nan": None,
+}
+
+
+@pytest.mark.parametrize(("accept", "encoding"), ENCODINGS.items())
+def test_files_are_compressed_for_clients_that_prefer_it(
+    folder: Path, accept: str, encoding: str | None
+) -> None:
+    """RFC 9110 section 12.5.3; caches are told that it depends on that, and the entity tags differ."""
+    text = b"let a = 1;\n" * 1000
+    (folder / "assets" / "large-1.js").write_bytes(text)
+    world = World(folder)
+    answer = world.ask("GET", "/assets/large-1.js", Accept_Encoding=accept)
+    assert (answer.status, answer.headers.get("content-encoding")) == (200, encoding)
+    assert (gzip.decompress(answer.body) if encoding else answer.body) == text
+    assert answer.headers["content-length"] == str(len(answer.body))
+    assert answer.headers["vary"] == "accept-encoding"
+    plain = world.ask("GET", "/assets/large-1.js")
+    assert (plain.headers["etag"] == answer.headers["etag"]) is (encoding is None)
+    for headers in ({"Accept_Encoding": accept}, {}):
+        known = world.ask("GET", "/assets/large-1.js", If_None_Match=answer.headers["etag"], **headers)
+        assert (known.status, known.body) == (304, b"")
+        assert {"etag", "vary", "cache-control"} <= set(known.headers)
+
+
+def test_pictures_and_small_files_are_not_compressed(folder: Path) -> None:
+    """It would not make them smaller."""
+    noise = random.Random(1).randbytes(5000)
+    (folder / "assets" / "noise-1.png").write_bytes(noise)
+    for path in ("/assets/noise-1.png", "/icon.svg"):
+        answer = World(folder).ask("GET", path, Accept_Encoding="gzip")
+        assert "content-encoding" not in answer.headers
+        assert "vary" not in answer.headers
+
+
+def test_portal_files_are_those_of_the_start(folder: Path) -> None:
+    """No request reaches the disk, whatever its path is."""
+    world = World(folder)
+    (folder / "later.js").write_text("let b")
+    assert world.ask("GET", "/later.js").status == 404
+    assert world.ask("GET", "/assets/" + "a" * 300).status == 404
+    (folder / "icon.svg").unlink()
+    assert world.ask("GET", "/icon.svg").status == 200
+
+
+def test_requests_for_the_portal_are_counted(folder: Path) -> None:
+    """A network that sends too many is told when to try again."""
+    world = World(folder, rate=0.1)
+    assert world.ask("GET", "/icon.svg").status == 200
+    for path in ("/icon.svg", "/", "/nothing"):
+        answer = world.ask("GET", path)
+        told(answer, 429)
+        assert int(answer.headers["retry-after"]) > 0

@@ -1,0 +1,236 @@
+"""Answers that are not taken: pipelined requests wait, memory stays bounded, a reader that takes nothing is cut."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from twisted.internet.abstract import FileDescriptor
+from twisted.internet.address import IPv4Address
+
+from relay_server.edges import caps
+from relay_server.edges import site as module
+from relay_server.edges.caps import Unsent
+from tests.relay_server.edges.http_client import World, parse
+
+ASSET = 300_000
+BOUND = 3 * module.PIECE_BYTES
+"""Bytes that the transport holds at most: a piece more than are enough for it to call itself full, and a head."""
+
+
+class Socket(FileDescriptor):
+    """A connection with the buffers of Twisted's TCP; the client takes as many bytes as the test says."""
+
+    bufferSize = module.PIECE_BYTES
+
+    def __init__(self, world: World, address: str = "192.0.2.9") -> None:
+        super().__init__(world.clock)
+        self.connected = True
+        self.taken = b""
+        self.reading = True
+        self._room = 0
+        self._address = address
+        self.protocol: Any = world.site.buildProtocol(None)
+        self.protocol.makeConnection(self)
+
+    def takes(self, size: int) -> None:
+        """The client reads."""
+        self._room = size
+        while self._room and self.connected and (self.unsent or self.disconnecting):
+            ended = self.doWrite()
+            if ended is not None:
+                self.connectionLost(ended)
+
+    @property
+    def unsent(self) -> int:
+        """Bytes that the transport holds."""
+        return len(self.dataBuffer) - self.offset + self._tempDataLen
+
+    def send(self, data: bytes, size: int = module.PIECE_BYTES) -> int:
+        """Bytes of the client, as far as they are read; returns how many."""
+        sent = 0
+        while sent < len(data) and self.reading and self.connected:
+            self.protocol.dataReceived(data[sent : sent + size])
+            sent += size
+        return min(sent, len(data))
+
+    # --- FileDescriptor -----------------------------------------------------------------------------------
+
+    def writeSomeData(self, data: bytes) -> int:
+        taken, self._room = data[: self._room], self._room - min(self._room, len(data))
+        self.taken += taken
+        return len(taken)
+
+    def startWriting(self) -> None:
+        """The test asks."""
+
+    stopWriting = startWriting
+
+    def stopReading(self) -> None:
+        self.reading = False
+
+    def startReading(self) -> None:
+        self.reading = True
+
+    def getPeer(self) -> IPv4Address:
+        """The client."""
+        return IPv4Address("TCP", self._address, 50000)
+
+    getHost = getPeer
+
+    def abortConnection(self) -> None:
+        """Close at once."""
+        if self.connected:
+            self.connectionLost(None)
+
+    def connectionLost(self, reason: Any) -> None:
+        super().connectionLost(reason)
+        self.protocol.connectionLost(reason)
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """A site with a portal that has one large file."""
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "assets" / "app.bin").write_bytes(bytes(range(256)) * (ASSET // 256))
+    return World(tmp_path)
+
+
+def get(path: str, headers: str = "") -> bytes:
+    """A request."""
+    return f"GET {path} HTTP/1.1\r\nHost: x\r\n{headers}\r\n".encode()
+
+
+def turns(world: World, count: int = 10) -> None:
+    """Of the reactor."""
+    world.clock.pump([0] * count)
+
+
+@pytest.mark.parametrize(
+    "path", ["/assets/app.bin", "/nothing", "/api/v1/session", "/robots/rover", "/healthz"]
+)
+def test_pipelined_requests_of_a_client_that_takes_nothing_wait(world: World, path: str) -> None:
+    """Two hundred kilobytes of them: what the transport holds is bounded, and so is what is read."""
+    transport = Socket(world)
+    one = get(path)
+    sent = transport.send(one * (200_000 // len(one)))
+    turns(world, 3000)
+    assert transport.connected
+    assert not transport.reading
+    assert sent <= module.AHEAD_BYTES + 2 * module.PIECE_BYTES
+    assert transport.unsent < BOUND
+
+
+def test_pipelined_requests_are_answered_in_order_as_the_answers_are_taken(world: World) -> None:
+    """Each whole, and none is lost."""
+    transport = Socket(world)
+    transport.send(get("/assets/app.bin") + get("/nothing") + get("/assets/app.bin", "Connection: close\r\n"))
+    for _ in range(2000):
+        transport.takes(1000)
+        turns(world, 1)
+        assert transport.unsent < BOUND
+    first, _, rest = transport.taken.partition(b"HTTP/1.1 404")
+    file = bytes(range(256)) * (ASSET // 256)
+    assert parse(first).body == file
+    assert parse(rest[rest.index(b"HTTP/1.1 200") :]).body == file
+    assert not transport.connected
+
+
+def test_requests_that_are_pipelined_are_answered_one_a_turn(world: World) -> None:
+    """Between two of them others are served."""
+    transport = Socket(world)
+    transport.send(get("/nothing") * 5)
+    transport.takes(10_000)
+    assert transport.taken.count(b"HTTP/1.1 404") == 1
+    turns(world)
+    transport.takes(10_000)
+    assert transport.taken.count(b"HTTP/1.1 404") == 5
+
+
+def test_a_client_that_takes_nothing_of_an_answer_is_cut(world: World) -> None:
+    """One that takes a little now and then is not."""
+    slow, silent = Socket(world), Socket(world)
+    for each in (slow, silent):
+        each.send(get("/assets/app.bin"))
+    for _ in range(4):
+        world.clock.advance(module.STALL_SECONDS * 0.7)
+        slow.takes(BOUND)
+    assert slow.connected
+    assert not silent.connected
+    slow.abortConnection()
+    assert not world.cap._counts
+    assert not world.site.unsent._waiting
+    assert not world.clock.getDelayedCalls()
+
+
+def test_a_client_that_takes_nothing_at_the_end_of_a_stream_is_cut(world: World) -> None:
+    """The stream has its own limit; what it leaves in the transport has this one."""
+    transport = Socket(world)
+    transport.send(get("/api/v1/robots/stream", "Authorization: Bearer ann\r\n"))
+    transport.write(b"x" * BOUND)
+    del world.desk.tokens["ann"]
+    transport.protocol._requestProducer = None
+    world.clock.pump([1.0] * 4)
+    world.clock.advance(module.STALL_SECONDS)
+    assert not transport.connected
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_what_follows_while_a_request_is_answered_is_read_to_a_bound(world: World, full: bool) -> None:
+    """A stream is open for ever; also when it waits for the transport."""
+    transport = Socket(world)
+    transport.send(get("/api/v1/robots/stream", "Authorization: Bearer ann\r\n"))
+    if full:
+        transport.write(b"x" * BOUND)
+    sent = transport.send(b"x" * 1_000_000)
+    assert sent <= module.AHEAD_BYTES + 2 * module.PIECE_BYTES
+    assert not transport.reading
+
+
+def test_a_pipelined_request_that_lasts_is_not_cut_as_idle(world: World) -> None:
+    """The time that an idle connection has is over when the next request is there."""
+    transport = Socket(world)
+    transport.send(get("/nothing") + get("/api/v1/robots/stream", "Authorization: Bearer ann\r\n"))
+    for _ in range(int(module.IDLE_SECONDS) + 5):
+        world.clock.advance(1.0)
+        transport.takes(100_000)
+    assert transport.connected
+    assert b"event: robots" in transport.taken
+
+
+def test_what_one_network_does_not_take_is_bounded(tmp_path: Path) -> None:
+    """The connection that has waited longest is cut; those of other networks are left alone."""
+    world = World(tmp_path)
+    world.cap = world.site.cap = caps.AddressCap(100)
+    world.site.unsent = Unsent(most=1_000_000)
+    body = b"x" * 400_000
+    transports = [Socket(world, address) for address in ("192.0.2.9",) * 4 + ("203.0.113.5",)]
+    for each in transports:
+        each.protocol._handlingRequest = True
+        each.protocol.write(body)
+    assert [each.connected for each in transports] == [False, False, True, True, True]
+
+
+def test_a_pipelined_request_is_told_what_is_wrong_behind_the_answer_before(world: World) -> None:
+    """A body that is too large, as the second of two requests."""
+    transport = Socket(world)
+    transport.send(
+        get("/nothing") + b"POST /api/v1/session HTTP/1.1\r\nHost: x\r\nContent-Length: 100000\r\n\r\n"
+    )
+    turns(world)
+    transport.takes(10_000)
+    assert transport.taken.index(b"HTTP/1.1 404") < transport.taken.index(b"HTTP/1.1 413")
+
+
+def test_a_client_that_leaves_leaves_nothing_behind(world: World) -> None:
+    """At any moment of an answer."""
+    for taken in (0, 10_000, ASSET, 2 * ASSET):
+        transport = Socket(world)
+        transport.send(get("/assets/app.bin") * 2)
+        transport.takes(taken)
+        turns(world, 2)
+        transport.abortConnection()
+        assert not world.site.unsent._waiting
+        assert not world.clock.getDelayedCalls()
+    assert not world.cap._counts
