@@ -11,8 +11,7 @@ from typing import Any
 
 import msgspec
 
-from relay_protocol import jsontext
-from relay_protocol.json_keys import check_keys
+from relay_protocol import json_keys, jsontext
 from relay_protocol.limits import JSON_DEPTH
 from relay_protocol.message import Body, Message
 from relay_protocol.qos import QoS
@@ -188,6 +187,8 @@ _INTEGERS = frozenset(("id", "queue_size", "queue_length", "fragment_size", "num
 _EXACT = 2**53
 """Larger integers are not exact as a double."""
 
+_OF_NUMBERS, _DISTINCT = json_keys.OF_NUMBERS, json_keys.distinct
+
 _decode: Callable[[bytes], ClientOp] = msgspec.json.Decoder(ClientOp).decode
 
 
@@ -204,7 +205,8 @@ def decode(data: bytes) -> ClientOp:
         message = _decode(data)
     except jsontext.FAULTS as error:
         message = _decode_as_meant(data, error)
-    check_keys(data)
+    if len(data) > json_keys.SHORT or data.translate(None, _OF_NUMBERS) not in _DISTINCT:
+        json_keys.check_keys(data)
     return message
 
 

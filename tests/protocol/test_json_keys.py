@@ -104,7 +104,7 @@ def test_shapes_that_are_kept_are_bounded() -> None:
         for _ in range(3):
             assert accepted(f'{{"{name}":1}}')
     assert len(json_keys._seen) <= json_keys.SHAPES
-    assert len(json_keys._distinct) <= json_keys.SHAPES
+    assert len(json_keys.distinct) <= json_keys.SHAPES
 
 
 @pytest.mark.parametrize("number", ["NaN", "-Infinity", "9" * 5000, "1e999"])
