@@ -171,9 +171,10 @@ def view(camera: link.Camera, streams: Iterable[Stream]) -> dict[str, Any]:
 
 
 def _shown(stream: Stream) -> dict[str, Any]:
+    playing = stream.told or stream.failed
     return {
         "viewers": len(stream.viewers),
         "state": stream.state.name.lower(),
         "settings": msgspec.structs.asdict(stream.settings),
-        "playing": None if stream.told is None else msgspec.structs.asdict(stream.told),
+        "playing": None if playing is None else msgspec.structs.asdict(playing),
     }

@@ -400,6 +400,11 @@ class _Eye:
                 f"{self._camera}: the robot's uplink is thin; for a while its pictures are smaller, coarser or fewer",
             )
 
+        if playing.trouble:
+            self._recorder.tell(
+                "warning", f"{self._camera}: for a while no picture could be shown: {playing.trouble}"
+            )
+
     def moved(self, stream: Stream) -> None:
         """Where the robot is at its limit what others watch is recorded, and that is told."""
         self._stream = stream

@@ -63,6 +63,10 @@ class Patience:
         since = self._clock.seconds()
         self._timers[viewer] = self._clock.callLater(FIRST_PICTURE_SECONDS, self._look, viewer, since)
 
+    def waits(self, viewer: Viewer) -> bool:
+        """Whether he has got no picture yet."""
+        return viewer in self._timers
+
     def ends(self, viewer: Viewer) -> None:
         """He has a picture, or has left."""
         cancel(self._timers.pop(viewer, None))

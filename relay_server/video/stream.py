@@ -87,6 +87,8 @@ class Stream:
         self.newest: Picture | None = None
         self.told: link.Playing | None = None
         """What the robot sends at present, once it has said so."""
+        self.failed: link.Playing | None = None
+        """What it sent before it could not show the camera any more, and why it can't; ``None`` while all is well."""
         self._link: VideoLink | None = None
         self._lateness = Lateness()
         self._patience = Patience(clock, self._due, self._in_vain)
@@ -225,7 +227,8 @@ class Stream:
             return NotFound(NO_CAMERA)
         if self.state is State.OPENING:
             return NothingCame(f"robot {robot} does not open the video of {self.camera}")
-        return NothingCame(f"camera {self.camera} has given no picture for {waited:.0f} s")
+        trouble = f": {self.told.trouble}" if self.told is not None and self.told.trouble else ""
+        return NothingCame(f"camera {self.camera} has given no picture for {waited:.0f} s{trouble}")
 
     # --- the robot ----------------------------------------------------------------------------------------
 
@@ -260,7 +263,7 @@ class Stream:
     def picture(self, frame: VideoFrame) -> None:
         """A picture came over the link.
 
-        :raises MalformedMessage: it is none; the stream is over, and so must be the link
+        :raises MalformedMessage: it is none; the link must end
         """
         if self._link is None:
             return
@@ -270,7 +273,7 @@ class Stream:
         except MalformedMessage as error:
             # The link is told by whoever broke off, not by us.
             self._link = None
-            self.shut(self._not_so(f"robot {self.robot.name} sent what is no picture: {error}"))
+            self._fails(f"robot {self.robot.name} sent what is no picture: {error}")
             raise
         self._pause = REOPEN_SECONDS
         self.newest = picture
@@ -280,7 +283,7 @@ class Stream:
     def message(self, message: link.RobotVideo) -> None:
         """A message came over the link; pings and farewells are the connection's."""
         if isinstance(message, link.Playing):
-            self.told = message
+            self.told, self.failed = message, None
             if self._telling is None or not self._telling.active():
                 self._tell()
         elif isinstance(message, link.NotPlaying):
@@ -289,7 +292,28 @@ class Stream:
                 self._hooks.busy(self)
                 self.shut(Unavailable(reason))
             else:
-                self.shut(self._not_so(reason))
+                self._fails(reason)
+
+    def _fails(self, reason: str) -> None:
+        """The camera can't be shown now, and the link ends.
+
+        Viewers that have seen pictures stay, and the robot is asked again: a camera's bad spell must not freeze pages.
+        Others are told why. So are all of H.264, since another codec may do.
+        """
+        error = self._not_so(reason)
+        stay = [each for each in self.viewers if not self._patience.waits(each)]
+        if not stay or isinstance(error, NotMade):
+            self.shut(error)
+            return
+        for viewer in self.viewers.difference(stay):
+            self._drop(viewer)
+            viewer.ended(error)
+        told = self.told
+        self._happen(Event.LINK_LOST)
+        if told is not None:
+            self.failed = structs.replace(told, trouble=reason)
+            for viewer in stay:
+                viewer.playing(self.failed)
 
     def _tell(self) -> None:
         """Tell the viewers the newest of what the robot says it sends, and then nothing for a while."""

@@ -1,4 +1,5 @@
-"""Pictures as cameras publish them, turned into arrays: every usual encoding of sensor_msgs/msg/Image, JPEG and PNG.
+"""Pictures as cameras publish them, turned into arrays: every usual encoding of sensor_msgs/msg/Image, JPEG, PNG and
+WebP.
 
 Colours mean what cv_bridge and image_encodings.hpp say. Sixteen bits become eight by 255 / 65535, whatever the camera
 uses of them, so that the brightness doesn't jump; depth gets colours of a fixed scale for the same reason, also where
@@ -85,7 +86,7 @@ def compressed(cdr: bytes) -> Packed:
     """The file in a sensor_msgs/msg/CompressedImage.
 
     :param cdr: the message as ROS serialised it, with its four-byte header
-    :raises Invalid: no such message, or neither a whole JPEG nor a whole PNG, or depth in a form that can't be shown
+    :raises Invalid: no such message, or no whole JPEG, PNG or WebP, or depth in a form that can't be shown
     """
     return _packed(cdr)
 
@@ -98,7 +99,9 @@ def _packed(cdr: bytes) -> Packed:
     try:
         kind = files.kind_of(cdr, found.start)
     except Invalid as error:
-        if found.start == found.stop or any(name in found.format.lower() for name in ("jpeg", "jpg", "png")):
+        if found.start == found.stop or any(
+            name in found.format.lower() for name in ("jpeg", "jpg", "png", "webp")
+        ):
             raise Damaged(str(error)) from None
         raise
     file = cdr[found.start : files.end_of(cdr, found.start, found.stop, kind)]
@@ -154,9 +157,9 @@ def unpacked(packed: Packed) -> Raw:
 
 
 def decoded(file: bytes) -> Raw:
-    """Pixels of a JPEG or PNG; grey ones stay grey.
+    """Pixels of a JPEG, PNG or WebP; grey ones stay grey.
 
-    :raises Invalid: it is neither, is broken, or has more than :data:`PIXELS`
+    :raises Invalid: it is none, is broken, or has more than :data:`PIXELS`
     """
     kind = files.kind_of(file)
     pixels = _decoded(kind, file, cv2.IMREAD_ANYCOLOR).astype(np.uint8, copy=False)
@@ -267,11 +270,38 @@ def _metres(found: Image) -> Pixels:
     return depth.coloured(depth.whole_millimetres(_plane(found, "f4")))
 
 
-def _nv21(found: Image) -> Pixels:
-    """Grey, then a pair V, U for every four pixels."""
-    return _converted(
-        _plane(found._replace(height=found.height * 3 // 2)).view(np.uint8), cv2.COLOR_YUV2BGR_NV21
+def _light(channels: int) -> Callable[[Image], Pixels]:
+    """Blue, green and red from 0 to 1, what is below and above as these; NaN is black.
+
+    Nothing says what such numbers mean; this is what renderers and OpenCV make of them. The scale is fixed.
+    """
+
+    def read(found: Image) -> Pixels:
+        values = np.nan_to_num(_plane(found, "f4", channels)[:, :, :3], nan=0.0, posinf=1.0, neginf=0.0)
+        shown: Pixels = np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+        return shown
+
+    return read
+
+
+def _pairs_behind(code: int) -> Callable[[Image], Pixels]:
+    """Grey, then a pair of U and V for every four pixels."""
+
+    def read(found: Image) -> Pixels:
+        return _converted(_plane(found._replace(height=found.height * 3 // 2)).view(np.uint8), code)
+
+    return read
+
+
+def _i420(found: Image) -> Pixels:
+    """Grey, then U and then V for every four pixels, in rows of half the step."""
+    height, width, half = found.height, found.width, found.step // 2
+    shape, strides = (2, height // 2, width // 2), (half * height // 2, half, 1)
+    behind: npt.NDArray[np.uint8] = np.ndarray(
+        shape, np.uint8, found.pixels[found.step * height :], strides=strides
     )
+    planes = np.concatenate((_plane(found).view(np.uint8).ravel(), behind.ravel()))
+    return _converted(planes.reshape(height * 3 // 2, width), cv2.COLOR_YUV2BGR_I420)
 
 
 _FROM_YUV = np.array(
@@ -312,7 +342,11 @@ _LAYOUTS: dict[str, _Layout] = {
     "8UC3": _Layout(3, _eight_bit(3)),
     "8UC4": _Layout(4, _eight_bit(4, cv2.COLOR_BGRA2BGR)),
     "16UC1": _Layout(2, _millimetres),
+    "16UC3": _Layout(6, _sixteen_bit(3)),
+    "16UC4": _Layout(8, _sixteen_bit(4, cv2.COLOR_BGRA2BGR)),
     "32FC1": _Layout(4, _metres),
+    "32FC3": _Layout(12, _light(3)),
+    "32FC4": _Layout(16, _light(4)),
     "bayer_rggb8": _bayer8(cv2.COLOR_BayerRGGB2BGR),
     "bayer_bggr8": _bayer8(cv2.COLOR_BayerBGGR2BGR),
     "bayer_gbrg8": _bayer8(cv2.COLOR_BayerGBRG2BGR),
@@ -326,9 +360,13 @@ _LAYOUTS: dict[str, _Layout] = {
     "yuv422": _Layout(2, _eight_bit(2, cv2.COLOR_YUV2BGR_UYVY), even=_PAIRS),
     "yuyv": _Layout(2, _eight_bit(2, cv2.COLOR_YUV2BGR_YUY2), even=_PAIRS),
     "yuv422_yuy2": _Layout(2, _eight_bit(2, cv2.COLOR_YUV2BGR_YUY2), even=_PAIRS),
-    "nv21": _Layout(1, _nv21, lines=3, even=_FOURS),
+    "nv12": _Layout(1, _pairs_behind(cv2.COLOR_YUV2BGR_NV12), lines=3, even=_FOURS),
+    "nv21": _Layout(1, _pairs_behind(cv2.COLOR_YUV2BGR_NV21), lines=3, even=_FOURS),
+    "yuv420": _Layout(1, _i420, lines=3, even=_FOURS),
+    "i420": _Layout(1, _i420, lines=3, even=_FOURS),
     "nv24": _Layout(1, _nv24, lines=6),
 }
 
 ENCODINGS = tuple(_LAYOUTS)
-"""Of sensor_msgs/msg/Image, those that can be shown."""
+"""Of sensor_msgs/msg/Image, those that can be shown. Of image_encodings.hpp the others say nothing of light or
+distance: two values a pixel, signed ones, and doubles."""

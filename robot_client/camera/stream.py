@@ -23,8 +23,9 @@ from robot_client.reactors import Clock, Timer
 from robot_client.transport import LinkLost, LinkProtocol
 
 FAULTS = 10
-"""Pictures in a row that may be damaged before a stream is given up; once it has shown some, those that could not be
-made count, too."""
+"""Pictures in a row that may be damaged before a stream is given up that has shown none. One that has shown some
+outlives any number of pictures that can't be shown; only an encoder of H.264 that fails so often is given up, since
+another codec may do."""
 
 BEARS = 5.0
 """Seconds after a damaged picture in which the first good one must come: viewers who wait are told what is wrong before
@@ -99,6 +100,8 @@ class Stream:
         """Whether the relay lacks a picture that those made of H.264 need, up to one that stands alone."""
         self._number = 0
         self._faults = 0
+        self._fault: tuple[float, str] | None = None
+        """Since when pictures can't be shown, once some were, and why not."""
         self._damaged: tuple[float, str] | None = None
         """When the first picture came that was damaged, while none was shown, and in what way."""
         self._told: link.Playing | None = None
@@ -215,6 +218,7 @@ class Stream:
         if self._view is None:
             return
         self._faults = 0
+        self._fault = None
         alone = wish.key or self.line.settings.codec != "h264"
         if self._broken and not alone:
             self._newest = self._newest or shot
@@ -236,18 +240,33 @@ class Stream:
         self._faults += 1
         reason = failure.getErrorMessage()
         # Cameras often begin with a damaged picture or two, but another encoding or size will not come by itself.
-        hopeless = not self._number and failure.check(Damaged) is None
-        if hopeless or self._faults >= FAULTS:
+        if self._number:
+            no_encoder = self.line.settings.codec == "h264" and failure.check(Unavailable) is not None
+            hopeless = no_encoder and self._faults >= FAULTS
+        else:
+            hopeless = failure.check(Damaged) is None or self._faults >= FAULTS
+        if hopeless:
             self.refuse(reason)
             return
         if not self._number and self._damaged is None:
             self._damaged = self._clock.seconds(), reason
-        self._next()
+        self._bear(reason)
 
     def _failed(self, failure: Failure) -> None:
-        self._log.failure("a picture could not be made", failure=failure)
-        if self._view is not None:
-            self.refuse("a picture could not be made; the robot's log says why")
+        if self._fault is None:
+            self._log.failure("a picture could not be made", failure=failure)
+        reason = "a picture could not be made; the robot's log says why"
+        if self._number and self._view is not None:
+            self._bear(reason)
+        elif self._view is not None:
+            self.refuse(reason)
+
+    def _bear(self, reason: str) -> None:
+        """Go on with the next picture; :meth:`_look` tells why none comes, if that lasts."""
+        if self._number:
+            since = self._clock.seconds() if self._fault is None else self._fault[0]
+            self._fault = since, reason
+        self._next()
 
     def _took(self, took: link.Took) -> None:
         measured = self._protocol.link.offset.round_trip
@@ -267,9 +286,15 @@ class Stream:
             self.refuse(self._damaged[1])
             return
         self._looking = self._clock.callLater(TELL_EVERY, self._look)
-        if self._told is not None and self._view is not None and self._told.latched != self._view.latched:
-            self._told = replace(self._told, latched=self._view.latched)
-            self._say(self._told)
+        if self._told is None or self._view is None:
+            return
+        trouble = ""
+        if self._fault is not None and self._clock.seconds() - self._fault[0] >= TELL_EVERY:
+            trouble = self._fault[1]
+        now = replace(self._told, latched=self._view.latched, trouble=trouble)
+        if now != self._told:
+            self._told = now
+            self._say(now)
 
     def _tell(self, made: Made, wish: Wish, view: View) -> None:
         """Say how this picture and those that follow are, if the relay does not know."""

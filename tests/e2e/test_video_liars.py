@@ -25,6 +25,7 @@ from relay_protocol.frames import encode_video
 
 CAMERA = "/front/image"
 JPEG = cv2.imencode(".jpg", np.zeros((24, 32, 3), np.uint8))[1].tobytes()
+OTHER = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
 PATH = f"/robots/liar/video/{{}}?topic={CAMERA}"
 HTML = b"<!doctype html><script>alert(document.cookie)</script>"
 
@@ -114,10 +115,11 @@ def shed(tmp_path: Any) -> Iterator[Shed]:
 
 
 def test_html_never_reaches_a_viewer(shed: Shed) -> None:
-    """Who has seen real pictures sees the end; the robot is told why it is cut."""
+    """The robot is told why it is cut. Who has seen real pictures stays, and sees those that come by another link."""
     with shed.robot() as control:
         viewer = Viewer(shed)
         with shed.showing(control) as end:
+            end.send(link.Playing(width=32, height=24, quality=80))
             end.send_bytes(encode_video(1, time.time_ns(), JPEG))
             assert end.until("took")["number"] == 1
             viewer.sees_a_picture()
@@ -126,6 +128,14 @@ def test_html_never_reaches_a_viewer(shed: Shed) -> None:
             assert refused["code"] == "malformed"
             assert "this is no JPEG" in refused["reason"]
             assert end.ended()
+        told = ask(shed.relay.http_port, "GET", "/api/v1/robots/liar/cameras", token=shed.token).json
+        (stream,) = told["cameras"][0]["streams"]
+        assert "this is no JPEG" in stream["playing"]["trouble"]
+        with shed.showing(control) as end:
+            end.send_bytes(encode_video(1, time.time_ns(), OTHER))
+            assert end.until("took")["number"] == 1
+            wait_for("another picture comes", lambda: OTHER in viewer.seen)
+            shed.relay.cli("right", "revoke", "ann", "liar")
         viewer.join(PATIENCE)
         assert not viewer.is_alive()
         assert b"script" not in viewer.seen

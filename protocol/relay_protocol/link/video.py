@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from relay_protocol import limits
 from relay_protocol.link.both_ways import Bye, Ping, Pong
-from relay_protocol.link.fields import Label, Name, Reasoned
+from relay_protocol.link.fields import Label, Name, Reasoned, cut
 from relay_protocol.message import Message
 
 Side = Annotated[int, Meta(ge=0, le=limits.PICTURE_SIDE)]
@@ -129,6 +129,7 @@ class Playing(Message, frozen=True, kw_only=True):
     :param encoding: of the camera's own pictures
     :param source_fps: pictures per second the camera gives
     :param latched: its publisher keeps the latest picture for those who come later, however old it is
+    :param trouble: why no picture has come for a while though the camera gives some, in words; empty while all is well
     """
 
     width: Shown
@@ -140,6 +141,11 @@ class Playing(Message, frozen=True, kw_only=True):
     encoding: Label = ""
     source_fps: Rate = 0.0
     latched: bool = False
+    trouble: str = ""
+
+    def __post_init__(self) -> None:
+        """Words are cut."""
+        cut(self, "trouble")
 
 
 class NotPlaying(Reasoned, frozen=True, kw_only=True):

@@ -350,18 +350,74 @@ def test_another_link_is_turned_away(world: World) -> None:
 @pytest.mark.parametrize(
     "body", [b"<html>", b"", png(), jpeg() + b"\n", jpeg()[:-2]], ids=lambda b: repr(b[:6])
 )
-def test_what_is_no_picture_ends_the_stream(world: World, body: bytes) -> None:
-    """Nobody gets it, everybody is told, and the link breaks."""
+def test_what_is_no_picture_breaks_the_link_and_no_stream(world: World, body: bytes) -> None:
+    """Nobody gets it; who waits for a first picture is told, who has seen some is told and sees what comes later."""
     stream, watcher, end = watched(world)
+    stream.message(PLAYING)
     shows(world, stream, 1)
+    world.clock.advance(STALE_SECONDS + 1)
+    late = Watcher()
+    late.watch(world)
     with pytest.raises(MalformedMessage):
         shows(world, stream, 2, body)
-    assert watcher.numbers == [1]
+    assert watcher.numbers == [1] and watcher.error is None
+    assert str(late.error).startswith("robot rover sent what is no picture: ")
+    assert watcher.played[-1].trouble == str(late.error)
+    assert stream.failed == watcher.played[-1]
+    assert end.closed is None, "it is the connection that says why"
+    assert end.all(link.Took) == [link.Took(number=1), link.Took(number=2)]
+    world.clock.advance(REOPEN_SECONDS)
+    robot_joins(world)
+    stream.message(PLAYING)
+    shows(world, stream, 1)
+    assert watcher.numbers == [1, 1]
+    assert stream.failed is None
+
+
+def test_what_is_no_picture_ends_a_stream_that_has_shown_none(world: World) -> None:
+    """Everybody is told."""
+    stream, watcher, _ = watched(world)
+    with pytest.raises(MalformedMessage):
+        shows(world, stream, 1, b"<html>")
     assert str(watcher.error).startswith("robot rover sent what is no picture: ")
     assert stream.state is State.CLOSED
-    assert end.closed is None, "it is the connection that says why"
-    shows(world, stream, 3)
-    assert end.all(link.Took) == [link.Took(number=1), link.Took(number=2)]
+
+
+def test_a_robot_that_can_not_show_it_any_more_is_asked_again(world: World) -> None:
+    """Less and less often, as long as anybody watches who has seen pictures; he is told why none comes."""
+    stream, watcher, end = watched(world)
+    stream.message(PLAYING)
+    shows(world, stream, 1)
+    pause = REOPEN_SECONDS
+    for _ in range(8):
+        stream.message(link.NotPlaying(reason="the JPEG ends in the middle"))
+        assert end.closed and stream.state is State.OPENING
+        world.clock.advance(pause / 2)
+        assert asked(world) == []
+        world.clock.advance(pause / 2)
+        end = robot_joins(world)
+        pause = min(2 * pause, MOST_REOPEN_SECONDS)
+    assert watcher.error is None
+    assert [each.trouble for each in watcher.played] == ["", "the JPEG ends in the middle"]
+    shows(world, stream, 1)
+    assert watcher.numbers == [1, 1]
+    watcher.leave()
+    world.clock.advance(LINGER_SECONDS)
+    assert stream.state is State.CLOSED
+
+
+def test_a_viewer_who_waits_for_his_first_picture_in_a_bad_spell_is_told_what_is_wrong(world: World) -> None:
+    """With the words of the robot, when his patience is over; who has seen some stays."""
+    stream, watcher, _ = watched(world)
+    stream.message(PLAYING)
+    shows(world, stream, 1)
+    world.clock.advance(STALE_SECONDS + 1)
+    stream.message(structs.replace(PLAYING, trouble="the PNG is broken"))
+    late = Watcher()
+    late.watch(world)
+    world.clock.advance(FIRST_PICTURE_SECONDS)
+    assert str(late.error) == "camera /camera/image has given no picture for 10 s: the PNG is broken"
+    assert watcher.error is None and watcher.played[-1].trouble == "the PNG is broken"
 
 
 def test_a_robot_that_can_not_show_it_says_why(world: World) -> None:

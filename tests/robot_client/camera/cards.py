@@ -99,10 +99,17 @@ def coded(
     :param padding: bytes of 0xA5 behind each row
     """
     rgb = card(width, height)
+    if encoding in ("yuv420", "i420"):
+        padding -= padding % 2
     grey = _padded(_values(encoding, rgb, ">" if big_endian else "<"), padding)
     step, data = grey.shape[1], grey.tobytes()
     if encoding == "nv21":
         data += _padded(_yuv(rgb)[::2, ::2, :0:-1], padding).tobytes()
+    elif encoding == "nv12":
+        data += _padded(_yuv(rgb)[::2, ::2, 1:], padding).tobytes()
+    elif encoding in ("yuv420", "i420"):
+        for plane in (1, 2):
+            data += _padded(_yuv(rgb)[::2, ::2, plane], padding // 2).tobytes()
     elif encoding == "nv24":
         # A row of its colours is as long as two of its grey, and so is what pads it.
         data += _padded(_yuv(rgb)[:, :, 1:], 2 * padding).tobytes()
@@ -137,11 +144,18 @@ def _values(encoding: str, rgb: Pixels, order: str) -> npt.NDArray[np.generic]:
         "32FC1": lambda: np.where(depths(width, height) > 0, depths(width, height), np.nan).astype(
             order + "f4"
         ),
+        "16UC3": lambda: _values("bgr16", rgb, order),
+        "16UC4": lambda: _values("bgra16", rgb, order),
+        "32FC3": lambda: (rgb[:, :, ::-1] / 255).astype(order + "f4"),
+        "32FC4": lambda: np.concatenate((rgb[:, :, ::-1] / 255, opaque), axis=2).astype(order + "f4"),
         "uyvy": lambda: _pairs(rgb, 1),
         "yuv422": lambda: _pairs(rgb, 1),
         "yuyv": lambda: _pairs(rgb, 0),
         "yuv422_yuy2": lambda: _pairs(rgb, 0),
+        "nv12": lambda: _yuv(rgb)[:, :, 0],
         "nv21": lambda: _yuv(rgb)[:, :, 0],
+        "yuv420": lambda: _yuv(rgb)[:, :, 0],
+        "i420": lambda: _yuv(rgb)[:, :, 0],
         "nv24": lambda: _yuv(rgb)[:, :, 0],
     }[encoding]()
 

@@ -42,6 +42,8 @@ def stills() -> dict[str, Pixels]:
         shown[f"{kind}, passed through"] = decoded(
             compressed(compressed_cdr(encoder.encode(bgr, 80, True)[0]))[1]
         ).pixels
+    webp = cv2.imencode(".webp", bgr, (cv2.IMWRITE_WEBP_QUALITY, 80))[1].tobytes()
+    shown["webp"] = _edited(unpacked(compressed(compressed_cdr(webp, "webp"))))
     for title, changed in {
         "crop 80,60,80,60": {"crop": (80, 60, 80, 60)},
         "rotate 90": {"rotate": 90},

@@ -45,10 +45,24 @@ from tests.robot_client.camera.cards import (
 
 DEPTH = ("16UC1", "32FC1")
 GREY = ("mono8", "mono16", "8UC1")
-SUBSAMPLED = ("uyvy", "yuv422", "yuyv", "yuv422_yuy2", "nv21")
+SUBSAMPLED = ("uyvy", "yuv422", "yuyv", "yuv422_yuy2", "nv12", "nv21", "yuv420", "i420")
 COLOUR = [each for each in ENCODINGS if each not in (*DEPTH, *GREY)]
 EXACT = [each for each in COLOUR if "bayer" not in each and each not in (*SUBSAMPLED, "nv24")]
 WAYS = [(big_endian, padding) for big_endian in (False, True) for padding in (0, 7)]
+
+LOSSY, LOSSLESS = (
+    cv2.imencode(".webp", card(64, 48)[:, :, ::-1], (cv2.IMWRITE_WEBP_QUALITY, quality))[1].tobytes()
+    for quality in (90, 101)
+)
+"""WebP, whose quality above 100 loses nothing (OpenCV, ImwriteFlags)."""
+
+
+def extended(file: bytes, width: int = 64, height: int = 48) -> bytes:
+    """The same WebP with a canvas (RFC 9649, 2.7), as those have that carry more than a picture."""
+    canvas = bytes(4) + (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
+    body = b"WEBPVP8X" + struct.pack("<I", len(canvas)) + canvas + file[12:]
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
 
 JPEG = cv2.imencode(".jpg", card(64, 48)[:, :, ::-1])[1].tobytes()
 PNG = cv2.imencode(".png", card(64, 48)[:, :, ::-1])[1].tobytes()
@@ -61,7 +75,8 @@ def small(of: str = "bgr8", **changed: object) -> Coded:
 def test_every_usual_encoding_is_known() -> None:
     """What cameras and drivers publish, by the names of image_encodings.hpp."""
     usual = {"rgb8", "bgr8", "rgba8", "bgra8", "mono8", "mono16", "8UC1", "8UC3", "16UC1", "32FC1"}
-    yuv = {"yuv422", "yuv422_yuy2", "uyvy", "yuyv", "nv21", "nv24"}
+    usual |= {"8UC4", "16UC3", "16UC4", "32FC3", "32FC4"}
+    yuv = {"yuv422", "yuv422_yuy2", "uyvy", "yuyv", "nv12", "nv21", "nv24", "yuv420", "i420"}
     bayer = {f"bayer_{order}{bits}" for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)}
     assert usual | yuv | bayer <= set(ENCODINGS)
 
@@ -203,6 +218,10 @@ def test_unknown_encoding_is_named_with_those_that_are_known() -> None:
         (small("yuv422", width=11), "pairs of pixels"),
         (small("nv21", height=7), "pairs of pixels"),
         (small("nv21", height=10), "takes 180 bytes; there are 144"),
+        (small("nv12", height=10), "takes 180 bytes; there are 144"),
+        (small("i420", width=11), "pairs of pixels"),
+        (small("yuv420", height=10), "takes 180 bytes; there are 144"),
+        (small("32FC3", step=143), "rows of 144 bytes, but step says 143"),
         (small("nv24", height=9), "takes 324 bytes; there are 288"),
         (small("bayer_rggb8", height=2), "at least 3 pixels"),
         (small(encoding="x" * 255), "256 bytes; there are at most 255"),
@@ -262,7 +281,8 @@ def test_damaged_images_are_invalid_or_pictures_no_larger_than_they(data: st.Dat
 @given(st.data())
 def test_damaged_files_are_invalid_or_pictures_of_the_size_they_say(data: st.DataObject) -> None:
     """Whatever a publisher puts into a CompressedImage."""
-    whole = st.sampled_from([compressed_cdr(JPEG), compressed_cdr(PNG), INVERSE_CDR])
+    files = JPEG, PNG, LOSSY, LOSSLESS, extended(LOSSLESS)
+    whole = st.sampled_from([*map(compressed_cdr, files), INVERSE_CDR])
     cdr = data.draw(damaged(data.draw(whole)))
     try:
         look = looked_at(cdr, True)
@@ -288,12 +308,70 @@ def test_any_bytes_are_no_more_than_invalid(cdr: bytes) -> None:
             read(cdr)
 
 
-@pytest.mark.parametrize(("file", "kind"), [(JPEG, "jpeg"), (PNG, "png")])
+@pytest.mark.parametrize(("file", "kind"), [(JPEG, "jpeg"), (PNG, "png"), (LOSSY, "webp")])
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_files_go_through_untouched(file: bytes, kind: str, order: str) -> None:
     """The kind is what the bytes are, whatever the format says."""
     assert compressed(compressed_cdr(file, "bgr8; tiff compressed", order=order))[:2] == (kind, file)
     assert looked_at(compressed_cdr(file, order=order), True) == (kind, 64, 48)
+
+
+@pytest.mark.parametrize("file", [LOSSY, LOSSLESS, extended(LOSSY), extended(LOSSLESS)])
+def test_webp_is_decoded_as_opencv_does(file: bytes) -> None:
+    """Each of its forms, also with what fills the camera's buffer behind it, and the size is that of its head."""
+    cdr = compressed_cdr(file + b"\0" * 100, "webp")
+    assert looked_at(cdr, True) == ("webp", 64, 48)
+    raw = unpacked(compressed(cdr))
+    assert np.array_equal(raw.pixels, cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR))
+    assert np.abs(raw.pixels.astype(int) - card(64, 48)[:, :, ::-1]).mean() < 12
+
+
+def test_lossless_webp_is_exact() -> None:
+    """Every pixel."""
+    assert np.array_equal(decoded(LOSSLESS).pixels, card(64, 48)[:, :, ::-1])
+
+
+@pytest.mark.parametrize("file", [LOSSY, LOSSLESS, extended(LOSSY)])
+def test_webp_that_breaks_off_is_damaged(file: bytes) -> None:
+    """Wherever it does, behind what says that it is one."""
+    for length in range(12, len(file)):
+        with pytest.raises(Damaged):
+            unpacked(compressed(compressed_cdr(file[:length], "webp")))
+
+
+def test_webp_of_too_many_pixels_is_not_decoded() -> None:
+    """Its head alone is read."""
+    huge = extended(LOSSY, 8192, 8192)
+    with pytest.raises(Invalid, match="too large to be decoded"):
+        unpacked(compressed(compressed_cdr(huge, "webp")))
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(math.nan, 0), (-1.0, 0), (-math.inf, 0), (0.5, 128), (1.0, 255), (7.0, 255), (math.inf, 255)],
+)
+def test_floating_colour_goes_from_0_to_1(value: float, shown: int) -> None:
+    """What is beyond is cut."""
+    one = Coded("32FC3", 1, 1, False, 12, struct.pack("<3f", value, 0, 1))
+    assert image(image_cdr(one)).pixels.tolist() == [[[shown, 0, 255]]]
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21", "i420", "yuv420"])
+def test_quartered_colours_are_as_opencv_has_them(encoding: str) -> None:
+    """Of a picture in which each pixel is another one, its planes put together by hand."""
+    grey, first, second = (
+        np.random.default_rng(7).integers(16, 236, shape, np.uint8) for shape in ((8, 12), (4, 6), (4, 6))
+    )
+    if encoding.startswith("nv"):
+        behind, code = (
+            np.stack((first, second), axis=2).ravel(),
+            getattr(cv2, f"COLOR_YUV2BGR_{encoding.upper()}"),
+        )
+    else:
+        behind, code = np.concatenate((first.ravel(), second.ravel())), cv2.COLOR_YUV2BGR_I420
+    planes = np.concatenate((grey.ravel(), behind))
+    raw = image(image_cdr(Coded(encoding, 12, 8, False, 12, planes.tobytes())))
+    assert np.array_equal(raw.pixels, cv2.cvtColor(planes.reshape(12, 12), code))
 
 
 def test_compressed_messages_of_rclpy_are_read() -> None:
@@ -314,8 +392,8 @@ def test_padding_behind_a_file_is_cut_off(file: bytes) -> None:
     [
         (JPEG[:-2], "JPEG ends in the middle"),
         (PNG[:-12], "PNG ends in the middle"),
-        (b"<html></html>", "neither JPEG nor PNG"),
-        (b"", "neither JPEG nor PNG"),
+        (b"<html></html>", "no JPEG, PNG or WebP"),
+        (b"", "no JPEG, PNG or WebP"),
     ],
 )
 def test_what_is_no_whole_file_is_refused(file: bytes, words: str) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,66 @@ def test_picture_that_was_published_once_is_shown_to_all_who_come(
     first.expect_end()
     again, _ = picture(scene.video(once, link.VideoSettings(quality=50), "s3"))
     assert again.number == 1
+
+
+@pytest.fixture
+def wild(environment: dict[str, str]) -> Iterator[Any]:
+    """Publishes any Image on ``/wild``."""
+    context = rclpy.Context()
+    with without_shared_memory(rclpy.get_rmw_implementation_identifier()):
+        rclpy.init(context=context)
+        node: Any = rclpy.create_node("wild", context=context)
+    yield node.create_publisher(Image, "/wild", 1)
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_bad_spell_of_a_camera_and_its_changes_end_no_stream(
+    relay: FakeRelay, robot: Robot, wild: Any
+) -> None:
+    """Pictures that are too short, of an encoding nobody knows, and then of another size and encoding than before."""
+    scene = Scene(relay, robot)
+    scene.until_listed("/wild")
+    peer = scene.video("/wild")
+
+    def until_seen(high: int, wide: int, **image: Any) -> int:
+        """Publish it until it is shown; the picture's number."""
+        with publishing(wild, height=high, width=wide, **image):
+            while True:
+                frame, shown = picture(peer)
+                if shown.shape == (high, wide, 3):
+                    return frame.number
+
+    def until_told(words: str, **image: Any) -> None:
+        with publishing(wild, height=48, width=64, **image):
+            while words not in peer.expect(link.Playing).trouble:
+                pass
+
+    until_seen(48, 64, step=64, encoding="mono8", data=bytes(64 * 48))
+    until_told("there are 9", step=64, encoding="mono8", data=bytes(9))
+    until_told("'odd' can't be shown", step=64, encoding="odd", data=bytes(64 * 48))
+    last = until_seen(24, 32, step=96, encoding="rgb8", data=bytes(96 * 24))
+    assert until_seen(96, 128, step=128, encoding="nv12", data=bytes([128]) * (128 * 144)) > last
+    assert not [each for each in peer.skipped if isinstance(each, link.NotPlaying)]
+    assert [each for each in peer.skipped if isinstance(each, link.Playing)][-1].trouble == ""
+
+
+@contextmanager
+def publishing(publisher: Any, **image: Any) -> Iterator[None]:
+    """Twenty times a second."""
+    over = threading.Event()
+
+    def publish() -> None:
+        while not over.wait(0.05):
+            publisher.publish(Image(**image))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def test_what_can_not_be_shown_is_said_on_the_link(scene: Scene) -> None:

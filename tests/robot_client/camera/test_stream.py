@@ -10,9 +10,10 @@ import pytest
 from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 from twisted.internet.testing import StringTransportWithDisconnection
+from twisted.logger import capturedLogs
 
 from relay_protocol import frames, link
-from relay_protocol.errors import Invalid, NotFound, SwitchboardError
+from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from robot_client.camera.leaving import PART
 from robot_client.camera.lines import Open
 from robot_client.camera.messages import Damaged
@@ -353,7 +354,7 @@ def test_first_picture_that_can_not_be_made_ends_the_stream() -> None:
     assert scene.view.closed == 1
 
 
-def spoil(scene: Scene, error: SwitchboardError) -> None:
+def spoil(scene: Scene, error: Exception) -> None:
     """Another picture comes, of which nothing can be made."""
     scene.shot(1)
     scene.view.making[-1][1].errback(error)
@@ -411,19 +412,77 @@ def test_what_can_not_be_shown_ends_the_stream_also_behind_a_damaged_picture() -
     assert [each["reason"] for each in scene.heard()] == ["no such encoding"]
 
 
-def test_broken_picture_in_between_is_left_out() -> None:
-    """A stream that has shown something bears some broken pictures in a row, not for ever."""
+@pytest.mark.parametrize(
+    "error", [Damaged("cut off"), Invalid("no such encoding"), Unavailable("OpenCV can't")]
+)
+def test_stream_outlives_any_spell_of_pictures_that_can_not_be_shown(error: SwitchboardError) -> None:
+    """Why none comes is said once that has lasted, and taken back with the first good one."""
     scene = Scene().joined()
+    first(scene)
+    for _ in range(30 * FAULTS):
+        spoil(scene, error)
+        scene.clock.advance(TELL_EVERY / 10)
+        scene.say(link.Pong(t=scene.now(), at=2))
+    (said,) = scene.heard()
+    assert (said["op"], said["trouble"]) == ("playing", str(error))
+    scene.shot(3)
+    scene.make(width=32)
+    playing, picture = scene.heard()
+    assert (playing.get("trouble", ""), playing["width"], picture.stamp) == ("", 32, 3)
+    assert scene.transport.connected
+
+
+def test_single_picture_that_can_not_be_shown_is_no_trouble() -> None:
+    """The next one comes before anybody is told."""
+    scene = Scene().joined()
+    first(scene)
+    for stamp in range(2, 40):
+        spoil(scene, Damaged("cut off"))
+        scene.clock.advance(TELL_EVERY / 4)
+        scene.shot(stamp)
+        scene.make()
+        scene.say(link.Took(number=stamp))
+    assert not [each for each in scene.heard() if isinstance(each, dict) and each.get("trouble")]
+
+
+def test_encoder_of_h264_that_fails_ends_the_stream() -> None:
+    """Another codec may do, and viewers are told so; a camera's own faults don't end it."""
+    scene = Scene(codec="h264").joined()
+    first(scene)
+    for _ in range(3 * FAULTS):
+        spoil(scene, Damaged("cut off"))
+    assert scene.transport.connected
+    scene.shot(2)
+    scene.make()
+    scene.say(link.Took(number=2))
+    scene.heard()
+    for _ in range(FAULTS):
+        assert scene.transport.connected
+        spoil(scene, Unavailable("this size can't be encoded"))
+    assert scene.heard()[-1]["reason"] == "this size can't be encoded"
+
+
+def test_fault_of_ours_in_between_is_logged_once_and_borne() -> None:
+    """What nobody foresaw is for the log, not for viewers."""
+    scene = Scene().joined()
+    first(scene)
+    with capturedLogs() as logs:
+        for _ in range(5):
+            spoil(scene, ZeroDivisionError("at /home/secret"))
+    assert len(logs) == 1
+    scene.clock.advance(2 * TELL_EVERY)
+    (said,) = scene.heard()
+    assert "robot's log" in said["trouble"] and "secret" not in said["trouble"]
+    assert scene.transport.connected
+
+
+def first(scene: Scene) -> None:
+    """One picture is shown."""
     scene.shot(1)
     scene.make()
     scene.clock.advance(0.05)
     scene.say(link.Took(number=1))
-    for broken in range(FAULTS):
-        assert scene.transport.connected, broken
-        scene.shot(2)
-        scene.view.making[-1][1].errback(Invalid("cut off"))
-    assert scene.heard()[-1]["reason"] == "cut off"
-    assert not scene.transport.connected
+    scene.heard()
 
 
 def test_fault_of_ours_ends_the_stream_without_its_text() -> None:

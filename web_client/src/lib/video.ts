@@ -52,6 +52,8 @@ export interface Playing {
   source_fps: number
   /** Of another form that is shown in the place of the one asked for: in what it differs; null: it is as asked. */
   instead?: Record<string, unknown> | null
+  /** Why no picture has come for a while though the camera gives some; empty while all is well. */
+  trouble?: string
 }
 
 /** Another form of the camera in words. */

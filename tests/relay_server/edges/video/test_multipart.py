@@ -12,6 +12,7 @@ from twisted.internet import reactor, task
 from twisted.internet.defer import DeferredList, ensureDeferred
 
 from relay_protocol import limits, link
+from relay_protocol.errors import Unavailable
 from relay_server.edges import site
 from relay_server.edges.video import multipart
 from relay_server.video import patience
@@ -203,7 +204,7 @@ async def test_a_busy_robot_is_503_in_its_words(show: Show) -> None:
     stream = await show.joined(control)
     show.shows(stream, jpeg())
     assert (await looker.head())[0] == 200
-    stream.message(link.NotPlaying(reason="no more"))
+    stream.shut(Unavailable("no more"))
     assert await looker.closed() < 1
 
 
@@ -214,7 +215,7 @@ async def test_a_picture_right_before_the_end_still_comes(show: Show) -> None:
     looker = show.looks(STREAM, window=4096)
     stream = await show.joined(control)
     show.shows(stream, jpeg(60_000))
-    stream.message(link.NotPlaying(reason="no more"))
+    stream.shut(Unavailable("no more"))
     assert (await looker.head())[0] == 200
     assert (await looker.part())[1] == jpeg(60_000)
     assert await looker.closed() < 1

@@ -12,7 +12,7 @@ from switchboard_pulse import Pulse
 from twisted.internet import reactor
 from twisted.logger import LogEvent, globalLogPublisher
 
-from relay_protocol import link
+from relay_protocol.errors import Unavailable
 from relay_server.edges.video.multipart import LEAVING_SECONDS
 from relay_server.store import Store
 from relay_server.tls import ServerTls
@@ -59,7 +59,7 @@ async def test_the_end_of_a_stream_leaves_nothing_behind(show: Show) -> None:
     looker = await looks(show)
     stream = await show.joined(control)
     show.shows(stream, jpeg(60_000))
-    stream.message(link.NotPlaying(reason="no more"))
+    stream.shut(Unavailable("no more"))
     assert (await looker.head())[0] == 200
     assert (await looker.part())[1] == jpeg(60_000)
     assert await looker.closed() < LEAVING_SECONDS
