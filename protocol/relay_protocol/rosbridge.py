@@ -7,11 +7,12 @@ once, when its type is known.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
+from msgspec import UNSET
 
-from relay_protocol import json_keys, jsontext
+from relay_protocol import json_keys, jsontext, nonfinite
 from relay_protocol.limits import JSON_DEPTH
 from relay_protocol.message import Body, Message
 from relay_protocol.qos import QoS
@@ -193,9 +194,10 @@ _decode: Callable[[bytes], ClientOp] = msgspec.json.Decoder(ClientOp).decode
 
 
 def decode(data: bytes) -> ClientOp:
-    """One client message.
+    """One client message. NaN and infinity in its body are marked, see :mod:`relay_protocol.nonfinite`.
 
     :raises MalformedMessage: not strict JSON, a key twice, an unknown ``op``, a field missing or of the wrong type
+    :raises NotFinite: NaN or infinity outside of the body
     """
     # As jsontext.decode, with fewer calls: this is done for every message of every client. What is ASCII, without a
     # list, and too short for many objects in each other has passed all that check_text looks for.
@@ -211,6 +213,14 @@ def decode(data: bytes) -> ClientOp:
 
 
 def _decode_as_meant(data: bytes, fault: Exception) -> ClientOp:
+    if nonfinite.may_hold_literals(data):
+        marked = nonfinite.mark_fields(data, _BODIES)
+        if marked is not None:
+            data = marked
+            try:
+                return _decode(data)
+            except jsontext.FAULTS as error:
+                fault = error
     if any(words in str(fault) for words in _MAY_BE_MEANT):
         try:
             return _decode(_as_meant(data))
@@ -251,34 +261,42 @@ class _Request(msgspec.Struct, frozen=True):
     action: Any = None
 
 
-def unreadable_request(data: bytes) -> CallService | SendActionGoal | None:
-    """The call or goal that somebody waits for an answer to, although :func:`decode` refused the message.
+class Unreadable(NamedTuple):
+    """What can be read of a message that :func:`decode` refused.
 
-    :return: nothing but its name and ``id``, as far as they can be read; ``None`` for any other op, and without either
+    :param id: as far as it is one
+    :param request: the call or goal that a client waits for an answer to, with nothing but its name and ``id``;
+        ``None`` for any other op, and without either
     """
+
+    id: Id = None
+    request: CallService | SendActionGoal | None = None
+
+
+def unreadable(data: bytes) -> Unreadable:
+    """What can be read of a message that :func:`decode` refused; all is ``None`` of what is no JSON object."""
+    if nonfinite.may_hold_literals(data):
+        data = nonfinite.mark(data)
     try:
         request = msgspec.json.decode(data, type=_Request)
     except jsontext.FAULTS:
-        return None
-    if request.op == "call_service":
-        name = request.service
-    elif request.op == "send_action_goal":
-        name = request.action
-    else:
-        return None
+        return Unreadable()
     id = _usable(request.id)
-    if id is None and not isinstance(name, str):
-        return None
+    name = {"call_service": request.service, "send_action_goal": request.action}.get(str(request.op), UNSET)
+    if name is UNSET or (id is None and not isinstance(name, str)):
+        return Unreadable(id)
     name = name if isinstance(name, str) else ""
     if request.op == "call_service":
-        return CallService(service=name, id=id)
-    return SendActionGoal(action=name, id=id)
+        return Unreadable(id, CallService(service=name, id=id))
+    return Unreadable(id, SendActionGoal(action=name, id=id))
 
 
 def _usable(id: Any) -> Id:
     if isinstance(id, float) and id.is_integer() and abs(id) <= _EXACT:
         return int(id)
-    return id if isinstance(id, (str, int)) and not isinstance(id, bool) else None
+    if isinstance(id, bool) or not isinstance(id, (str, int)) or id in nonfinite.NUMBERS:
+        return None
+    return id
 
 
 def publish(topic: str, body: bytes) -> bytes:

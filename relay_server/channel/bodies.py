@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from twisted.internet.defer import Deferred
 
-from relay_protocol import jsontext, limits, link
+from relay_protocol import jsontext, limits, link, nonfinite
 from relay_protocol.errors import Invalid
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.wire import Wire
@@ -42,13 +42,26 @@ class Bodies:
         :raises NotFound: the type's definition is not known
         """
         value = jsontext.decode_any(text) if text else {}
+        types = self._wire.robot.types
+        if self._wire.cdr or types.knows(part):
+            body = types.args_from_json(part, value, self._now_ns())
         if not self._wire.cdr:
-            body = jsontext.encode({} if value is None else value)
-        else:
-            body = self._wire.robot.types.args_from_json(part, value, self._now_ns())
+            body = self._as_json(part, text, value)
         if len(body) > LARGEST:
             raise Invalid(f"{part} has {len(body)} bytes here; a robot takes at most {LARGEST}")
         return body
+
+    def _as_json(self, part: str, text: bytes, value: Any) -> bytes:
+        """What a client said, for a robot that speaks JSON: in its own words, so that numbers keep all their digits."""
+        if value is None or not text:
+            return b"{}"
+        if not isinstance(value, dict | list):
+            raise Invalid(f"{part} must be an object, or a list of its fields in order")
+        if isinstance(value, list) and self._wire.robot.types.knows(part):
+            fields = self._wire.robot.types.definitions(part)[part].fields
+            values = msgspec.json.decode(text, type=list[msgspec.Raw])
+            text = jsontext.encode({field.name: each for field, each in zip(fields, values, strict=False)})
+        return nonfinite.as_null(text)
 
     def to_client(self, part: str, body: bytes) -> bytes:
         """A body as JSON.
@@ -58,15 +71,17 @@ class Bodies:
         """
         if self._wire.cdr:
             return self._wire.robot.types.to_json(part, body)
-        return jsontext.encode(jsontext.decode_any(body))
+        return body if jsontext.decode_any(body) is not None else b"{}"
 
     def from_robot(self, part: str, cdr: str | None, text: Text) -> bytes:
         """A body out of a message of the robot, from its ``cdr`` or its ``args`` or ``values``.
 
         :raises Invalid: it is none
         """
-        if cdr is None:
+        if cdr is None and self._wire.cdr:
             return self.from_client(part, bytes(text or b""))
+        if cdr is None:
+            return self.to_client(part, bytes(text or b"{}"))
         if not self._wire.cdr:
             raise Invalid("the robot announced JSON and sent CDR")
         return link.from_base64(cdr, "cdr")

@@ -7,10 +7,11 @@ from collections.abc import Callable, Collection
 
 import orjson
 
-from relay_protocol import jsontext, link, rosbridge
+from relay_protocol import jsontext, link, nonfinite, rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError
 from relay_protocol.limits import MIB
 from relay_protocol.rights import Operation
+from relay_protocol.ros.fast_writer import LARGEST_BODY
 from relay_protocol.ros_types import Writer
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
@@ -164,16 +165,18 @@ class Publications:
         robot = self._wire.link
         if robot is None or publication.phase in (Phase.WAITING, Phase.FAILED) or self._untyped(publication):
             return None
-        if self._wire.cdr:
-            try:
-                writer = self._wire.robot.types.writer(publication.type, checked=True)
-            except SwitchboardError as error:
-                # The robot said it was known: it told of a service's type, or of something else that is no message.
-                self.refused(publication.number, str(error))
-                return None
-            publication.send = _as_cdr(writer, self._now_ns, _way(robot, publication))
-        else:
-            publication.send = _as_it_came(_way(robot, publication))
+        put, types = _way(robot, publication), self._wire.robot.types
+        if not self._wire.cdr and not types.knows(publication.type):
+            publication.send = _unchecked(put)
+            return publication.send
+        try:
+            writer = types.writer(publication.type, checked=True)
+        except SwitchboardError as error:
+            # The robot said it was known: it told of a service's type, or of something else that is no message.
+            self.refused(publication.number, str(error))
+            return None
+        make = _as_cdr if self._wire.cdr else _as_json
+        publication.send = make(writer, self._now_ns, put)
         return publication.send
 
     def _hold(self, publication: Publication, message: Held) -> None:
@@ -265,7 +268,7 @@ class Publications:
         return (publication.type if publication else None) or self._wire.robot.graph.topic_type(topic) or ""
 
     def _untyped(self, publication: Publication) -> bool:
-        return self._wire.cdr and not self._wire.robot.types.knows(publication.type)
+        return not self._definitions.settled(publication.type)
 
     def _get(self, member: Member, topic: str, type_name: str) -> Publication:
         known = self.known_type(topic)
@@ -373,11 +376,31 @@ def _as_cdr(write: Writer, now_ns: Callable[[], int], put: Way) -> Send:
     return send
 
 
+def _as_json(write: Writer, now_ns: Callable[[], int], put: Way) -> Send:
+    """Send messages to a robot that speaks JSON: in the client's own words, when they are of the topic's type.
+
+    So numbers keep all their digits, and fields that were left out stay out.
+    """
+
+    def send(body: bytes, stamp: int, source: int) -> None:
+        write(body, now_ns())
+        put(stamp, source, _json_for_robot(body))
+
+    return send
+
+
+def _json_for_robot(body: bytes) -> bytes:
+    body = nonfinite.as_null(body)
+    if len(body) > LARGEST_BODY:
+        raise Invalid(f"the message has {len(body)} bytes as JSON; a robot takes at most {LARGEST_BODY}")
+    return body
+
+
 _BRACE = ord("{")
 
 
-def _as_it_came(put: Way) -> Send:
-    """Send messages to a robot that speaks JSON: in the client's own words, once any reader can take them.
+def _unchecked(put: Way) -> Send:
+    """Send messages to a robot that speaks JSON and can't tell the type: any object that every reader can take.
 
     msgspec has skipped the body, which finds all that is not JSON except a number beyond any double; the text around
     it was checked for UTF-8 and depth.
@@ -391,6 +414,6 @@ def _as_it_came(put: Way) -> Send:
                 orjson.loads(body)
             except ValueError as error:
                 raise Invalid(f"the message can't be read: {error}") from None
-        put(stamp, source, body)
+        put(stamp, source, _json_for_robot(body))
 
     return send

@@ -329,7 +329,8 @@ class Subscriptions:
             uplink.retype(next(iter(self._types_of(uplink.topic)), ""))
         if self._wire.link is None or not uplink.type or not uplink.served:
             return
-        self._definitions.want(uplink.type)
+        if self._wire.cdr:
+            self._definitions.want(uplink.type)
         uplink.asked()
         self._send(uplink)
 

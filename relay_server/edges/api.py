@@ -5,7 +5,7 @@ A cookie that changes state counts only with a listed Origin. Every error is pro
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Container, Mapping
 from typing import Any, Protocol, TypeVar
 
 import msgspec
@@ -20,7 +20,7 @@ from werkzeug.exceptions import HTTPException, MethodNotAllowed
 from werkzeug.exceptions import NotFound as NothingHere
 from werkzeug.routing import RequestRedirect
 
-from relay_protocol import jsontext
+from relay_protocol import jsontext, nonfinite
 from relay_protocol.errors import Invalid, Refused, SwitchboardError, Unavailable
 from relay_protocol.limits import TICKET_SECONDS
 from relay_protocol.realms import DEFAULT_REALM
@@ -351,15 +351,17 @@ STREAMED = object()
 """Result of a handler that has written the answer itself."""
 
 
-def body_of(request: Request, kind: type[T]) -> T:
+def body_of(request: Request, kind: type[T], numbers: Container[str] = ()) -> T:
     """A request's JSON, checked.
 
-    :raises Invalid: it is not said to be JSON
+    :param numbers: fields with values of a robot's types, in which NaN and infinity are marked, see
+        :mod:`relay_protocol.nonfinite`
+    :raises Invalid: it is not said to be JSON, or has NaN or infinity in another field
     :raises MalformedMessage: it is none, or not of this form
     """
     if (request.getHeader("content-type") or "").partition(";")[0].strip().lower() != "application/json":
         raise Invalid("send the body as application/json")
-    return jsontext.decode(msgspec.json.Decoder(kind), request.content.read())
+    return nonfinite.decode(msgspec.json.Decoder(kind), request.content.read(), numbers)
 
 
 def _me(principal: Principal) -> dict[str, Any]:

@@ -149,7 +149,11 @@ def _order_of(request: Request) -> Order:
     :raises Invalid: its body is not said to be JSON
     :raises MalformedMessage: it is no order
     """
-    return body_of(request, StopOrder).order if is_stop(request) else body_of(request, Order)
+    return (
+        body_of(request, StopOrder).order
+        if is_stop(request)
+        else body_of(request, Order, ("args", "msg", "value"))
+    )
 
 
 def is_stop(request: Request) -> bool:

@@ -96,7 +96,7 @@ class Giving:
         :raises SwitchboardError: it is refused, or can't begin
         """
         notice(request.channel.transport)
-        wish = body_of(request, Wish)
+        wish = body_of(request, Wish, ("goal",))
         ask = Ask(bytes(wish.goal), wish.type, wish.unwatched)
         # Before the goal is given: what can't be read of a request keeps it from being done.
         seconds = wait_preferred(request) or 0.0

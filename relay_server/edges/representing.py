@@ -151,7 +151,7 @@ class Representing:
         """
         form = sent(request.getHeader("content-type"))
         if form is JSON:
-            message = body_of(request, Message)
+            message = body_of(request, Message, ("value",))
             _see_own("topic", message.topic, name)
             return message
         meant: Meant = await self._read(request, asker, name, form, message_in)
@@ -161,7 +161,7 @@ class Representing:
         """The value of a parameter in a request's body, as JSON; see :meth:`message`."""
         form = sent(request.getHeader("content-type"))
         if form is JSON:
-            param = body_of(request, Value)
+            param = body_of(request, Value, ("value",))
             _see_own("name", param.name, name)
             return bytes(param.value)
         return jsontext.encode(await self._read(request, asker, name, form, value_in))

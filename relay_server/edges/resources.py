@@ -213,7 +213,7 @@ class RobotResources:
 
     async def _call(self, request: Request, name: str) -> Any:
         asker = await self._asker(request, passes=resolve(name) in URGENT)
-        body, moment = body_of(request, Call), self._moment(request)
+        body, moment = body_of(request, Call, ("args",)), self._moment(request)
         seconds = wait_preferred(request, LEAST_TIMEOUT) if body.timeout is UNSET else body.timeout
         timeout = TIMEOUT if seconds is None else seconds
 

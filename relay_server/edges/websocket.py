@@ -20,6 +20,7 @@ from twisted.logger import Logger
 
 from relay_protocol import limits, rosbridge
 from relay_protocol.errors import PeerError, SwitchboardError, Unavailable
+from relay_protocol.nonfinite import NotFinite
 from relay_server import closing, wsframe
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth import Opening
@@ -237,7 +238,7 @@ class ClientProtocol(BoundedProtocol):
     def _authenticate(self, payload: bytes) -> None:
         try:
             message = rosbridge.decode(payload)
-        except PeerError as error:
+        except (PeerError, NotFinite) as error:
             self.close(closing.UNAUTHENTICATED, f"log in first: {error}")
             return
         if not isinstance(message, rosbridge.Auth):

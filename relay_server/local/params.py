@@ -11,7 +11,7 @@ import contextlib
 from collections import deque
 from typing import Any
 
-from relay_protocol import jsontext
+from relay_protocol import jsontext, nonfinite
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound, SwitchboardError, Unavailable
 from relay_protocol.limits import NAME
 from relay_protocol.rights import Operation
@@ -84,7 +84,7 @@ async def _ask(
     answer = await session.channel.asking.call(
         name,
         found.types[0],
-        jsontext.encode(request),
+        jsontext.encode(nonfinite.with_marks(request)),
         seconds,
         session.calling.sent(name, session.not_before if stamp is None else stamp),
     )
@@ -156,7 +156,7 @@ async def set_param(session: Session, args: Any) -> Any:
     try:
         node, parameter = _split(args)
         try:
-            value = jsontext.decode_any(given.encode())
+            value = nonfinite.plain(jsontext.decode_any(nonfinite.mark(given.encode())))
         except MalformedMessage as error:
             raise Invalid(f"'value' must be JSON text: {error}") from None
         session.judge(Operation.CALL, f"{node}/set_parameters")
@@ -167,8 +167,8 @@ async def set_param(session: Session, args: Any) -> Any:
 
 
 def _ambiguous(value: Any) -> bool:
-    """JSON does not tell 1 from 1.0, nor bytes from integers, nor what an empty list would hold."""
-    return isinstance(value, list) or (isinstance(value, int) and not isinstance(value, bool))
+    """JSON does not tell 1 from 1.0, NaN from nothing, nor bytes from integers, nor what an empty list would hold."""
+    return isinstance(value, list | None) or (isinstance(value, int) and not isinstance(value, bool))
 
 
 async def _type_it_has(session: Session, node: str, parameter: str) -> int | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import math
 from typing import Any
 
 from relay_protocol.errors import Invalid
@@ -57,12 +58,16 @@ def to_parameter(value: Any, has: int | None = None) -> dict[str, Any]:
 
     :param value: decoded from JSON
     :param has: the type the parameter has now, where that is known: it decides between 1 and 1.0, bytes and
-        integers, and what an empty list is of
+        integers, what an empty list is of, and whether null is NaN, as which it is read
     :raises Invalid: no parameter can have this value
     """
     if isinstance(value, list):
+        if has == DOUBLES or any(isinstance(each, float) for each in value):
+            value = [math.nan if each is None else each for each in value]
         kind = _kind_of_list(value, has)
     else:
+        if value is None and has == DOUBLE:
+            value = math.nan
         kind = _kind(value)
         if kind == INTEGER and has == DOUBLE:
             kind = DOUBLE
@@ -78,6 +83,10 @@ def _kind(value: Any) -> int:
         return DOUBLE
     if isinstance(value, str):
         return STRING
+    if value is None:
+        raise Invalid(
+            "null is NaN, which only a parameter of numbers with a fraction can be; this one is none now"
+        )
     raise Invalid("a parameter is a boolean, a number, a string, or a list of one of these")
 
 

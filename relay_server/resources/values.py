@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from rdflib import RDF, RDFS, SOSA, XSD, BNode, Graph, Literal, URIRef
 from rdflib.term import Node
 
-from relay_protocol import jsontext
+from relay_protocol import jsontext, nonfinite
 from relay_protocol.errors import Invalid, MalformedMessage
 from relay_protocol.limits import JSON_DEPTH
 from relay_server.resources.vocabulary import DATATYPES, field_of, own_word, type_of
@@ -182,12 +182,12 @@ def _none(text: str, place: str, what: str) -> Invalid:
     return Invalid(f"{place}: '{text[:40]}' is no {what}")
 
 
-def _float_read(text: str, place: str) -> float | None:
+def _float_read(text: str, place: str) -> float | str | None:
     text = text.strip()
     if text == "NaN":
         return None
     if text.lstrip("+-") == "INF":
-        raise Invalid(f"{place} is infinite, which no message can be that goes by way of JSON")
+        return nonfinite.INFINITE[text.startswith("-")]
     if _FLOAT.match(text) is None:
         raise _none(text, place, "number")
     number = float(text)

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from twisted.internet.defer import CancelledError, Deferred
 
-from relay_protocol import jsontext, rosbridge
+from relay_protocol import jsontext, nonfinite, rosbridge
 from relay_protocol.errors import Refused, SwitchboardError
 from relay_protocol.limits import KIB, MIB
 from relay_protocol.link import MotionPolicy
+from relay_protocol.nonfinite import NotFinite
 from relay_protocol.rights import Operation
 from relay_server.channel import resolve
 from relay_server.channel.wire import Sent
@@ -172,6 +173,8 @@ def _arguments(service: str, raw: bytes) -> Any:
     try:
         if len(raw) > LOCAL_BYTES:
             raise Refused(f"arguments for the relay's own services may have {LOCAL_BYTES} bytes")
+        if nonfinite.is_marked(raw):
+            raise NotFinite(f"NaN and infinity are no arguments of {service}; send numbers")
         return jsontext.decode_any(raw) if raw else {}
     except SwitchboardError:
         if service != STOP:

@@ -13,6 +13,7 @@ from twisted.logger import Logger
 from relay_protocol import rosbridge
 from relay_protocol.errors import MalformedMessage, PeerError, Refused, SwitchboardError
 from relay_protocol.limits import KIB
+from relay_protocol.nonfinite import NotFinite
 from relay_protocol.rights import Operation
 from relay_server import closing
 from relay_server.access import BadCredentials, Permit
@@ -224,7 +225,7 @@ class Session:
             operation = rosbridge.decode(data)
             if joined and isinstance(operation, rosbridge.Fragment):
                 raise MalformedMessage("a message in fragments can't be a fragment itself")
-        except PeerError as error:
+        except (PeerError, NotFinite) as error:
             self._no_rosbridge(error, data)
             return
         try:
@@ -261,16 +262,17 @@ class Session:
                 self.share.refused()
                 raise
 
-    def _no_rosbridge(self, error: PeerError, data: bytes) -> None:
-        self._malformed += 1
+    def _no_rosbridge(self, error: SwitchboardError, data: bytes) -> None:
+        # NaN in the wrong place is a value that does not fit, not a message that is none.
+        self._malformed += not isinstance(error, NotFinite)
         if not self.share.counting:
             self.share.refused()
         if self._malformed == 1 and self._noise.take():
             self.log.info(
                 "client {number} sent what is not rosbridge: {reason}", number=self.number, reason=str(error)
             )
-        request = rosbridge.unreadable_request(data)
-        self.tell("error", str(error), None if request is None else request.id)
+        id, request = rosbridge.unreadable(data)
+        self.tell("error", str(error), id)
         if request is not None:
             answer_failed(self, request, error)
         if self._malformed >= MALFORMED:

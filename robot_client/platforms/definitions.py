@@ -105,7 +105,8 @@ def installed(name: str, where: Iterable[Path], suffix: str = "") -> str | None:
     for prefix in where:
         path = prefix / "share" / package / kind / (short + (suffix or "." + kind))
         try:
-            return path.read_text(encoding="utf-8")
+            # As rosidl tells lines apart: a form feed ends one too. In a text that is sent only a line feed does.
+            return "".join(f"{line}\n" for line in path.read_text(encoding="utf-8").splitlines())
         except (OSError, UnicodeDecodeError):
             continue
     return None

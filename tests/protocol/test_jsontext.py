@@ -186,9 +186,11 @@ def test_what_is_in_range_at_a_glance_any_reader_takes(text: str, junk: str, at:
     at %= len(text) + 1
     body = (text[:at] + junk + text[at:]).encode()
     try:
-        rosbridge.decode(b'{"op":"publish","topic":"/x","msg":' + body + b"}")
+        message = rosbridge.decode(b'{"op":"publish","topic":"/x","msg":' + body + b"}")
     except MalformedMessage:
         return
+    assert isinstance(message, rosbridge.Publish)
+    body = bytes(message.msg)
     if jsontext.in_range(body):
         orjson.loads(body)
         json.loads(body, parse_float=jsontext._in_range, parse_int=jsontext._in_range)

@@ -145,7 +145,7 @@ def test_who_waits_for_an_answer_is_seen_in_what_is_malformed(text: str, wanted:
     """A call or a goal is known by its op, and by its name or its id."""
     with pytest.raises(MalformedMessage):
         rosbridge.decode(text.encode())
-    assert rosbridge.unreadable_request(text.encode()) == wanted
+    assert rosbridge.unreadable(text.encode()).request == wanted
 
 
 @pytest.mark.parametrize("args", [b"[" * 200 + b"]" * 200, b'"\xff"'])
@@ -154,13 +154,13 @@ def test_who_waits_is_seen_beside_a_body_that_is_refused(args: bytes) -> None:
     text = b'{"op":"call_service","id":"1","service":"/s","args":' + args + b"}"
     with pytest.raises(MalformedMessage):
         rosbridge.decode(text)
-    assert rosbridge.unreadable_request(text) == rosbridge.CallService(service="/s", id="1")
+    assert rosbridge.unreadable(text) == ("1", rosbridge.CallService(service="/s", id="1"))
 
 
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
 def test_nobody_waits_for_an_answer_to_junk(data: bytes) -> None:
     """No bytes make the look fail."""
-    assert rosbridge.unreadable_request(data) is None
+    assert rosbridge.unreadable(data) == (None, None)
 
 
 def test_an_unknown_op_is_told_with_those_known() -> None:

@@ -107,6 +107,8 @@ class MemoryLink:
         self.pings: list[Deferred[float]] = []
         self.obeys: Callable[[Order], None] | None = None
         """Carries out orders about motion."""
+        self.has_no_type: Callable[[link.Failed], None] | None = None
+        """Takes the answer of a robot that can't tell definitions."""
 
     def send(self, message: link.Message) -> None:
         """Keep it, once it has proved to be JSON that a robot can read."""
@@ -114,6 +116,8 @@ class MemoryLink:
         self.said.append(message)
         if self.obeys is not None and isinstance(message, Order):
             self.obeys(message)
+        if self.has_no_type is not None and isinstance(message, link.GetType):
+            self.has_no_type(link.Failed(what="get_type", ref=message.type, reason="small"))
 
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Keep it."""
@@ -271,11 +275,16 @@ class World:
         """The control link ends."""
         self.registry.lost(self.robot, self.control)
 
-    def robot_joins(self) -> MemoryLink:
-        """The robot dials with the ticket it was given."""
+    def robot_joins(self, *, tells_types: bool = False) -> MemoryLink:
+        """The robot dials with the ticket it was given.
+
+        :param tells_types: whether one that speaks JSON leaves it to the test to answer for definitions
+        """
         self.clock.advance(0)
         ticket = self.control.take(link.OpenChannel)[-1].ticket
         self.link = MemoryLink()
+        if "cdr" not in self.robot.encodings and not tells_types:
+            self.link.has_no_type = self.channel.message
         self.channels.redeem(ticket).joined(self.link)
         return self.link
 

@@ -175,7 +175,7 @@ def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) 
     :param top: the type whose text it is
     :param definitions: what :func:`parse` made of it
     """
-    main, *contained = _sections(text.splitlines())
+    main, *contained = _sections(text.split("\n"))
     bodies = {each: body.split("\n") for each, body in _BUILT_IN.items()}
     for lines in reversed(contained):
         bodies[normalise(lines[0].strip()[4:].strip())] = lines[1:]
@@ -194,7 +194,7 @@ def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) 
 
 
 def _parse_all(type_name: str, text: str) -> dict[str, Definition]:
-    main, *contained = _sections(text.splitlines())
+    main, *contained = _sections(text.split("\n"))
     names = parts_of(type_name)
     bodies = dict(zip(names, _split_parts(main, len(names)), strict=True))
     for lines in contained:

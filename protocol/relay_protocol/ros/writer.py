@@ -19,6 +19,7 @@ import pybase64
 
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import COMMAND_FRAME
+from relay_protocol.nonfinite import NUMBERS, shown
 from relay_protocol.ros.definition import BYTES, HEADER, Definition, Field, FieldType, Primitive, Shape
 from relay_protocol.ros.reader import Run, group_numbers, layouts
 
@@ -27,7 +28,8 @@ Write = Callable[[bytearray, Any, int], None]
 
 _U32 = struct.Struct("<I").pack
 _PADDING = (b"", b"\0", b"\0\0", b"\0\0\0", b"\0" * 4, b"\0" * 5, b"\0" * 6, b"\0" * 7)
-_ROS1_TIME = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
+_TIME_TYPE = "builtin_interfaces/msg/Time"
+_ROS1_TIME = {_TIME_TYPE, "builtin_interfaces/msg/Duration"}
 _ROS1_NAMES = {"secs": "sec", "nsecs": "nanosec"}
 _NUMBERS = {
     "?": frozenset({bool}),
@@ -35,6 +37,7 @@ _NUMBERS = {
     "d": frozenset({float, int}),
 }
 _INTEGER = frozenset({int})
+_NO_LINE_BREAKS = {ord("\r"): None, ord("\n"): None}
 _ZEROS = object()
 """Default of a fixed array of numbers, which may be long."""
 _KINDS = {
@@ -86,12 +89,12 @@ class WriterFactory:
 
         def write(out: bytearray, value: Any, now: int) -> None:
             if type(value) is not dict:
-                raise Mismatch(f"must be an object, not {_kind(value)}")
+                raise Mismatch(_not_a_message(value, definition))
             if ros1 and not known.issuperset(value):
                 value = {_ROS1_NAMES.get(name, name): part for name, part in value.items()}
             if not known.issuperset(value):
                 name = next(name for name in value if name not in known)
-                raise Mismatch(f"is no field of {definition.name}", shorten(name))
+                raise Mismatch(_unknown(name, definition), shorten(shown(name)))
             if header and "stamp" not in value:
                 value = {**value, "stamp": {"sec": now // 10**9, "nanosec": now % 10**9}}
             for step in steps:
@@ -119,6 +122,23 @@ class WriterFactory:
         else:
             one = _string(kind) if kind.base == "string" else _wstring(kind)
         return one if kind.shape is Shape.SCALAR else _many(kind, one)
+
+
+def _unknown(name: str, definition: Definition) -> str:
+    """Why a name is refused that is no field."""
+    if definition.name == HEADER and name == "seq":
+        return f"is no field of {HEADER} in ROS 2; leave it out"
+    return f"is no field of {definition.name}"
+
+
+def _not_a_message(value: Any, definition: Definition) -> str:
+    """Why a value is refused that is no message."""
+    if definition.name == _TIME_TYPE and type(value) is str:
+        return (
+            f'must be an object, not {_kind(value)}: send {{"sec": ..., "nanosec": ...}}, '
+            "or leave the stamp of a header out for the present time"
+        )
+    return f"must be an object, not {_kind(value)}"
 
 
 def _default(field: Field) -> Any:
@@ -195,6 +215,8 @@ def fit(value: Any, primitive: Primitive) -> Any:
     if primitive.code in "fd":
         if value is None:
             return float("nan")
+        if type(value) is str and value in NUMBERS:
+            return NUMBERS[value]
         if type(value) not in (int, float):
             raise Mismatch(f"must be a number, not {_kind(value)}")
     elif type(value) is float and value.is_integer():
@@ -224,7 +246,7 @@ def _number_array(kind: FieldType, primitive: Primitive) -> Write:
     def write(out: bytearray, value: Any, now: int) -> None:
         if value is _ZEROS:
             body = bytes(kind.length * primitive.size)
-        elif is_bytes and type(value) is str:
+        elif is_bytes and type(value) is str and value not in NUMBERS:
             body = _from_base64(value)
             _check_length(kind, len(body))
         else:
@@ -266,7 +288,8 @@ def _array_bytes(code: str, values: list[Any]) -> bytes:
 
 def _from_base64(text: str) -> bytes:
     try:
-        return pybase64.b64decode(text, validate=True)
+        # Some encoders break lines (RFC 2045 section 6.8), with CR LF or LF; nothing else beside the alphabet is taken.
+        return pybase64.b64decode(text.translate(_NO_LINE_BREAKS), validate=True)
     except ValueError:
         raise Mismatch("is a string that is not base64") from None
 
@@ -331,7 +354,7 @@ def _wstring(kind: FieldType) -> Write:
 
 
 def _text(kind: FieldType, value: Any, encoding: str) -> bytes:
-    if type(value) is not str:
+    if type(value) is not str or value in NUMBERS:
         raise Mismatch(f"must be a string, not {_kind(value)}")
     if "\0" in value:
         raise Mismatch("must not hold a NUL character, which ends a string in ROS")
@@ -342,6 +365,8 @@ def _text(kind: FieldType, value: Any, encoding: str) -> bytes:
 
 
 def _kind(value: Any) -> str:
+    if type(value) is str and value in NUMBERS:
+        return shown(value)
     return _KINDS.get(type(value), type(value).__name__)
 
 

@@ -100,7 +100,7 @@ BAD = {
     "op a number": '{"op": 5}',
     "a field missing": '{"op": "subscribe"}',
     "a field of the wrong type": '{"op": "subscribe", "topic": 5}',
-    "NaN": '{"op": "publish", "topic": "/x", "msg": {"data": NaN}}',
+    "a word that is no number": '{"op": "publish", "topic": "/x", "msg": {"data": nan}}',
     "a control character": '{"op": "publish", "topic": "/x\n", "msg": {}}',
 }
 

@@ -208,9 +208,9 @@ def test_a_robot_of_json_is_called_with_json(world: World) -> None:
     world.robot_comes(encodings=["json"])
     person = world.person()
     world.robot_joins()
-    person.says("call_service", service="/reset", args={"hard": True})
+    person.says("call_service", service="/own", type="a/srv/Own", args={"hard": True})
     (call,) = world.link.all(link.CallService)
-    assert (call.cdr, bytes(call.args)) == (None, b'{"hard":true}')  # type: ignore[arg-type]
+    assert (call.cdr, bytes(call.args)) == (None, b'{"hard": true}')  # type: ignore[arg-type]
     answer(world, cdr=None, values=msgspec.Raw(b'{"done": 1}'))
     assert person.hears("service_response")[0]["values"] == {"done": 1}
 

@@ -213,7 +213,7 @@ def test_a_robot_of_json_gets_and_gives_json(world: World) -> None:
     person = with_action(world, ("json",))
     send(person, feedback=True)
     (goal,) = world.link.all(link.SendActionGoal)
-    assert (goal.cdr, bytes(goal.args)) == (None, b'{"order":3}')  # type: ignore[arg-type]
+    assert (goal.cdr, bytes(goal.args)) == (None, b'{"order": 3}')  # type: ignore[arg-type]
     values = msgspec.Raw(b'{ "sequence": [1] }')
     world.channel.message(link.ActionFeedback(id=goal.id, values=values))
     world.channel.message(link.ActionResult(id=goal.id, status=4, result=True, values=values))

@@ -9,7 +9,7 @@ import pytest
 from relay_protocol import link
 from relay_protocol.qos import QoS
 from relay_server.channel import publications as module
-from tests.relay_server.memory import STRING, TRIGGER, TWIST, World, words
+from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World, words
 
 
 def said(world: World) -> list[str]:
@@ -335,12 +335,94 @@ def test_a_robot_of_json_gets_objects_with_numbers_that_are_finite(world: World,
     person = world.person()
     person.says("set_level", level="error")
     world.robot_joins()
-    person.session.message(b'{"op":"publish","topic":"/chatter","msg":%s}' % body)
+    person.session.message(b'{"op":"publish","topic":"/own","type":"a/Own","msg":%s}' % body)
     assert not world.link.samples
     (error,) = person.told()
-    assert error.startswith("publish /chatter: ")
-    person.session.message(b'{"op":"publish","topic":"/chatter","msg":  {"a" : 1e308}  }')
+    assert error.startswith("publish /own: ")
+    person.session.message(b'{"op":"publish","topic":"/own","type":"a/Own","msg":  {"a" : 1e308}  }')
     assert [sent for _, _, sent in world.link.samples] == [b'{"a" : 1e308}']
+
+
+OWN = "vendor_msgs/msg/Own"
+OWN_TEXT = "int64 whole\nfloat64[] many\nfloat32 one\nuint8[] raw\nstring text\nstd_msgs/Header header\n" + (
+    "=" * 80 + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("topic", "type_name", "msg", "reason"),
+    [
+        ("/cmd_vel", TWIST, '{"linear":{"x":true}}', "linear.x must be a number, not a boolean"),
+        ("/cmd_vel", TWIST, '{"linear":{"x":"1"}}', "linear.x must be a number, not a string"),
+        ("/cmd_vel", TWIST, '"1"', "must be an object, not a string"),
+        ("/cmd_vel", TWIST, "null", "must be an object, not null"),
+        ("/cmd_vel", TWIST, "[1]", "must be an object, not an array"),
+        ("/cmd_vel", TWIST, '{"linear":{"w":1}}', "linear.w is no field of geometry_msgs/msg/Vector3"),
+        ("/own", OWN, '{"whole":9223372036854775808}', "whole is out of range for int64"),
+        ("/own", OWN, '{"whole":0.5}', "whole must be an integer, not a fraction"),
+        ("/own", OWN, '{"whole":NaN}', "whole must be an integer, not NaN"),
+        ("/own", OWN, '{"raw":"?"}', "raw is a string that is not base64"),
+        ("/own", OWN, '{"one":1e39}', "one is out of range for float32"),
+    ],
+)  # fmt: skip
+def test_a_robot_of_json_is_sent_nothing_that_is_not_of_the_type(
+    world: World, topic: str, type_name: str, msg: str, reason: str
+) -> None:
+    """Checked as for CDR, by the robot's definition, or the relay's own of a common type."""
+    person = json_robot(world)
+    text = f'{{"op":"publish","id":"p","topic":"{topic}","type":"{type_name}","msg":{msg}}}'
+    person.session.message(text.encode())
+    tells(world)
+    assert person.told() == [
+        f"publish {topic}: {type_name}{'' if reason.startswith('must') else ':'} {reason}"
+    ]
+    assert not world.link.samples
+
+
+@pytest.mark.parametrize(
+    ("msg", "sent"),
+    [
+        ('{"whole":9007199254740993, "many":[0.1,1e300,5,1E2]}', None),
+        ('{"whole": -9223372036854775808}', None),
+        ('{"header":{"stamp":{"secs":1}}, "raw":[1,2]}', None),
+        ('{"many":[NaN, -Infinity,1],"one":Infinity,"text":"NaN\\""}',
+         '{"many":[null, null,1],"one":null,"text":"NaN\\""}'),
+        ("{}", None),
+    ],
+)  # fmt: skip
+def test_a_robot_of_json_is_sent_the_clients_own_words(world: World, msg: str, sent: str | None) -> None:
+    """Numbers keep all their digits; NaN and infinity, which strict JSON lacks, are null."""
+    person = json_robot(world)
+    person.session.message(f'{{"op":"publish","topic":"/own","type":"{OWN}","msg":{msg}}}'.encode())
+    tells(world)
+    assert person.told() == []
+    assert [body.decode() for _, _, body in world.link.samples] == [sent or msg]
+
+
+def test_a_robot_of_json_that_never_tells_a_type_gets_it_unchecked(world: World) -> None:
+    """After two seconds: any object; nothing else is a message."""
+    person = json_robot(world)
+    person.says("publish", topic="/own", type=OWN, msg={"any": 1})
+    assert not world.link.samples
+    world.clock.advance(2)
+    person.says("publish", topic="/own", type=OWN, msg=[1])
+    assert [body for _, _, body in world.link.samples] == [b'{"any": 1}']
+    assert person.told() == ["publish /own: 'msg' must be an object"]
+
+
+def json_robot(world: World) -> Person:
+    """A robot that speaks JSON and leaves it to the test to tell definitions; a client that wants to hear of errors."""
+    world.robot_comes(encodings=["json"])
+    person = world.person()
+    person.says("set_level", level="error")
+    world.robot_joins(tells_types=True)
+    return person
+
+
+def tells(world: World) -> None:
+    """It answers what it was asked for."""
+    for asked in world.link.take(link.GetType):
+        world.channel.message(link.TypeDefinition(type=asked.type, text={OWN: OWN_TEXT}[asked.type]))
 
 
 def test_a_robot_that_comes_back_with_another_definition_is_sent_that(world: World) -> None:

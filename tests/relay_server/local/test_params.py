@@ -126,6 +126,7 @@ def test_has_param_is_false_for_what_is_not_there_or_not_shown(person: Person) -
         ("true", {"type": 1, "bool_value": True}),
         ("0.5", {"type": 3, "double_value": 0.5}),
         ('"a"', {"type": 4, "string_value": "a"}),
+        ("NaN", {"type": 3, "double_value": None}),
     ],
 )
 def test_a_parameter_is_set_by_json_text(world: World, person: Person, text: str, sent: Any) -> None:
@@ -171,7 +172,7 @@ def test_without_a_look_at_its_type_a_whole_number_is_an_integer(world: World, p
     assert got()["successful"]
 
 
-@pytest.mark.parametrize("text", ["", "{", "null", "{}", "[[1]]", "NaN", "[" * 100])
+@pytest.mark.parametrize("text", ["", "{", "null", "{}", "[[1]]", "[null]", "nan", "[" * 100])
 def test_values_that_are_none_are_refused_in_words(world: World, person: Person, text: str) -> None:
     """Nobody asks the node to set them."""
     got = begin(person, "/rosapi/set_param", {"name": "/base:x", "value": text})

@@ -43,6 +43,16 @@ def test_what_no_parameter_can_hold_is_refused_in_words(value: Any) -> None:
         to_parameter(value)
 
 
+@pytest.mark.parametrize(
+    ("value", "has", "kind"), [(None, 3, 3), ([None], 8, 8), ([None, 1], 8, 8), ([0.5, None], None, 8)]
+)
+def test_null_is_nan_where_the_parameter_is_of_floats(value: Any, has: int | None, kind: int) -> None:
+    """As NaN is read; of anything else it is nothing."""
+    made = to_parameter(value, has)
+    assert made["type"] == kind
+    assert "nan" in repr(made)
+
+
 def test_bytes_are_a_list_of_numbers_and_nan_is_null() -> None:
     """In messages they are base64."""
     assert from_parameter({"type": 5, "byte_array_value": "AP8="}) == ([0, 255],)

@@ -100,6 +100,15 @@ def test_files_and_hashes_are_found_under_share(tmp_path: Path) -> None:
     assert type_hash("a/msg/C", where) == ""
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r", "\f", "\x85", "\u2028"])
+def test_lines_end_as_rosidl_has_it(tmp_path: Path, end: str) -> None:
+    """Whatever stands in the file, in the text that is sent a line feed ends each."""
+    folder = tmp_path / "share" / "a" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "B.msg").write_bytes(f"int8 x # why{end}# more{end}a/C y".encode())
+    assert installed("a/msg/B", [tmp_path]) == "int8 x # why\n# more\na/C y\n"
+
+
 def test_ament_prefixes_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """The robot's own ROS is asked before the Python environment."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/ws/install")

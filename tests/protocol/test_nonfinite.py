@@ -1,0 +1,149 @@
+"""NaN and infinity as Python's ``json`` writes them, in what clients send."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_protocol import nonfinite, rosbridge
+from relay_protocol.errors import Invalid, MalformedMessage, SwitchboardError
+from relay_protocol.nonfinite import NotFinite
+from tests.protocol.ros_texts import LINE, registry
+
+TYPES = registry(
+    B="float32 x\nfloat64 y\nint64 whole\nuint8[] raw\nfloat32[] f\nfloat64[2] g\nstring text\nbool on\nN[] n\n"
+    f"std_msgs/Header header\n{LINE}\nMSG: a/N\nfloat64 v\n"
+    f"{LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+)
+WORDS = st.text(max_size=4) | st.sampled_from(
+    ["NaN", "-Infinity", '"NaN', "NaN\\", '\\"', "\\\\", "Infinity,"]
+)
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | WORDS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(WORDS, inner, max_size=4),
+    max_leaves=12,
+)
+
+
+def message_of(msg: str) -> rosbridge.Publish:
+    """What is made of a ``publish`` with this body."""
+    made = rosbridge.decode(f'{{"op":"publish","id":"q","topic":"/a","msg":{msg}}}'.encode())
+    assert isinstance(made, rosbridge.Publish)
+    return made
+
+
+@given(VALUES, st.sampled_from([None, 1]), st.booleans())
+def test_whatever_pythons_json_writes_is_read_as_it_reads_it(
+    value: Any, indent: int | None, ascii: bool
+) -> None:
+    """Also where words within strings look like these literals."""
+    text = json.dumps(value, indent=indent, ensure_ascii=ascii)
+    try:
+        body = bytes(message_of(text).msg)
+    except MalformedMessage as error:
+        assert "surrogate" in str(error) or "UTF-8" in str(error) or "range" in str(error)
+        return
+    assert repr(nonfinite.plain(json.loads(body))) == repr(value)
+
+
+@given(VALUES)
+def test_without_them_strict_json_is_left(value: Any) -> None:
+    """They are null, and all else is the same to the letter."""
+    strict = json.dumps(_nulled(value), allow_nan=False)
+    marked = nonfinite.mark(json.dumps(value).encode())
+    assert nonfinite.as_null(marked).decode() == strict
+
+
+def _nulled(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, list):
+        return [_nulled(each) for each in value]
+    if isinstance(value, dict):
+        return {name: _nulled(each) for name, each in value.items()}
+    return value
+
+
+@given(
+    st.lists(
+        st.sampled_from(['"', "\\", "NaN", "-", "Infinity", "{", "}", "[", "]", ":", ",", "1", " ", "a"])
+    )
+)
+def test_junk_raises_nothing_but_errors_in_words(pieces: list[str]) -> None:
+    """And what is taken is JSON."""
+    text = "".join(pieces)
+    try:
+        body = bytes(message_of(text).msg)
+    except SwitchboardError:
+        return
+    json.loads(nonfinite.as_null(body), parse_constant=lambda word: pytest.fail(word))
+
+
+@pytest.mark.parametrize("piece", ['"",', '"\\"NaN",', "NaN,", '"\\\\', "-Infinity ", '"NaN', " " * 9, '\\"'])
+def test_time_is_linear(piece: str) -> None:
+    """Ten times the input takes about ten times as long, not a hundred times."""
+
+    def seconds(pieces: int) -> float:
+        text = f'{{"op":"publish","topic":"/a","msg":[NaN,{piece * pieces}'.encode()
+        began = time.process_time()
+        with pytest.raises(MalformedMessage):
+            rosbridge.decode(text)
+        return time.process_time() - began
+
+    short = min(seconds(10_000) for _ in range(3))
+    assert min(seconds(100_000) for _ in range(3)) < 50 * short + 0.05
+
+
+@pytest.mark.parametrize(
+    ("msg", "reason"),
+    [
+        ('{"whole":NaN}', "a/msg/B: whole must be an integer, not NaN"),
+        ('{"text":NaN}', "a/msg/B: text must be a string, not NaN"),
+        ('{"on":Infinity}', "a/msg/B: on must be true or false, not Infinity"),
+        ('{"raw":-Infinity}', "a/msg/B: raw must be an array or a base64 string, not -Infinity"),
+        ('{"raw":[NaN]}', "a/msg/B: raw[0] must be an integer, not NaN"),
+        ('{"n":NaN}', "a/msg/B: n must be an array, not NaN"),
+        ('{"n":[{"v":1},NaN]}', "a/msg/B: n[1] must be an object, not NaN"),
+        ("NaN", "a/msg/B must be an object, not NaN"),
+        ('{"header":{"seq":1}}', "a/msg/B: header.seq is no field of std_msgs/msg/Header in ROS 2; leave it out"),
+        ('{"header":{"stamp":"now"}}', 'a/msg/B: header.stamp must be an object, not a string: send '
+         '{"sec": ..., "nanosec": ...}, or leave the stamp of a header out for the present time'),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_told_with_what_to_send_instead(msg: str, reason: str) -> None:
+    """By field, with the client's own word."""
+    with pytest.raises(Invalid) as caught:
+        TYPES.from_json("a/msg/B", bytes(message_of(msg).msg), 0)
+    assert str(caught.value) == reason
+
+
+@pytest.mark.parametrize("base64", ["AQID", "AQ\\r\\nID", "AQ\\nID\\n", "\\nAQID"])
+def test_base64_may_have_line_breaks(base64: str) -> None:
+    """As encoders for mail write it, RFC 2045 section 6.8."""
+    cdr = TYPES.from_json("a/msg/B", bytes(message_of(f'{{"raw":"{base64}"}}').msg), 0)
+    assert json.loads(TYPES.to_json("a/msg/B", cdr))["raw"] == "AQID"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason", "id"),
+    [
+        ('{"op":"subscribe","id":"i","topic":NaN}', "topic: ", "i"),
+        ('{"op":"subscribe","id":NaN,"topic":"/a"}', "id: ", None),
+        ('{"op":"subscribe","id":7,"topic":"/a","throttle_rate":Infinity}', "throttle_rate: ", 7),
+        ('{"op":NaN}', "op: ", None),
+        ('{NaN:1,"op":"subscribe","id":"i","topic":"/a"}', "NaN: ", "i"),
+        ('{"op":"advertise","topic":"/a","type":"a/B","qos":{"depth":NaN}}', "qos: ", None),
+    ],
+)  # fmt: skip
+def test_outside_of_a_body_they_are_refused_in_words(text: str, reason: str, id: rosbridge.Id) -> None:
+    """The id is known all the same."""
+    with pytest.raises(NotFinite) as caught:
+        rosbridge.decode(text.encode())
+    assert str(caught.value).startswith(f"{reason}NaN and infinity are no JSON")
+    assert rosbridge.unreadable(text.encode()).id == id
