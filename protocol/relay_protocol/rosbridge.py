@@ -314,9 +314,9 @@ def service_response(service: str, id: Id, result: bool, values: bytes) -> bytes
     return _object("service_response", service=service, id=id) + _result(result, values)
 
 
-def call_service(service: str, id: str, type_name: str, args: bytes) -> bytes:
+def call_service(service: str, id: str, args: bytes) -> bytes:
     """A ``call_service`` towards the client that offers the service; ``args`` is JSON."""
-    return _object("call_service", service=service, id=id, type=type_name) + b',"args":' + args + b"}"
+    return _object("call_service", service=service, id=id) + b',"args":' + args + b"}"
 
 
 def send_action_goal(action: str, id: str, type_name: str, args: bytes, feedback: bool) -> bytes:

@@ -151,7 +151,9 @@ class Goals:
         goal.type = offer.type
         goal.pursuer = pursuit
         offer.member.say(
-            rosbridge.send_action_goal(offer.written, pursuit.id, offer.type, args, goal.wants_feedback)
+            rosbridge.send_action_goal(
+                offer.written, pursuit.id, offer.written_type, args, goal.wants_feedback
+            )
         )
 
     # --- the robot answers --------------------------------------------------------------------------------

@@ -73,12 +73,14 @@ class Offer:
     """A service or action of a client.
 
     :param written: its name as the client writes it
+    :param written_type: its type as the client writes it; rosbridge hands both back so
     """
 
-    def __init__(self, name: str, written: str, type_name: str, member: Provider) -> None:
+    def __init__(self, name: str, written: str, type_name: str, written_type: str, member: Provider) -> None:
         self.name = name
         self.written = written
         self.type = type_name
+        self.written_type = written_type
         self.member = member
         self.phase = Phase.WAITING
         self.trouble = ""
@@ -114,8 +116,8 @@ class Offers:
         if self.standing(offer.name) is not offer:
             raise NotFound(f"the client that offered {offer.name} does so no more")
 
-    def advertise(self, member: Provider, name: str, written: str, type_name: str) -> None:
-        """A client offers something. The same once more changes nothing.
+    def advertise(self, member: Provider, name: str, written: str, type_name: str, written_type: str) -> None:
+        """A client offers something. The same once more changes its spelling at most.
 
         :raises Refused: the name is the relay's own; the client or its user offers too much
         :raises Invalid: the name is taken, or there is no type
@@ -129,6 +131,7 @@ class Offers:
             raise Invalid(f"{word} {name} needs a type")
         former = self._offers.get(name)
         if former is not None and former.member is member and former.type == type_name:
+            former.written, former.written_type = written, written_type
             return
         if former is not None:
             whose = "you offer" if former.member is member else "another client offers"
@@ -137,7 +140,7 @@ class Offers:
             raise Invalid(f"the robot offers the {word} {name} itself")
         self._check_room(member)
         self._wire.take_name()
-        offer = self._offers[name] = Offer(name, written, type_name, member)
+        offer = self._offers[name] = Offer(name, written, type_name, written_type, member)
         self._ask(offer)
 
     def unadvertise(self, member: Provider, name: str) -> None:

@@ -76,7 +76,7 @@ class ServedCalls:
         self._errands.add(call)
         waiting = call.waiting = Deferred(lambda _: self._give_up(call))
         call.late = self._clock.callLater(seconds, self._too_late, call, seconds)
-        offer.member.say(rosbridge.call_service(offer.written, call.id, offer.type, args))
+        offer.member.say(rosbridge.call_service(offer.written, call.id, args))
         return waiting
 
     def answered(self, member: Provider, answer: rosbridge.ServiceResponse) -> None:

@@ -148,10 +148,11 @@ def test_every_kind_of_field_passes_in_goals(world: Any, tmp_path: Path) -> None
 def test_a_client_pursues_a_nodes_goal(world: Any, peer: Peer) -> None:
     """With feedback and a result, as a node would."""
     with world.operating() as client:
-        client.send(op="advertise_action", action="/clients", type=FIBONACCI)
+        spelled = "example_interfaces/Fibonacci"
+        client.send(op="advertise_action", action="/clients", type=spelled)
         peer.do("send", "/clients", 7)
         goal = client.until(op="send_action_goal", action="/clients")
-        assert (goal["args"], goal["action_type"], goal["feedback"]) == ({"order": 7}, FIBONACCI, True)
+        assert (goal["args"], goal["action_type"], goal["feedback"]) == ({"order": 7}, spelled, True)
         about = {"action": "/clients", "id": goal["id"]}
         client.send(op="action_feedback", **about, values={"sequence": [0, 1]})
         peer.until(lambda: peer.told("feedback", "/clients"))

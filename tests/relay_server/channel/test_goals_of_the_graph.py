@@ -17,15 +17,17 @@ from tests.relay_server.memory import FIBONACCI, Person, World
 FAILS = "the client that offers /fib could not do it"
 
 
-def test_a_goal_of_the_graph_is_pursued_by_the_client(world: World) -> None:
-    """Goal, feedback and result, under an id of the relay's own."""
+@pytest.mark.parametrize("spelled", ["example_interfaces/Fibonacci", FIBONACCI])
+def test_a_goal_of_the_graph_is_pursued_by_the_client(world: World, spelled: str) -> None:
+    """Goal, feedback and result, under an id of the relay's own; name and type as the client spelled them last."""
     person = offering(world)
+    person.says("advertise_action", action="fib", type=spelled)
     graph_sends(world, "g1")
     (goal,) = person.hears("send_action_goal")
     id = goal.pop("id")
     assert id != "g1"
     assert goal == {
-        "op": "send_action_goal", "action": "fib", "action_type": FIBONACCI, "args": {"order": 3}, "feedback": True
+        "op": "send_action_goal", "action": "fib", "action_type": spelled, "args": {"order": 3}, "feedback": True
     }  # fmt: skip
     person.says("action_feedback", action="fib", id=id, values={"sequence": [0]})
     person.says("action_feedback", action="fib", id=id, values={"sequence": [0, 1]})
