@@ -19,7 +19,7 @@ from relay_protocol.limits import TICKET_SECONDS
 from relay_protocol.realms import parted
 from relay_server import passwords
 from relay_server.access import BadCredentials, Principal
-from relay_server.limiter import LoginLimiter
+from relay_server.limiter import FAILURES_OF_ACCOUNT, LoginLimiter
 from relay_server.origins import Origins
 from relay_server.store import Store, Threads
 
@@ -46,7 +46,9 @@ class TooManyTries(SwitchboardError):
     code = "too_many_tries"
 
     def __init__(self, retry_after: float) -> None:
-        super().__init__(f"too many failed logins from your network; try again in {int(retry_after) + 1} s")
+        super().__init__(
+            f"too many failed logins from your network, or of this account; try again in {int(retry_after) + 1} s"
+        )
         self.retry_after = retry_after
 
 
@@ -103,7 +105,7 @@ class Authenticator:
         self._store = store
         self._seconds = seconds
         self._wall = wall
-        self._limiter = LoginLimiter(seconds)
+        self._limiter = LoginLimiter(seconds, of_account=FAILURES_OF_ACCOUNT)
         self._hashing = Threads(
             reactor, "passwords", HASHING_THREADS, LOGINS_WAITING, "too many people log in now; try again"
         )
@@ -115,6 +117,14 @@ class Authenticator:
         Deferred.fromCoroutine(self._hashing.run(passwords.prepare)).addErrback(
             lambda failure: self.log.failure("passwords can't be hashed", failure)
         )
+
+    async def take_up(self) -> None:
+        """Remember from which networks people have logged in lately, as the audit log has it.
+
+        :raises Unavailable: the database does not answer
+        """
+        for account, address in await self._store.read(queries.recent_logins):
+            self._limiter.remember(account, address)
 
     def stop(self) -> None:
         """Wait for the hashing under way and end its threads."""
@@ -198,6 +208,7 @@ class Authenticator:
             )
         except Refused as error:
             raise BadCredentials(str(error)) from None
+        self._limiter.remember(login.full, address)
         return token
 
     def issue_ticket(self, principal: Principal, opens: Opening) -> str:

@@ -146,6 +146,7 @@ class Relay:
             each.start()
         self._recordings.open()
         self._audit.restore()
+        await self._auth.take_up()
         await self._taking_up.begin()
         await sweep(self._recordings, self._store, self._journal)
         self._recordings.recover()

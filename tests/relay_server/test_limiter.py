@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 
 from relay_server import limiter as module
-from relay_server.limiter import FAILURES, FAILURES_OF_NETWORK, WINDOW, LoginLimiter, network_of
+from relay_server.limiter import (
+    ACCOUNT_WINDOW,
+    FAILURES,
+    FAILURES_OF_NETWORK,
+    NETWORKS,
+    WINDOW,
+    LoginLimiter,
+    network_of,
+)
 from tests.relay_server.memory import Time
 
 
@@ -91,6 +99,51 @@ def test_a_try_that_could_not_be_judged_is_taken_back(time: Time) -> None:
         limiter.failed("ann", "192.0.2.1")
         limiter.forgive("ann", "192.0.2.1")
     assert limiter.wait("ann", "192.0.2.1") == 0
+
+
+def guessed(time: Time, account: str = "ann") -> LoginLimiter:
+    """A limiter that has had all failures of an account, from many networks."""
+    limiter = LoginLimiter(time, of_account=5)
+    limiter.remember("ann", "198.51.100.7")
+    for number in range(5):
+        assert limiter.wait(account, f"192.0.2.{number}") == 0
+        limiter.failed(account, f"192.0.2.{number}")
+    return limiter
+
+
+@pytest.mark.parametrize("account", ["ann", "nobody"])
+def test_an_account_has_a_limit_over_all_networks(time: Time, account: str) -> None:
+    """In a longer window, whether it is there or not; other accounts go on."""
+    limiter = guessed(time, account)
+    assert limiter.wait(account, "192.0.2.99") == ACCOUNT_WINDOW
+    assert limiter.wait(account.upper(), "2001:db8::1") == ACCOUNT_WINDOW
+    assert limiter.wait("bob", "192.0.2.99") == 0
+    time.now += ACCOUNT_WINDOW
+    assert limiter.wait(account, "192.0.2.99") == 0
+
+
+def test_a_network_that_has_logged_in_is_not_locked_by_others(time: Time) -> None:
+    """What fails there counts for it alone; a success there opens nothing to others."""
+    limiter = guessed(time)
+    for _ in range(FAILURES):
+        assert limiter.wait("ann", "198.51.100.7") == 0
+        limiter.failed("ann", "198.51.100.7")
+    assert limiter.wait("ann", "198.51.100.7") == WINDOW
+    time.now += WINDOW
+    limiter.failed("ann", "198.51.100.7")
+    limiter.succeeded("ann", "198.51.100.7")
+    assert limiter.wait("ann", "198.51.100.7") == 0
+    assert limiter.wait("ann", "192.0.2.99") > 0
+
+
+def test_networks_remembered_of_an_account_are_bounded(time: Time) -> None:
+    """The latest stay; what logs in again is among them."""
+    limiter = guessed(time)
+    for number in range(NETWORKS):
+        limiter.remember("ann", f"203.0.113.{number}")
+        limiter.remember("ann", "198.51.100.7")
+    assert limiter.wait("ann", "203.0.113.0") > 0
+    assert limiter.wait("ann", "203.0.113.1") == limiter.wait("ann", "198.51.100.7") == 0
 
 
 def test_what_is_remembered_is_bounded(time: Time, monkeypatch: pytest.MonkeyPatch) -> None:

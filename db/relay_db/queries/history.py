@@ -124,7 +124,7 @@ def append_audit(
 AuditKey = tuple[float, str, str, str]
 
 _LATELY = 20_000
-"""Entries, from the newest, among which one that may be there already is looked for."""
+"""Entries, from the newest, among which is looked: for one that may be there already, and for logins."""
 
 
 def audit_key(at: float, actor: str, action: str, target: str) -> AuditKey:
@@ -162,6 +162,19 @@ def unshared_robots(s: Session, names: Collection[str]) -> dict[tuple[str, str],
     )
     found = s.execute(query) if names else ()
     return {(row.target, str(row.data["realm"])): row.at for row in found}
+
+
+def recent_logins(s: Session) -> list[tuple[str, str]]:
+    """Who has proved a password or used a login link lately, and from which address; the oldest first."""
+    newest = select(Revision.audit_id).scalar_subquery()
+    query = (
+        select(AuditEntry.target, AuditEntry.origin, AuditEntry.data)
+        .where(AuditEntry.id > newest - _LATELY, AuditEntry.action.in_(("login", "token.issue")))
+        .order_by(AuditEntry.id)
+    )
+    return [
+        (row.target, row.origin) for row in s.execute(query) if row.data.get("how") in ("password", "link")
+    ]
 
 
 def verify_audit(s: Session) -> int | None:
