@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from twisted.internet.defer import Deferred
+
 from relay_protocol import link
 from relay_protocol.realms import full_name
 from relay_protocol.ros_types import TypeRegistry
@@ -28,6 +30,15 @@ class ControlLink(Protocol):
 
     def close(self, reason: str) -> None:
         """Say ``bye`` and end the connection."""
+
+    def replaced(self, reason: str, answers: Callable[[], None]) -> None:
+        """End the connection as :meth:`close`, because there is a newer one of the robot.
+
+        :param answers: called if a ping sent now is answered: then the robot's key is used by two daemons
+        """
+
+    def round_trip(self) -> Deferred[float]:
+        """Ping the robot; seconds, or :class:`Unavailable` when the connection ends first."""
 
     def reading(self) -> Reading:
         """How good the way to the robot is."""
@@ -187,8 +198,13 @@ class Registry:
         """The entry of a robot, if there is one."""
         return self._robots.get(robot_id)
 
-    def registered(self, robot: Presence, control: ControlLink) -> None:
-        """A robot has proved itself on this link. An older link of it gives way."""
+    def registered(
+        self, robot: Presence, control: ControlLink, used_twice: Callable[[], None] = lambda: None
+    ) -> None:
+        """A robot has proved itself on this link. An older link of it gives way.
+
+        :param used_twice: called when a daemon still answers on the older one
+        """
         older = robot.control
         robot.control = control
         robot.types = TypeRegistry()
@@ -201,7 +217,7 @@ class Registry:
         if older is not None:
             for watcher in list(robot.watchers):
                 watcher.robot_offline()
-            older.close("the robot has connected anew")
+            older.replaced("the robot has connected anew", used_twice)
         for watcher in list(robot.watchers):
             watcher.robot_online()
         self.changed()

@@ -111,6 +111,7 @@ class Alerts:
             "control.lost": self._control_lost,
             "control.taken": self._control_taken,
             "audit.lost": self._audit_lost,
+            "robot.key_used_twice": self._key_used_twice,
             "audit.written": lambda robot, data: self.over(robot, kinds.AUDIT),
         }
         journal.listen(self._happened)
@@ -266,6 +267,13 @@ class Alerts:
     def _control_taken(self, robot: Presence, data: dict[str, Any]) -> None:
         self._steered.add(robot.robot_id)
         self.over(robot, kinds.CONTROL)
+
+    def _key_used_twice(self, robot: Presence, data: dict[str, Any]) -> None:
+        text = (
+            f"two daemons use the robot's key, at {data.get('addresses', '')}: stop one of them. If one is not yours, "
+            "revoke the key and enroll the robot again"
+        )
+        self.tell(robot, kinds.KEY, "", "error", text)
 
     def _audit_lost(self, robot: Presence, data: dict[str, Any]) -> None:
         text = "audit entries about this robot are lost: the database could not be written for too long"

@@ -15,13 +15,14 @@ STALE = "stale"
 ROBOT = "robot"
 FLOOD = "flood"
 AUDIT = "audit"
+KEY = "key"
 
-KINDS = (OFFLINE, BATTERY, DIAGNOSTICS, STOP, MODULE, CONTROL, STALE, ROBOT, FLOOD, AUDIT)
+KINDS = (OFFLINE, BATTERY, DIAGNOSTICS, STOP, MODULE, CONTROL, STALE, ROBOT, FLOOD, AUDIT, KEY)
 
-OURS = frozenset({OFFLINE, BATTERY, STOP, CONTROL, STALE, FLOOD, AUDIT})
+OURS = frozenset({OFFLINE, BATTERY, STOP, CONTROL, STALE, FLOOD, AUDIT, KEY})
 """What only the relay tells: a robot's word of such a kind is one of kind :data:`ROBOT`."""
 
-SINGLE = frozenset({OFFLINE, BATTERY, STOP, CONTROL, AUDIT})
+SINGLE = frozenset({OFFLINE, BATTERY, STOP, CONTROL, AUDIT, KEY})
 """What a robot can have one of at most: no flood of others hides it."""
 
 RESERVED = frozenset({MODULE})
@@ -79,7 +80,7 @@ class Event(str, enum.Enum):
 
 def endless(kind: str) -> bool:
     """Whether alerts of this kind may have no end of their own: to acknowledge one ends it."""
-    return kind in (CONTROL, ROBOT) or kind not in KINDS
+    return kind in (CONTROL, ROBOT, KEY) or kind not in KINDS
 
 
 def from_robot(kind: str, about: str) -> tuple[str, str]:

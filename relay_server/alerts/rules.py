@@ -154,12 +154,14 @@ def passes(rule: AlertRuleRecord, alert: AlertRecord, now: float) -> bool:
 
 
 def visible(rights: Rules, kind: str, about: str) -> bool:
-    """Whether somebody with a right on the robot may know of an alert: names of topics are not for everybody."""
+    """Whether somebody with a right on the robot may know of an alert: not everybody may know topics and addresses."""
     if kind == kinds.DIAGNOSTICS:
         return rights.judge(Operation.SUBSCRIBE, DIAGNOSTICS_TOPIC).allowed
     if kind == kinds.STALE:
         asked = (Operation.SUBSCRIBE, Operation.VIEW)
         return all(rights.judge(each, about).allowed for each in asked)
+    if kind == kinds.KEY:
+        return rights.judge(Operation.MANAGE, "").allowed
     return True
 
 

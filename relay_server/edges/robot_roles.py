@@ -9,6 +9,7 @@ import secrets
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -253,6 +254,7 @@ class Control(Role):
     def begin(self) -> None:
         """Register the robot, unless it has only just registered from elsewhere."""
         robot, hall, connection = self._robot, self._hall, self._connection
+        used_twice = partial(self._used_twice, connection.address, robot.address)
         now = hall.seconds()
         wait = robot.registered_at + robot.patience - now
         if robot.control is not None and wait > 0:
@@ -262,6 +264,7 @@ class Control(Role):
                     retry_after=wait,
                 )
             )
+            robot.control.round_trip().addCallbacks(lambda _: used_twice(), lambda _: None)
             return
         self._replace(now - robot.registered_at)
         session = secrets.token_hex(4)
@@ -277,7 +280,7 @@ class Control(Role):
         robot.address = connection.address
         connection.on_round_trip = self._round_trip
         connection.proven(self, limits.CONTROL_FRAME, measured=True)
-        hall.registry.registered(robot, connection)
+        hall.registry.registered(robot, connection, used_twice)
         self._event("robot.online", address=connection.address)
         self.log.info(
             "robot {robot} is online from {address} ({agent})",
@@ -292,10 +295,18 @@ class Control(Role):
         if robot.control is None or age >= FLAPPING_SECONDS:
             robot.patience = REPLACE_SECONDS
             return
-        # Once may be a robot that came back before its old connection was known to be dead.
-        if robot.patience > REPLACE_SECONDS:
-            self._event("robot.key_used_twice", address=self._connection.address, other=robot.address)
         robot.patience = min(MOST_PATIENCE, robot.patience * 2)
+
+    def _used_twice(self, newer: str, older: str) -> None:
+        """A daemon answers on a link although another one has proved the same key since: one has no two links."""
+        self.log.warn(
+            "the key of robot {robot} is used by two daemons, at {older} and {newer}",
+            robot=self._robot.full,
+            older=older,
+            newer=newer,
+            limited="key used twice",
+        )
+        self._event("robot.key_used_twice", addresses=f"{older}, {newer}")
 
     def _event(self, kind: str, source: str = "relay", what: str = "robot", **data: Any) -> bool:
         robot = self._robot

@@ -19,7 +19,7 @@ from twisted.internet.protocol import Protocol as TwistedProtocol
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from relay_protocol import limits, link
+from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
 from relay_protocol.frames import (
     CommandFrame,
@@ -41,6 +41,9 @@ from relay_server.outbox import Outbox
 
 PINGS = 256
 """Pings without an answer that are remembered."""
+
+REPLACED_SECONDS = 2.0
+"""A link that a newer one has replaced is closed after so long at most."""
 
 MEASURED_SECONDS = 1.0
 """A link whose quality is told is pinged at least so often."""
@@ -198,6 +201,26 @@ class RobotConnection(TwistedProtocol):
             self.send(link.Bye(reason=reason))
             self._hang_up(reason)
 
+    def replaced(self, reason: str, answers: Callable[[], None]) -> None:
+        """Say ``bye``, and end the connection as soon as the robot may have answered one more ping.
+
+        :param answers: called if it does
+        """
+        if self._role is None:
+            return
+
+        def alive(_: float) -> None:
+            answers()
+            self._hang_up(reason)
+
+        self._role.lost(reason)
+        self._role = _Replaced(self)
+        if self._beating.running:
+            self._beating.stop()
+        self.round_trip().addCallbacks(alive, lambda _: None)
+        self.send(link.Bye(reason=reason))
+        self._aborting = self._clock.callLater(REPLACED_SECONDS, self._hang_up, reason)
+
     def finish(self, reason: str) -> None:
         """All is said; end the connection."""
         if self._role is not None:
@@ -340,6 +363,7 @@ class RobotConnection(TwistedProtocol):
 
     def _hang_up(self, reason: str) -> None:
         self._end(reason)
+        cancel(self._aborting)
         self._writer.flush()
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()
@@ -371,6 +395,28 @@ class RobotConnection(TwistedProtocol):
         self.log.warn("the robot at {address} takes nothing; it is cut", address=self.address)
         self._end("the robot takes nothing")
         self.transport.abortConnection()
+
+
+class _Replaced(Role):
+    """The link of a robot that has a newer one: only the answer to a ping counts."""
+
+    def __init__(self, connection: RobotConnection) -> None:
+        self._connection = connection
+
+    def message(self, body: bytes) -> None:
+        """What is no answer to a ping is passed over."""
+        message = jsontext.decode(link.robot_control_decoder, body)
+        if isinstance(message, link.Pong):
+            self._connection.heartbeat(message)
+
+    def sample(self, frame: SampleFrame) -> None:
+        """Passed over."""
+
+    def picture(self, frame: VideoFrame | PicturePart) -> None:
+        """Passed over."""
+
+    def lost(self, reason: str) -> None:
+        """It had been given up before."""
 
 
 def _nowhere(data: bytes) -> None:

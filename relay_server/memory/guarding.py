@@ -16,6 +16,7 @@ FIELDS = {
     "publication.begun": "topic",
     "robot.suppressed": "resource",
     "robot.inhibited": "resource",
+    "robot.key_used_twice": "addresses",
     "param.set": "param",
     "video.joined": "camera",
     "video.left": "camera",
@@ -45,6 +46,10 @@ def _param(rules: Rules, name: str) -> bool:
     return _may(rules, Operation.CALL, f"{name.partition(':')[0]}/get_parameters")
 
 
+def _addresses(rules: Rules, name: str) -> bool:
+    return _may(rules, Operation.MANAGE, "")
+
+
 def _may(rules: Rules, operation: Operation, name: str) -> bool:
     return rules.judge(operation, name).allowed
 
@@ -56,6 +61,7 @@ _WAYS: Mapping[str, Callable[[Rules, str], bool]] = {
     "service": _call,
     "action": _call,
     "param": _param,
+    "addresses": _addresses,
 }
 
 

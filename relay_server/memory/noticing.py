@@ -25,6 +25,7 @@ KINDS = frozenset(
         "robot.offline",
         "robot.stopped",
         "robot.resumed",
+        "robot.key_used_twice",
         "robot.suppressed",
         "robot.inhibited",
         "client.joined",
@@ -70,7 +71,7 @@ _SHARES = {"module": "module", "video": "video"}
 """Kinds, by what they begin with, that have a share of what may be noted for themselves: they take no room from what
 else somebody does, or becomes of a robot."""
 
-_GUARDED = frozenset({"stale", "diagnostics"})
+_GUARDED = frozenset({"stale", "diagnostics", "key"})
 """Kinds of alerts whose words take further rights (SPEC section 1.10); that there is one does not."""
 
 

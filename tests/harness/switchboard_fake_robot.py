@@ -25,8 +25,8 @@ class FakeRobot:
     Orders about motion it answers by itself, as if they were done.
     """
 
-    def __init__(self, port: int) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
+    def __init__(self, port: int, source: str = "127.0.0.1") -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), PATIENCE, source_address=(source, 0))
         self._decoder = FrameDecoder(limits.COMMAND_FRAME)
         self._heard: list[dict[str, Any]] = []
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from twisted.internet import reactor
+from twisted.internet.address import IPv4Address
 from twisted.internet.defer import Deferred
 from twisted.internet.error import ConnectionDone
 from twisted.internet.testing import StringTransportWithDisconnection
@@ -63,6 +64,9 @@ class Hall:
         self.cap = AddressCap(3)
         clock = self.world.clock
         self.journal = Journal(store, clock.seconds)
+        self.told: list[tuple[str, dict[str, Any]]] = []
+        """Kinds and data of events."""
+        self.journal.listen(lambda kind, _, data: self.told.append((kind, data)))
         self.hall = RobotHall(
             RELAY,
             store,
@@ -81,13 +85,13 @@ class Hall:
             )
         )
 
-    def dial(self) -> Robot:
+    def dial(self, address: str = "192.168.1.1") -> Robot:
         """A robot's new connection."""
-        return Robot(self)
+        return Robot(self, address)
 
-    async def registered(self) -> Robot:
+    async def registered(self, address: str = "192.168.1.1") -> Robot:
         """A robot that has proved its key."""
-        robot = self.dial()
+        robot = self.dial(address)
         assert (await robot.registers())["op"] == "welcome"
         return robot
 
@@ -105,9 +109,9 @@ class Hall:
 class Robot:
     """A robot's end of one connection."""
 
-    def __init__(self, hall: Hall) -> None:
+    def __init__(self, hall: Hall, address: str) -> None:
         self.hall = hall
-        self.transport = Transport()
+        self.transport = Transport(peerAddress=IPv4Address("TCP", address, 54321))
         self.connection = hall.factory.buildProtocol(None)
         self.transport.protocol = self.connection
         self._decoder = FrameDecoder(limits.COMMAND_FRAME)
@@ -130,6 +134,16 @@ class Robot:
     def hears(self) -> list[dict[str, Any]]:
         """Messages that came since the last time."""
         return [json.loads(frame.body) for frame in self.frames() if isinstance(frame, JsonFrame)]
+
+    def pongs(self) -> list[dict[str, Any]]:
+        """Answer all pings that came; the other messages that came."""
+        others = []
+        for each in self.hears():
+            if each["op"] == "ping":
+                self.says(link.Pong(t=each["t"], at=1))
+            else:
+                others.append(each)
+        return others
 
     def refusal(self) -> dict[str, Any]:
         """The refusal, with which the connection has ended."""

@@ -12,7 +12,7 @@ from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json, encode_sample, encode_video
 from relay_server import limiter
 from relay_server.edges.robot_roles import FLAPPING_SECONDS, MOST_PATIENCE
-from relay_server.edges.robots import PINGS
+from relay_server.edges.robots import PINGS, REPLACED_SECONDS
 from relay_server.journal import BURST
 from relay_server.registry import REPLACE_SECONDS
 from tests.relay_server.edges.robot_ends import FINGERPRINT, KEY, Hall, until
@@ -348,10 +348,55 @@ async def test_a_newer_link_replaces_the_older_but_not_at_once(hall: Hall) -> No
     assert first.transport.connected
     hall.world.clock.advance(REPLACE_SECONDS)
     third = await hall.registered()
-    assert first.hears()[-1] == {"op": "bye", "reason": "the robot has connected anew"}
+    assert [each for each in first.hears() if each["op"] == "bye"] == [
+        {"op": "bye", "reason": "the robot has connected anew"}
+    ]
+    hall.world.clock.advance(REPLACED_SECONDS)
     assert not first.transport.connected
     assert hall.presence is not None
     assert hall.presence.control is third.connection
+    assert told_twice(hall) == []
+
+
+def told_twice(hall: Hall) -> list[str]:
+    """What was told of keys that are used twice, since the last time."""
+    told, hall.told = hall.told, []
+    return [data["addresses"] for kind, data in told if kind == "robot.key_used_twice"]
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_daemon_that_still_answers_when_another_comes_is_told_of_at_once(hall: Hall) -> None:
+    """Whether the newer one is refused or takes its place, with both addresses."""
+    first = await hall.registered(address="192.0.2.1")
+    first.pongs()
+    second = hall.dial("192.0.2.2")
+    assert (await second.registers())["op"] == "refused"
+    assert told_twice(hall) == []
+    first.pongs()
+    assert told_twice(hall) == ["192.0.2.1, 192.0.2.2"]
+    hall.world.clock.advance(REPLACE_SECONDS)
+    await hall.registered(address="192.0.2.3")
+    assert told_twice(hall) == []
+    assert [each["op"] for each in first.pongs()] == ["bye"]
+    assert told_twice(hall) == ["192.0.2.1, 192.0.2.3"]
+    assert not first.transport.connected
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_robot_that_comes_back_is_no_second_daemon(hall: Hall) -> None:
+    """What its old connection still brings is older than the newer one; only an answer to a later ping counts."""
+    first = await hall.registered()
+    hall.world.clock.advance(REPLACE_SECONDS)
+    owed = [each for each in first.hears() if each["op"] == "ping"]
+    await hall.registered()
+    for each in owed:
+        first.says(link.Pong(t=each["t"], at=1))
+    first.says(link.Health())
+    first.says(link.Bye(reason="the network has changed"))
+    hall.world.clock.advance(REPLACED_SECONDS)
+    assert told_twice(hall) == []
+    assert not first.transport.connected
+    assert not [each for each in hall.world.clock.getDelayedCalls() if "hang_up" in str(each.func)]
 
 
 @pytest_twisted.ensureDeferred
@@ -363,13 +408,12 @@ async def test_two_daemons_with_one_key_flap_ever_more_slowly(hall: Hall) -> Non
         waits.append(round((await hall.dial().registers())["retry_after"]))
         for _ in range(waits[-1]):
             hall.world.clock.advance(1)
-            current.says(link.Health())
-        current = hall.dial()
+            current.pongs()
+        former, current = current, hall.dial()
         assert (await current.registers())["op"] == "welcome"
+        former.pongs()
     assert waits == [3, 6, 12, 24, 48, 60, 60]
-    await until(lambda: hall.journal._waiting == 0)
-    events = await hall.store.read(queries.list_events, kind="robot.key_used_twice")
-    assert len(events) == 6
+    assert len(told_twice(hall)) == 2 * len(waits)
     assert hall.presence is not None
     assert hall.presence.patience == MOST_PATIENCE
     hall.presence.registered_at -= FLAPPING_SECONDS
