@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 from twisted.logger import Logger
@@ -32,11 +31,33 @@ from robot_client.topics import TypedTopic
 from robot_client.wire import Wire, check_room
 
 
-class _Listening(NamedTuple):
+class _Listening:
+    """A subscription of the relay's.
+
+    :param topic: its full name
+    """
+
     source: Source
-    request: link.Subscribe
-    topic: str
-    """Its full name."""
+
+    def __init__(self, sending: Sending, request: link.Subscribe, topic: str) -> None:
+        self._sending = sending
+        self.request = request
+        self.topic = topic
+
+    def take(self, body: bytes) -> None:
+        """Pass a sample on."""
+        self._sending.offer(self.request.number, body, self.source.stamp)
+
+    def recall(self, known: frozenset[int]) -> None:
+        """Repeat what publishers keep.
+
+        :param known: stamps of the samples whose bodies the relay has
+        """
+        number, repeat = self.request.number, self._sending.repeat
+        self.source.recall(
+            lambda stamp, body: repeat(number, stamp, b"" if stamp in known else body),
+            lambda: repeat(number, 0, b""),
+        )
 
 
 class _Publishing(NamedTuple):
@@ -195,20 +216,19 @@ class Channel:
         number = message.number
         known = self._listening.get(number)
         if known is not None:
-            self._listening[number] = known._replace(request=message)
+            known.request = message
             self._confirm(number)
             self._sending.arm()
+            if message.kept is not None and known.source.replays:
+                self._recall(known, frozenset(message.kept))
             return
         check_room(self._listening, "subscriptions")
         topic = self._platform.full_name(message.topic, "topic")
-        source = self._platform.subscribe(
-            message.topic,
-            message.type,
-            message.qos,
-            partial(self._sending.offer, number),
-            lambda: self._confirm(number),
+        listening = _Listening(self._sending, message, topic)
+        listening.source = self._platform.subscribe(
+            message.topic, message.type, message.qos, listening.take, lambda: self._confirm(number)
         )
-        self._listening[number] = _Listening(source, message, topic)
+        self._listening[number] = listening
         self._confirm(number)
         if topic in self._silent:
             self._mute(number, topic)
@@ -217,7 +237,7 @@ class Channel:
         listening = self._listening.get(number)
         if listening is None:
             return
-        source, request, _ = listening
+        source, request = listening.source, listening.request
         self.uplink.open(number, request.throttle_ms / 1000, source.latched)
         self._wire.say(
             link.Subscribed(
@@ -227,8 +247,17 @@ class Channel:
                 encoding=self._platform.encoding,
                 latched=source.latched,
                 publishers=source.publishers,
+                replays=source.replays,
             )
         )
+
+    def _recall(self, listening: _Listening, known: frozenset[int]) -> None:
+        try:
+            listening.recall(known)
+        except Exception:
+            # The subscription itself goes on.
+            self._log.failure("could not ask for what publishers of {topic} keep", topic=listening.topic)
+            self._sending.repeat(listening.request.number, 0, b"")
 
     def _mute(self, number: int, topic: str) -> None:
         hold = self._silent.get(topic)

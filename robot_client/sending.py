@@ -41,14 +41,22 @@ class Sending:
         self._flush: Timer | None = None
         self._release: Timer | None = None
 
-    def offer(self, number: int, body: bytes) -> None:
-        """Take one sample; see :meth:`robot_client.uplink.Uplink.offer`."""
-        taken = self.uplink.offer(number, self._wall(), body)
+    def offer(self, number: int, body: bytes, stamp: int = 0) -> None:
+        """Take one sample; see :meth:`robot_client.uplink.Uplink.offer`.
+
+        :param stamp: nanoseconds since 1970; 0 for now
+        """
+        taken = self.uplink.offer(number, stamp or self._wall(), body)
         if self.uplink.held:
             self.arm()
         if taken and not self._awaited and not self.uplink.paused:
             self._awaited = True
             self._after(self.flush)
+
+    def repeat(self, number: int, stamp: int, body: bytes) -> None:
+        """Take a sample that publishers keep; see :meth:`robot_client.uplink.Uplink.repeat`."""
+        if self.uplink.repeat(number, stamp, body) and not self.uplink.paused:
+            self.flush()
 
     def unmute(self, number: int) -> None:
         """Let a subscription speak again; see :meth:`robot_client.uplink.Uplink.unmute`."""

@@ -23,6 +23,9 @@ WHOLE = 64 * KIB
 """A sample of more bytes goes in parts."""
 
 PART = 32 * KIB
+MISSED = 64
+"""Latched samples of one subscription that wait while it is muted, one for each publisher; more than one only as far as
+they are not larger than :data:`LANE_BYTES` together."""
 
 
 class _Sample(msgspec.Struct, frozen=True, gc=False):
@@ -30,6 +33,8 @@ class _Sample(msgspec.Struct, frozen=True, gc=False):
     arrived: float
     stamp: int
     body: bytes
+    repeat: bool = False
+    """Whether it went before: it is not the latest of its topic."""
 
 
 class _Lane:
@@ -51,8 +56,8 @@ class _Lane:
         self.muted = False
         self.instead: bytes | None = None
         """What is sent in the place of each sample while it is muted."""
-        self.missed: _Sample | None = None
-        """The newest sample of publishers that keep theirs, which came while it was muted: there may be no other."""
+        self.missed: deque[_Sample] = deque(maxlen=MISSED)
+        """Samples of publishers that keep theirs, which came while it was muted: there may be no others."""
 
 
 class Uplink:
@@ -125,7 +130,9 @@ class Uplink:
         now = self._now()
         if lane.muted:
             if lane.latched:
-                lane.missed = _Sample(number, now, stamp, body)
+                lane.missed.append(_Sample(number, now, stamp, body))
+                while len(lane.missed) > 1 and sum(len(each.body) for each in lane.missed) > LANE_BYTES:
+                    lane.missed.popleft()
             if lane.instead is None:
                 return False
             body = lane.instead
@@ -135,6 +142,26 @@ class Uplink:
             lane.held = sample
             return False
         self._admit(lane, sample, now)
+        return True
+
+    def repeat(self, number: int, stamp: int, body: bytes) -> bool:
+        """Take a sample that publishers keep, without heed of the throttle (SPEC 2.5, ``kept`` of ``subscribe``).
+
+        :param stamp: the one it went by before, 0 for the end
+        :param body: empty where the relay has it
+        :return: whether it goes
+        """
+        lane = self._lanes.get(number)
+        if lane is None:
+            return False
+        if len(body) + frames.SAMPLE_HEAD > self._limit:
+            self.oversized += 1
+            self.dropped += 1
+            return False
+        # Muted, what went before is all there is, and only where the last value is held.
+        if stamp and lane.muted and (body or lane.instead is None):
+            return False
+        self._append(lane, _Sample(number, self._now(), stamp, body, True))
         return True
 
     def mute(self, number: int, hold: bool) -> None:
@@ -164,10 +191,10 @@ class Uplink:
         lane.muted, lane.instead = False, None
         self.held -= lane.held is not None
         lane.held = None
-        missed, lane.missed = lane.missed, None
-        if missed is not None:
-            self._admit(lane, missed, self._now())
-        return missed is not None
+        missed, lane.missed = lane.missed, deque(maxlen=MISSED)
+        for sample in missed:
+            self._admit(lane, sample, self._now())
+        return bool(missed)
 
     def next_due(self) -> float | None:
         """When the next sample held back by a throttle may go, on the clock given; ``None`` for none."""
@@ -197,7 +224,8 @@ class Uplink:
             lane, size = self._lanes[sample.number], len(sample.body)
             lane.waiting.remove(serial)
             lane.size -= size
-            lane.last = sample.body
+            if not sample.repeat:
+                lane.last = sample.body
             self._size -= size
             frame = frames.encode_sample(sample.number, sample.stamp, sample.body)
             taken += len(frame)
@@ -227,6 +255,9 @@ class Uplink:
             lane.held = None
             self.held -= 1
         lane.next_at = now + lane.throttle
+        self._append(lane, sample)
+
+    def _append(self, lane: _Lane, sample: _Sample) -> None:
         if sample.arrived < self._since or not (self._small or self._large):
             self._since = sample.arrived
         self._serial += 1
@@ -263,7 +294,8 @@ class Uplink:
         if self._begun and self._begun + size > self._limit:
             return False
         lane.begun, lane.sent = self._remove(serial), 0
-        lane.last = lane.begun.body
+        if not lane.begun.repeat:
+            lane.last = lane.begun.body
         self._begun += size
         return True
 
@@ -300,8 +332,8 @@ class Uplink:
             for serial, sample in queue.items():
                 if sample.arrived >= oldest:
                     break
-                lane = self._lanes[sample.number]
-                if not (lane.latched and lane.waiting[-1] == serial):
+                # What publishers keep does not age, and each may be another publisher's only one.
+                if not self._lanes[sample.number].latched:
                     old.append(serial)
             for serial in old:
                 self._drop(serial)

@@ -204,9 +204,8 @@ class Channel:
 
         :param stamp: the robot's wall clock when it came, nanoseconds since 1970; simulated time replaces it
         """
-        if self.robot.description.sim_time:
-            stamp = self.now_ns()
-        self.subscriptions.sample(number, body, stamp)
+        time = self.now_ns() if self.robot.description.sim_time else stamp
+        self.subscriptions.sample(number, body, time, stamp)
 
     def message(self, message: link.RobotChannel) -> None:
         """A message came over the channel's link."""

@@ -66,12 +66,14 @@ class Subscriptions:
             self._check_room(member)
         if uplink is None:
             uplink = TopicUplink(
+                self._wire.clock,
                 self._wire.number(),
                 topic,
                 has or type_name or "",
                 qos,
                 lambda: self._wire.robot.types,
                 self._broken,
+                self._send,
             )
             uplink.certain = bool(has)
             self._topics[topic] = self._numbers[uplink.number] = uplink
@@ -91,12 +93,13 @@ class Subscriptions:
             return
         self._follow_throttle(uplink)
         self._tell_untypeable(uplink, member)
-        if not served_before and uplink.serves(member):
+        # Each subscription gets what is latched, also a further one of the same connection, as with rosbridge_suite.
+        if type_name is not None and uplink.serves(member):
             if self._silent(topic):
                 uplink.owed[member] = listener
                 self._look_later()
-            else:
-                uplink.replay(listener)
+            elif uplink.phase is Phase.ACTIVE:
+                uplink.welcome(member, listener, live=served_before)
 
     def active(self) -> tuple[tuple[str, str], ...]:
         """Topics the robot is subscribed to for us, with their types."""
@@ -191,7 +194,7 @@ class Subscriptions:
         """The robot's side is gone."""
         for uplink in self._topics.values():
             uplink.certain = False
-            uplink.reset()
+            uplink.lost()
 
     def graph_changed(self) -> None:
         """What waited for a topic to appear may go on; a topic that has another type now is followed."""
@@ -212,7 +215,9 @@ class Subscriptions:
         self._wire.asks.answered(("subscribe", message.number))
         uplink = self._numbers.get(message.number)
         if uplink is not None:
-            uplink.activate(message.type, message.encoding, message.latched, message.publishers)
+            uplink.activate(
+                message.type, message.encoding, message.latched, message.publishers, message.replays
+            )
             if message.encoding == "cdr":
                 self._definitions.want(message.type)
 
@@ -250,14 +255,15 @@ class Subscriptions:
         if uplink.untypeable and listener is not None and uplink.serves(member) and not listener.raw:
             listener.fail(uplink.untypeable)
 
-    def sample(self, number: int, body: bytes, stamp: int) -> None:
-        """A sample from the robot; one of a subscription given back already is let go.
+    def sample(self, number: int, body: bytes, time: int, stamp: int) -> None:
+        """Take a sample from the robot; one of a subscription that has ended is dropped.
 
-        :param stamp: the robot's time when it came, nanoseconds
+        :param time: the robot's time when it came, nanoseconds
+        :param stamp: of the frame
         """
         uplink = self._numbers.get(number)
         if uplink is not None:
-            uplink.sample(body, stamp)
+            uplink.sample(body, time, stamp)
 
     # --- late joiners of what is inhibited ----------------------------------------------------------------
 
@@ -346,11 +352,14 @@ class Subscriptions:
 
     def _send(self, uplink: TopicUplink) -> None:
         uplink.throttle_ms = uplink.least_throttle_ms()
+        kept = uplink.kept
         message = link.Subscribe(
             number=uplink.number,
             topic=uplink.topic,
             type=uplink.type,
             throttle_ms=uplink.throttle_ms,
             qos=uplink.qos,
+            kept=kept.stamps if kept.wanted else None,
         )
-        self._wire.asks.ask(Ask(("subscribe", uplink.number), message, lambda: None))
+        sent = kept.asked if kept.wanted else lambda: None
+        self._wire.asks.ask(Ask(("subscribe", uplink.number), message, sent))

@@ -7,19 +7,17 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from relay_protocol import limits, rosbridge
+from relay_protocol import rosbridge
 from relay_protocol.link import QoS, Topic
 from relay_protocol.ros_types import TypeRegistry
+from relay_server.channel.latched import KEPT_BYTES, Latched
 from relay_server.channel.listener import Listener
 from relay_server.channel.sample import Converter, Sample
 from relay_server.channel.wire import Commander, Member
-from relay_server.clock import Timer, cancel
+from relay_server.clock import Clock, Timer, cancel
 
-LATCHED_KEPT = 64
-"""Most latched samples kept for late joiners of one topic (one for each publisher)."""
-
-KEPT_BYTES = limits.ROBOT_FRAME
-"""Most bytes of latched samples kept for one topic, and most that wait for its type."""
+UNTYPED = 64
+"""Most samples of one topic that wait for its type."""
 
 
 class Phase(enum.Enum):
@@ -38,16 +36,19 @@ class TopicUplink:
     :param type_name: empty when nobody knows it yet
     :param types: gives what is known of the robot's types
     :param broken: called with the reason when a message can't be converted, the first time
+    :param ask: asks the robot which samples the topic's publishers keep
     """
 
     def __init__(
         self,
+        clock: Clock,
         number: int,
         topic: str,
         type_name: str,
         qos: QoS | None,
         types: Callable[[], TypeRegistry],
         broken: Callable[[TopicUplink, str], None],
+        ask: Callable[[TopicUplink], None],
     ) -> None:
         self.number = number
         self.topic = topic
@@ -74,13 +75,23 @@ class TopicUplink:
         """The type each client says the topic has; those who leave it to the graph are not here."""
         self.served: list[Listener] = []
         """Those who get the samples: not those who say another type."""
+        self._live: list[Listener] = []
+        """Those of :attr:`served` who get samples as they come: not those who are to get older ones first."""
+        self._early: set[Member] = set()
+        """Those who have subscribed while the robot was away."""
         self.owed: dict[Member, Listener] = {}
         """Late joiners that get the latched samples when the topic is inhibited no more."""
         self._types = types
         self._broken = broken
         self._converter = self._new_converter()
-        self._recent: deque[Sample] = deque(maxlen=1)
-        self._untyped: deque[Sample] = deque(maxlen=LATCHED_KEPT)
+        self.kept = Latched(clock, lambda: ask(self), self._serve)
+        self._untyped: deque[Sample] = deque(maxlen=UNTYPED)
+        self._unready: set[Member] = set()
+        """Those who are to get what publishers keep when the topic's type is known."""
+        self._stamp = 0
+        """Of the latest sample."""
+        self._since: dict[Member, int] = {}
+        """The latest stamp when each subscribed to a topic that was not latched then, as far as the robot had said."""
 
     # --- who listens --------------------------------------------------------------------------------------
 
@@ -89,6 +100,8 @@ class TopicUplink:
 
         :param type_name: empty when it leaves the type to the graph, ``None`` when it is as before
         """
+        if self.phase is not Phase.ACTIVE and member not in self.listeners:
+            self._early.add(member)
         self.listeners[member] = listener
         if type_name:
             self.wanted[member] = type_name
@@ -100,6 +113,10 @@ class TopicUplink:
         """A client listens no more; whether it did."""
         self.wanted.pop(member, None)
         self.owed.pop(member, None)
+        self._early.discard(member)
+        self._unready.discard(member)
+        self._since.pop(member, None)
+        self.kept.leave(member)
         left = self.listeners.pop(member, None) is not None
         self._serve()
         return left
@@ -113,7 +130,9 @@ class TopicUplink:
         return [(member, wanted) for member, wanted in self.wanted.items() if wanted != self.type]
 
     def _serve(self) -> None:
-        self.served = [listener for member, listener in self.listeners.items() if self.serves(member)]
+        served = [member for member in self.listeners if self.serves(member)]
+        self.served = [self.listeners[member] for member in served]
+        self._live = [self.listeners[member] for member in served if not self.kept.holds(member)]
 
     def least_throttle_ms(self) -> int:
         """The throttle that still satisfies everyone who is served."""
@@ -127,8 +146,12 @@ class TopicUplink:
         cancel(self.retry)
         self._converter = self._new_converter()
 
-    def activate(self, type_name: str, encoding: str, latched: bool, publishers: int) -> None:
-        """The robot has subscribed."""
+    def activate(self, type_name: str, encoding: str, latched: bool, publishers: int, memory: str) -> None:
+        """The robot has subscribed, or its publishers have changed.
+
+        :param memory: see :attr:`Latched.memory`
+        """
+        begins = latched and not (self.latched and self.phase is Phase.ACTIVE)
         self.phase = Phase.ACTIVE
         self.refusals = 0
         if (type_name, encoding) != (self.type, self.encoding):
@@ -136,9 +159,27 @@ class TopicUplink:
         self.encoding = encoding
         self.latched = latched
         self.retype(type_name)
-        self._recent = deque(self._recent, maxlen=min(max(publishers, 1), LATCHED_KEPT))
+        early, self._early = self._early, set()
+        if latched:
+            self.kept.robot(memory, publishers)
+        if begins and memory:
+            self.kept.begin(self._stamp)
+            self._begin_latched(early)
         if not self.untypeable:
             self._mended()
+
+    def _begin_latched(self, early: set[Member]) -> None:
+        """The robot begins to send what publishers keep.
+
+        A throttle would let nothing but the last of it through. Those who subscribed before have had some of it: what
+        came since then.
+        """
+        since, self._since = self._since, {}
+        for member, listener in list(self.listeners.items()):
+            if listener.throttle or (member in early and self.kept.newest):
+                self.welcome(member, listener, live=False)
+            elif member in since and self.serves(member):
+                self.kept.join(member, listener, live=True, since=since[member])
 
     def retype(self, type_name: str) -> None:
         """The topic has this type."""
@@ -149,12 +190,26 @@ class TopicUplink:
         self._serve()
 
     def reset(self) -> None:
-        """The robot's side is gone."""
+        """The robot is not subscribed any more."""
+        self._pause()
+        self._forget()
+
+    def lost(self) -> None:
+        """The robot's side is gone; when it is back it may go on with the samples that it sent before."""
+        self._pause()
+        self.kept.lost()
+        self._stamp = 0
+        self._untyped.clear()
+        self._unready.clear()
+        self._since.clear()
+        self._serve()
+
+    def _pause(self) -> None:
         self.phase = Phase.WAITING
         self.refusals = self.patience = 0
         self.untypeable = ""
+        self.owed.clear()
         cancel(self.retry)
-        self._forget()
         self._mended()
 
     def _mended(self) -> None:
@@ -163,8 +218,12 @@ class TopicUplink:
 
     def _forget(self) -> None:
         self.owed.clear()
-        self._recent.clear()
+        self.kept.forget()
+        self._stamp = 0
         self._untyped.clear()
+        self._unready.clear()
+        self._since.clear()
+        self._serve()
 
     def _new_converter(self) -> Converter:
         return Converter(self._types(), self.type, self.encoding, self._failed)
@@ -176,20 +235,26 @@ class TopicUplink:
 
     # --- samples ------------------------------------------------------------------------------------------
 
-    def sample(self, body: bytes, stamp: int) -> None:
-        """Take a sample from the robot and hand it to the listeners."""
-        self.taken += 1
+    def sample(self, body: bytes, time: int, stamp: int) -> None:
+        """Take a sample from the robot and hand it to the listeners.
+
+        :param time: the robot's time when it came, nanoseconds
+        :param stamp: of the frame
+        """
         converter = self._converter
-        sample = Sample(body, stamp, converter)
+        sample = Sample(body, time, converter)
         if self.latched:
             self.pay()
-            _keep(self._recent, sample)
+            if not self.kept.take(stamp, sample):
+                return
+        self.taken += 1
+        self._stamp = stamp
         if converter.known or converter.knows:
-            for listener in self.served:
+            for listener in self._live:
                 listener.offer(sample)
             return
         _keep(self._untyped, sample)
-        for listener in self.served:
+        for listener in self._live:
             if listener.raw:
                 listener.offer(sample)
 
@@ -201,16 +266,29 @@ class TopicUplink:
             self._mended()
         waiting = list(self._untyped)
         self._untyped.clear()
+        unready, self._unready = self._unready, set()
+        for member in unready:
+            if self.serves(member):
+                self.welcome(member, self.listeners[member], live=False)
         for sample in waiting:
-            for listener in self.served:
+            for listener in self._live:
                 if not listener.raw:
                     listener.offer(sample)
 
-    def replay(self, listener: Listener) -> None:
-        """Give a late joiner the latched samples the others have had."""
-        if self._converter.knows or listener.raw:
-            for sample in list(self._recent):
-                listener.replay(sample)
+    def welcome(self, member: Member, listener: Listener, live: bool) -> None:
+        """Give a new subscription the latched samples.
+
+        Before the topic's type is known there is nothing to give; of a robot that can't repeat its samples they wait in
+        :attr:`_untyped` for all.
+
+        :param live: whether its member has the topic already
+        """
+        if not self.latched:
+            self._since[member] = self._stamp
+        elif self._converter.knows or listener.raw:
+            self.kept.join(member, listener, live)
+        elif self.kept.memory and not live:
+            self._unready.add(member)
 
     def pay(self) -> None:
         """The topic is inhibited no more: late joiners get what the others have had."""
@@ -219,7 +297,7 @@ class TopicUplink:
         owed, self.owed = self.owed, {}
         for member, listener in owed.items():
             if self.serves(member):
-                self.replay(listener)
+                self.welcome(member, listener, live=True)
 
 
 def _keep(samples: deque[Sample], sample: Sample) -> None:

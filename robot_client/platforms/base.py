@@ -61,10 +61,20 @@ class Motion(enum.Enum):
     """No message of its type, or with a number that is none (NaN, infinity)."""
 
 
+OnKept = Callable[[int, bytes], None]
+"""Takes the stamp and the body of a sample that a publisher keeps."""
+
+
 class Source(Protocol):
     """A topic the daemon listens to."""
 
     type: str
+    stamp: int
+    """Of the sample that is being passed on: nanoseconds since 1970 when it first came, 0 when nobody noted it."""
+
+    @property
+    def replays(self) -> str:
+        """Names the memory of stamps: under the same name a stamp means the same sample. Empty: no :meth:`recall`."""
 
     @property
     def latched(self) -> bool:
@@ -73,6 +83,14 @@ class Source(Protocol):
     @property
     def publishers(self) -> int:
         """How many publish now."""
+
+    def recall(self, on_kept: OnKept, on_end: Callable[[], None]) -> None:
+        """Ask the publishers for what they keep for late joiners; ends what was asked before.
+
+        :param on_kept: called with each of these samples, also with those passed on before, and with what is published
+            meanwhile
+        :param on_end: called once, when all have had time to come; not when the source is closed before
+        """
 
     def close(self) -> None:
         """Stop listening; no sample comes any more."""

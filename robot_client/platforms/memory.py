@@ -22,6 +22,7 @@ from robot_client.platforms.base import (
     OnCancel,
     OnChange,
     OnGoal,
+    OnKept,
     OnSample,
     Outcome,
     Platform,
@@ -42,6 +43,9 @@ def twist(forward: float = 0.0, turn: float = 0.0) -> bytes:
 class MemorySource:
     """A subscription; samples come by :meth:`MemoryPlatform.emit`."""
 
+    stamp = 0
+    replays = ""
+
     def __init__(self, platform: MemoryPlatform, topic: str, type: str, on_sample: OnSample) -> None:
         self.type = type
         self.topic = topic
@@ -49,7 +53,17 @@ class MemorySource:
         self.publishers = 1
         self.on_sample = on_sample
         self.on_change: OnChange = lambda: None
+        self.keeps: dict[int, bytes] = {}
+        """What its publishers keep, by stamp."""
+        self.recalls: list[Callable[[], None]] = []
+        """What ends each :meth:`recall`."""
         self._platform = platform
+
+    def recall(self, on_kept: OnKept, on_end: Callable[[], None]) -> None:
+        """Tell what is in :attr:`keeps`."""
+        self.recalls.append(on_end)
+        for stamp, body in self.keeps.items():
+            on_kept(stamp, body)
 
     def close(self) -> None:
         """Stop listening."""

@@ -44,7 +44,7 @@ from robot_client.platforms.ros2_names import action_type, check_name, service_t
 from robot_client.platforms.ros2_nodes import Nodes
 from robot_client.platforms.ros2_offers import Offers
 from robot_client.platforms.ros2_services import RosService
-from robot_client.platforms.ros2_topics import Lingering, RosSink, RosSource
+from robot_client.platforms.ros2_topics import Lingering, RosSink, RosSource, Stamps
 from robot_client.platforms.ros2_types import Types
 from robot_client.ros_log import ensure_log_folder
 from robot_client.topics import TypedTopic
@@ -96,6 +96,7 @@ class Ros2Platform(Platform):
         self._hop = Hop(reactor.callFromThread)
         self._nodes = Nodes(name, executor, sim_time)
         self._sources: list[RosSource] = []
+        self._stamps = Stamps()
         self._sinks: list[RosSink] = []
         self._seen: Mapping[str, link.Topic] = {}
         self._looks = 0
@@ -186,6 +187,8 @@ class Ros2Platform(Platform):
                 on_sample,
                 on_change,
                 self._sources.remove,
+                self._reactor,
+                self._stamps,
                 self._guard,
             )
         self._sources.append(source)

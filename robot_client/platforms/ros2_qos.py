@@ -26,22 +26,27 @@ class Match(NamedTuple):
     """What a subscription has to know of its publishers.
 
     :param reliable: all of them send again what was lost
-    :param latched: all of them keep messages for late joiners
+    :param latched: some of them keep messages for late joiners
+    :param publishers: how many there are
+    :param all_latched: whether all of them keep messages
     """
 
     reliable: bool
     latched: bool
     publishers: int
+    all_latched: bool
 
 
 def match(publishers: Sequence[QoSProfile]) -> Match:
     """What suits all these publishers; none yet: the usual."""
     if not publishers:
-        return Match(False, False, 0)
+        return Match(False, False, 0, False)
+    latched = [each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers]
     return Match(
         all(each.reliability == ReliabilityPolicy.RELIABLE for each in publishers),
-        all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers),
+        any(latched),
         len(publishers),
+        all(latched),
     )
 
 
@@ -51,9 +56,19 @@ def for_subscription(found: Match, asked: QoS | None) -> QoSProfile:
         depth=DEPTH,
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE if found.reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if found.latched else DurabilityPolicy.VOLATILE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if found.all_latched else DurabilityPolicy.VOLATILE,
     )
     return _override(profile, asked)
+
+
+def for_recall() -> QoSProfile:
+    """The profile to get with what latched publishers keep."""
+    return QoSProfile(
+        depth=MAX_DEPTH,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
 
 
 def for_publisher(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-from collections import deque
+import inspect
+import secrets
+import time
+from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.subscription import Subscription
 
 try:
     from rclpy.event_handler import SubscriptionEventCallbacks
@@ -17,20 +21,79 @@ except ImportError:  # Humble
 
 from relay_protocol.link import QoS
 from robot_client.platforms import ros2_qos
-from robot_client.platforms.base import OnChange, OnSample
+from robot_client.platforms.base import OnChange, OnKept, OnSample
 from robot_client.platforms.ros2_executor import Hop
 from robot_client.platforms.ros2_types import Types
 from robot_client.reactors import Clock, Timer
 
 LINGER = 0.5
 
+RECALL_SECONDS = 5.0
+"""How long publishers have to send what they keep: a lost packet of discovery is sent again after 3 s (Fast DDS)."""
+
+KNOWN = 2048
+"""Messages of a topic that are known again when they come once more."""
+
+KNOWN_TOPICS = 256
+
+TELLS_APART = hasattr(Subscription, "CallbackType")
+"""Whether this rclpy gives callbacks what tells one message from another (since Iron)."""
+
+_TWO = inspect.signature(lambda message, info: None)
+
 # What tells of such events ends the process when it goes at the wrong moment; see Nodes.for_actions.
 _NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
+
+
+Identity = tuple[int, int | None]
+"""What tells a message from all others of its topic, also when the middleware delivers it again: when its publisher
+sent it, nanoseconds, and how many it had sent by then (``rmw_message_info_t``)."""
+
+Arrived = tuple[bytes, Identity | None]
+
+
+class Stamps:
+    """Which stamp each latched message was first passed on by, for as long as the daemon lives.
+
+    After the loss of a link the relay subscribes again, and the middleware delivers again what publishers keep: the
+    relay knows by the stamp which of it its clients have had.
+    """
+
+    def __init__(self, wall: Callable[[], int] = time.time_ns) -> None:
+        self.memory = secrets.token_hex(8)
+        """A name for this memory: after a restart the same message has another stamp."""
+        self._wall = wall
+        self._latest = 0
+        self._topics: OrderedDict[str, OrderedDict[Identity, int]] = OrderedDict()
+
+    def now(self) -> int:
+        """The wall clock, nanoseconds since 1970; stamps of latched messages will be greater."""
+        now = self._wall()
+        self._latest = max(self._latest, now)
+        return now
+
+    def of(self, topic: str, identity: Identity) -> int:
+        """The stamp of a message: now, when it was not passed on before; later ones are never less."""
+        known = self._topics.setdefault(topic, OrderedDict())
+        self._topics.move_to_end(topic)
+        if len(self._topics) > KNOWN_TOPICS:
+            self._topics.popitem(last=False)
+        stamp = known.get(identity)
+        if stamp is None:
+            stamp = self._latest = known[identity] = max(self._wall(), self._latest + 1)
+            if len(known) > KNOWN:
+                known.popitem(last=False)
+        return stamp
 
 
 class RosSource:
     """A raw subscription that follows its publishers' quality of service.
 
+    Two publishers of one topic may offer different qualities, and a subscription matches only those that offer what it
+    asks for. So it asks for what all offer. What the latched ones among them keep comes by a second subscription, which
+    lives for :data:`RECALL_SECONDS`.
+
+    :param stamps: of latched messages
     :param ignore: how the names of nodes begin whose publishers don't count
     """
 
@@ -45,9 +108,12 @@ class RosSource:
         on_sample: OnSample,
         on_change: OnChange,
         on_close: Callable[[RosSource], None],
+        clock: Clock,
+        stamps: Stamps,
         ignore: str = "",
     ) -> None:
         self.type = type
+        self.stamp = 0
         self._node = node
         self._hop = hop
         self.topic = topic
@@ -56,23 +122,33 @@ class RosSource:
         self._on_sample: OnSample | None = on_sample
         self._on_change = on_change
         self._on_close = on_close
+        self._clock = clock
+        self._stamps = stamps
         self._ignore = ignore
         self._generation = 0
         self._subscription: Any = None
         self._former: Any = None
-        self._passed_on: deque[bytes] = deque(maxlen=ros2_qos.DEPTH)
+        self._recall: _Recall | None = None
+        self._known: OrderedDict[Identity, int] = OrderedDict()
+        """Stamps of the latest messages that were passed on."""
         self._match = self._look()
         self._build()
+        self._recall_some()
 
     @property
     def latched(self) -> bool:
-        """Whether all publishers keep their last messages."""
-        return self._match.latched
+        """Whether there are publishers that keep their last messages."""
+        return self._match.latched and (self._asked is None or self._asked.durability != "volatile")
 
     @property
     def publishers(self) -> int:
         """How many publish now."""
         return self._match.publishers
+
+    @property
+    def replays(self) -> str:
+        """The memory of stamps, where this rclpy tells messages apart (Iron and later)."""
+        return self._stamps.memory if TELLS_APART else ""
 
     def refresh(self) -> None:
         """Look at the publishers again; subscribe anew if they want another quality of service."""
@@ -80,12 +156,22 @@ class RosSource:
         if new == old:
             return
         if new.publishers == 0:
-            # Whoever comes back is likely to be as before.
+            # Those that come back are likely to be as before.
             new = old._replace(publishers=0)
         self._match = new
-        if (new.reliable, new.latched) != (old.reliable, old.latched):
+        if (new.reliable, new.all_latched) != (old.reliable, old.all_latched):
             self._build()
+        if new.publishers > old.publishers or not old.latched:
+            self._recall_some()
         self._on_change()
+
+    def recall(self, on_kept: OnKept, on_end: Callable[[], None]) -> None:
+        """Ask the publishers for what they keep: the middleware sends it to each new subscription."""
+        self._end_recall()
+        recall = _Recall(on_kept, on_end)
+        recall.subscription = self._subscribe(partial(self._recalled, recall), ros2_qos.for_recall())
+        recall.timer = self._clock.callLater(RECALL_SECONDS, self._end_recall)
+        self._recall = recall
 
     def close(self) -> None:
         """Stop listening."""
@@ -95,6 +181,7 @@ class RosSource:
         self._generation += 1
         self._node.destroy_subscription(self._subscription)
         self._retire()
+        self._drop_recall()
         self._on_close(self)
 
     def _look(self) -> ros2_qos.Match:
@@ -106,15 +193,19 @@ class RosSource:
 
     def _build(self) -> None:
         self._generation += 1
-        generation = self._generation
         profile = ros2_qos.for_subscription(self._match, self._asked)
-        # Called for each sample: without a function of Python's around it.
-        arrived = partial(self._hop.put, partial(self._deliver, generation), size=None)
         self._retire()
-        self._passed_on.clear()
         self._former = self._subscription
-        self._subscription = self._node.create_subscription(
-            self._class, self.topic, arrived, profile, event_callbacks=_NO_EVENTS, raw=True
+        self._subscription = self._subscribe(partial(self._deliver, self._generation), profile)
+
+    def _subscribe(self, deliver: Callable[[Arrived], None], profile: Any) -> Any:
+        return self._node.create_subscription(
+            self._class,
+            self.topic,
+            _with_identity(self._hop.put, deliver),
+            profile,
+            event_callbacks=_NO_EVENTS,
+            raw=True,
         )
 
     def _retire(self) -> None:
@@ -122,29 +213,90 @@ class RosSource:
         if former is not None:
             self._node.destroy_subscription(former)
 
-    def _deliver(self, generation: int, body: bytes) -> None:
+    def _deliver(self, generation: int, arrived: Arrived) -> None:
         if self._on_sample is None:
             return
         # Finding the publishers takes a new subscription a while: until it hears something the former one counts.
         if generation == self._generation:
             if self._former is not None:
                 self._retire()
-            if self._passed_on and self._repeats(body):
-                return
         elif self._former is None or generation != self._generation - 1:
             return
-        else:
-            self._passed_on.append(body)
-        self._on_sample(body)
+        body, identity = arrived
+        if self._is_new(identity):
+            self._on_sample(body)
 
-    def _repeats(self, body: bytes) -> bool:
-        """Whether the former subscription has passed this sample on already; then also what came before it."""
-        if body not in self._passed_on:
-            self._passed_on.clear()
+    def _is_new(self, identity: Identity | None) -> bool:
+        """Whether a message has not been passed on; its stamp is in :attr:`stamp` then."""
+        if identity is None:
+            self.stamp = 0
+            return True
+        known = self._known.get(identity)
+        if known is not None:
+            self.stamp = known
             return False
-        while self._passed_on.popleft() != body:
-            pass
+        stamps = self._stamps
+        self.stamp = stamps.of(self.topic, identity) if self._match.latched else stamps.now()
+        self._known[identity] = self.stamp
+        if len(self._known) > KNOWN:
+            self._known.popitem(last=False)
         return True
+
+    # --- what publishers keep -----------------------------------------------------------------------------
+
+    def _recall_some(self) -> None:
+        """Where not all publishers are latched, the subscription gets nothing that was published before it."""
+        if self.latched and not self._match.all_latched and TELLS_APART and self._recall is None:
+            self.recall(lambda stamp, body: None, lambda: None)
+
+    def _recalled(self, recall: _Recall, arrived: Arrived) -> None:
+        if recall is not self._recall or self._on_sample is None:
+            return
+        body, identity = arrived
+        if self._is_new(identity):
+            self._on_sample(body)
+        recall.on_kept(self.stamp, body)
+
+    def _end_recall(self) -> None:
+        recall = self._recall
+        self._drop_recall()
+        if recall is not None:
+            recall.on_end()
+
+    def _drop_recall(self) -> None:
+        recall, self._recall = self._recall, None
+        if recall is not None:
+            if recall.timer is not None and recall.timer.active():
+                recall.timer.cancel()
+            self._node.destroy_subscription(recall.subscription)
+
+
+class _Recall:
+    """A subscription that lives for a moment, to get what publishers keep."""
+
+    subscription: Any
+    timer: Timer | None = None
+
+    def __init__(self, on_kept: OnKept, on_end: Callable[[], None]) -> None:
+        self.on_kept = on_kept
+        self.on_end = on_end
+
+
+def _with_identity(put: Callable[..., None], deliver: Callable[[Arrived], None]) -> Callable[..., None]:
+    """A callback of a raw subscription that has each message delivered on the reactor's thread."""
+
+    def arrived(message: Any, info: Any = None) -> None:
+        if type(message) is tuple:
+            # What the EventsExecutor of rclpy 7.1 calls with: both in one.
+            message, info = message
+        sent = info["source_timestamp"] if info is not None else 0
+        identity = (sent, info.get("publication_sequence_number")) if sent else None
+        put(deliver, (message, identity), len(message))
+
+    if TELLS_APART:
+        # rclpy gives the second argument to a callback that can't be called with one (PEP 362).
+        arrived.__signature__ = _TWO  # type: ignore[attr-defined]
+    return arrived
 
 
 class RosSink:

@@ -12,7 +12,7 @@ from relay_protocol.frames import CommandFrame, SampleFrame
 from relay_protocol.link import MotionPolicy
 from robot_client.motion import KEPT, MOTION_QOS
 from robot_client.platforms.base import CANCELED, GraphView, Outcome
-from robot_client.platforms.memory import TWIST, twist
+from robot_client.platforms.memory import TWIST, MemorySource, twist
 from robot_client.tracks import MAX_TOPICS
 from tests.robot_client.breaking import broken
 from tests.robot_client.scene import DRIVER, STRING, Scene
@@ -343,3 +343,74 @@ def test_samples_to_what_moves_the_robot_are_dropped_and_counted(scene: Scene) -
     scene.channel.sample(SampleFrame(5, scene.now(), twist(1.0)))
     assert scene.platform.published == []
     assert scene.authority.refused == 1
+
+
+# --- what publishers keep -----------------------------------------------------------------------------------
+
+
+def latched(scene: Scene, **fields: object) -> MemorySource:
+    """A latched topic that is subscribed as number 1, and of which three samples have gone to the relay."""
+    scene.ask(link.Subscribe(number=1, topic="/chat", **fields))
+    (source,) = scene.platform.sources
+    source.latched, source.replays = True, "memory"
+    source.on_change()
+    for stamp, body in ((10, b"aaaa"), (11, b"bbbb"), (12, b"cccc")):
+        source.stamp = stamp
+        scene.platform.emit("/chat", body)
+    return source
+
+
+def test_what_publishers_keep_is_repeated_by_its_stamps(scene: Scene) -> None:
+    """With bodies only where the relay has none; a sample of stamp 0 without a body is the end."""
+    source = latched(scene)
+    assert scene.wire.said[-1].replays == "memory"
+    scene.clock.advance(0)
+    assert [each.stamp for each in scene.frames()] == [10, 11, 12]
+    source.keeps = {11: b"bbbb", 12: b"cccc"}
+    scene.ask(link.Subscribe(number=1, topic="/chat", kept=[10, 11]))
+    source.recalls[0]()
+    assert scene.frames()[3:] == [
+        SampleFrame(1, 11, b""),
+        SampleFrame(1, 12, b"cccc"),
+        SampleFrame(1, 0, b""),
+    ]
+
+
+def test_no_throttle_and_no_full_transport_loses_what_is_kept(scene: Scene) -> None:
+    """It waits as long as it takes; it may be some publisher's only message."""
+    source = latched(scene, throttle_ms=60_000)
+    source.keeps = {10: b"aaaa", 11: b"bbbb", 12: b"cccc"}
+    scene.channel.pause()
+    scene.ask(link.Subscribe(number=1, topic="/chat", throttle_ms=60_000, kept=[]))
+    scene.clock.advance(30)
+    scene.channel.resume()
+    scene.run(0.1)
+    assert {each.body for each in scene.frames()} == {b"aaaa", b"bbbb", b"cccc"}
+
+
+def test_muted_topics_repeat_nothing_new(scene: Scene) -> None:
+    """Nothing at all, or with the last value held what the relay has already; the end is said in any case."""
+    source = latched(scene)
+    source.keeps = {12: b"cccc", 13: b"dddd"}
+    for hold, told in ((False, [0]), (True, [12, 0])):
+        scene.clock.advance(0)
+        before = len(scene.frames())
+        scene.silent["/chat"] = hold
+        scene.channel.silence("/chat")
+        scene.ask(link.Subscribe(number=1, topic="/chat", kept=[12]))
+        source.recalls.pop()()
+        assert [(each.stamp, each.body) for each in scene.frames()[before:]] == [(each, b"") for each in told]
+
+
+def test_platform_that_can_not_ask_again_says_so(scene: Scene) -> None:
+    """The subscription goes on, and the relay waits for nothing."""
+    source = latched(scene)
+
+    def broken_recall(*_: object) -> None:
+        raise RuntimeError("out of memory")
+
+    source.recall = broken_recall  # type: ignore[method-assign]
+    answer = scene.ask(link.Subscribe(number=1, topic="/chat", kept=[10]))
+    assert isinstance(answer, link.Subscribed)
+    scene.clock.advance(0)
+    assert scene.frames()[-1] == SampleFrame(1, 0, b"")

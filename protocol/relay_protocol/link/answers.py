@@ -29,10 +29,13 @@ class Subscribed(Numbered, frozen=True, kw_only=True):
 
     :param latched: publishers keep their last messages for late joiners (transient local)
     :param publishers: how many publish now
+    :param replays: names the memory of stamps of a robot that can repeat what publishers keep; empty when it can't.
+        While it is the same, also on another link, a stamp means the same sample
     """
 
     latched: bool = False
     publishers: int = 0
+    replays: Label = ""
 
 
 class Advertised(Numbered, frozen=True, kw_only=True):

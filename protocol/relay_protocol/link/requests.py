@@ -24,6 +24,7 @@ class Subscribe(Message, frozen=True, kw_only=True):
 
     :param type: the type, where the asker knows it; else the robot takes the topic's one type from its graph
     :param throttle_ms: least time between two samples, milliseconds; 0 for all
+    :param kept: with a known number: repeat the samples that publishers keep, those with these stamps without body
     """
 
     number: int
@@ -31,6 +32,7 @@ class Subscribe(Message, frozen=True, kw_only=True):
     type: str = ""
     throttle_ms: int = 0
     qos: QoS | None = None
+    kept: list[int] | None = None
 
 
 class Unsubscribe(Message, frozen=True, kw_only=True):

@@ -321,7 +321,7 @@ def test_what_is_made_ready_of_a_sample_is_bounded(world: World) -> None:
     number, (person,) = watching(world, {})
     world.subscribed(number, latched=True, publishers=1)
     world.channel.sample(number, text("x" * 100_000))
-    (kept,) = world.channel.subscriptions._numbers[number]._recent
+    (kept,) = world.channel.subscriptions._numbers[number].kept._samples.values()
     for size in range(1000, 1100):
         person.says("subscribe", topic="/chatter", fragment_size=size)
         listener = person.session.listening._listeners["/chatter"]

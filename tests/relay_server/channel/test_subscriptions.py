@@ -139,6 +139,8 @@ def test_late_joiners_get_the_latched_samples_of_every_publisher(world: World) -
     late.says("subscribe", topic="/chatter", throttle_rate=10_000)
     assert heard(late) == ["b", "c"]
     late.says("subscribe", topic="/chatter", id="again")
+    assert heard(late) == ["b", "c"]
+    late.says("unsubscribe", topic="/chatter", id="again")
     assert heard(late) == []
 
 
@@ -198,7 +200,7 @@ def test_what_is_kept_of_one_topic_is_bounded_in_bytes(world: World) -> None:
     world.define()
     for _ in range(5):
         world.channel.sample(number, text("x" * (module.KEPT_BYTES // 3)))
-    assert 0 < sum(each.size for each in uplink._recent) <= module.KEPT_BYTES
+    assert 0 < uplink.kept.size <= module.KEPT_BYTES
 
 
 def test_samples_that_come_before_their_type_are_handed_on_after_it(world: World) -> None:

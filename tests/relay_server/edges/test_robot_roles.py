@@ -161,7 +161,7 @@ async def test_a_robot_joins_its_channel_and_samples_flow(hall: Hall) -> None:
     assert joined == {"op": "joined", "channel": channel.name, "at": hall.world.now_ns()}
     assert channel.state is State.OPEN
     got: list[tuple[int, bytes]] = []
-    channel.subscriptions.sample = lambda number, body, stamp: got.append((number, body))  # type: ignore[method-assign]
+    channel.subscriptions.sample = lambda number, body, time, stamp: got.append((number, body))  # type: ignore[method-assign]
     end.sends(encode_sample(7, 1, text("hi")))
     end.sends(encode_sample(8, 1, bytes(limits.HANDSHAKE_FRAME)))
     assert [number for number, _ in got] == [7, 8]
