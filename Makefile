@@ -28,7 +28,7 @@ LISTEN ?= 0.0.0.0:9091
 
 conformance: ## check a rosbridge server: URL=ws://host:9090 TOKEN=…, without URL our own (docs/conformance.md)
 	@scripts/setup.sh python $(if $(URL),,web fixtures)
-	@CONFORMANCE_TOKEN='$(TOKEN)' $(CASES) tests/conformance/clients --url='$(URL)' --target='$(TARGET)'
+	@CONFORMANCE_TOKEN='$(TOKEN)' $(CASES) tests/conformance/clients --url='$(URL)' --target='$(TARGET)' --restart='$(RESTART)'
 
 robot-conformance: ## check a robot that dials LISTEN=0.0.0.0:9091 (docs/conformance.md)
 	@scripts/setup.sh python

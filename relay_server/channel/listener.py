@@ -167,7 +167,7 @@ class Listener:
     def offer(self, sample: Sample) -> None:
         """A new sample. Within the throttle it waits, in a queue or as the newest, so the last of a burst arrives.
 
-        Source: rosbridge v2 protocol, section 3.4.4, ``queue_length``.
+        Source: rosbridge v2 protocol, section 3.3.4, ``queue_length``.
         """
         throttle = self.throttle
         if throttle:

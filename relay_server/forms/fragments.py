@@ -1,4 +1,4 @@
-"""Long text messages in fragments (rosbridge v2 protocol, section 3.2.1; SPEC section 1.6)."""
+"""Long text messages in fragments (rosbridge v2 protocol, section 3.1.1; SPEC section 1.6)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages that a client sends in fragments (rosbridge v2 protocol, section 3.2.1; SPEC section 1.6)."""
+"""Messages that a client sends in fragments (rosbridge v2 protocol, section 3.1.1; SPEC section 1.6)."""
 
 from __future__ import annotations
 

@@ -15,7 +15,8 @@ import pytest
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from rosbridge_client import Client
+from rosbridge_client import PATIENCE, Client
+from websockets.exceptions import WebSocketException
 
 MARK = "conformance_case"
 ROSBRIDGE_SUITE = "rosbridge_suite"
@@ -23,6 +24,7 @@ WORDS = {
     "passed": "[green]passed[/]",
     "failed": "[bold red]FAILED[/]",
     "differs": "[yellow]differs as known[/]",
+    "spec only": "[dim]SPEC only[/]",
     "not tried": "[dim]not tried[/]",
     "not offered": "[dim]not offered[/]",
 }
@@ -31,6 +33,11 @@ NO_STATUS = "it sends no status, errors go to its node's log only (rosbridge_lib
 """Why every case that reads a ``status`` differs on rosbridge_suite."""
 
 SPEC_ONLY = "a rule of this project's SPEC.md, not of rosbridge v2"
+"""What a case that cites SPEC.md alone, or first, says about a server that never promised it: nothing."""
+
+FIXTURE_VERSION = 2
+FIXTURE_PATIENCE = 10.0
+"""Seconds a command of the fixture node waits, unless it is told to wait for less."""
 
 _names = itertools.count(1)
 
@@ -40,9 +47,17 @@ def case(op: str, section: str, *, suite: str = "") -> pytest.MarkDecorator:
 
     :param op: operation it belongs to in the table
     :param section: document and section it checks
-    :param suite: how rosbridge_suite (ros2 branch) is known to differ, with where that is seen
+    :param suite: how rosbridge_suite 2.1 is known to differ, with where that is seen; needless for a section of SPEC
     """
     return getattr(pytest.mark, MARK)(op=op, section=section, suite=suite)
+
+
+def known_difference(mark: pytest.Mark, target: str) -> str:
+    """Why a case may fail on this target; empty when it may not."""
+    if target != ROSBRIDGE_SUITE:
+        return ""
+    known: str = mark.kwargs["suite"]
+    return known or (SPEC_ONLY if mark.kwargs["section"].startswith("SPEC ") else "")
 
 
 def not_tried(why: str) -> None:
@@ -79,7 +94,7 @@ def outcome_of(item: pytest.Item, report: pytest.TestReport) -> Outcome | None:
     title = title.partition("\n")[0] + (f" [{params.id}]" if params else "")
     word, remark = report.outcome, ""
     if hasattr(report, "wasxfail"):
-        word, remark = "differs", report.wasxfail
+        word, remark = ("spec only" if report.wasxfail == SPEC_ONLY else "differs"), report.wasxfail
     elif report.skipped:
         text = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
         word, _, remark = text.removeprefix("Skipped: ").partition(": ")
@@ -124,21 +139,55 @@ class Server:
     :param url: its websocket
     :param token: an access token, empty where none is needed
     :param target: ``rosbridge_suite`` where its known differences are to be counted as such
+    :param patience: seconds an answer may take
     """
 
     url: str
     token: str = ""
     target: str = ""
+    patience: float = PATIENCE
     about: dict[str, Any] = field(default_factory=dict)
 
     def connect(self, **options: Any) -> Client:
         """A client that is logged in."""
-        return Client(self.url, self.token, **options)
+        return Client(self.url, self.token, self.patience, **options)
 
     @property
     def http_url(self) -> str:
         """The same address for HTTP."""
         return "http" + self.url.removeprefix("ws")
+
+    @property
+    def fixture_patience(self) -> float:
+        """Seconds the fixture node waits for what a command is about."""
+        return min(FIXTURE_PATIENCE, self.patience)
+
+    def look_for_fixture(self) -> str:
+        """Find the fixture node behind the server, and have it wait no longer than the suite; else, what is missing."""
+        with self.connect() as client:
+            client.send("subscribe", topic="/conformance/about", type="std_msgs/msg/String")
+            try:
+                about = client.until("publish", min(15.0, 4 * self.patience), topic="/conformance/about")
+            except AssertionError:
+                return (
+                    "the fixture node is not to be seen: start tests/conformance/fixture_node.py on the robot "
+                    "(same ROS_DOMAIN_ID as the server)"
+                )
+            self.about = json.loads(about["msg"]["data"])
+            if self.about["version"] != FIXTURE_VERSION:
+                return "the fixture node is of another version: start it again from this checkout"
+            words = ["patience", str(self.fixture_patience)]
+            client.values("/conformance/do", {"prefixes": words, "depth": 0})
+        return ""
+
+    def lives(self) -> bool:
+        """Whether a new client is served."""
+        try:
+            with self.connect() as client:
+                client.lives()
+        except (AssertionError, OSError, WebSocketException):
+            return False
+        return True
 
     def needs_examples(self) -> None:
         """End the case where the robot has no ``example_interfaces``."""
@@ -156,6 +205,9 @@ class Hand:
 
     def __init__(self, server: Server) -> None:
         self._client = server.connect()
+        self.waits = server.fixture_patience
+        """Seconds the fixture node waits for what a command is about."""
+        self._limit = self.waits + min(5.0, server.patience)
         self._open: list[tuple[str, str]] = []
 
     def close(self) -> None:
@@ -166,16 +218,21 @@ class Hand:
         finally:
             self._client.close()
 
-    def ask(self, command: str, *words: str, seconds: float = 15.0) -> str:
+    def ask(self, command: str, *words: str) -> str:
         """Send a command; the id its answer will have."""
         call_id = f"hand-{next(_names)}"
         args = {"prefixes": [command, *words], "depth": 0}
-        self._client.send("call_service", id=call_id, service="/conformance/do", args=args, timeout=seconds)
+        self._client.send(
+            "call_service", id=call_id, service="/conformance/do", args=args, timeout=self._limit
+        )
         return call_id
 
-    def answer(self, call_id: str, seconds: float = 15.0) -> list[str]:
-        """What a command gave."""
-        told = self._client.until("service_response", seconds, id=call_id)
+    def answer(self, call_id: str, seconds: float | None = None) -> list[str]:
+        """What a command gave.
+
+        :param seconds: of a command that waits for more than one thing
+        """
+        told = self._client.until("service_response", seconds or self._limit, id=call_id)
         assert told["result"] is True, f"/conformance/do failed: {told.get('values')}"
         names: list[str] = told["values"]["result"]["names"]
         assert names[:1] != ["error"], names
@@ -205,9 +262,9 @@ class Hand:
         self.do("listen", name, type_name, profile)
         self._open.append(("subscription", name))
 
-    def heard(self, name: str, count: int, seconds: float = 8.0) -> list[Any]:
+    def heard(self, name: str, count: int) -> list[Any]:
         """Wait until so many messages came, and return all."""
-        found = [json.loads(each) for each in self.do("heard", name, str(count), str(seconds))]
+        found = [json.loads(each) for each in self.do("heard", name, str(count), str(self.waits))]
         assert len(found) >= count, f"the robot heard {len(found)} messages on {name}, not {count}"
         return found
 

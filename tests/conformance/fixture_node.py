@@ -41,12 +41,14 @@ try:
 except ImportError:
     Fibonacci = AddTwoInts = None
 
-VERSION = 1
+VERSION = 2
 COUNTER_SECONDS = 0.02
 LARGE = 1_000_000
 SLOW_SECONDS = 1.0
 STEP_SECONDS = 0.05
 PATIENCE = 10.0
+"""Seconds a command waits for what it is about, until ``patience`` says otherwise."""
+
 SETTLE = 1.0
 PROFILES = {
     "reliable": QoSProfile(depth=100),
@@ -111,7 +113,7 @@ def fill(message: Any, values: dict[str, Any]) -> Any:
     return message
 
 
-def wait_for(condition: Callable[[], Any], seconds: float = PATIENCE) -> Any:
+def wait_for(condition: Callable[[], Any], seconds: float) -> Any:
     """Poll until something true comes, and return it; after the time, whatever there is."""
     until = time.monotonic() + seconds
     while not (found := condition()) and time.monotonic() < until:
@@ -131,6 +133,7 @@ class Fixture(Node):
         """Action clients to be destroyed by the thread that spins."""
         self._began = time.monotonic()
         self.cancelled = 0
+        self.patience = PATIENCE
         for name, value in (("text", "hello"), ("number", 7), ("ratio", 0.5), ("truths", [True, False])):
             self.declare_parameter(f"conformance.{name}", value, ParameterDescriptor(dynamic_typing=True))
         self._offer()
@@ -228,6 +231,14 @@ class Fixture(Node):
             response.result.names = ["error", f"{command}: {type(error).__name__}: {error}"]
         return response
 
+    def do_patience(self, seconds: str) -> list[str]:
+        """Wait so long for what a command is about."""
+        self.patience = float(seconds)
+        return []
+
+    def _wait(self, condition: Callable[[], Any]) -> Any:
+        return wait_for(condition, self.patience)
+
     def do_publisher(self, topic: str, type_name: str, profile: str) -> list[str]:
         """Let a topic appear."""
         self._ends["publisher", topic] = self.create_publisher(load(type_name), topic, PROFILES[profile])
@@ -239,7 +250,7 @@ class Fixture(Node):
         Who came before the topic was known there may listen best effort at first, and miss what comes meanwhile.
         """
         publisher = self._ends["publisher", topic]
-        if wait_for(publisher.get_subscription_count) and self._reliable(publisher):
+        if self._wait(publisher.get_subscription_count) and self._reliable(publisher):
             wait_for(lambda: any(map(self._reliable, self.get_subscriptions_info_by_topic(topic))), SETTLE)
         for text in texts:
             publisher.publish(fill(publisher.msg_type(), json.loads(text)))
@@ -258,7 +269,7 @@ class Fixture(Node):
     def do_subscribers(self, topic: str, count: str) -> list[str]:
         """Wait until a publisher of ours has so many subscriptions; how many there are."""
         publisher = self._ends["publisher", topic]
-        wait_for(lambda: publisher.get_subscription_count() == int(count))
+        self._wait(lambda: publisher.get_subscription_count() == int(count))
         return [str(publisher.get_subscription_count())]
 
     def do_listen(self, topic: str, type_name: str, profile: str) -> list[str]:
@@ -289,7 +300,7 @@ class Fixture(Node):
 
     def do_publishers(self, topic: str, count: str) -> list[str]:
         """Wait until a topic has so many publishers; what there is to know of each, as JSON."""
-        wait_for(lambda: self.count_publishers(topic) == int(count))
+        self._wait(lambda: self.count_publishers(topic) == int(count))
         return [
             json.dumps(
                 {
@@ -323,7 +334,7 @@ class Fixture(Node):
         def offered() -> bool:
             return name in dict(self.get_service_names_and_types())
 
-        wait_for(lambda: offered() == bool(int(wanted)))
+        self._wait(lambda: offered() == bool(int(wanted)))
         return [str(int(offered()))]
 
     def do_goal(self, action: str, type_name: str, text: str, cancel: str = "0") -> list[str]:
@@ -333,7 +344,7 @@ class Fixture(Node):
         feedback = self._heard[action] = []
         client = Pursuer(self, type_, action, callback_group=self._group)
         try:
-            if not client.wait_for_server(PATIENCE):
+            if not client.wait_for_server(self.patience):
                 return ["absent"]
             goal = fill(type_.Goal(), json.loads(text))
             asked = client.send_goal_async(
@@ -344,7 +355,7 @@ class Fixture(Node):
                 return [json.dumps({"accepted": False})]
             ended = handle.get_result_async()
             if int(cancel):
-                wait_for(lambda: feedback)
+                self._wait(lambda: feedback)
                 self._settled(handle.cancel_goal_async())
             answer = self._settled(ended)
             told = {"accepted": True, "status": answer.status, "result": to_plain(answer.result)}
@@ -354,13 +365,13 @@ class Fixture(Node):
 
     def do_cancelled(self, count: str) -> list[str]:
         """Wait until so many goals of ours were cancelled; how many."""
-        wait_for(lambda: self.cancelled >= int(count))
+        self._wait(lambda: self.cancelled >= int(count))
         return [str(self.cancelled)]
 
     def _settled(self, future: Any) -> Any:
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
-        if not done.wait(PATIENCE):
+        if not done.wait(self.patience):
             raise TimeoutError("no answer came")
         return future.result()
 

@@ -15,6 +15,8 @@ import cbor2
 from websockets.sync.client import ClientConnection, connect
 
 PATIENCE = 30.0
+"""Seconds an answer may take, unless the client is told otherwise: our own server may run on a busy machine."""
+
 SOON = 8.0
 """Seconds to be closed for what was done, and not for saying nothing, which takes the relay longer."""
 
@@ -79,12 +81,20 @@ class Client:
     """One websocket to a rosbridge server.
 
     :param token: sent as ``Authorization: Bearer``, if there is one
+    :param patience: seconds an answer may take
     :param options: further ones of ``websockets.sync.client.connect``
     """
 
-    def __init__(self, url: str, token: str = "", **options: Any) -> None:
+    def __init__(self, url: str, token: str = "", patience: float = PATIENCE, **options: Any) -> None:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
-        options = {"open_timeout": 20, "close_timeout": 1, "max_size": None, "compression": None, **options}
+        self.patience = patience
+        options = {
+            "open_timeout": min(20.0, patience),
+            "close_timeout": 1,
+            "max_size": None,
+            "compression": None,
+            **options,
+        }
         self._stack = contextlib.ExitStack()
         self.connection: ClientConnection = self._stack.enter_context(
             connect(url, additional_headers=headers, **options)
@@ -113,20 +123,21 @@ class Client:
 
     # --- receiving ---
 
-    def receive_raw(self, seconds: float = PATIENCE) -> str | bytes:
+    def receive_raw(self, seconds: float | None = None) -> str | bytes:
         """The next message as it came."""
-        return self.connection.recv(timeout=seconds)
+        return self.connection.recv(timeout=self.patience if seconds is None else seconds)
 
-    def receive(self, seconds: float = PATIENCE) -> Any:
+    def receive(self, seconds: float | None = None) -> Any:
         """The next message, decoded: text is JSON, binary is CBOR."""
         data = self.receive_raw(seconds)
         return cbor2.loads(data) if isinstance(data, bytes) else strict_json(data)
 
-    def until(self, op: str, seconds: float = PATIENCE, **like: Any) -> Any:
+    def until(self, op: str, seconds: float | None = None, **like: Any) -> Any:
         """The next message with this ``op`` and these fields. Others are kept for later."""
         for place, message in enumerate(self._passed_over):
             if _alike(message, op, like):
                 return self._passed_over.pop(place)
+        seconds = self.patience if seconds is None else seconds
         end = time.monotonic() + seconds
         while True:
             try:
@@ -140,13 +151,14 @@ class Client:
                 return message
             self._passed_over.append(message)
 
-    def formed(self, ask: Callable[[], object], seconds: float = PATIENCE) -> None:
+    def formed(self, ask: Callable[[], object], seconds: float | None = None) -> None:
         """Ask until what comes is a PNG or fragments. It is kept for whoever waits for it.
 
         A server may send plain JSON while a user's share of its processor is used up (SPEC 1.6).
 
         :param ask: has one message sent
         """
+        seconds = self.patience if seconds is None else seconds
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             ask()
@@ -179,7 +191,7 @@ class Client:
                 break
         return found
 
-    def fragments(self, seconds: float = PATIENCE) -> list[Any]:
+    def fragments(self, seconds: float | None = None) -> list[Any]:
         """The next message's fragments (rosbridge v2, 3.1.1), by their number."""
         first = self.until("fragment", seconds)
         parts = [first]
@@ -187,8 +199,9 @@ class Client:
             parts.append(self.until("fragment", seconds, id=first["id"]))
         return sorted(parts, key=lambda part: int(part["num"]))
 
-    def closed(self, seconds: float = SOON) -> int:
+    def closed(self) -> int:
         """Wait until the server closes; its close code."""
+        seconds = min(SOON, self.patience)
         end = time.monotonic() + seconds
         try:
             while True:
@@ -201,7 +214,7 @@ class Client:
 
     # --- everyday work ---
 
-    def call(self, service: str, args: Any = None, seconds: float = PATIENCE, **fields: Any) -> Any:
+    def call(self, service: str, args: Any = None, seconds: float | None = None, **fields: Any) -> Any:
         """Call a service; its ``service_response``."""
         call_id = f"call-{next(_ids)}"
         if args is not None:
@@ -209,7 +222,7 @@ class Client:
         self.send("call_service", id=call_id, service=service, **fields)
         return self.until("service_response", seconds, id=call_id)
 
-    def values(self, service: str, args: Any = None, seconds: float = PATIENCE) -> Any:
+    def values(self, service: str, args: Any = None, seconds: float | None = None) -> Any:
         """What a service answers, when it does."""
         answer = self.call(service, args, seconds)
         assert answer["result"] is True, f"{service} failed: {answer.get('values')}"

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import shlex
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import Any
+
+import pytest
+from conformance_suite import FIXTURE_VERSION
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection, serve
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -43,6 +53,106 @@ def test_bad(what):
     """It fails."""
     assert "this" == "that"
 '''
+
+
+SPEC_CASES = '''
+import pytest
+from conformance_suite import case
+
+@case("ours", "SPEC 1.2 ours")
+def test_ours():
+    """Only ours does that."""
+    assert 1 == 2
+
+@case("ours", "SPEC 1.2 ours; rosbridge v2, 3.1")
+def test_ours_met():
+    """Theirs does it too."""
+
+@pytest.fixture
+def broken():
+    raise AssertionError("it has no such thing")
+
+@case("ours", "SPEC 1.2 ours")
+def test_ours_in_a_fixture(broken):
+    """Its fixture asks for it."""
+
+@pytest.fixture
+def untidy():
+    yield
+    raise AssertionError("it can't be cleared away")
+
+@case("ours", "SPEC 1.2 ours")
+def test_ours_with_remains(untidy):
+    """It leaves something behind."""
+    assert 1 == 2
+'''
+HANGS = '''
+from conformance_suite import case
+
+@case("good", "section 1")
+def test_first(client):
+    """It lives."""
+    client.lives()
+
+@case("bad", "section 2")
+def test_hang(client):
+    """It hangs."""
+    client.send("hang")
+    client.lives()
+
+@case("good", "section 3")
+def test_later(client):
+    """It lives again."""
+    client.lives()
+
+@case("good", "section 4")
+def test_last(client):
+    """It still lives."""
+    client.lives()
+'''
+
+
+class FakeServer:
+    """A rosbridge server with the fixture node behind it, as far as the suite itself needs one. It hangs when told.
+
+    :param again: a file; while it is there the server does not hang
+    """
+
+    def __init__(self, again: Path) -> None:
+        self._again = again
+        self._hangs = False
+        self.answered = 0
+        self._server = serve(self._client, "127.0.0.1", 0)
+        self.url = f"ws://127.0.0.1:{self._server.socket.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
+
+    def __enter__(self) -> FakeServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._thread.join()
+
+    def _client(self, connection: ServerConnection) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            for text in connection:
+                answer = self._answer(json.loads(text))
+                if answer is not None and not (self._hangs and not self._again.exists()):
+                    self.answered += 1
+                    connection.send(json.dumps({"topic": "/conformance/about", **answer}))
+
+    def _answer(self, said: dict[str, Any]) -> dict[str, Any] | None:
+        if said["op"] == "hang":
+            self._hangs = True
+            return None
+        if said["op"] == "subscribe":
+            about = json.dumps({"version": FIXTURE_VERSION, "example_interfaces": False})
+            return {"op": "publish", "msg": {"data": about}}
+        values = {"success": True, "message": "inverted"}
+        if said["service"] == "/conformance/do":
+            values = {"result": {"names": []}}
+        return {"op": "service_response", "id": said["id"], "result": True, "values": values}
 
 
 def run(folder: Path, cases: str, *options: str) -> subprocess.CompletedProcess[str]:
@@ -99,3 +209,43 @@ def test_a_server_that_is_not_there_is_told_in_a_sentence(tmp_path: Path) -> Non
     done = run(tmp_path, cases, "--url", "ws://127.0.0.1:1")
     assert done.returncode == 2
     assert "ws://127.0.0.1:1 can't be reached" in done.stdout
+
+
+def test_cases_of_the_spec_alone_are_no_failures_of_the_target(tmp_path: Path) -> None:
+    """Nor is what their fixtures ask for, and what is left behind by them. Without the target named they are."""
+    done = run(tmp_path, SPEC_CASES, "--target", "rosbridge_suite")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 passed, 3 spec only" in done.stdout
+    assert "a rule of this project's SPEC.md, not of rosbridge v2" in done.stdout.replace("\n", " ")
+    assert run(tmp_path, SPEC_CASES).returncode == 1
+
+
+def test_after_a_server_hangs_the_cases_that_are_left_are_not_tried(tmp_path: Path) -> None:
+    """Each would only cost time; the remark says since when."""
+    with FakeServer(tmp_path / "again") as server:
+        done = run(tmp_path, HANGS, "--url", server.url, "--answers-within", "1")
+    assert done.returncode == 1
+    assert "1 passed, 1 failed, 2 not tried" in done.stdout
+    assert "since test_hang" in " ".join(done.stdout.split())
+
+
+def test_a_server_that_hangs_is_started_again_by_a_command(tmp_path: Path) -> None:
+    """The cases that are left are tried then."""
+    again = tmp_path / "again"
+    with FakeServer(again) as server:
+        restart = f"touch {shlex.quote(str(again))}"
+        done = run(tmp_path, HANGS, "--url", server.url, "--answers-within", "1", "--restart", restart)
+    assert "3 passed, 1 failed" in done.stdout
+
+
+@pytest.mark.parametrize("message", ["the fixture node is of another version", "not to be seen"])
+def test_a_fixture_node_that_does_not_fit_is_told_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: str
+) -> None:
+    """Before any case is tried."""
+    answers = {"op": "publish", "msg": {"data": '{"version": 1}'}} if "version" in message else None
+    monkeypatch.setattr(FakeServer, "_answer", lambda self, said: answers)
+    with FakeServer(tmp_path / "again") as server:
+        done = run(tmp_path, HANGS, "--url", server.url, "--answers-within", "1")
+    assert done.returncode == 2
+    assert message in done.stdout

@@ -6,17 +6,17 @@ import json
 from typing import Any
 
 import pytest
-from conformance_suite import NO_STATUS, SPEC_ONLY, Hand, Server, case, fresh_name
+from conformance_suite import NO_STATUS, Hand, Server, case, fresh_name
 from rosbridge_client import Client
 
 FIBONACCI = "/conformance/fibonacci"
 TYPE = "example_interfaces/action/Fibonacci"
-GOAL = "rosbridge v2, 3.2.12 Send Action Goal"
-CANCEL = "rosbridge v2, 3.2.13 Cancel Action Goal"
-FEEDBACK = "rosbridge v2, 3.2.14 Action Feedback"
-RESULT = "rosbridge v2, 3.2.15 Action Result"
-OFFER = "rosbridge v2, 3.2.10 Advertise Action"
-WITHDRAW = "rosbridge v2, 3.2.11 Unadvertise Action"
+GOAL = "rosbridge v2, 3.3.12 Send Action Goal"
+CANCEL = "rosbridge v2, 3.3.13 Cancel Action Goal"
+FEEDBACK = "rosbridge v2, 3.3.14 Action Feedback"
+RESULT = "rosbridge v2, 3.3.15 Action Result"
+OFFER = "rosbridge v2, 3.3.10 Advertise Action"
+WITHDRAW = "rosbridge v2, 3.3.11 Unadvertise Action"
 NEEDS_TYPE = "action_type is required (send_action_goal.py, send_action_goal_msg_fields)"
 SUCCEEDED, CANCELED, ABORTED, NEVER_BEGAN = 4, 5, 6, 0
 
@@ -114,7 +114,7 @@ def test_goal_unknown_action(client: Client) -> None:
     assert isinstance(result["values"], str)
 
 
-@case("send_action_goal", RESULT)
+@case("send_action_goal", "SPEC 1.2 send_action_goal, always answered")
 def test_goal_wrong_args(client: Client) -> None:
     """Arguments that don't fit are answered with result false and a string."""
     for args in ({"order": "many"}, {"wrong": 1}, [1, 2], "text"):
@@ -175,7 +175,7 @@ def test_cancel_of_another(client: Client, server: Server) -> None:
         assert client.until("action_result", id="goal")["status"] == SUCCEEDED
 
 
-@case("send_action_goal", "SPEC 1.2 send_action_goal, always answered", suite=SPEC_ONLY)
+@case("send_action_goal", "SPEC 1.2 send_action_goal, always answered")
 def test_goal_wrong_fields(client: Client) -> None:
     """Fields of a wrong type are answered too: status 0, result false and a string."""
     for number, wrong in enumerate(({"feedback": "yes"}, {"fragment_size": "big"})):
@@ -192,7 +192,7 @@ def test_cancel_unknown(told: Client) -> None:
     assert told.until("status", level="error")["msg"]
 
 
-@case("cancel_action_goal", "SPEC 1.2 send_action_goal, a client that leaves", suite=SPEC_ONLY)
+@case("cancel_action_goal", "SPEC 1.2 send_action_goal, a client that leaves")
 def test_cancel_by_leaving(hand: Hand, server: Server) -> None:
     """Goals of a client that leaves are cancelled on the robot."""
     before = int(hand.do("cancelled", "0")[0])
@@ -208,11 +208,11 @@ def test_cancel_by_leaving(hand: Hand, server: Server) -> None:
 class Offer:
     """A client that offers an action."""
 
-    def __init__(self, client: Client, hand: Hand) -> None:
+    def __init__(self, client: Client, hand: Hand, type_name: str = TYPE) -> None:
         self.name = fresh_name("action")
         self.client = client
         self.hand = hand
-        client.send("advertise_action", action=self.name, type=TYPE)
+        client.send("advertise_action", action=self.name, type=type_name)
         client.lives()
 
     def ask(self, order: int = 3, cancel: bool = False) -> str:
@@ -235,7 +235,7 @@ class Offer:
 
     def outcome(self, asked: str) -> dict[str, Any]:
         """What the robot got."""
-        (answer,) = self.hand.answer(asked, 20)
+        (answer,) = self.hand.answer(asked, 2 * self.hand.waits)
         return dict(json.loads(answer))
 
 
@@ -258,12 +258,15 @@ def test_offer(offer: Offer) -> None:
     assert outcome["result"] == {"sequence": [0, 1, 1]}
 
 
-@case("advertise_action", "SPEC 1.2 advertise_action")
-def test_offer_type(offer: Offer) -> None:
-    """The goal that comes to the client names the type and wants feedback."""
+@case("advertise_action", "rosbridge_library, advertise_action.py")
+@pytest.mark.parametrize("spelled", ["example_interfaces/Fibonacci", TYPE])
+def test_offer_type(client: Client, hand: Hand, spelled: str) -> None:
+    """The goal that comes to the client names the type as the client spelled it, and wants feedback."""
+    offer = Offer(client, hand, spelled)
     asked = offer.ask()
     goal = offer.asked()
-    assert (goal["action_type"], goal["feedback"]) == (TYPE, True)
+    assert set(goal) == {"op", "id", "action", "action_type", "args", "feedback"}
+    assert (goal["action_type"], goal["feedback"]) == (spelled, True)
     offer.finish(goal, 0, status=SUCCEEDED)
     assert offer.outcome(asked)["status"] == SUCCEEDED
 
@@ -281,7 +284,7 @@ def test_offer_feedback(offer: Offer) -> None:
     assert [each["sequence"] for each in offer.outcome(asked)["feedback"]] == [[0], [0, 1]]
 
 
-@case("advertise_action", "SPEC 1.2 action_result, from a client without status", suite=SPEC_ONLY)
+@case("advertise_action", "SPEC 1.2 action_result, from a client without status")
 def test_offer_without_status(offer: Offer) -> None:
     """A client's result without status is 4 with result true and 6 with result false."""
     asked = offer.ask()
@@ -304,7 +307,7 @@ def test_offer_cancelled(offer: Offer) -> None:
     assert offer.outcome(asked)["status"] == CANCELED
 
 
-@case("advertise_action", "SPEC 1.2 advertise_action, an answer from anybody else", suite=SPEC_ONLY)
+@case("advertise_action", "SPEC 1.2 advertise_action, an answer from anybody else")
 def test_offer_answered_by_another(offer: Offer, server: Server) -> None:
     """A result from a client that was not asked is not accepted."""
     asked = offer.ask()

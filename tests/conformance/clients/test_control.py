@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from conformance_suite import SPEC_ONLY, Hand, Server, case
+from conformance_suite import Hand, Server, case
 from rosbridge_client import Client
 
 CONTROL = "SPEC 1.7 Control"
@@ -35,7 +35,7 @@ def told(client: Client, state: str) -> Any:
             return message
 
 
-@case("call_service", f"{CONTROL}, /relay/take_control", suite=SPEC_ONLY)
+@case("call_service", f"{CONTROL}, /relay/take_control")
 def test_control_take(pair: tuple[Client, Client]) -> None:
     """A free robot becomes the caller's; everybody who follows is told whose."""
     one, two = pair
@@ -49,7 +49,7 @@ def test_control_take(pair: tuple[Client, Client]) -> None:
     assert told(two, "free")["holder"] is None
 
 
-@case("call_service", f"{CONTROL}, answers", suite=SPEC_ONLY)
+@case("call_service", f"{CONTROL}, answers")
 def test_control_answers(pair: tuple[Client, Client]) -> None:
     """What can't be is answered with success false and a sentence."""
     one, _ = pair
@@ -59,7 +59,7 @@ def test_control_answers(pair: tuple[Client, Client]) -> None:
         assert answer["message"]
 
 
-@case("publish", f"{CONTROL}, the first command", suite=SPEC_ONLY)
+@case("publish", f"{CONTROL}, the first command")
 def test_control_first_command(pair: tuple[Client, Client], hand: Hand, topic: str) -> None:
     """The first command takes a free robot and is obeyed; who publishes there meanwhile hears who has control."""
     one, two = pair
@@ -71,7 +71,7 @@ def test_control_first_command(pair: tuple[Client, Client], hand: Hand, topic: s
     told(two, "held")
 
 
-@case("call_service", f"{CONTROL}, /relay/stop", suite=SPEC_ONLY)
+@case("call_service", f"{CONTROL}, /relay/stop")
 def test_control_stop(pair: tuple[Client, Client]) -> None:
     """A stop is told with who and why, until somebody resumes."""
     one, two = pair
@@ -86,7 +86,7 @@ def test_control_stop(pair: tuple[Client, Client]) -> None:
         pass
 
 
-@case("call_service", f"{CONTROL}, /relay/suppress, /relay/inhibit", suite=SPEC_ONLY)
+@case("call_service", f"{CONTROL}, /relay/suppress, /relay/inhibit")
 def test_control_times(client: Client) -> None:
     """Times that can't be are refused in words."""
     for service, ms in (("suppress", 20), ("suppress", 201), ("inhibit", -1), ("inhibit", 60_001)):
@@ -95,7 +95,7 @@ def test_control_times(client: Client) -> None:
         assert "ms" in answer["values"]
 
 
-@case("call_service", f"{CONTROL}, /relay/inhibit", suite=SPEC_ONLY)
+@case("call_service", f"{CONTROL}, /relay/inhibit")
 def test_control_inhibit(client: Client) -> None:
     """A topic that is inhibited says nothing, and speaks again when that is ended."""
     client.send("subscribe", topic="/conformance/counter", type="std_msgs/msg/Int64")

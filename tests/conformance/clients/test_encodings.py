@@ -10,7 +10,7 @@ import zlib
 
 import cbor2
 import pytest
-from conformance_suite import NO_STATUS, SPEC_ONLY, Hand, Server, case
+from conformance_suite import NO_STATUS, Hand, Server, case
 from rosbridge_client import Client, png_text, strict_json
 
 STRING = "std_msgs/msg/String"
@@ -95,7 +95,7 @@ def test_fragment_ids_differ(client: Client, hand: Hand, topic: str) -> None:
     assert client.fragments()[0]["id"] != first
 
 
-@case("fragment", "rosbridge v2, 3.2.4 Subscribe, several subscriptions")
+@case("fragment", "rosbridge v2, 3.3.4 Subscribe, several subscriptions")
 def test_fragment_least_size(client: Client, hand: Hand, topic: str) -> None:
     """Of several subscriptions of one client the least fragment_size counts."""
     client.send("subscribe", topic=topic, type=STRING, id="large", fragment_size=100_000)
@@ -103,7 +103,7 @@ def test_fragment_least_size(client: Client, hand: Hand, topic: str) -> None:
     assert max(len(part["data"]) for part in client.fragments()) <= 256
 
 
-@case("fragment", "rosbridge v2, 3.2.8 Call Service, fragment_size", suite=SIZE_OF_CLIENT)
+@case("fragment", "rosbridge v2, 3.3.8 Call Service, fragment_size", suite=SIZE_OF_CLIENT)
 def test_fragment_of_answers(client: Client) -> None:
     """With fragment_size a longer service_response comes in fragments, and the next call without it whole."""
     call = {"service": "/rosapi/services", "args": {}}
@@ -206,7 +206,7 @@ def test_fragment_in_again(client: Client) -> None:
     assert client.until("service_response", id="sense")["result"] is True
 
 
-@case("fragment", "SPEC 1.6, less than 64 counts as 64", suite=SPEC_ONLY)
+@case("fragment", "SPEC 1.6, less than 64 counts as 64")
 def test_fragment_size_tiny(server: Server, hand: Hand, topic: str) -> None:
     """A fragment_size below 64 counts as 64, told by a warning."""
     with server.connect() as client:
@@ -217,7 +217,7 @@ def test_fragment_size_tiny(server: Server, hand: Hand, topic: str) -> None:
         assert max(len(part["data"]) for part in parts) == 64
 
 
-@case("fragment", "SPEC 1.6, 16 messages at a time", suite=SPEC_ONLY)
+@case("fragment", "SPEC 1.6, 16 messages at a time")
 def test_fragment_in_too_many(told: Client) -> None:
     """More than 16 unfinished messages at a time are refused in words, and the connection lives."""
     for number in range(17):
@@ -226,7 +226,7 @@ def test_fragment_in_too_many(told: Client) -> None:
     told.lives()
 
 
-@case("fragment", "SPEC 1.6, 1 MiB together", suite=SPEC_ONLY)
+@case("fragment", "SPEC 1.6, 1 MiB together")
 def test_fragment_in_too_large(told: Client) -> None:
     """Unfinished messages of more than 1 MiB together are refused in words, and the connection lives."""
     for number in range(3):
@@ -269,7 +269,7 @@ def test_png_of_samples(client: Client, hand: Hand, topic: str) -> None:
     assert whole == {"op": "publish", "topic": topic, "msg": {"data": LONG}}
 
 
-@case("png", "SPEC 1.6, png", suite=SPEC_ONLY)
+@case("png", "SPEC 1.6, png")
 def test_png_plain(client: Client, hand: Hand, topic: str) -> None:
     """The picture is about square, has no chunk that is not needed, and its JSON is ASCII."""
     subscribed(client, hand, topic, STRING, {"data": LONG}, compression="png")
@@ -293,7 +293,7 @@ def test_png_small(client: Client) -> None:
     assert strict_json(png_text(client.until("png")["data"]))["topic"] == COUNTER
 
 
-@case("png", "rosbridge v2, 3.2.8 Call Service, compression", suite=NO_COMPRESSION_OF_CALLS)
+@case("png", "rosbridge v2, 3.3.8 Call Service, compression", suite=NO_COMPRESSION_OF_CALLS)
 def test_png_of_answers(client: Client) -> None:
     """With compression png the service_response comes as PNG."""
     call = {"service": "/conformance/invert", "args": {"data": False}}
@@ -428,7 +428,7 @@ def test_raw_of_answers(client: Client) -> None:
     assert cbor2.loads(data)["values"] == {"success": True, "message": "inverted"}
 
 
-@case("cbor-raw", "rosbridge v2, 3.2.4 Subscribe, compression")
+@case("cbor-raw", "rosbridge v2, 3.3.4 Subscribe, compression")
 def test_every_client_its_own_form(server: Server, hand: Hand, topic: str) -> None:
     """Five clients on one topic each get it in the form they asked for."""
     forms = (

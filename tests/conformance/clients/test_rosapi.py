@@ -14,13 +14,7 @@ COUNTER = "/conformance/counter"
 INVERT = "/conformance/invert"
 FIBONACCI = "/conformance/fibonacci"
 SECTION = "rosbridge v2, 4.1; rosapi_msgs/srv/{}"
-SLASHES = pytest.mark.parametrize("slash", ["/", ""], ids=["slash", "bare"])
 TYPEDEF = {"type", "fieldnames", "fieldtypes", "fieldarraylen", "examples", "constnames", "constvalues"}
-
-
-def bare(name: str, slash: str) -> str:
-    """The name with or without its leading slash."""
-    return slash + name.lstrip("/")
 
 
 def typedef(typedefs: list[dict], type_name: str) -> dict:
@@ -48,7 +42,7 @@ def test_topics_appear_and_vanish(client: Client, hand: Hand, topic: str) -> Non
     """topics follows the graph: what appears is listed, what vanishes is not."""
 
     def listed(wanted: bool) -> None:
-        until = time.monotonic() + 8
+        until = time.monotonic() + client.patience
         while (topic in client.values("/rosapi/topics")["topics"]) is not wanted:
             assert time.monotonic() < until, f"{topic} is {'not ' if wanted else ''}listed"
             time.sleep(0.05)
@@ -76,10 +70,9 @@ def test_topics_and_raw_types(client: Client) -> None:
 
 
 @case("rosapi topics", SECTION.format("TopicType"))
-@SLASHES
-def test_topic_type(client: Client, slash: str) -> None:
+def test_topic_type(client: Client) -> None:
     """topic_type tells the type of a topic."""
-    args = {"topic": bare(COUNTER, slash)}
+    args = {"topic": COUNTER}
     assert client.values("/rosapi/topic_type", args) == {"type": "std_msgs/msg/Int64"}
 
 
@@ -90,17 +83,15 @@ def test_topic_type_unknown(client: Client, topic: str) -> None:
 
 
 @case("rosapi topics", SECTION.format("Publishers"))
-@SLASHES
-def test_publishers(client: Client, slash: str) -> None:
+def test_publishers(client: Client) -> None:
     """publishers lists the nodes that publish a topic."""
-    assert client.values("/rosapi/publishers", {"topic": bare(COUNTER, slash)})["publishers"] == [NODE]
+    assert client.values("/rosapi/publishers", {"topic": COUNTER})["publishers"] == [NODE]
 
 
 @case("rosapi topics", SECTION.format("Subscribers"))
-@SLASHES
-def test_subscribers(client: Client, slash: str) -> None:
+def test_subscribers(client: Client) -> None:
     """subscribers lists the nodes that subscribe to a topic."""
-    args = {"topic": bare("/conformance/echo/in", slash)}
+    args = {"topic": "/conformance/echo/in"}
     assert NODE in client.values("/rosapi/subscribers", args)["subscribers"]
 
 
@@ -122,18 +113,16 @@ def test_services_for_type(client: Client) -> None:
 
 
 @case("rosapi services", SECTION.format("ServiceType"))
-@SLASHES
-def test_service_type(client: Client, slash: str) -> None:
+def test_service_type(client: Client) -> None:
     """service_type tells the type of a service."""
-    args = {"service": bare(INVERT, slash)}
+    args = {"service": INVERT}
     assert client.values("/rosapi/service_type", args) == {"type": "std_srvs/srv/SetBool"}
 
 
 @case("rosapi services", SECTION.format("ServiceNode"))
-@SLASHES
-def test_service_node(client: Client, slash: str) -> None:
+def test_service_node(client: Client) -> None:
     """service_node tells the node that offers a service."""
-    assert client.values("/rosapi/service_node", {"service": bare(INVERT, slash)}) == {"node": NODE}
+    assert client.values("/rosapi/service_node", {"service": INVERT}) == {"node": NODE}
 
 
 @case("rosapi services", SECTION.format("ServiceProviders"))
@@ -153,10 +142,9 @@ def test_nodes(client: Client) -> None:
 
 
 @case("rosapi nodes", SECTION.format("NodeDetails"))
-@SLASHES
-def test_node_details(client: Client, slash: str) -> None:
+def test_node_details(client: Client) -> None:
     """node_details tells what a node publishes, subscribes to and offers."""
-    values = client.values("/rosapi/node_details", {"node": bare(NODE, slash)})
+    values = client.values("/rosapi/node_details", {"node": NODE})
     assert COUNTER in values["publishing"]
     assert "/conformance/echo/in" in values["subscribing"]
     assert INVERT in values["services"]
@@ -173,11 +161,10 @@ def test_action_servers(client: Client, server: Server) -> None:
 
 
 @case("rosapi actions", SECTION.format("ActionType"))
-@SLASHES
-def test_action_type(client: Client, server: Server, slash: str) -> None:
+def test_action_type(client: Client, server: Server) -> None:
     """action_type tells the type of an action."""
     server.needs_examples()
-    args = {"action": bare(FIBONACCI, slash)}
+    args = {"action": FIBONACCI}
     assert client.values("/rosapi/action_type", args) == {"type": "example_interfaces/action/Fibonacci"}
 
 
@@ -192,6 +179,30 @@ def test_action_details(client: Client, server: Server, part: str, fields: list[
     typedefs = client.values(f"/rosapi/action_{part}_details", args)["typedefs"]
     assert typedef(typedefs, typedefs[0]["type"])["fieldnames"] == fields
     assert typedefs[0]["fieldtypes"] == ["int32"]
+
+
+BARE = {
+    "topic_type": {"topic": COUNTER},
+    "publishers": {"topic": COUNTER},
+    "subscribers": {"topic": "/conformance/echo/in"},
+    "service_type": {"service": INVERT},
+    "service_node": {"service": INVERT},
+    "node_details": {"node": NODE},
+    "action_type": {"action": FIBONACCI},
+    "get_param": {"name": f"{NODE}:conformance.number"},
+}
+
+
+@case("rosapi names", "SPEC 1.2, names and types")
+@pytest.mark.parametrize("service", BARE)
+def test_bare_name(client: Client, server: Server, service: str) -> None:
+    """A name without its leading slash means the same."""
+    if service == "action_type":
+        server.needs_examples()
+    ((field, name),) = BARE[service].items()
+    answer = client.values(f"/rosapi/{service}", {field: name.lstrip("/")})
+    assert answer == client.values(f"/rosapi/{service}", {field: name})
+    assert any(answer.values())
 
 
 # --- types ---
@@ -265,11 +276,10 @@ def test_service_response_details(client: Client) -> None:
 
 
 @case("rosapi params", SECTION.format("GetParam"))
-@SLASHES
-def test_get_param(client: Client, slash: str) -> None:
+def test_get_param(client: Client) -> None:
     """get_param gives the value of node:parameter as JSON text."""
     for name, value in (("number", 7), ("text", "hello"), ("ratio", 0.5), ("truths", [True, False])):
-        answer = client.values("/rosapi/get_param", {"name": f"{bare(NODE, slash)}:conformance.{name}"})
+        answer = client.values("/rosapi/get_param", {"name": f"{NODE}:conformance.{name}"})
         assert json.loads(answer["value"]) == value
 
 
@@ -285,7 +295,7 @@ def test_get_param_default(client: Client) -> None:
 @case("rosapi params", SECTION.format("GetParam"))
 def test_get_param_no_node(client: Client) -> None:
     """get_param of a node that does not exist is answered soon, and not with a value."""
-    answer = client.call("/rosapi/get_param", {"name": "/conformance/nobody:x"})
+    answer = client.call("/rosapi/get_param", {"name": "/conformance/nobody:x"}, max(8.0, client.patience))
     assert answer["result"] is False or answer["values"]["value"] in ("", "null", '""')
 
 

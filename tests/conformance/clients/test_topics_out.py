@@ -5,15 +5,15 @@ from __future__ import annotations
 import base64
 import json
 
-from conformance_suite import NO_STATUS, SPEC_ONLY, Hand, Server, case, fresh_name
+from conformance_suite import NO_STATUS, Hand, Server, case, fresh_name
 from rosbridge_client import ABSENCE, Client
 
 STRING = "std_msgs/msg/String"
 INT = "std_msgs/msg/Int64"
 COUNTER = "/conformance/counter"
 THROTTLE_DROPS = "what comes within the throttle is dropped, the last too (subscription_modifiers.py)"
-SUBSCRIBE = "rosbridge v2, 3.2.4 Subscribe"
-UNSUBSCRIBE = "rosbridge v2, 3.2.5 Unsubscribe"
+SUBSCRIBE = "rosbridge v2, 3.3.4 Subscribe"
+UNSUBSCRIBE = "rosbridge v2, 3.3.5 Unsubscribe"
 ENCODING = "rosbridge v2, 4.6 Data Type Encoding"
 
 
@@ -94,7 +94,7 @@ def test_subscribe_type_mismatch_lives(client: Client) -> None:
     client.lives()
 
 
-@case("subscribe", "SPEC 1.2 subscribe, under both names", suite=SPEC_ONLY)
+@case("subscribe", "SPEC 1.2 subscribe, under both names")
 def test_subscribe_both_names(client: Client, hand: Hand, topic: str) -> None:
     """Subscribed with and without leading slash, each sample comes under both names."""
     hand.topic(topic, STRING)
@@ -144,7 +144,7 @@ def test_subscribe_last_of_burst(client: Client, hand: Hand, topic: str) -> None
     assert client.until("publish", msg={"data": 9})
 
 
-@case("subscribe", "rosbridge v2, 3.4.4 Subscribe, queue_length")
+@case("subscribe", "rosbridge v2, 3.3.4 Subscribe, queue_length")
 def test_subscribe_queue(client: Client, hand: Hand, topic: str) -> None:
     """With throttle_rate and queue_length, what comes within the throttle is queued and sent, the oldest give way."""
     hand.topic(topic, INT)
@@ -301,7 +301,7 @@ def test_subscribe_unknown_compression(told: Client) -> None:
     assert isinstance(told.until("publish")["msg"]["data"], int)
 
 
-@case("subscribe", "SPEC 1.2, /relay/status", suite=SPEC_ONLY)
+@case("subscribe", "SPEC 1.2, /relay/status")
 def test_subscribe_relay_status(client: Client) -> None:
     """The relay's own topic /relay/status can be subscribed like any other."""
     client.send("subscribe", topic="/relay/status")
