@@ -36,7 +36,7 @@ MOST_LINES = 1000
 """The same of all other kinds."""
 
 LONGEST = 2000
-"""Characters of one line that is not a traceback's."""
+"""Characters of one line."""
 
 Later = Callable[[float, Callable[[], None]], None]
 """Calls something after so many seconds."""
@@ -156,5 +156,5 @@ def _line(now: float, level: str, namespace: str, text: str, as_json: bool) -> s
         # Pure ASCII: whatever shows the log, nothing in it drives a terminal.
         return json.dumps(entry).replace("\x7f", "\\u007f") + "\n"
     # Our own tracebacks have lines; nobody else's text can make one up.
-    lines = "\n    ".join(inert(each) for each in text.split("\n"))
+    lines = "\n    ".join(inert(each, LONGEST) for each in text.split("\n"))
     return f"{stamp} {level:<8} {lines}\n"

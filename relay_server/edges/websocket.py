@@ -34,6 +34,9 @@ from relay_server.frontdesk import Admission
 
 T = TypeVar("T")
 
+UNPROVED_BYTES = limits.UNPROVEN_BYTES + 1024
+"""Bytes before the session began, with the heads of frames."""
+
 EARLY_OVERHEAD = 64
 """What a message before the proof counts for beside its bytes; empty ones take memory too."""
 
@@ -41,7 +44,8 @@ EARLY_OVERHEAD = 64
 class ClientProtocol(BoundedProtocol):
     """One client's websocket."""
 
-    log = Logger()
+    relay_log = Logger()
+    """Autobahn warns in ``log``, which is limited as a library's (:mod:`relay_server.logs`)."""
     factory: ClientFactory
     vouches = True
     takes = limits.CLIENT_MESSAGE
@@ -56,6 +60,7 @@ class ClientProtocol(BoundedProtocol):
         self._proving = False
         self._early: list[bytes] = []
         self._early_bytes = 0
+        self._unproved_bytes = 0
         self._deadline: Timer | None = None
         self._place: Place | None = None
         self._asking = False
@@ -78,11 +83,19 @@ class ClientProtocol(BoundedProtocol):
         if self._asking:
             # Autobahn would take them for a handshake of their own, and open a second session here.
             self._drop("it sent more before its handshake was answered")
-        else:
-            super().dataReceived(data)
+            return
+        if self._open and self._session is None:
+            # Pings and empty frames, too, are bytes of a client that has proved nothing.
+            self._unproved_bytes += len(data)
+            if self._unproved_bytes > UNPROVED_BYTES:
+                self.close(
+                    closing.TOO_BIG, f"more than {limits.UNPROVEN_BYTES} bytes before the session began"
+                )
+                return
+        super().dataReceived(data)
 
     def _drop(self, reason: str) -> None:
-        self.log.info(
+        self.relay_log.info(
             "a client at {address} is cut: {reason}", address=self._address(), reason=reason, limited="cut"
         )
         self._stop_deadline()
@@ -202,7 +215,7 @@ class ClientProtocol(BoundedProtocol):
         if isinstance(error, SwitchboardError):
             self.close(code_of(error), str(error))
         else:
-            self.log.failure("a client's session could not be opened", failure)
+            self.relay_log.failure("a client's session could not be opened", failure)
             self.close(closing.INTERNAL, "the relay failed; its log tells more")
 
     def _address(self) -> str:
@@ -311,7 +324,7 @@ class ClientProtocol(BoundedProtocol):
             self.say_close(code, reason)
 
     def _log_refused(self, reason: str, kind: str | int) -> None:
-        self.log.info(
+        self.relay_log.info(
             "a client at {address} is refused: {reason}",
             address=self._address(),
             reason=reason,

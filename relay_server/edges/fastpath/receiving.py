@@ -56,7 +56,7 @@ class FastProtocol(WebSocketServerProtocol):
     The factory's ``reactor`` is the clock. No extension may be negotiated: frames with reserved bits are refused.
     """
 
-    log = Logger()
+    relay_log = Logger()
     takes_text: Callable[[bytes], object] | None = None
     """Gets the text messages read here, if it is set; else ``onMessage`` does."""
 
@@ -156,7 +156,7 @@ class FastProtocol(WebSocketServerProtocol):
             self._read(bytes(waiting))
         except Exception:
             # Twisted, too, cuts a connection whose protocol fails on what it is given.
-            self.log.failure("what a client sent could not be handled; it is cut")
+            self.relay_log.failure("what a client sent could not be handled; it is cut")
             self.transport.abortConnection()
             return
         if not self._resting and self.state in _SPEAKING:

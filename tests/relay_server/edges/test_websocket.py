@@ -270,6 +270,20 @@ def test_a_large_frame_before_the_proof_is_refused_by_its_length(gate: MemoryGat
     assert client.closed == closing.TOO_BIG
 
 
+@pytest.mark.parametrize("kind", [0x89, 0x8A, 0x01], ids=["pings", "pongs", "unfinished text"])
+def test_frames_without_a_message_count_as_bytes_before_the_proof(gate: MemoryGate, kind: int) -> None:
+    """64 KiB in all, whatever they are."""
+    client = Client(gate)
+    client.end.dataReceived(bytes([kind, 0x80]) + bytes(4))
+    for _ in range(limits.UNPROVEN_BYTES // 600 + 2):
+        if client.transport.connected:
+            client.end.dataReceived(
+                (bytes([kind & 0x80 | (kind & 0x0F if kind & 8 else 0), 0x80]) + bytes(4)) * 100
+            )
+            client.run()
+    assert client.closed == closing.TOO_BIG
+
+
 def test_a_session_takes_and_sends_larger_messages(gate: MemoryGate) -> None:
     """Up to the limit for clients; what the relay sends has none here."""
     client = Client(gate, Authorization="Bearer good")

@@ -411,7 +411,9 @@ def test_a_failure_after_a_rest_cuts_the_connection(monkeypatch: pytest.MonkeyPa
     clock.step = receiving.SHARE_SECONDS
     end.dataReceived(frame(b"x" * 20) * 5)
     failures: list[str] = []
-    monkeypatch.setattr(end, "log", type("Log", (), {"failure": lambda self, text: failures.append(text)})())
+    monkeypatch.setattr(
+        end, "relay_log", type("Log", (), {"failure": lambda self, text: failures.append(text)})()
+    )
 
     def broken(payload: bytes) -> None:
         raise RuntimeError("a fault of ours")

@@ -1,0 +1,309 @@
+"""What strangers send costs little, is answered, and hardly fills the log. Measured is the reactor's processor time.
+
+Bounds are several times what was measured, and a fraction of what it was while parsers were given all of it.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from switchboard_hostile import FIELDS, SHAPES, UPGRADE, Reactor, exchange, request, send, unproved
+from switchboard_relay import Relay
+from switchboard_small_robot import SmallRobot
+from switchboard_waiting import PATIENCE, wait_for
+
+MOST = 0.1
+"""Processor seconds for one input; a tenth of them in the mean."""
+
+NOTICED = 0.02
+"""Processor seconds below which it does not matter how they grow."""
+
+
+@pytest.fixture(scope="module")
+def relay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Relay]:
+    """A relay that serves as many requests as come."""
+    started = Relay(tmp_path_factory.mktemp("hostile"), "--requests-per-second", "0")
+    yield started
+    started.stop()
+
+
+@pytest.fixture
+def reactor(relay: Relay) -> Iterator[Reactor]:
+    """Its reactor. Whatever a test sends, the log shows no traceback."""
+    assert relay.process is not None
+    logged = len(relay.log)
+    yield Reactor(relay.process.popen.pid)
+    assert "Traceback" not in relay.log[logged:]
+
+
+def ask(relay: Relay, data: bytes) -> bytes:
+    """Send bytes to the port for clients on a connection of their own."""
+    with socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE) as connection:
+        return exchange(connection, data)
+
+
+def test_no_input_of_a_stranger_takes_long_or_fails(relay: Relay, reactor: Reactor) -> None:
+    """Each field, path, query, form, body and frame, in each shape that some parser is slow on or stumbles over."""
+    logged = len(relay.log)
+    slow, failed = [], []
+    attacks = unproved()
+    total = reactor.seconds()
+    for attack in attacks:
+        answers: list[bytes] = []
+
+        def once(part: float = 1.0, attack: Any = attack, answers: list[bytes] = answers) -> None:
+            answers.append(send(relay.http_port, relay.robots_port, attack, part))
+
+        cost = reactor.cost(once)
+        if cost > NOTICED:
+            cost = min(cost, reactor.cost(once, 3))
+        if cost > MOST or (cost > NOTICED and cost > 3 * reactor.cost(lambda once=once: once(0.5), 3)):  # type: ignore[misc]
+            slow.append(f"{attack.name}: {cost:.3f} s")
+        if answers[0].startswith(b"HTTP/1.1 5") or (not attack.waits and not answers[0]):
+            failed.append(f"{attack.name}: {answers[0][:60]!r}")
+    assert slow == []
+    assert failed == []
+    assert (reactor.seconds() - total) / len(attacks) < MOST / 10
+    # Twenty kinds of lines or so, each of them 30 times a minute.
+    assert len(relay.log) - logged < 30 * len(attacks)
+
+
+JSON = {"Content-Type": b"application/json"}
+MARKS = "a" + "\u0316\u0300" * 15_000
+FOUND = {
+    "a handshake's cookie": request("GET", b"/robots/x", UPGRADE | {"Cookie": b"a" + b"=" * 15_800 + b'"'}),
+    "a short one's": request("GET", b"/robots/x", UPGRADE | {"Cookie": b"a" + b"=" * 8000 + b'"'}),
+    "a login's user": request(
+        "POST",
+        b"/api/v1/session",
+        JSON,
+        json.dumps({"user": MARKS, "password": "b"}, ensure_ascii=False).encode(),
+    ),
+    "its realm": request(
+        "POST",
+        b"/api/v1/session",
+        JSON,
+        json.dumps({"user": "a@" + MARKS, "password": "b"}, ensure_ascii=False).encode(),
+    ),
+    "a client's id": request(
+        "POST",
+        b"/oauth/token",
+        {"Content-Type": b"application/x-www-form-urlencoded"},
+        b"grant_type=client_credentials&client_secret=b&client_id=" + MARKS.encode(),
+    ),
+    "comments as content type": request("POST", b"/healthz", {"Content-Type": b"(a)" * 5300}, b"{}"),
+    "tabs at the vocabulary": request(
+        "GET", b"/api/v1/vocabulary/switchboard", {"Accept": b"a" + b"\t" * 15_500 + b"b"}
+    ),
+    "tabs as entity tags": request(
+        "GET", b"/api/openapi.json", {"If-None-Match": b"a" + b"\t" * 15_500 + b"b"}
+    ),
+    "chunks of one byte": request("POST", b"/api/v1/session", JSON | {"Transfer-Encoding": b"chunked"})
+    + b"1\r\nx\r\n" * 65_000
+    + b"0\r\n\r\n",
+}
+"""What took 0.1 to 7 s, and what was found beside it."""
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_what_took_seconds_takes_none(relay: Relay, reactor: Reactor, name: str) -> None:
+    """As it was sent."""
+    answers: list[bytes] = []
+    assert reactor.cost(lambda: answers.append(ask(relay, FOUND[name])), 3) < 0.05
+    expected = b"HTTP/1.1 101" if name == "a short one's" else b"HTTP/1.1 4"
+    assert all(each.startswith(expected) for each in answers)
+
+
+def test_eight_at_once_take_no_more_than_eight(relay: Relay, reactor: Reactor) -> None:
+    """They took 13.9 s."""
+
+    def all_at_once() -> None:
+        threads = [
+            threading.Thread(target=ask, args=(relay, FOUND["comments as content type"])) for _ in range(8)
+        ]
+        for each in threads:
+            each.start()
+        for each in threads:
+            each.join()
+
+    assert reactor.cost(all_at_once, 3) < 8 * 0.05
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        b"a\x0bb",
+        b"a\x0cb",
+        b"a\x1cb",
+        b"a\x1db",
+        b"a\x1eb",
+        b"a\x85b",
+        b"((((((",
+        b"a/b; boundary*=idna''%00",
+    ],
+)
+def test_a_content_type_that_failed_in_a_parser_is_answered(
+    relay: Relay, reactor: Reactor, value: bytes
+) -> None:
+    """By 400, and without a traceback."""
+    answer = ask(relay, request("POST", b"/api/v1/session", {"Content-Type": value}, b"{}"))
+    assert answer.startswith(b"HTTP/1.1 400")
+
+
+# --- the log ----------------------------------------------------------------------------------------------
+
+
+def grown(relay: Relay, data: bytes, times: int) -> int:
+    """By how many bytes the log grows when this is sent so often."""
+    before = len(relay.log)
+    with socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE) as connection:
+        for _ in range(times):
+            if exchange(connection, data):
+                continue
+            break
+        else:
+            return len(relay.log) - before
+    for _ in range(times):
+        ask(relay, data)
+    return len(relay.log) - before
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a long path", request("GET", b"/assets/" + b"a" * 300, {"Connection": b"keep-alive"})),
+        ("a refused handshake", request("GET", b"/robots/x", UPGRADE | {"Authorization": b"Bearer x"})),
+        ("a handshake that is none", request("GET", b"/robots/x", UPGRADE | {"Sec-WebSocket-Key": b"x"})),
+        ("no request", b"x\r\n\r\n"),
+        ("a long field", request("GET", b"/", {"Accept": b"a" * 2000})),
+    ],
+)
+def test_a_flood_of_refusals_hardly_fills_the_log(relay: Relay, name: str, data: bytes) -> None:
+    """30 lines a minute of each kind, not one for each of 500."""
+    assert grown(relay, data, 500) < 70 * 500
+
+
+def test_a_handshake_that_never_finishes_closing_costs_no_line_each(relay: Relay) -> None:
+    """Nobody answers the relay's close."""
+    before = relay.log.count("\n")
+    opened = [socket.create_connection(("127.0.0.1", relay.http_port), timeout=PATIENCE) for _ in range(120)]
+    refused = request("GET", b"/robots/x", UPGRADE | {"Authorization": b"Bearer x", "Origin": b"http://x"})
+    for each in opened:
+        assert exchange(each, refused).startswith(b"HTTP/1.1 101")
+    for each in opened:
+        wait_for("it is cut", lambda each=each: _ended(each))
+        each.close()
+    # Two kinds, and a line that counts each.
+    assert relay.log.count("\n") - before <= 2 * 30 + 2
+
+
+def _ended(connection: socket.socket) -> bool:
+    try:
+        return not connection.recv(65536)
+    except ConnectionError:
+        return True
+
+
+# --- all that is described --------------------------------------------------------------------------------
+
+
+HEADERS = {
+    name: most
+    for name, most in FIELDS.items()
+    if name not in ("Authorization", "Connection", "Expect", "Upgrade")
+}
+TEXTS = {
+    "text/turtle": [b"<a> <b> (" + b"()" * 200 + b") .", b"@prefix a: <b> .\n" * 300],
+    "application/rdf+xml": [b'<a xmlns:a="b">' * 300],
+    "application/ld+json": [b'{"@context":{"a":"' + b"b" * 5000 + b'"}}', b'{"@list":' * 60],
+}
+
+
+def test_no_request_that_is_described_takes_long_or_fails(
+    relay: Relay, reactor: Reactor, tmp_path: Path
+) -> None:
+    """For each operation: names in its path, its parameters, all fields, and its body, in every shape, logged in."""
+    token = relay.user("walker", admin=True).encode()
+    robot = SmallRobot(relay, "rover", {}).comes()
+    chance = random.Random(16)
+    described = json.loads(ask(relay, request("GET", b"/api/openapi.json", {})).partition(b"\r\n\r\n")[2])
+    slow, failed = [], []
+    try:
+        for name, data in _described(described, chance):
+            answers: list[bytes] = []
+            sent = data.replace(b"\r\n", b"\r\nAuthorization: Bearer " + token + b"\r\n", 1)
+
+            def once(sent: bytes = sent, answers: list[bytes] = answers) -> None:
+                answers.append(ask(relay, sent))
+
+            cost = reactor.cost(once)
+            if cost > NOTICED:
+                cost = min(cost, reactor.cost(once, 3))
+            if cost > MOST:
+                slow.append(f"{name}: {cost:.3f} s")
+            if not answers[0] or answers[0].startswith(b"HTTP/1.1 500"):
+                failed.append(f"{name}: {answers[0][:60]!r}")
+    finally:
+        robot.goes()
+    assert slow == []
+    assert failed == []
+
+
+def _described(described: dict[str, Any], chance: random.Random) -> Iterator[tuple[str, bytes]]:
+    """Requests of all operations: some shapes of each, other ones of the next, in each place they can stand in."""
+    for path, methods in described["paths"].items():
+        for method, operation in methods.items():
+            if "x-lasts" in operation:
+                continue
+            asked = operation.get("parameters", [])
+            media = list(operation.get("requestBody", {}).get("content", {}))
+            plain = _path(path, asked, None)
+            for shape in chance.sample(sorted(SHAPES), 16):
+                made, name = SHAPES[shape], f"{method} {path}: {shape}"
+                fields = {"Content-Type": media[0].encode()} if media else {}
+                yield f"{name} in the path", request(method.upper(), _path(path, asked, made(2000)), fields)
+                queries = [each["name"] for each in asked if each["in"] == "query"]
+                if queries:
+                    share = 6000 // len(queries)
+                    query = "&".join(f"{each}={_quoted(made(share // 3), share)}" for each in queries)
+                    yield (
+                        f"{name} in the query",
+                        request(method.upper(), plain + b"?" + query.encode(), fields),
+                    )
+                for header in chance.sample(sorted(HEADERS), 3):
+                    value = made(HEADERS[header])
+                    yield f"{name} in {header}", request(method.upper(), plain, fields | {header: value})
+                for each in media:
+                    body = made(20_000)
+                    yield (
+                        f"{name} as {each}",
+                        request(method.upper(), plain, {"Content-Type": each.encode()}, body),
+                    )
+            for each in media:
+                for text in TEXTS.get(each, []):
+                    yield (
+                        f"{method} {path}: {text[:20]!r}",
+                        request(method.upper(), plain, {"Content-Type": each.encode()}, text),
+                    )
+
+
+def _path(path: str, asked: list[dict[str, Any]], shape: bytes | None) -> bytes:
+    """An address; with a shape in the place of each name, but that of the robot."""
+    for each in asked:
+        if each["in"] == "path":
+            known = "rover" if each["name"] == "robot" else "mode"
+            share = 6000 // path.count("{")
+            text = known if shape is None or each["name"] == "robot" else _quoted(shape, share)
+            path = path.replace("{" + each["name"] + "}", text)
+    return path.encode()
+
+
+def _quoted(shape: bytes, most: int) -> str:
+    return "".join(f"%{byte:02X}" for byte in shape[: most // 3])
