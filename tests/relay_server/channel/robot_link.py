@@ -51,7 +51,7 @@ class RobotLink:
         """Dial with the newest ticket."""
         self.world.clock.advance(0)
         ticket = self.world.control.take(link.OpenChannel)[-1].ticket
-        self._robot = Robot(_Relay(self.world))  # type: ignore[arg-type]  # all that it uses of a hall
+        self._robot = Robot(_Relay(self.world), "192.168.1.1")  # type: ignore[arg-type]  # all that it uses of a hall
         self._heard = []
         self.says(link.Join(version=1, ticket=ticket))
         return self
