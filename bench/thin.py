@@ -1,4 +1,5 @@
-"""An uplink that becomes thin: how old pictures are 5 s later, how much smaller, and how soon they are as before.
+"""Thin links. A downlink to a client is measured in :mod:`bench.downlink`. Here an uplink becomes thin: how old
+pictures are 5 s later, how much smaller, and how soon they are as before.
 
 Real relay, daemon and simulated robot, whose bytes go through a proxy that hands on so many a second and holds back
 what comes beyond that. A picture is as old as the stamp in its header says, by the clock both ends share here.
@@ -11,6 +12,7 @@ import time
 
 from switchboard_video import Eye, Shown
 
+from bench import downlink
 from bench.cameras import CAMERAS, Camera, Scene, scene
 from bench.report import Options, Row
 
@@ -28,8 +30,8 @@ BACK_SECONDS = 120.0
 
 
 def run(options: Options) -> list[Row]:
-    """Both cameras, each over both uplinks."""
-    rows = []
+    """Downlinks, then both cameras, each over both uplinks."""
+    rows = downlink.run(options)
     for camera in CAMERAS[:1] if options.quick else CAMERAS:
         with scene(camera) as at:
             for kilobits in KILOBITS:

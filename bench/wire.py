@@ -80,6 +80,7 @@ class End:
     def __init__(self, loop: Loop, connection: socket.socket) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.socket = connection
+        self._loop = loop
         self.messages = 0
         self.bytes = 0
         self.at = 0.0
@@ -171,9 +172,11 @@ class WebEnd(End):
                 break
             opcode = buffer[start] & 15
             if opcode <= 2:
-                self.messages += 1
+                # A message in several frames counts when its last one is there.
+                self.messages += buffer[start] >> 7
                 self.payload_bytes += length
                 self.last = bytes(buffer[start + head : start + head + 200])
+                self.frame(buffer, start, start + head, end)
             elif opcode == 9:
                 answer = Frame(Opcode.PONG, bytes(buffer[start + head : end])).serialize(mask=True)
                 self.send(answer)
@@ -181,6 +184,9 @@ class WebEnd(End):
                 raise AssertionError(f"the websocket was closed: {bytes(buffer[start + head + 2 : end])!r}")
             start = end
         del buffer[:start]
+
+    def frame(self, buffer: bytearray, start: int, payload: int, end: int) -> None:
+        """A data frame: where it starts, where its payload starts, and where both end."""
 
 
 _COUNTED = (1, 5)

@@ -31,6 +31,9 @@ QUEUES_BYTES = 8 * MIB
 PLAINLY_SECONDS = 60.0
 """How often a client is told that it gets plain JSON because it has used up its share of the processor."""
 
+TOO_SLOW_SECONDS = 10.0
+"""How often a client is told that samples of a topic are dropped because its connection is thin."""
+
 _LEVELS = {Flaw.BROKEN: "error", Flaw.NOT_CDR: "error", Flaw.TOO_LARGE: "warning"}
 
 
@@ -80,6 +83,7 @@ class Listener:
         "_sent_at",
         "_timer",
         "_told",
+        "_too_slow_at",
         "_waiting",
         "depth",
         "throttle",
@@ -102,6 +106,7 @@ class Listener:
         self._failed: frozenset[rosbridge.Id] = frozenset()
         """Ids of the subscriptions whose failure the client was told."""
         self._plainly_at = -PLAINLY_SECONDS
+        self._too_slow_at = -TOO_SLOW_SECONDS
         self._sent_at = -THROTTLE_SECONDS
         # A deque takes 600 bytes when it is empty; most never have a throttle.
         self._waiting: deque[Sample] | None = None
@@ -221,6 +226,16 @@ class Listener:
         if now >= self._plainly_at + PLAINLY_SECONDS:
             self._plainly_at = now
             self._receiver.tell("warning", f"{self.topic}: {TOO_COSTLY}")
+
+    def too_slow(self, words: str) -> None:
+        """A sample is dropped because the client's connection is thin: tell the client now and then.
+
+        :param words: what it can do
+        """
+        now = self._clock.seconds()
+        if now >= self._too_slow_at + TOO_SLOW_SECONDS:
+            self._too_slow_at = now
+            self._receiver.tell("warning", f"{self.topic}: samples are dropped: {words}", self.latest)
 
     def close(self) -> None:
         """Stop; nothing more is sent."""

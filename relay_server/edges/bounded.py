@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from autobahn.websocket.protocol import TrafficStats
 from autobahn.websocket.utf8validator import Utf8Validator
 from twisted.internet.protocol import connectionDone
+from twisted.internet.tcp import Server
 
 from relay_server.clock import Clock, Timer, cancel
 from relay_server.edges.fastpath import FastProtocol, Turns, Writer, writer_for
@@ -148,8 +149,10 @@ class BoundedProtocol(FastProtocol):
         """Nothing may follow a close frame (RFC 6455 section 5.5.1): whoever writes past Autobahn must cease now."""
 
     def sendData(self, data: bytes, sync: bool = False, chopsize: int | None = None) -> None:
-        """What Autobahn itself sends, in order with what does not go through it."""
-        self._writer.write(data)
+        """What Autobahn itself sends, in order with what does not go through it: after the handshake control frames
+        only, which may go between the frames of a message (RFC 6455 section 5.4).
+        """
+        self._writer.urgent(data)
 
     def say_close(self, code: int, reason: str) -> None:
         """Send a close frame, with as much of the reason as there is room for."""
@@ -164,11 +167,23 @@ class BoundedProtocol(FastProtocol):
         super().sendCloseFrame(code, reasonUtf8, isReply)
         self.nothing_more()
 
+    def dataReceived(self, data: bytes) -> None:
+        """Bytes. Nothing is read any more once the connection ends."""
+        if self._leaving is None:
+            super().dataReceived(data)
+
     def _closeConnection(self, abort: bool = False) -> None:
         self.nothing_more()
         self._writer.flush()
         # TLS would not shut down while a producer is registered.
         self.transport.unregisterProducer()
-        if not abort and self._leaving is None:
-            self._leaving = self.factory.clock.callLater(LEAVING_SECONDS, self.transport.abortConnection)
-        super()._closeConnection(abort)
+        if abort or self._leaving is not None:
+            super()._closeConnection(abort)
+            return
+        self._leaving = self.factory.clock.callLater(LEAVING_SECONDS, self.transport.abortConnection)
+        if type(self.transport) is Server and not self.transport.TLS:
+            # What the client still sends, as answers to pings, would have the kernel reset a connection that is closed
+            # both ways, and the close frame would be lost where the line is thin.
+            self.transport.loseWriteConnection()
+        else:
+            super()._closeConnection(abort)

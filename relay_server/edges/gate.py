@@ -46,6 +46,9 @@ class Occupant(Protocol):
         :param since: what :attr:`not_before` was when its first frame came
         """
 
+    def ping(self) -> None:
+        """Send a ping now, by which what was sent is measured."""
+
     def pong(self, payload: bytes) -> None:
         """The answer to a ping."""
 

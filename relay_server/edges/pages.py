@@ -118,6 +118,7 @@ class PageClient:
     ) -> None:
         desk = gate.desk
         self.outbox = Outbox(transport.send, gate.clock.seconds, self.cut)
+        self.outbox.on_hold = self._held
         self._clock = gate.clock
         self._rounds = gate.rounds
         self._timing = desk.timing
@@ -129,6 +130,7 @@ class PageClient:
         self._running: Deferred[None] | None = None
         self._pinging = Round(self._ping, self._timing.client_ping)
         self._heard_at = gate.clock.seconds()
+        self._pings = 0
 
     # --- Occupant -----------------------------------------------------------------------------------------
 
@@ -141,6 +143,10 @@ class PageClient:
     def message(self, payload: bytes, *, since: int | None = None) -> None:
         """There is nothing to say here."""
         self.close(closing.INVALID, "say nothing here: what there is to tell is told unasked")
+
+    def ping(self) -> None:
+        """Send a ping now."""
+        self._ping()
 
     def pong(self, payload: bytes) -> None:
         """It is still there."""
@@ -172,6 +178,15 @@ class PageClient:
         if running is not None:
             running.cancel()
 
+    def _held(self, held: bool) -> None:
+        """The connection is thin: what changes meanwhile is told as it is when there is room again."""
+        if self._running is None:
+            return
+        if held:
+            self._telling.wait()
+        else:
+            self._telling.resume()
+
     # --- Page ---------------------------------------------------------------------------------------------
 
     def tell(self, event: str, body: bytes) -> None:
@@ -197,7 +212,8 @@ class PageClient:
         if silent > max(self._timing.client_ping * 3, self._timing.stall_limit):
             self.close(closing.TOO_SLOW, f"no answer to pings for {silent:.0f} s")
         else:
-            self._transport.ping(b"")
+            self._pings += 1
+            self._transport.ping(self._pings.to_bytes(8, "big"))
 
 
 class PageProtocol(ClientProtocol):

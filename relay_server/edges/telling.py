@@ -88,6 +88,8 @@ class Telling:
         """Whether anything has changed since what was told last was looked up."""
         self._wake: Deferred[None] | None = None
         self._late: Timer | None = None
+        self._waits = False
+        """Whether nothing more is told for now: it would only be old when it arrives."""
         self._stalled: Timer | None = None
         """Cuts the page; there while it takes nothing."""
 
@@ -106,8 +108,13 @@ class Telling:
             forget()
             cancel(self._stalled)
 
+    def wait(self) -> None:
+        """Tell nothing until :meth:`resume`: the page takes what it was told, but slowly."""
+        self._waits = True
+
     def pause(self) -> None:
         """The page takes nothing for now."""
+        self._waits = True
         if self._stalled is None:
             self._stalled = self._clock.callLater(STALL_SECONDS, self._page.cut)
 
@@ -115,6 +122,7 @@ class Telling:
         """It does again."""
         cancel(self._stalled)
         self._stalled = None
+        self._waits = False
         self._due = self._clock.seconds()
         self._changed()
 
@@ -136,8 +144,7 @@ class Telling:
         if due:
             self._put_off()
         for name, now in found:
-            # Once it is paused nothing more is told: it would only wait, and be old by then.
-            if self._stalled is None and self._is_told(name, now, due):
+            if not self._waits and self._is_told(name, now, due):
                 self._told[name] = now
                 if name == FIRST:
                     self._reason = ""
@@ -162,7 +169,7 @@ class Telling:
         if reason == self._reason and self._left() > 0:
             return
         self._put_off()
-        if self._stalled is None:
+        if not self._waits:
             self._reason = reason
             self._told.pop(FIRST, None)
             self._page.tell(UNKNOWN, jsontext.encode({"reason": reason}))

@@ -30,12 +30,17 @@ from relay_server.edges.caps import AddressCap, Place
 from relay_server.edges.fastpath import Turns
 from relay_server.edges.gate import HANDSHAKE_STATUS, Gate, Occupant, code_of, identify, status_of
 from relay_server.edges.limiting import RequestLimits, TooManyRequests
+from relay_server.edges.pacing import Pacer
+from relay_server.edges.tcp import keep_little, tcp_of
 from relay_server.frontdesk import Admission
 
 T = TypeVar("T")
 
 UNPROVED_BYTES = limits.UNPROVEN_BYTES + 1024
 """Bytes before the session began, with the heads of frames."""
+
+PACED_UNSENT_BYTES = 128 * limits.KIB
+"""Bytes the kernel may hold unsent; what is on its way at all is limited by the pacer."""
 
 EARLY_OVERHEAD = 64
 """What a message before the proof counts for beside its bytes; empty ones take memory too."""
@@ -67,6 +72,7 @@ class ClientProtocol(BoundedProtocol):
         self._open = False
         self._opened_ns = 0
         self._begun_ns = 0
+        self._pacer: Pacer | None = None
 
     # --- handshake ----------------------------------------------------------------------------------------
 
@@ -204,11 +210,22 @@ class ClientProtocol(BoundedProtocol):
         session = self._session = self._occupant(admission)
         # What the session sends goes to the socket without a look at the state; see nothing_more.
         session.outbox.write = self._writer.write
+        self._pace(session)
         session.start()
         self.takes_text = session.message
         early, self._early = self._early, []
         for message in early:
             session.message(message)
+
+    def _pace(self, session: Occupant) -> None:
+        """Keep little on its way to the client, so that pings and small messages wait for little."""
+        tcp = tcp_of(self.transport)
+        if tcp is not None:
+            keep_little(tcp, PACED_UNSENT_BYTES)
+        clock, seconds = self.factory.clock, self.factory.turns.stalls.seconds
+        self._pacer = Pacer(
+            self._writer, session.outbox, clock, seconds, session.ping, wsframe.Fragments, tcp
+        )
 
     def _failed(self, failure: Any) -> None:
         error = failure.value
@@ -275,6 +292,8 @@ class ClientProtocol(BoundedProtocol):
 
     def onPong(self, payload: bytes) -> None:
         """The answer to a ping."""
+        if self._pacer is not None:
+            self._pacer.answered(bytes(payload))
         if self._session is not None:
             self._session.pong(payload)
 
@@ -293,6 +312,8 @@ class ClientProtocol(BoundedProtocol):
         self._turn_away()
         session, self._session = self._session, None
         self.takes_text = None
+        self.nothing_more()
+        self._pacer = None
         if session is not None:
             session.end(orderly=wasClean and not self.closedByMe)
 
@@ -300,6 +321,8 @@ class ClientProtocol(BoundedProtocol):
         """Hold off what the session sends, which goes to the writer without a look at the state. None begins now."""
         self._open = False
         self._stop_deadline()
+        if self._pacer is not None:
+            self._pacer.stop()
         if self._session is not None:
             self._session.outbox.close()
 
@@ -311,8 +334,11 @@ class ClientProtocol(BoundedProtocol):
             self._writer.write(frames)
 
     def ping(self, payload: bytes) -> None:
-        """A websocket ping."""
-        self.send(wsframe.ping(payload))
+        """A websocket ping. It goes ahead of everything that waits here, also between the frames of a message."""
+        if self.state == self.STATE_OPEN:
+            if self._pacer is not None:
+                self._pacer.probing(payload)
+            self._writer.urgent(wsframe.ping(payload))
 
     def close(self, code: int, reason: str) -> None:
         """Close with a code; the peer has a moment to answer, then the connection is dropped."""
@@ -342,6 +368,8 @@ class ClientProtocol(BoundedProtocol):
         super().resume()
         if self._session is not None:
             self._session.resume()
+        if self._pacer is not None:
+            self._pacer.go_on()
 
     def _known(self) -> None:
         if self._place is not None:
@@ -385,7 +413,8 @@ class ClientFactory(WebSocketServerFactory):
             failByDrop=False,
             # The protocol's own deadline and limits of size, which change when a session begins.
             openHandshakeTimeout=0,
-            closeHandshakeTimeout=1,
+            # Over a thin connection the close frame needs some of this.
+            closeHandshakeTimeout=2,
             tcpNoDelay=True,
             # Pings are the session's: they also tell how old a command can be.
             autoPingInterval=0,

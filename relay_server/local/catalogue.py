@@ -99,6 +99,7 @@ Person[] people
 uint32 more
 uint64 drops
 TopicDrops[] topic_drops
+Downlink downlink
 uint64 plain_instead
 uint64 refusals
 uint64 stale_commands
@@ -125,6 +126,12 @@ MSG: switchboard_msgs/msg/Client
 string user
 float64 since
 string camera
+{_LINE}
+MSG: switchboard_msgs/msg/Downlink
+bool thin
+float64 bytes_per_second
+uint64 waiting_bytes
+string advice
 {_LINE}
 MSG: switchboard_msgs/msg/RoundTrips
 float64 client_relay

@@ -14,7 +14,7 @@ from relay_server.control import view
 from relay_server.linkmeter import joined, milliseconds
 from relay_server.local import control, rosapi
 from relay_server.people import Asker, People, clients
-from relay_server.session import Session
+from relay_server.session import Session, thin_words
 from relay_server.video import Stream, Videos
 
 CONTROL = "/relay/control"
@@ -86,6 +86,7 @@ class RelayNode:
             "topic_drops": [
                 {"topic": topic, "drops": drops} for topic, drops in session.listening.drops().items()
             ],
+            "downlink": _downlink(session),
             "plain_instead": session.plain_instead,
             "refusals": session.refusals,
             "stale_commands": session.stale_commands,
@@ -114,6 +115,16 @@ class RelayNode:
             "published": len(ends.publishes),
             "sim_time": session.robot.description.sim_time,
         }
+
+
+def _downlink(session: Session) -> dict[str, Any]:
+    rate = session.outbox.rate
+    return {
+        "thin": rate is not None,
+        "bytes_per_second": None if rate is None else round(rate),
+        "waiting_bytes": session.outbox.waiting_bytes,
+        "advice": "" if rate is None else thin_words(rate),
+    }
 
 
 def _shown(stream: Stream) -> dict[str, Any]:

@@ -5,7 +5,7 @@ Bytes come in as whole websocket messages and go out as frames; every message is
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import partial
 
 from twisted.logger import Logger
@@ -51,6 +51,17 @@ SMALL = 4 * KIB
 
 MALFORMED = 100
 """Messages in a row that are no rosbridge; then the client is cut."""
+
+
+def thin_words(rate: float) -> str:
+    """Why a client does not get all samples, and what it can do.
+
+    :param rate: bytes per second its connection carries
+    """
+    return (
+        f"your connection carries about {rate / 1000:.0f} kB/s; subscribe with a throttle_rate, a smaller "
+        "compression (cbor) or queue_length 1, or to fewer topics"
+    )
 
 
 class Session:
@@ -113,6 +124,7 @@ class Session:
         self._malformed = 0
         self._closed = False
         self.outbox = Outbox(transport.send, clock.seconds, self._overflow)
+        self.outbox.on_drop = self._sample_dropped
         self._rounds = rounds
         self._pinging = Pinging(self, clock, transport, freshness, timing)
         self.incoming = Incoming(
@@ -392,6 +404,11 @@ class Session:
         if ask.level not in LEVELS:
             raise Refused(f"level '{ask.level[:20]}' is none of {', '.join(LEVELS)}")
         self._level = LEVELS[ask.level]
+
+    def _sample_dropped(self, key: Hashable) -> None:
+        rate = self.outbox.rate
+        if rate is not None and isinstance(key, Listener):
+            key.too_slow(thin_words(rate))
 
     def _overflow(self) -> None:
         self.close(closing.TOO_SLOW, "replies pile up; read faster")

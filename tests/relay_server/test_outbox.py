@@ -236,3 +236,95 @@ def test_drops_are_counted_by_topic() -> None:
     assert outbox.dropped == 4
     outbox.forget("a")
     assert outbox.drops == {"b": 2}
+
+
+def thin(large: int = 1000) -> Receiver:
+    """A receiver behind a thin connection, whose window is full."""
+    receiver = Receiver()
+    receiver.outbox.limit(large, 300_000.0)
+    receiver.outbox.hold(large=True)
+    return receiver
+
+
+def released(receiver: Receiver) -> list[bytes]:
+    """What goes when there is room again."""
+    receiver.got = []
+    receiver.outbox.release()
+    return receiver.got
+
+
+def test_what_is_held_is_no_stall() -> None:
+    """A full window says nothing about whether the receiver takes anything; nothing passes meanwhile."""
+    receiver = thin()
+    receiver.outbox.control(b"answer")
+    receiver.outbox.data("t", b"sample")
+    assert (receiver.got, receiver.outbox.paused_since, receiver.outbox.passing) == ([], None, False)
+    assert released(receiver) == [b"answer", b"sample"]
+
+
+def test_small_samples_go_before_large_ones_on_a_thin_connection() -> None:
+    """All of them, whatever came first."""
+    receiver = thin()
+    receiver.outbox.data("cloud", bytes(5000))
+    for number in range(3):
+        receiver.outbox.data("pose", b"%d" % number)
+    receiver.now += 0.2
+    assert released(receiver) == [b"0", b"1", b"2"]
+
+
+def test_a_large_sample_that_held_up_others_leaves_them_as_much_time() -> None:
+    """The next large one waits, small ones pass at once meanwhile; then it goes, the newest of its topic."""
+    receiver = thin()
+    outbox = receiver.outbox
+    outbox.data("pose", b"waited")
+    receiver.now += 0.4
+    assert released(receiver) == [b"waited"]
+    outbox.data("cloud", b"a" * 5000, depth=1)
+    receiver.now += 0.3
+    outbox.data("cloud", b"b" * 5000, depth=1)
+    outbox.data("pose", b"now")
+    assert receiver.got == [b"waited", b"now"]
+    assert 0 < outbox.opens_in <= 0.11
+    receiver.now += outbox.opens_in
+    outbox.open()
+    assert receiver.got[2:] == [b"b" * 5000]
+    assert outbox.passing
+
+
+def test_a_large_topic_alone_has_the_whole_connection() -> None:
+    """Nobody waited, so nobody is given time."""
+    receiver = thin()
+    receiver.now += 0.4
+    receiver.outbox.data("cloud", bytes(5000))
+    assert len(released(receiver)) == 1
+    assert receiver.outbox.opens_in == 0
+
+
+def test_small_samples_without_end_do_not_hold_off_a_large_one_for_ever() -> None:
+    """After a second it goes first."""
+    receiver = thin()
+    outbox = receiver.outbox
+    outbox.pause()
+    outbox.release()
+    outbox.data("cloud", bytes(5000))
+    sent: list[bytes] = []
+    for number in range(20):
+        outbox.data("pose", b"%d" % number)
+        sent += receiver.resume(1)
+        receiver.now += 0.1
+    assert 5 < [len(each) for each in sent].index(5000) < 15
+
+
+def test_of_a_stream_only_the_last_moments_are_sent_on_a_thin_connection() -> None:
+    """Of a burst, as events are, a second."""
+    receiver = thin()
+    for number in range(10):
+        receiver.outbox.data("pose", b"%d" % number)
+        receiver.now += 0.05
+    for number in range(4):
+        receiver.outbox.data("event", b"e%d" % number)
+    receiver.now += 0.31
+    got = released(receiver)
+    assert [each for each in got if each[:1] == b"e"] == [b"e0", b"e1", b"e2", b"e3"]
+    assert [each for each in got if each[:1] != b"e"] == [b"6", b"7", b"8", b"9"]
+    assert receiver.outbox.drops == {"pose": 6}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
-from websockets.frames import Opcode
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from websockets.frames import Frame, Opcode
 from websockets.protocol import CLIENT, OPEN, Protocol
 
 from relay_server import wsframe
@@ -32,3 +36,30 @@ def test_a_ping_is_read_back() -> None:
     reader.receive_data(wsframe.ping(b"12345678"))
     read = [(frame.opcode, bytes(frame.data)) for frame in reader.events_received()]
     assert read == [(Opcode.PING, b"12345678")]
+
+
+@given(
+    st.lists(st.binary(max_size=70_000), min_size=1, max_size=3), st.lists(st.integers(1, 30_000), min_size=1)
+)
+@settings(deadline=None, max_examples=50)
+def test_messages_in_pieces_are_the_same_messages(payloads: list[bytes], sizes: list[int]) -> None:
+    """However they are cut. Between two pieces a ping may be sent (RFC 6455 section 5.4)."""
+    pieces = wsframe.Fragments(b"".join(map(wsframe.binary, payloads)))
+    reader = Protocol(CLIENT, state=OPEN, max_size=None)
+    for size in itertools.cycle(sizes):
+        if not pieces.left:
+            break
+        reader.receive_data(pieces.take(max(size, 50)))
+        reader.receive_data(wsframe.ping(b"now"))
+    assert reader.parser_exc is None
+    joined, part = [], b""
+    for frame in reader.events_received():
+        assert isinstance(frame, Frame)
+        if frame.opcode is Opcode.PING:
+            continue
+        assert len(frame.data) <= max(*sizes, 50)
+        part += frame.data
+        if frame.fin:
+            joined.append(part)
+            part = b""
+    assert (joined, part) == (payloads, b"")

@@ -22,7 +22,7 @@ from relay_server.access import Principal
 from relay_server.auth import Opening
 from relay_server.clock import Clock
 from relay_server.edges.caps import AddressCap
-from relay_server.edges.gate import Gate, code_of
+from relay_server.edges.gate import Gate, Occupant, code_of
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.video.parameters import Asked, asked
 from relay_server.edges.video.viewing import LOOK_SECONDS, STALL_SECONDS, Made, Progress, Waiting, narrow
@@ -166,6 +166,10 @@ class VideoClient:
         if self._mistakes >= MISTAKES:
             self.close(closing.TOO_MANY_ERRORS, "say nothing here but 'took' with the number of a picture")
 
+    def ping(self) -> None:
+        """Send a ping now."""
+        self._ping()
+
     def pong(self, payload: bytes) -> None:
         """It is still there."""
         self._heard_at = self._shared.clock.seconds()
@@ -287,6 +291,9 @@ class VideoProtocol(ClientProtocol):
     def cut(self, reason: str) -> None:
         """End the connection at once."""
         self._drop(reason)
+
+    def _pace(self, session: Occupant) -> None:
+        """One picture at a time is on its way, and the viewer says itself when it is there."""
 
     def _occupant(self, admission: Admission) -> VideoClient:
         return VideoClient(self.factory, self, admission, self._wanted, self._progress, self._opened_ns)

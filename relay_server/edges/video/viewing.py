@@ -6,11 +6,7 @@ replaced, and not in the kernel, where it would only grow old.
 
 from __future__ import annotations
 
-import fcntl
 import socket
-import struct
-import sys
-import termios
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +15,7 @@ from urllib.parse import urlencode
 from twisted.web.server import Request
 
 from relay_protocol.limits import KIB, MIB
-from relay_server.edges.tcp import tcp_of
+from relay_server.edges.tcp import keep_little, tcp_of, unacknowledged
 from relay_server.video import Picture
 
 CONTENT_TYPES = {"jpeg": b"image/jpeg", "png": b"image/png"}
@@ -44,8 +40,7 @@ APART = 1.5
 """The most of these must be so many times the least, or the network's wavering would seem to be slowness."""
 
 SOCKET_BYTES = 256 * KIB
-UNSENT_BYTES = 16 * KIB
-"""What the kernel holds for a viewer: all of it, and what has not gone over the network yet."""
+"""What the kernel holds for a viewer."""
 
 UNDER_WAY_BYTES = 16 * KIB
 """With more than this not acknowledged yet, the last picture is still under way."""
@@ -53,9 +48,6 @@ UNDER_WAY_BYTES = 16 * KIB
 _PROBES = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
 """Seconds, seconds, times: while a robot is away nothing is written, and these alone notice a viewer who vanished
 (tcp(7); some systems know only some of them)."""
-
-# Python 3.11 knows the name only where its C library did.
-_TCP_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", 25 if sys.platform == "linux" else None)
 
 
 class Waiting:
@@ -169,7 +161,7 @@ class Progress:
     @property
     def under_way(self) -> bool:
         """Whether much of what was sent has not arrived yet."""
-        return self._tcp is not None and unsent(self._tcp) > UNDER_WAY_BYTES
+        return self._tcp is not None and unacknowledged(self._tcp) > UNDER_WAY_BYTES
 
     def sent(self) -> None:
         """A picture was sent just now."""
@@ -185,7 +177,7 @@ class Progress:
         return self._seconds() - self._moved
 
     def _unsent(self) -> int:
-        return 0 if self._tcp is None else unsent(self._tcp)
+        return 0 if self._tcp is None else unacknowledged(self._tcp)
 
 
 class Made:
@@ -225,18 +217,5 @@ def narrow(transport: Any) -> Any:
         for name, value in _PROBES.items():
             if hasattr(socket, name):
                 handle.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-        if _TCP_NOTSENT_LOWAT is not None:
-            handle.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, UNSENT_BYTES)
+        keep_little(tcp)
     return tcp
-
-
-def unsent(tcp: Any) -> int:
-    """Bytes the peer has not acknowledged: Twisted's, which are only read here, and the kernel's."""
-    left = int(tcp._tempDataLen + len(tcp.dataBuffer) - tcp.offset)
-    try:
-        # On Linux what is not acknowledged (tcp(7), SIOCOUTQ), elsewhere what is not sent.
-        answer = fcntl.ioctl(tcp.fileno(), termios.TIOCOUTQ, bytes(4))
-    except (OSError, ValueError):
-        # Closed meanwhile.
-        return left
-    return left + int(struct.unpack("i", answer)[0])

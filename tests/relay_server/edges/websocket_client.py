@@ -44,6 +44,11 @@ class MemorySession:
         self.got.append(payload)
         self.since.append(since)
 
+    def ping(self) -> None:
+        """Send a ping, by which what was sent is measured."""
+        self.pings = getattr(self, "pings", 0) + 1
+        self.transport.ping(b"probe %d" % self.pings)
+
     def pong(self, payload: bytes) -> None:
         """A pong, to a ping that was sent a second after the one before."""
         self.not_before += 1_000_000_000
@@ -228,12 +233,21 @@ class Client:
 
     @property
     def heard(self) -> list[bytes]:
-        """Text messages so far."""
-        return [
-            bytes(each.data)
-            for each in self._events()
-            if isinstance(each, Frame) and each.opcode is Opcode.TEXT
-        ]
+        """Text messages so far, those in several frames joined."""
+        found: list[bytes] = []
+        part = b""
+        for each in self._events():
+            if isinstance(each, Frame) and each.opcode in (Opcode.TEXT, Opcode.CONT):
+                part += bytes(each.data)
+                if each.fin:
+                    found.append(part)
+                    part = b""
+        return found
+
+    @property
+    def frames(self) -> list[Frame]:
+        """All frames so far, as they came."""
+        return [each for each in self._events() if isinstance(each, Frame)]
 
     @property
     def pongs(self) -> list[bytes]:

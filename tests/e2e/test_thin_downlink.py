@@ -1,0 +1,240 @@
+"""A thin downlink between the relay and a client: commands, pings and small topics pass beside what is too much for it.
+
+Everything is real but the robot, which is played by the test. Ages are compared with what the line itself needs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import ssl
+import statistics
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from switchboard_fake_robot import FakeRobot
+from switchboard_processes import running
+from switchboard_proxy import ChaosProxy
+from switchboard_relay import Relay
+from switchboard_waiting import PATIENCE, wait_for
+from websockets.sync.client import connect
+
+from relay_protocol import PROTOCOL_VERSION, frames, identity, link
+
+STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+HEAVY_BYTES = 100_000
+
+
+class Robot:
+    """A robot that speaks JSON: it offers every topic, and publishes a pose and what is heavy when it is told to."""
+
+    def __init__(self, relay: Relay, port: int) -> None:
+        code = relay.cli("robot", "add", "rover")["enrolment_code"]
+        key = identity.generate_key()
+        with FakeRobot(relay.robots_port) as enrolling:
+            assert enrolling.enroll("rover", code, key)["op"] == "enrolled"
+        self._port = port
+        self.control = FakeRobot(port)
+        assert self.control.register("rover", key)["op"] == "welcome"
+        self.control.send(link.Describe(platform="test", motion=link.MotionPolicy(types=[TWIST])))
+        self.control.send(link.Graph(full=True))
+        self.channel: FakeRobot | None = None
+        self.numbers: dict[str, int] = {}
+        self.commands: list[dict[str, Any]] = []
+        self.samples: list[tuple[float, Any]] = []
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._threads = [threading.Thread(target=self._serve_control, daemon=True)]
+        self._threads[0].start()
+
+    def stop(self) -> None:
+        """Leave."""
+        self._over.set()
+        for each in self._threads:
+            each.join(PATIENCE)
+        for end in (self.control, self.channel):
+            if end is not None:
+                end.socket.close()
+
+    def _serve_control(self) -> None:
+        for message in self._messages(self.control):
+            if message["op"] == "open_channel" and self.channel is None:
+                self.channel = FakeRobot(self._port)
+                self.channel.send(link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"]))
+                self._threads.append(threading.Thread(target=self._serve_channel, daemon=True))
+                self._threads[-1].start()
+
+    def _messages(self, end: FakeRobot) -> Iterator[dict[str, Any]]:
+        while not self._over.is_set():
+            end.socket.settimeout(0.2)
+            try:
+                data = end.socket.recv(65536)
+            except TimeoutError:
+                continue
+            except OSError:
+                return
+            if not data:
+                return
+            for frame in end._decoder.feed(data):
+                if not isinstance(frame, frames.JsonFrame):
+                    body = json.loads(frame.body)
+                    if isinstance(frame, frames.CommandFrame):
+                        self.commands.append(body)
+                    else:
+                        self.samples.append((time.monotonic(), body))
+                    continue
+                message = json.loads(frame.body)
+                if message["op"] == "ping":
+                    self._send(end, link.Pong(t=message["t"], at=time.monotonic_ns()))
+                elif message["op"] == "control":
+                    self._send(end, link.Done(id=message["id"]))
+                else:
+                    yield message
+
+    def _send(self, end: FakeRobot, message: link.Message) -> None:
+        with self._lock:
+            end.send(message)
+
+    def _serve_channel(self) -> None:
+        channel = self.channel
+        assert channel is not None
+        for message in self._messages(channel):
+            named = {key: message.get(key) for key in ("number", "topic", "type")}
+            if message["op"] == "subscribe":
+                self._send(channel, link.Subscribed(**named, encoding="json"))
+                self.numbers[message["topic"]] = message["number"]
+            elif message["op"] == "advertise":
+                self._send(channel, link.Advertised(**named, encoding="json"))
+
+    def publish(self, topic: str, body: Any) -> None:
+        """One sample."""
+        assert self.channel is not None
+        frame = frames.encode_sample(self.numbers[topic], time.time_ns(), json.dumps(body).encode())
+        with self._lock:
+            self.channel.send_bytes(frame)
+
+
+class Ground:
+    """A relay, its robot, and an operator; clients come by a proxy."""
+
+    def __init__(self, relay: Relay, robot: Robot, proxy: ChaosProxy, token: str) -> None:
+        self.relay, self.robot, self.proxy, self.token = relay, robot, proxy, token
+
+    def connect(self, tls: ssl.SSLContext | None = None) -> Any:
+        """A client's websocket over the thin line."""
+        scheme = "ws" if tls is None else "wss"
+        return connect(
+            f"{scheme}://localhost:{self.proxy.port}/robots/rover",
+            additional_headers={"Authorization": f"Bearer {self.token}"},
+            open_timeout=PATIENCE,
+            max_queue=None,
+            max_size=None,
+            compression=None,
+            ssl=tls,
+        )
+
+
+@contextlib.contextmanager
+def ground(folder: Path, *options: str) -> Iterator[Ground]:
+    """One, with a line as fast as it goes at first."""
+    relay = Relay(folder, *options)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(running(relay))
+        proxy = ChaosProxy(relay.http_port)
+        stack.callback(proxy.close)
+        robot = Robot(relay, relay.robots_port)
+        stack.callback(robot.stop)
+        token = relay.user("driver")
+        relay.cli("right", "grant", "driver", "rover", "operator")
+        wait_for("the robot is online", lambda: relay.state_of("rover") != "offline")
+        yield Ground(relay, robot, proxy, token)
+
+
+class Seen:
+    """What came while a client drove beside a heavy topic."""
+
+    def __init__(self) -> None:
+        self.ages: list[float] = []
+        self.heavy = self.sent = 0
+        self.statuses: list[str] = []
+        self.told: list[dict[str, Any]] = []
+
+
+def drive(ground: Ground, socket: Any, seconds: float) -> Seen:
+    """Commands at 10 Hz on a connection that has also subscribed to 100 kB at 10 Hz and to a pose at 20 Hz."""
+    robot, seen = ground.robot, Seen()
+
+    def say(**message: Any) -> None:
+        socket.send(json.dumps(message))
+
+    def read() -> None:
+        # The iteration ends with an orderly close, and fails otherwise.
+        for text in socket:
+            message = json.loads(text)
+            if message["op"] == "status":
+                seen.statuses.append(message["msg"])
+            elif message.get("topic") == "/heavy":
+                seen.heavy += 1
+            elif message.get("topic") == "/pose":
+                seen.ages.append(time.monotonic() - float(message["msg"]["data"]))
+            elif message.get("topic") == "/relay/status":
+                seen.told.append(message["msg"])
+
+    say(op="set_level", level="warning")
+    say(op="advertise", topic="/cmd_vel", type=TWIST)
+    say(op="subscribe", topic="/relay/status")
+    for topic in ("/pose", "/heavy"):
+        say(op="subscribe", topic=topic, type=STRING)
+    wait_for("both are subscribed", lambda: {"/pose", "/heavy"} <= robot.numbers.keys())
+    say(op="publish", topic="/cmd_vel", msg={"linear": {"x": 0.0}})
+    wait_for("the first command arrives", lambda: robot.commands)
+    reading = threading.Thread(target=read, daemon=True)
+    reading.start()
+    heavy = {"data": "x" * HEAVY_BYTES}
+    begun = time.monotonic()
+    for tick in itertools.count():
+        if (wait := begun + tick * 0.05 - time.monotonic()) > 0:
+            time.sleep(wait)
+        if time.monotonic() > begun + seconds:
+            break
+        robot.publish("/pose", {"data": repr(time.monotonic())})
+        if tick % 2:
+            robot.publish("/heavy", heavy)
+            seen.sent += 1
+            say(op="publish", topic="/cmd_vel", msg={"linear": {"x": 1.0 + seen.sent}})
+    wait_for(
+        "the last command arrives",
+        lambda: any(each["linear"]["x"] == 1.0 + seen.sent for each in robot.commands),
+    )
+    assert reading.is_alive(), f"the connection was closed: {socket.close_code} {socket.close_reason}"
+    return seen
+
+
+@pytest.mark.parametrize("rate", [300_000, 100_000])
+def test_a_heavy_topic_takes_neither_control_nor_the_small_topics_away(tmp_path: Path, rate: int) -> None:
+    """All commands arrive, the pose is as old as one heavy sample makes it at most, and the heavy topic still comes."""
+    with ground(tmp_path) as at:
+        at.proxy.squeeze_down(rate * 8)
+        with at.connect() as socket:
+            seen = drive(at, socket, 20)
+    arrived = {each["linear"]["x"] for each in at.robot.commands}
+    lost = [number for number in range(1, seen.sent + 1) if 1.0 + number not in arrived]
+    # A machine that stands still makes commands old, but no line does.
+    assert len(lost) <= seen.sent / 50, f"commands {lost} of {seen.sent} are lost"
+    alone = HEAVY_BYTES / rate
+    assert statistics.median(seen.ages) <= max(0.3, alone)
+    assert max(seen.ages) <= alone + 1.5
+    assert len(seen.ages) >= 20 * 20 / 3
+    assert seen.heavy >= 0.25 * 20 / alone
+    words = next(each for each in seen.statuses if each.startswith("/heavy: "))
+    assert "throttle_rate" in words
+    last = seen.told[-1]
+    assert last["downlink"]["thin"]
+    assert last["downlink"]["bytes_per_second"] == pytest.approx(rate, rel=0.5)
+    assert "throttle_rate" in last["downlink"]["advice"]
+    assert {each["topic"] for each in last["topic_drops"]} >= {"/heavy"}

@@ -1,0 +1,151 @@
+"""A connection whose pings come back late, on a clock: what goes when, and what may go in between."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.internet.task import Clock
+
+from relay_protocol.pacing import FIRST
+from relay_server import wsframe
+from relay_server.edges.fastpath.sending import PlainWriter, Stalls
+from relay_server.edges.pacing import Pacer
+from relay_server.outbox import Outbox
+
+TICK = 0.005
+
+
+class Wire:
+    """A connection of so many bytes a second, both ways without further delay, and the relay's end of it."""
+
+    def __init__(self, rate: float) -> None:
+        self.clock = Clock()
+        self.rate = rate
+        self.free_at = 0.0
+        self.way: list[tuple[float, bytes]] = []
+        self.came: list[tuple[float, bytes]] = []
+        """When each frame was there."""
+        self.pings = 0
+        self.writer = PlainWriter(self)
+        self.outbox = Outbox(self.writer.write, self.clock.seconds, lambda: None)
+        self.pacer = Pacer(
+            self.writer, self.outbox, self.clock, self.clock.seconds, self.ping, wsframe.Fragments, None
+        )
+
+    def write(self, data: bytes) -> None:
+        """As a transport."""
+        self.free_at = max(self.free_at, self.clock.seconds()) + len(data) / self.rate
+        self.way.append((self.free_at, data))
+
+    def ping(self) -> None:
+        """As a session does."""
+        self.pings += 1
+        payload = self.pings.to_bytes(8, "big")
+        self.pacer.probing(payload)
+        self.writer.urgent(wsframe.ping(payload))
+
+    def pass_time(self, seconds: float) -> None:
+        """Let what is on its way arrive, and pings be answered."""
+        for _ in range(round(seconds / TICK)):
+            self.clock.advance(TICK)
+            while self.way and self.way[0][0] <= self.clock.seconds():
+                at, data = self.way.pop(0)
+                self.came.append((at, data))
+                if data[0] == wsframe.PING:
+                    self.pacer.answered(data[2:])
+
+    def payloads(self) -> list[bytes]:
+        """Whole messages that came."""
+        found, part = [], b""
+        for _, frame in self.came:
+            if frame[0] == wsframe.PING:
+                continue
+            head = 2 if frame[1] < 126 else 4 if frame[1] == 126 else 10
+            part += frame[head:]
+            if frame[0] & wsframe.FIN:
+                found.append(part)
+                part = b""
+        return found
+
+
+def test_a_fast_connection_gets_large_messages_whole_after_the_first_ones() -> None:
+    """The window opens within some round trips; nothing is lost or divided then."""
+    wire = Wire(100e6)
+    for number in range(10):
+        wire.outbox.data("cloud", wsframe.text(b"%d" % number * 300_000))
+        wire.pass_time(0.1)
+    assert [len(each) for each in wire.payloads()] == [300_000] * 10
+    whole = [frame for _, frame in wire.came if len(frame) > 300_000]
+    assert len(whole) >= 5
+    assert wire.outbox.dropped == 0
+
+
+def test_a_ping_goes_between_the_pieces_of_a_large_message() -> None:
+    """It is back long before the message is there, which takes ten seconds here."""
+    wire = Wire(100_000)
+    wire.ping()
+    wire.pass_time(1)
+    wire.outbox.data("cloud", wsframe.text(bytes(1_000_000)))
+    wire.pass_time(2)
+    sent = wire.clock.seconds()
+    wire.ping()
+    payload = wire.pings.to_bytes(8, "big")
+    wire.pass_time(1)
+    back = next(at for at, frame in wire.came if frame == wsframe.ping(payload))
+    assert back - sent <= 0.3
+    assert not wire.payloads()
+    wire.pass_time(10)
+    assert [len(each) for each in wire.payloads()] == [1_000_000]
+
+
+def test_what_is_on_its_way_is_bounded_before_anything_is_known() -> None:
+    """A connection that answers nothing gets no more than the first window."""
+    wire = Wire(1.0)
+    for _ in range(50):
+        wire.outbox.data("cloud", wsframe.text(bytes(100_000)))
+    assert sum(len(data) for _, data in wire.way) <= 1.1 * FIRST
+    assert wire.outbox.dropped > 0
+
+
+def test_nothing_but_control_frames_follows_the_end() -> None:
+    """A message that was begun is not finished behind a close frame (RFC 6455 section 5.5.1)."""
+    wire = Wire(100_000)
+    wire.outbox.data("cloud", wsframe.text(bytes(1_000_000)))
+    wire.pacer.stop()
+    wire.outbox.close()
+    before = len(wire.way)
+    wire.pass_time(20)
+    assert {frame[0] for _, frame in wire.came[before:]} <= {wsframe.PING}
+
+
+@given(
+    rate=st.sampled_from([30_000, 100_000, 1_000_000, 50_000_000]),
+    sizes=st.lists(st.integers(0, 200_000), min_size=1, max_size=12),
+    gap=st.sampled_from([0.0, 0.02, 0.3]),
+)
+@settings(deadline=None, max_examples=60)
+def test_answers_all_arrive_in_order_whatever_their_size(rate: float, sizes: list[int], gap: float) -> None:
+    """What must not be lost is not, and no message is mixed with another."""
+    wire = Wire(rate)
+    sent = [bytes([65 + number]) * size for number, size in enumerate(sizes)]
+    for payload in sent:
+        wire.outbox.control(wsframe.text(payload))
+        wire.pass_time(gap)
+    wire.pass_time(3 + 3 * sum(sizes) / rate)
+    assert wire.payloads() == sent
+    assert wire.outbox.waiting_bytes == 0
+
+
+def test_a_clock_that_does_not_run_while_the_reactor_stands_still() -> None:
+    """A ping of ours is not late because we are."""
+    clock: Any = Clock()
+    stalls = Stalls(clock)
+    begun = stalls.seconds()
+    for _ in range(100):
+        clock.advance(0.01)
+    assert abs(stalls.seconds() - begun - 1.0) < 0.03
+    clock.rightNow += 3.0  # nothing was served meanwhile
+    clock.advance(0.0)
+    assert abs(stalls.seconds() - begun - 1.0) < 0.06
