@@ -468,6 +468,82 @@ def test_text_that_is_not_utf8_closes_with_1007(
     assert gate.admitted == 0
 
 
+SEQUENCES = {
+    "60cebae1bdb9cf83cebcceb5": True,
+    "00": True,
+    "7f": True,
+    "c280": True,
+    "dfbf": True,
+    "e0a080": True,
+    "ed9fbf": True,
+    "ee8080": True,
+    "efbfbd": True,
+    "efbfbf": True,
+    "f0908080": True,
+    "f48fbfbf": True,
+    "80": False,
+    "bf": False,
+    "c1bf": False,
+    "c080": False,
+    "c320": False,
+    "ceba20": True,
+    "e09fbf": False,
+    "e0bf": False,
+    "eda080": False,
+    "edbfbf": False,
+    "eda080edb080": False,
+    "f08fbfbf": False,
+    "f09080": False,
+    "f4908080": False,
+    "f7bfbfbf": False,
+    "f888808080": False,
+    "fbbfbfbfbf": False,
+    "fc8480808080": False,
+    "fdbfbfbfbfbf": False,
+    "fe": False,
+    "ff": False,
+}
+"""Octets, and whether they are UTF-8 (RFC 3629): first and last of each length, overlong, surrogates, cuts."""
+
+
+@pytest.mark.parametrize("how", ["one frame", "a frame for each octet", "an octet at a time"])
+@pytest.mark.parametrize("octets", SEQUENCES)
+def test_utf8_is_told_from_what_is_not(gate: MemoryGate, octets: str, how: str) -> None:
+    """The same however it is cut."""
+    payload = bytes.fromhex(octets)
+    client = Client(gate, Authorization="Bearer good")
+    if how == "a frame for each octet":
+        client.core.send_text(b"", fin=False)
+        for octet in payload:
+            client.core.send_continuation(bytes([octet]), fin=False)
+        client.core.send_continuation(b"", fin=True)
+        client.run()
+    else:
+        client.core.send_text(payload)
+        sent = b"".join(client.core.data_to_send())
+        step = 1 if how == "an octet at a time" else len(sent)
+        for place in range(0, len(sent), step):
+            client.end.dataReceived(sent[place : place + step])
+        client.run()
+    assert gate.sessions[0].got[1:] == ([payload] if SEQUENCES[octets] else ["end"])
+    assert client.closed == (None if SEQUENCES[octets] else closing.NOT_UTF8)
+
+
+@pytest.mark.parametrize(
+    "code", [1000, 1001, 1002, 1003, 1007, 1008, 1009, 1010, 1011, 3000, 3999, 4000, 4999]
+)
+def test_a_close_of_the_client_is_answered(gate: MemoryGate, code: int) -> None:
+    """With a code that an endpoint may send (RFC 6455 section 7.4)."""
+    client = Client(gate, Authorization="Bearer good")
+    client.core.writes.append(
+        Frame(Opcode.CLOSE, code.to_bytes(2, "big") + "bye 🤖".encode()).serialize(mask=True)
+    )
+    client.run()
+    assert client.closed == 1000
+    assert gate.sessions[0].got[-1] == "end"
+    assert gate.sessions[0].orderly
+
+
 def test_no_session_begins_on_a_connection_that_has_failed(gate: MemoryGate) -> None:
     """The token may be found good while the client has not yet answered the close frame."""
     gate.wait = Deferred()
@@ -501,10 +577,14 @@ def test_the_close_for_text_that_is_not_utf8_waits_for_the_clients(gate: MemoryG
         (b"\x03\xe8\xe2\x82", 1007),
         (b"\x00\x00", 1002),
         (b"\x03\xe7", 1002),
+        (b"\x03\xec", 1002),
         (b"\x03\xed", 1002),
         (b"\x03\xee", 1002),
+        (b"\x04\x4c", 1002),
+        (b"\x07\xd0", 1002),
         (b"\x0b\xb7", 1002),
         (b"\x13\x88", 1002),
+        (b"\xff\xff", 1002),
         (b"\x03", 1002),
     ],
 )
