@@ -87,6 +87,9 @@ _PARTS = "/_action/"
 _OF_ACTION = {Operation.PUBLISH: Operation.PROVIDE}
 """What one needs for the action to do something to its parts, where that is not the same."""
 
+_EVENTS = "/_service_event"
+"""How the name of the topic ends on which a service tells of its calls, with all that is in them (REP 2012)."""
+
 
 class Grant(NamedTuple):
     """One right as it stands in the database, or as a token's scope names it.
@@ -190,6 +193,13 @@ class Rules:
     def _decide_own(self, operation: Operation, resource: str) -> Verdict:
         if self._own is None and not self._allow:
             return Verdict(False, "you have no right on this robot")
+        service = resource.removesuffix(_EVENTS)
+        if service != resource:
+            # To hear all that is asked of a service takes what it takes to ask it.
+            of_service = Operation.PROVIDE if operation is Operation.PUBLISH else Operation.CALL
+            whole = self._decide_own(of_service, service)
+            if not whole.allowed:
+                return whole
         action, part, _ = resource.partition(_PARTS)
         if part:
             whole = self._decide_own(_OF_ACTION.get(operation, operation), action)

@@ -14,7 +14,7 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage, NotFound
 from relay_protocol.limits import KIB, MIB, TYPE_TEXTS
 from relay_protocol.ros.compiled import Compiled, Reader, Writer
-from relay_protocol.ros.definition import Definition, normalise, parts_of, text_of
+from relay_protocol.ros.definition import Definition, normalise, parts_of, source_of, text_of
 from relay_protocol.ros.typedefs import typedef
 
 __all__ = ["Body", "Reader", "TypeRegistry", "Writer"]
@@ -95,21 +95,24 @@ class TypeRegistry:
         return name in self._types or all(part in self._types for part in parts_of(name))
 
     def has_text(self, type_name: str) -> bool:
-        """Whether the robot has sent a text for just this type."""
+        """Whether the robot has sent a text for just this type, or for what ROS makes it of."""
         try:
-            return normalise(type_name) in self._texts
+            return source_of(normalise(type_name)) in self._texts
         except Invalid:
             return False
 
     def definition(self, type_name: str) -> str:
-        """The text as the robot sent it.
+        """The text as the robot sent it; of what ROS makes of a service or an action, such a text.
 
         :raises NotFound: none was sent for just this type
         """
-        text = self._texts.get(normalise(type_name))
-        if text is None:
+        name = normalise(type_name)
+        text = self._texts.get(name)
+        if text is not None:
+            return text
+        if source_of(name) not in self._texts:
             raise NotFound(f"the definition of {type_name} is not known")
-        return text
+        return self.full_text(name)
 
     def full_text(self, type_name: str) -> str:
         """The definition of a message with all it contains, also if it came as a part of another's.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 from twisted.internet.defer import Deferred, fail, succeed
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
 from relay_protocol.ros import common
+from relay_protocol.ros.definition import normalise, source_of
 from relay_server.channel.wire import ChannelLink, Wire
 
 PATIENCE = 2.0
@@ -16,6 +18,17 @@ PATIENCE = 2.0
 
 UNCHECKED = 4096
 """Most names of types that are kept because a robot has no definition of them."""
+
+
+class _Asked(NamedTuple):
+    """A definition the robot was asked for.
+
+    :param names: of the types that are wanted of it
+    :param waiting: for each of those who wait, with the type
+    """
+
+    names: dict[str, None]
+    waiting: list[tuple[str, Deferred[None]]]
 
 
 class Definitions:
@@ -34,7 +47,8 @@ class Definitions:
         self._wire = wire
         self._defined = defined
         self._unusable = unusable
-        self._asked: dict[str, list[Deferred[None]]] = {}
+        self._asked: dict[str, _Asked] = {}
+        """By the types whose texts define what is wanted."""
         self._unchecked: dict[str, None] = {}
 
     def want(self, type_name: str) -> None:
@@ -47,19 +61,23 @@ class Definitions:
         return self._wire.robot.types.knows(type_name) or type_name in self._unchecked
 
     def _ask(self, type_name: str) -> None:
-        if type_name in self._asked or self._wire.link is None:
+        source = source_of(normalise(type_name))
+        if self._wire.link is None:
             return
-        if not self._wire.cdr and type_name in common.TEXTS:
-            self._wire.robot.types.add(type_name, common.TEXTS[type_name])
+        if source in self._asked:
+            self._asked[source].names[type_name] = None
             return
-        self._asked[type_name] = []
-        self._wire.send(link.GetType(type=type_name))
+        if not self._wire.cdr and source in common.TEXTS:
+            self._wire.robot.types.add(source, common.TEXTS[source])
+            return
+        self._asked[source] = _Asked({type_name: None}, [])
+        self._wire.send(link.GetType(type=source))
         if not self._wire.cdr:
-            self._wire.clock.callLater(PATIENCE, self._late, self._wire.link, type_name)
+            self._wire.clock.callLater(PATIENCE, self._late, self._wire.link, source)
 
-    def _late(self, asked: ChannelLink, type_name: str) -> None:
-        if self._wire.link is asked and type_name in self._asked:
-            self.refused(type_name, f"the robot did not tell it within {PATIENCE:g} s")
+    def _late(self, asked: ChannelLink, source: str) -> None:
+        if self._wire.link is asked and source in self._asked:
+            self.refused(source, f"the robot did not tell it within {PATIENCE:g} s")
 
     def ready(self, type_name: str, text: bool = False) -> Deferred[None]:
         """Fires when the type is settled; fails in words when the robot does not know it or is lost.
@@ -72,10 +90,11 @@ class Definitions:
             # Nobody would ask the robot, and this type would count as asked for.
             return fail(Unavailable(f"robot {self._wire.robot.name} is not connected"))
         self._ask(type_name)
-        if type_name not in self._asked:
+        asked = self._asked.get(source_of(normalise(type_name)))
+        if asked is None:
             return succeed(None)
         waiting: Deferred[None] = Deferred()
-        self._asked[type_name].append(waiting)
+        asked.waiting.append((type_name, waiting))
         return waiting
 
     def _has(self, type_name: str, text: bool) -> bool:
@@ -85,42 +104,49 @@ class Definitions:
 
     def add(self, message: link.TypeDefinition) -> None:
         """The robot has sent a definition."""
-        waiting = self._asked.pop(message.type, None)
-        if waiting is None:
+        asked = self._asked.pop(message.type, None)
+        if asked is None:
             return
         try:
             self._wire.robot.types.add(message.type, message.text)
         except SwitchboardError as error:
-            reason = f"the robot's definition of {message.type} is unusable: {error}"
-            self._fail(waiting, Invalid(reason))
-            self._unusable(message.type, reason)
+            self._unusable_now(
+                asked, Invalid(f"the robot's definition of {message.type} is unusable: {error}")
+            )
             return
-        for each in waiting:
-            each.callback(None)
-        self._defined(message.type)
+        for name, each in asked.waiting:
+            if self._wire.robot.types.knows(name):
+                each.callback(None)
+            else:
+                each.errback(NotFound(f"the definition of {message.type} does not define {name}"))
+        for name in asked.names:
+            self._defined(name)
 
-    def refused(self, type_name: str, reason: str) -> None:
+    def refused(self, source: str, reason: str) -> None:
         """The robot does not have the type."""
-        waiting = self._asked.pop(type_name, [])
-        if not self._wire.cdr:
+        asked = self._asked.pop(source, _Asked({source: None}, []))
+        if self._wire.cdr:
+            self._unusable_now(asked, NotFound(f"type {source}: {reason}"), reason)
+            return
+        for name in asked.names:
             if len(self._unchecked) >= UNCHECKED:
                 self._unchecked.clear()
-            self._unchecked[type_name] = None
-            for each in waiting:
-                each.callback(None)
-            self._defined(type_name)
-            return
-        self._fail(waiting, NotFound(f"type {type_name}: {reason}"))
-        self._unusable(type_name, reason)
+            self._unchecked[name] = None
+        for _, each in asked.waiting:
+            each.callback(None)
+        for name in asked.names:
+            self._defined(name)
+
+    def _unusable_now(self, asked: _Asked, error: SwitchboardError, reason: str = "") -> None:
+        for _, each in asked.waiting:
+            each.errback(error)
+        for name in asked.names:
+            self._unusable(name, reason or str(error))
 
     def reset(self) -> None:
         """The link is gone."""
         asked, self._asked = self._asked, {}
         self._unchecked.clear()
-        for waiting in asked.values():
-            self._fail(waiting, Unavailable(f"robot {self._wire.robot.name} lost its connection"))
-
-    @staticmethod
-    def _fail(waiting: list[Deferred[None]], error: SwitchboardError) -> None:
-        for each in waiting:
-            each.errback(error)
+        for each in asked.values():
+            for _, waiting in each.waiting:
+                waiting.errback(Unavailable(f"robot {self._wire.robot.name} lost its connection"))

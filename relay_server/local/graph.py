@@ -32,19 +32,19 @@ async def topics_for_type(session: Session, args: Any) -> Any:
 
 async def topic_type(session: Session, args: Any) -> Any:
     """``/rosapi/topic_type``"""
-    topic = view(session).topics.get(name(args, "topic"))
+    topic = view(session).topic(name(args, "topic"))
     return {"type": _first(topic.types) if topic else ""}
 
 
 async def publishers(session: Session, args: Any) -> Any:
     """``/rosapi/publishers``"""
-    topic = view(session).topics.get(name(args, "topic"))
+    topic = view(session).topic(name(args, "topic"))
     return {"publishers": topic.publishers if topic else []}
 
 
 async def subscribers(session: Session, args: Any) -> Any:
     """``/rosapi/subscribers``"""
-    topic = view(session).topics.get(name(args, "topic"))
+    topic = view(session).topic(name(args, "topic"))
     return {"subscribers": topic.subscribers if topic else []}
 
 

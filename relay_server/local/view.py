@@ -24,12 +24,20 @@ KEPT = 8
 
 
 class View(NamedTuple):
-    """What there is, by name and in order."""
+    """What there is, by name and in order.
+
+    :param hidden: topics that are not listed, but that a caller who names one may subscribe to
+    """
 
     topics: dict[str, Topic]
     services: dict[str, Service]
     actions: dict[str, Service]
     nodes: list[str]
+    hidden: dict[str, Topic]
+
+    def topic(self, name: str) -> Topic | None:
+        """A topic that the caller names, listed or not."""
+        return self.topics.get(name) or self.hidden.get(name)
 
 
 class Work(NamedTuple):
@@ -96,12 +104,13 @@ def _made(robot: Presence, ends: Ends, rules: Rules) -> View:
     def may_call(name: str) -> bool:
         return judge(Operation.CALL, name).allowed
 
-    topics = {
+    usable = {
         name: topic
         for name, topic in sorted(_topics(graph, ends).items())
-        if not hidden(name)
-        and (may_hear(judge, robot, name, topic.types).allowed or judge(Operation.PUBLISH, name).allowed)
+        if may_hear(judge, robot, name, topic.types).allowed or judge(Operation.PUBLISH, name).allowed
     }
+    topics = {name: topic for name, topic in usable.items() if not hidden(name)}
+    unlisted = {name: topic for name, topic in usable.items() if hidden(name)}
     services = {
         name: service
         for name, service in _services(graph.services, ends.services).items()
@@ -114,7 +123,7 @@ def _made(robot: Presence, ends: Ends, rules: Rules) -> View:
     }
     # The relay's own services are open to everyone with a right on the robot.
     services = dict(sorted({**services, **OWN_SERVICES}.items()))
-    return View(topics, services, actions, sorted({*graph.nodes, RELAY, ROSAPI}))
+    return View(topics, services, actions, sorted({*graph.nodes, RELAY, ROSAPI}), unlisted)
 
 
 def _topics(graph: GraphMirror, ends: Ends) -> dict[str, Topic]:

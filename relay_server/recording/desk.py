@@ -159,7 +159,11 @@ class RecordingDesk:
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             there, library = admission.robot, self._recordings.library
-            topics = {name: self._why_no_topic(admission, name) for name in sorted(there.graph.topics)}
+            topics = {
+                name: self._why_no_topic(admission, name)
+                for name in sorted(there.graph.topics)
+                if "/_" not in name
+            }
             cameras = {
                 camera.name: why_not(admission.permit, Operation.VIEW, camera.name)
                 for camera in there.cameras

@@ -114,7 +114,8 @@ class ResourceDesk:
         """
         async with self._guests.at(*asker) as guest:
             resource = resolve(name)
-            found = getattr(view(guest.session), kind).get(resource)
+            seen = view(guest.session)
+            found = seen.topic(resource) if kind == "topics" else getattr(seen, kind).get(resource)
             if found is None:
                 raise _nothing(guest.session, kind, resource)
             return _told(guest.session.robot, kind, resource, found)
@@ -398,7 +399,7 @@ def known_type(session: Session, topic: str) -> str:
     :raises NotFound: there is none
     :raises Unavailable: the robot is offline
     """
-    known = view(session).topics.get(topic)
+    known = view(session).topic(topic)
     if known is not None and known.types:
         return known.types[0]
     raise _nothing(session, "topics", topic)

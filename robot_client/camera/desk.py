@@ -64,6 +64,7 @@ class CameraDesk:
             for name, topic in view.topics.items()
             for type in topic.types
             if type in (IMAGE, COMPRESSED) and topic.publishers and name not in self._configured
+            if "/_" not in name
         }
         if topics != self._topics:
             self._topics = topics

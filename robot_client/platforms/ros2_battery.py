@@ -31,7 +31,14 @@ class Battery:
         """Listen to it as soon as there is one."""
         if self._listening:
             return
-        topic = next((name for name, each in sorted(view.topics.items()) if BATTERY in each.types), None)
+        topic = next(
+            (
+                name
+                for name, each in sorted(view.topics.items())
+                if BATTERY in each.types and "/_" not in name
+            ),
+            None,
+        )
         if topic is None or not view.topics[topic].publishers:
             return
         with suppress(SwitchboardError):  # no such type here; a robot without a gauge is a robot

@@ -1,4 +1,7 @@
-"""The ROS 2 graph as the relay wants it: by node, which is cheaper than by topic, without what is hidden."""
+"""The ROS 2 graph as the relay wants it: by node, which is cheaper than by topic.
+
+Hidden topics are in it, since clients may subscribe to them by name; hidden nodes, services and actions are not.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,6 @@ def read(node: Any, own: tuple[str, ...]) -> GraphView:
                 subscribers=sorted(topics.subscribers.get(topic, ())),
             )
             for topic, types in topics.types.items()
-            if not hidden(topic)
         },
         services=plain,
         actions=actions,

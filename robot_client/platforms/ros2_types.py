@@ -18,6 +18,22 @@ from robot_client.velocity import form
 _OF = {"msg": "messages", "srv": "services", "action": "actions"}
 
 
+_OF_ACTION = {"SendGoal": "SendGoalService", "GetResult": "GetResultService"}
+_DERIVED = {
+    **{("srv", each, "msg"): (each,) for each in ("Request", "Response", "Event")},
+    **{("action", each, "msg"): (each,) for each in ("Goal", "Result", "Feedback")},
+    ("action", "FeedbackMessage", "msg"): ("Impl", "FeedbackMessage"),
+    **{("action", name, "srv"): ("Impl", each) for name, each in _OF_ACTION.items()},
+    **{
+        ("action", f"{name}_{part}", "msg"): ("Impl", each, part)
+        for name, each in _OF_ACTION.items()
+        for part in ("Request", "Response", "Event")
+    },
+}
+"""Where the class of a service or an action has those of what ROS makes of it, by its kind, the ending of the name, and
+the kind that is wanted."""
+
+
 class Interface(NamedTuple):
     """A service or an action: its name in the graph, the full name of its type, and that type's class."""
 
@@ -62,9 +78,15 @@ class Types:
         if found is None:
             full = definitions.normalise(name, kind)
             package, has, short = full.split("/")
-            if has != kind:
+            made, separator, what = short.partition("_")
+            if separator and (has, what, kind) in _DERIVED:
+                loaded = _load(package, has, made, full)
+                found = _derived(loaded, _DERIVED[has, what, kind], full)
+            elif has == kind:
+                found = _load(package, kind, short, full)
+            else:
                 raise Invalid(f"{name} is no type of {_OF[kind]}")
-            found = self._classes[name, kind] = _load(package, kind, short, full)
+            self._classes[name, kind] = found
         return found
 
     def definition(self, name: str) -> link.TypeDefinition:
@@ -132,6 +154,20 @@ class Types:
         if message.get_fields_and_field_types().get("header") == ros2_motion.HEADER:
             message.header.stamp = stamp
         return bytes(serialize_message(message))
+
+
+def _derived(found: Any, path: tuple[str, ...], name: str) -> Any:
+    """The class of what ROS makes of a service or an action.
+
+    :raises NotFound: this distribution makes none (before Iron services have no events)
+    """
+    try:
+        for each in path:
+            found = getattr(found, each)
+        found.__class__.__import_type_support__()
+    except Exception:
+        raise NotFound(f"the type {name} is not available on this robot") from None
+    return found
 
 
 def parse(body: bytes, kind: Any, what: str) -> Any:

@@ -9,6 +9,7 @@ import os
 import re
 import struct
 import sys
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +44,18 @@ def thorough(name: str) -> settings:
     return MORE if name.startswith("switchboard_test_interfaces/msg") else EVERY
 
 
-PARTS = {"msg": [""], "srv": ["Request", "Response"], "action": ["Goal", "Result", "Feedback"]}
+ASKED = ["Request", "Response", "Event"]
+PARTS = {
+    "msg": {"": ""},
+    "srv": {part: part for part in ASKED},
+    "action": {
+        **{part: part for part in ("Goal", "Result", "Feedback")},
+        "FeedbackMessage": "Impl.FeedbackMessage",
+        **{f"SendGoal_{part}": f"Impl.SendGoalService.{part}" for part in ASKED},
+        **{f"GetResult_{part}": f"Impl.GetResultService.{part}" for part in ASKED},
+    },
+}
+"""Messages that are made of a type: how their names end, and where its class has theirs."""
 REFERENCE = re.compile(r"\s*([A-Za-z]\w*(?:/\w+){0,2})(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")
 
 
@@ -90,10 +102,9 @@ def installed() -> dict[str, Installed]:
         except ImportError:
             continue
         owner = f"{package}/{kind}/{name}"
-        for part in PARTS[kind]:
-            found[f"{owner}_{part}" if part else owner] = Installed(
-                owner, getattr(cls, part) if part else cls
-            )
+        for part, path in PARTS[kind].items():
+            made = attrgetter(path)(cls) if part else cls
+            found[f"{owner}_{part}" if part else owner] = Installed(owner, made)
     return found
 
 
@@ -116,7 +127,9 @@ def slots(cls: Any) -> dict[str, Any]:
 
 def class_of(kind: idl.NamespacedType) -> Any:
     """rclpy's class of a message within a message."""
-    return getattr(importlib.import_module(".".join(kind.namespaces)), kind.name)
+    name, _, part = kind.name.partition("_")
+    cls = getattr(importlib.import_module(".".join(kind.namespaces)), name)
+    return attrgetter(PARTS[kind.namespaces[-1]][part])(cls) if part else cls
 
 
 def messages(cls: Any, finite: bool = False) -> st.SearchStrategy[Any]:

@@ -80,6 +80,30 @@ def test_the_parts_of_an_action_need_a_right_on_the_action(
     assert not Rules([Grant(Level.OPERATOR, deny=(f"*:{name}",))]).judge(operation, name).allowed
 
 
+@pytest.mark.parametrize(
+    ("grant", "operation", "allowed"),
+    [
+        (Grant(Level.OPERATOR), Operation.SUBSCRIBE, True),
+        (Grant(Level.VIEWER), Operation.SUBSCRIBE, False),
+        (Grant(Level.VIEWER, allow=("subscribe:/arm/*",)), Operation.SUBSCRIBE, False),
+        (Grant(Level.VIEWER, allow=("call:/arm/home",)), Operation.SUBSCRIBE, True),
+        (Grant(Level.OPERATOR, deny=("call:/arm/home",)), Operation.SUBSCRIBE, False),
+        (Grant(Level.OPERATOR, deny=("subscribe:/arm/home/_*",)), Operation.SUBSCRIBE, False),
+        (Grant(Level.OPERATOR, deny=("call:/arm/home",)), Operation.RECORD, False),
+        (Grant(Level.OPERATOR, deny=("call:/arm/home",)), Operation.VIEW, False),
+        (Grant(Level.OPERATOR), Operation.PUBLISH, True),
+        (Grant(Level.OPERATOR, deny=("provide:/arm/home",)), Operation.PUBLISH, False),
+        (Grant(None, allow=("subscribe:/arm/home",)), Operation.SUBSCRIBE, False),
+        (Grant(None, allow=("subscribe:*",)), Operation.SUBSCRIBE, False),
+    ],
+)  # fmt: skip
+def test_what_a_service_tells_of_its_calls_is_for_its_callers(
+    grant: Grant, operation: Operation, allowed: bool
+) -> None:
+    """Requests and responses are in it: a right to hear all topics does not open them."""
+    assert Rules([grant]).judge(operation, "/arm/home/_service_event").allowed is allowed
+
+
 def test_nobody_has_no_channel() -> None:
     """Without any right there is no level, and the reason says so."""
     rules = Rules()

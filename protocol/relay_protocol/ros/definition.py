@@ -117,6 +117,15 @@ class Definition(NamedTuple):
 
 
 _PARTS = {"msg": ("",), "srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
+_SERVICES = ("_SendGoal", "_GetResult")
+"""Services that an action is made of (design.ros2.org, actions)."""
+_DERIVED = {
+    "srv": re.compile(r"(.+?)_(?:Request|Response|Event)\Z"),
+    "action": re.compile(
+        r"(.+?)_(?:Goal|Result|Feedback|FeedbackMessage|(?:SendGoal|GetResult)(?:_(?:Request|Response|Event))?)\Z"
+    ),
+}
+"""Names of what ROS makes of a service or an action, by its kind."""
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(?:(?:msg|srv|action)/)?[A-Za-z][A-Za-z0-9_]*\Z")
 _SEPARATOR = re.compile(r"={80,}[ \t\r]*\Z")
 _LINE = re.compile(
@@ -132,6 +141,15 @@ _BUILT_IN = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
     "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec",
 }
+_UUID = "unique_identifier_msgs/msg/UUID"
+_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
+_OF_DERIVED = {
+    _UUID: "uint8[16] uuid",
+    _EVENT_INFO: (
+        "uint8 REQUEST_SENT=0\nuint8 REQUEST_RECEIVED=1\nuint8 RESPONSE_SENT=2\nuint8 RESPONSE_RECEIVED=3\n"
+        "uint8 event_type\nbuiltin_interfaces/Time stamp\nchar[16] client_gid\nint64 sequence_number"
+    ),
+}
 
 
 def normalise(type_name: str) -> str:
@@ -146,9 +164,47 @@ def normalise(type_name: str) -> str:
 
 
 def parts_of(type_name: str) -> tuple[str, ...]:
-    """Names of the messages a text of this type defines: itself, or the parts of a service or action."""
+    """Names of the messages that a type consists of: itself, or the parts of a service or action."""
     kind = type_name.split("/")[1]
+    if source_of(type_name) != type_name:
+        kind = "srv" if type_name.endswith(_SERVICES) else "msg"
     return tuple(type_name + suffix for suffix in _PARTS[kind])
+
+
+def source_of(type_name: str) -> str:
+    """The type whose text defines a type: of ``pkg/action/Name_FeedbackMessage`` it is ``pkg/action/Name``.
+
+    ROS makes further messages and services of each service and action, which have no text of their own. No other type
+    has a name with an underscore (rosidl).
+
+    :param type_name: a normalised name
+    """
+    package, kind, name = type_name.split("/")
+    derived = _DERIVED[kind].match(name) if kind in _DERIVED else None
+    return type_name if derived is None else f"{package}/{kind}/{derived[1]}"
+
+
+def _derived(type_name: str) -> dict[str, str]:
+    """Texts of the messages that ROS makes of a service or an action beside its parts, and of what they contain."""
+    kind = type_name.split("/")[1]
+    if kind == "msg":
+        return {}
+    found = dict(_OF_DERIVED)
+    services = [type_name]
+    if kind == "action":
+        send, get = services = [type_name + each for each in _SERVICES]
+        found |= {
+            f"{type_name}_FeedbackMessage": f"{_UUID} goal_id\n{type_name}_Feedback feedback",
+            f"{send}_Request": f"{_UUID} goal_id\n{type_name}_Goal goal",
+            f"{send}_Response": "bool accepted\nbuiltin_interfaces/Time stamp",
+            f"{get}_Request": f"{_UUID} goal_id",
+            f"{get}_Response": f"int8 status\n{type_name}_Result result",
+        }
+    for each in services:
+        found[f"{each}_Event"] = (
+            f"{_EVENT_INFO} info\n{each}_Request[<=1] request\n{each}_Response[<=1] response"
+        )
+    return found
 
 
 def parse(type_name: str, text: str) -> dict[str, Definition]:
@@ -165,7 +221,19 @@ def parse(type_name: str, text: str) -> dict[str, Definition]:
         _check_size(definitions)
     except Invalid as error:
         raise Invalid(f"definition of {type_name}: {error}") from None
-    return definitions
+    return _with_derived(type_name, definitions)
+
+
+def _with_derived(type_name: str, definitions: dict[str, Definition]) -> dict[str, Definition]:
+    """The same with the messages that ROS makes of the type; without them, if they are beyond the limits."""
+    bodies = {name: body.split("\n") for name, body in _derived(type_name).items()}
+    known = {**bodies, **definitions}
+    whole = {**{name: _parse_one(name, body, known) for name, body in bodies.items()}, **definitions}
+    try:
+        _check_size(whole)
+    except Invalid:
+        return definitions
+    return {**definitions, **whole}
 
 
 def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) -> str:
@@ -176,7 +244,7 @@ def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) 
     :param definitions: what :func:`parse` made of it
     """
     main, *contained = _sections(text.split("\n"))
-    bodies = {each: body.split("\n") for each, body in _BUILT_IN.items()}
+    bodies = {each: body.split("\n") for each, body in (_BUILT_IN | _derived(top)).items()}
     for lines in reversed(contained):
         bodies[normalise(lines[0].strip()[4:].strip())] = lines[1:]
     names = parts_of(top)
@@ -185,8 +253,7 @@ def text_of(name: str, top: str, text: str, definitions: dict[str, Definition]) 
     while waiting:
         each = waiting.pop()
         if each not in found:
-            package, _, short = each.split("/")
-            title = "" if each == name else f"{'=' * 80}\nMSG: {package}/{short}\n"
+            title = "" if each == name else f"{'=' * 80}\nMSG: {each.replace('/msg/', '/')}\n"
             found[each] = title + "\n".join(bodies[each]).rstrip("\n") + "\n"
             kinds = (field.type for field in definitions[each].fields)
             waiting += reversed([kind.base for kind in kinds if kind.primitive is None])

@@ -117,7 +117,8 @@ def test_hidden_names_are_not_listed(world: World, operator: Person) -> None:
     )
     world.registry.graph(world.robot, hidden)
     assert "_" not in "".join(ask(operator, "/rosapi/topics")["topics"]).replace("cmd_vel", "")
-    assert ask(operator, "/rosapi/topic_type", {"topic": "/_own"}) == {"type": ""}
+    assert ask(operator, "/rosapi/topic_type", {"topic": "/_own"}) == {"type": STRING}
+    assert ask(operator, "/rosapi/publishers", {"topic": "/_own"}) == {"publishers": ["/base"]}
     assert ask(operator, "/rosapi/services_for_type", {"type": TRIGGER}) == {"services": ["/reset"]}
     assert ask(operator, "/rosapi/node_details", {"node": "/base"})["publishing"] == []
 

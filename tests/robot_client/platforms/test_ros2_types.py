@@ -44,6 +44,32 @@ def test_a_type_known_as_one_kind_is_no_other(kind: str, other: str) -> None:
         getattr(types, other)(KINDS[kind])
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "fields"),
+    [
+        ("message", "std_srvs/srv/SetBool_Event", {"info", "request", "response"}),
+        ("message", "std_srvs/srv/SetBool_Request", {"data"}),
+        ("message", "example_interfaces/action/Fibonacci_FeedbackMessage", {"goal_id", "feedback"}),
+        ("message", "example_interfaces/action/Fibonacci_Goal", {"order"}),
+        ("message", "example_interfaces/action/Fibonacci_GetResult_Response", {"status", "result"}),
+        ("message", "action_msgs/srv/CancelGoal_Event", {"info", "request", "response"}),
+    ],
+)
+def test_what_is_made_of_a_service_or_an_action_is_a_message(kind: str, name: str, fields: set[str]) -> None:
+    """As its publishers name it."""
+    assert set(getattr(Types(), kind)(name).get_fields_and_field_types()) == fields
+
+
+@pytest.mark.parametrize("name", ["Fibonacci_SendGoal", "Fibonacci_GetResult"])
+def test_an_action_has_services(name: str) -> None:
+    """They are no messages, and a message is none of them."""
+    full = f"example_interfaces/action/{name}"
+    assert Types().service(full).Request
+    for found, other in ((Types().message, full), (Types().service, f"{full}_Request")):
+        with pytest.raises(Invalid, match="is no type of "):
+            found(other)
+
+
 @pytest.mark.parametrize("kind", ["msg", "srv", "action"])
 def test_naming_a_type_runs_no_code_that_is_no_ros_interface(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
