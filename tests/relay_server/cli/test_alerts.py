@@ -69,7 +69,7 @@ def test_alerts_of_batteries_are_switched_off_by_a_low_charge_of_nothing(
     """Whatever is critical otherwise."""
     began: list[Settings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: began.append(settings))
-    monkeypatch.setattr(logs, "begin", lambda *how: None)
+    monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
     cli.ok("serve", *options)
     assert (began[0].alerts.battery_low, began[0].alerts.battery_critical) == (low, critical)
 
@@ -78,7 +78,7 @@ def test_networks_are_allowed_and_denied_by_name(cli: Any, monkeypatch: pytest.M
     """A list of each."""
     began: list[Settings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: began.append(settings))
-    monkeypatch.setattr(logs, "begin", lambda *how: None)
+    monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
     cli.ok("serve", "--webhook-networks", "10.0.0.0/8", "--webhook-deny", "10.0.0.7/32, 2606:2800:21f::/48")
     alerts = began[0].alerts
     assert alerts.webhook_networks == ("10.0.0.0/8",)

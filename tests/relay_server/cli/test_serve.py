@@ -16,7 +16,7 @@ def began(monkeypatch: pytest.MonkeyPatch) -> list[Settings]:
     """The settings of the relays that were begun."""
     found: list[Settings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: found.append(settings))
-    monkeypatch.setattr(logs, "begin", lambda *how: None)
+    monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
     return found
 
 
