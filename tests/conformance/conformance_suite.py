@@ -159,8 +159,8 @@ class Server:
 
     @property
     def fixture_patience(self) -> float:
-        """Seconds the fixture node waits for what a command is about."""
-        return min(FIXTURE_PATIENCE, self.patience)
+        """Seconds the fixture node waits for what a command is about: less than the answer may take."""
+        return min(FIXTURE_PATIENCE, self.patience * 2 / 3)
 
     def look_for_fixture(self) -> str:
         """Find the fixture node behind the server, and have it wait no longer than the suite; else, what is missing."""

@@ -17,8 +17,8 @@ _outcomes = pytest.StashKey[list[suite.Outcome]]()
 _watch = pytest.StashKey["Watch"]()
 _failed = pytest.StashKey[bool]()
 
-FOREIGN_PATIENCE = 4.0
-"""Seconds for an answer of a server that was named: a case that fails costs no more than twice that."""
+FOREIGN_PATIENCE = 6.0
+"""Seconds for an answer of a server that was named. rosbridge_server gives up a call after 5 s."""
 
 RESTART_SECONDS = 60.0
 """A server that was started again has so long to serve."""
@@ -68,7 +68,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--table", action="store_true", help="print the table of cases")
     group.addoption("--listen", default="", help="HOST:PORT for a robot to dial; without: our own robots")
     group.addoption("--robot-name", default="robot-under-test", help="the name it has to dial with")
-    group.addoption("--answers-within", type=float, help="seconds for an answer; 4 with --url, else 30")
+    group.addoption("--answers-within", type=float, help="seconds for an answer; 6 with --url, else 30")
     group.addoption("--restart", default="", help="shell command that starts the server again when it hangs")
     group.addoption("--patience", type=float, default=300.0, help="seconds to wait for it to dial")
 
