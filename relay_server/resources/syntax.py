@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Callable
 from io import BytesIO
+from itertools import islice
 from typing import Any
 from xml.parsers import expat
 
@@ -40,7 +41,10 @@ CONTEXT_TERMS = 128
 CONTEXT_CHARACTERS = 16 * 1024
 """Of a context of JSON-LD."""
 
-NAMESPACES = 256
+PARTS = 2048
+"""Elements of RDF/XML, words of Turtle, values of JSON-LD: parsers take some 30 µs for each. A long array is one."""
+
+NAMESPACES = 64
 """Of RDF/XML and Turtle; of JSON-LD they are terms."""
 
 XML_DEPTH = 2 * JSON_DEPTH + 2
@@ -49,6 +53,7 @@ XML_DEPTH = 2 * JSON_DEPTH + 2
 _ABSOLUTE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://\S*\Z|urn:\S*\Z")
 _TERM = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*\Z")
 _LONG_IRI = re.compile(rf"<[^\s<>\"{{}}|^`]{{{LONGEST_IRI},}}")
+_WORD = re.compile(r'"(?:[^"\\]|\\.)*"|<[^<>\s]*>|[\[\](),;]|[^\s\[\](),;"<]+|["<]', re.DOTALL)
 _PREFIX = re.compile(r"(?<![\w:/#])prefix", re.IGNORECASE)
 _KEYWORDS = frozenset({"@id", "@type", "@value", "@list", "@graph", "@vocab"})
 _ESCAPES = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r"})
@@ -93,6 +98,10 @@ def _first_line(error: Exception) -> str:
     return lines[0][:200]
 
 
+def _too_many(what: str) -> Invalid:
+    return Invalid(f"the body has more than {PARTS} {what}; send it as application/json")
+
+
 # --- RDF/XML ----------------------------------------------------------------------------------------------
 
 
@@ -107,7 +116,7 @@ def _see_xml(text: str) -> None:
     :raises Invalid: it has a document type, which could define entities; another encoding; deep nesting; long IRIs;
         many namespaces, for each of which the parser keeps a table; XML as a value, read anew with each element of it
     """
-    depth = namespaces = 0
+    depth = namespaces = elements = 0
 
     def declared(version: str, encoding: str | None, standalone: int) -> None:
         if (encoding or "utf-8").lower() not in ("utf-8", "utf8"):
@@ -117,8 +126,11 @@ def _see_xml(text: str) -> None:
         raise Invalid("the body must not have a DOCTYPE: entities are not read")
 
     def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, namespaces
+        nonlocal depth, namespaces, elements
         depth += 1
+        elements += 1 + len(attributes)
+        if elements > PARTS:
+            raise _too_many("elements and attributes")
         namespaces += sum(each.startswith("xmlns") for each in attributes)
         if namespaces > NAMESPACES:
             raise Invalid(f"the body declares more than {NAMESPACES} namespaces")
@@ -161,6 +173,8 @@ class _Turtle(TurtleSerializer):
 def _read_turtle(graph: Graph, text: str, base: str) -> None:
     if _LONG_IRI.search(text) is not None:
         raise Invalid(f"the body has an address of over {LONGEST_IRI} characters")
+    if sum(1 for _ in islice(_WORD.finditer(text), PARTS + 1)) > PARTS:
+        raise _too_many("words")
     # Each is compared with all before it. Also those in strings are counted: so many are none a sender needs.
     if sum(1 for _ in _PREFIX.finditer(text)) > NAMESPACES:
         raise Invalid(f"the body declares more than {NAMESPACES} namespaces")
@@ -253,10 +267,14 @@ def _see_term(context: dict[str, Any], name: str, word: str, value: Any) -> None
 
 
 def _see_no_context(value: Any) -> None:
-    """:raises Invalid: there is a context below the body's own"""
+    """:raises Invalid: there is a context below the body's own, or more than can be read"""
     waiting = [value]
+    values = 0
     while waiting:
         each = waiting.pop()
+        values += 1
+        if values > PARTS:
+            raise _too_many("values")
         if isinstance(each, dict):
             if "@context" in each or "@import" in each:
                 raise Invalid("'@context' may be at the top of the body alone, and nothing is imported")
