@@ -107,7 +107,7 @@ class FrontDesk:
         self._sessions: dict[int, dict[int, Session]] = {}
         self._watchings: set[Watching] = set()
         people = People(self.sessions_of, desks.holder, clock.seconds)
-        self.overview = Overview(access, registry, people, self.sessions_of, desks)
+        self.overview = Overview(access, registry, people, self.sessions_of, desks, clock.seconds)
         self._local = RelayNode(self.sessions_of, videos, people)
 
     def __iter__(self) -> Iterator[Session]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,11 +18,15 @@ from relay_server.people import Asker, People, clients
 from relay_server.registry import Presence, Registry
 from relay_server.session import Session
 
+FRESH_SECONDS = 0.25
+"""What passes without a change, such as the time to a robot and back, is so old at most in what pages show."""
+
 
 class Overview:
     """Puts together what is known of robots.
 
     :param sessions: the open sessions of a robot by its id, oldest first
+    :param seconds: a monotonic clock
     """
 
     def __init__(
@@ -31,12 +36,32 @@ class Overview:
         people: People,
         sessions: Callable[[int], list[Session]],
         desks: Desks,
+        seconds: Callable[[], float],
     ) -> None:
         self._access = access
         self._registry = registry
         self._people = people
         self._sessions = sessions
         self._desks = desks
+        self._seconds = seconds
+        self._views: dict[tuple[object, ...], tuple[float, dict[str, Any]]] = {}
+        registry.on_change(self._views.clear)
+
+    async def shared(self, principal: Principal) -> list[dict[str, Any]]:
+        """The same as :meth:`robots`, for pages: a row is shared by all users with equal rights on its robot.
+
+        It is made again when something has changed, and after :data:`FRESH_SECONDS`.
+        """
+        return [self._shared(record, rules) for record, rules in await self._access.robots(principal)]
+
+    def _shared(self, record: queries.RobotRecord, rules: Rules) -> dict[str, Any]:
+        key = (record, rules.alike)
+        now = self._seconds()
+        at, row = self._views.get(key, (-math.inf, {}))
+        if now - at >= FRESH_SECONDS:
+            row = self._view(record, rules)
+            self._views[key] = now, row
+        return row
 
     async def robots(self, principal: Principal) -> list[dict[str, Any]]:
         """What the principal may see of its robots."""

@@ -56,6 +56,7 @@ from relay_server.edges.robot_pages import RobotPages
 from relay_server.edges.robot_roles import Opening, RobotHall
 from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
 from relay_server.edges.site import RelaySite
+from relay_server.edges.sources import Sources
 from relay_server.edges.whole import site_of
 from relay_server.fleet import FleetDesk
 from relay_server.folder import DataFolder
@@ -226,11 +227,12 @@ class Relay:
             "realm": partial(realm.beside, realms),
             "vocabulary": partial(vocabulary.beside, meanings),
         }
-        told = {"alerts": self._alerts.desk.shown}
-        served = desk, origins, metrics, below, beside, RobotPages(desk, self._workshop)
-        limits = RequestLimits(settings.requests, time.monotonic)
-        api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, events=told, limits=limits)
-        self._pages = PageGate(self._reactor, desk, origins, cookie, {"robots": desk.robots, **told})
+        told = {"robots": desk.overview.shared, "alerts": self._alerts.desk.shown}
+        sources = Sources(self._reactor, told, self._registry.on_change)
+        served = desk, origins, metrics, below, beside, RobotPages(desk, self._workshop), sources
+        limits = RequestLimits(settings.requests, time.monotonic, settings.streams)
+        api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, limits=limits)
+        self._pages = PageGate(self._reactor, desk, origins, cookie, sources)
         oauth = OAuthDesk(self._store, self._auth, self._access, self._journal, time.monotonic, time.time)
         return site_of(self._reactor, now_ns, desk, api, oauth, self._pages, settings, limits, cookie)
 

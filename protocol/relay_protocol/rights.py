@@ -170,6 +170,11 @@ class Rules:
         """Equal for rules that judge alike."""
         return (self.grants, self.scope)
 
+    @cached_property
+    def alike(self) -> tuple[object, ...]:
+        """Equal for rules that judge alike, wherever the rights are from."""
+        return tuple(each and tuple(grant[:3] for grant in each) for each in (self.grants, self.scope))
+
     def judge(self, operation: Operation, resource: str) -> Verdict:
         """May the principal do this to that resource of the robot? Answers are kept: names recur."""
         key = (operation, resource)

@@ -141,6 +141,13 @@ MOST_REQUESTS = 1_000_000
     help="HTTP requests of one user, or of a network in which nobody has logged in; ten times as many at once. "
     "Never held back: stops. 0: no limit.",
 )
+@click.option(
+    "--streams-per-user",
+    default=128,
+    show_default=True,
+    type=click.IntRange(min=0),
+    help="Streams that one user may have open: events, topics, cameras, pages of the portal. 0: no limit.",
+)
 @click.option("--log-json", is_flag=True, help="Log one JSON object a line.")
 @click.option("--debug", is_flag=True, help="Log more.")
 @pass_app
@@ -168,6 +175,7 @@ def serve(
     battery_low: float,
     battery_critical: float,
     requests_per_second: float,
+    streams_per_user: int,
     log_json: bool,
     debug: bool,
 ) -> None:
@@ -217,6 +225,7 @@ def serve(
         events_of_source=events_per_source,
         events_kept=events_days * DAY,
         requests=requests_per_second,
+        streams=streams_per_user,
         alerts=AlertSettings(
             _listed(webhook_networks),
             _listed(webhook_deny),

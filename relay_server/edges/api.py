@@ -32,7 +32,8 @@ from relay_server.edges.api_operations import Login, TicketFor
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.once import see_no_key
 from relay_server.edges.problems import problem, problem_of
-from relay_server.edges.stream import EventStream, Source
+from relay_server.edges.sources import Sources
+from relay_server.edges.stream import EventStream
 from relay_server.openapi import described
 from relay_server.origins import Origins
 
@@ -86,7 +87,7 @@ class Api:
     :param below: what serves the addresses below those of robots, by their first part
     :param beside: the same for those beside them
     :param robots: tells of robots themselves
-    :param events: what else is told to pages, by the name of the event
+    :param sources: what pages show
     :param cookie: name of the session cookie
     :param secure: cookies only over TLS
     :param limits: how many requests there may be; without them as many as come
@@ -104,13 +105,13 @@ class Api:
         below: Mapping[str, Callable[[Api, str], IResource]],
         beside: Mapping[str, Callable[[Api], IResource]],
         robots: Shown,
+        sources: Sources,
         *,
         cookie: str,
         secure: bool,
-        events: Mapping[str, Source] | None = None,
         limits: RequestLimits | None = None,
     ) -> None:
-        self._events = {} if events is None else events
+        self._sources = sources
         self._limits = limits or RequestLimits(0.0, clock.seconds)
         self._clock = clock
         self._desk = desk
@@ -231,9 +232,8 @@ class Api:
         return self.answer(request, self._stream(request))
 
     async def _stream(self, request: Request) -> Any:
-        await self.principal(request)
-        sources = {"robots": self._desk.robots, **self._events}
-        await EventStream(self._clock, request, self.principal, sources, self._desk.on_change).run()
+        self.streams(request, await self.principal(request))
+        await EventStream(self._clock, request, self.principal, self._sources).run()
         return STREAMED
 
     @app.route("/api/v1/robots/<name>", methods=["GET"])
@@ -299,6 +299,13 @@ class Api:
         request.setHeader(b"content-type", CONTENT_TYPE_LATEST.encode())
         request.write(generate_latest(self._metrics))
         return STREAMED
+
+    def streams(self, request: Request, principal: Principal) -> None:
+        """The answer is a stream, which counts as one of its user's.
+
+        :raises TooManyStreams: they have too many
+        """
+        self._limits.answer_streams(request, principal.user_id)
 
     # --- answering ----------------------------------------------------------------------------------------
 

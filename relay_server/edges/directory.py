@@ -107,6 +107,7 @@ class DirectoryPages:
 
     async def _stream(self, request: Request, principal: Principal, ask: Ask) -> Any:
         """Changes as they come, or what came since ``Last-Event-ID``, until the reader leaves or may not read."""
+        self._api.streams(request, principal)
         proved = self._clock.seconds()
         request.setHeader("content-type", "text/event-stream")
         last = request.getHeader("last-event-id") or None

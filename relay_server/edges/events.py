@@ -176,6 +176,7 @@ class EventPages:
     async def _stream(self, request: Request, ask: Ask) -> Any:
         """New events as they come, or what came since ``Last-Event-ID``, until the reader leaves or may not read."""
         principal, proved = await self._api.principal(request), self._clock.seconds()
+        self._api.streams(request, principal)
         begun = await self._desk.follow_from(principal, _last_id(request))
         request.setHeader(b"content-type", STREAM.encode())
         async with Outflow(self._clock, request) as out, self._desk.following(begun) as following:

@@ -10,7 +10,7 @@ from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailab
 from relay_server import closing
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth import Opening
-from relay_server.edges.limiting import TooManyRequests
+from relay_server.edges.limiting import TooManyRequests, TooManyStreams
 from relay_server.frontdesk import Admission, GoingDown
 from relay_server.outbox import Outbox
 from relay_server.session import ClientTransport
@@ -124,7 +124,7 @@ def code_of(error: SwitchboardError) -> int:
         return closing.INVALID
     if isinstance(error, BadCredentials):
         return closing.UNAUTHENTICATED
-    if isinstance(error, TooManyRequests):
+    if isinstance(error, (TooManyRequests, TooManyStreams)):
         return closing.TOO_MANY_ERRORS
     if isinstance(error, NotFound):
         return closing.NOT_FOUND

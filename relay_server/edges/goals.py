@@ -188,6 +188,7 @@ class RobotGoals:
         return msgspec.Raw(told.body)
 
     async def _stream(self, request: Request, asker: Asker, goal: Goal) -> None:
+        self._api.streams(request, asker.principal)
         for name, value in (("content-type", "text/event-stream"), ("x-accel-buffering", "no")):
             request.setHeader(name, value)
         request.setHeader(HEADER, self._moments.now())

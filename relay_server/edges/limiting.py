@@ -6,6 +6,7 @@ The headers are those of draft-ietf-httpapi-ratelimit-headers.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Hashable
 
 from twisted.web.server import Request
@@ -31,15 +32,31 @@ class TooManyRequests(SwitchboardError):
         self.retry_after = retry_after
 
 
+class TooManyStreams(SwitchboardError):
+    """A user has as many streams open as one may have."""
+
+    code = "too_many_streams"
+
+    def __init__(self, most: int) -> None:
+        super().__init__(
+            f"you have {most} streams open, as many as one user may (events, topics, cameras, pages of the portal); "
+            "close one of them first"
+        )
+
+
 class RequestLimits:
-    """Counts requests, each once, and tells in its answer what is left.
+    """Counts requests, each once, and tells in its answer what is left. Counts streams that are open.
 
     :param rate: requests a second of one user or network in the long run; 0 for as many as come
     :param seconds: a monotonic clock
+    :param streams: answers without an end that one user may have open, websockets of pages and cameras among them; 0
+        for as many as come
     """
 
-    def __init__(self, rate: float, seconds: Callable[[], float]) -> None:
+    def __init__(self, rate: float, seconds: Callable[[], float], streams: int = 0) -> None:
         self._rate = rate
+        self._most_streams = streams
+        self._streams: Counter[int] = Counter()
         self._burst = max(1.0, rate * BURST_SECONDS)
         self._users = Buckets(rate, self._burst, KEPT, seconds)
         self._networks = Buckets(rate, self._burst, KEPT, seconds)
@@ -58,6 +75,30 @@ class RequestLimits:
         """
         network = network_of(getattr(request.getClientAddress(), "host", "local"))
         self._count(request, self._networks, network, "network", "your network")
+
+    def stream(self, user: int) -> Callable[[], None]:
+        """Count a stream that a user opens; call what is returned once, when it ends.
+
+        :raises TooManyStreams: they have too many already
+        """
+        if 0 < self._most_streams <= self._streams[user]:
+            raise TooManyStreams(self._most_streams)
+        self._streams[user] += 1
+
+        def end() -> None:
+            self._streams[user] -= 1
+            if not self._streams[user]:
+                del self._streams[user]
+
+        return end
+
+    def answer_streams(self, request: Request, user: int) -> None:
+        """The same for a stream that is the answer to a request, and ends with it.
+
+        :raises TooManyStreams: as :meth:`stream`
+        """
+        end = self.stream(user)
+        request.notifyFinish().addBoth(lambda _: end())
 
     def handshake(self, address: str, user: int | None) -> None:
         """Count a websocket's handshake as a request of the user, or of the network of an unknown client.

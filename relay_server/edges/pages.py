@@ -6,7 +6,7 @@ one for ever; of websockets they allow hundreds. Who comes in, and how it is clo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -20,7 +20,8 @@ from relay_server.access import Principal
 from relay_server.auth import BadCredentials, Opening, session_token
 from relay_server.clock import Clock
 from relay_server.edges.gate import code_of
-from relay_server.edges.telling import STALL_SECONDS, Source, Telling
+from relay_server.edges.sources import Sources
+from relay_server.edges.telling import STALL_SECONDS, Telling
 from relay_server.edges.websocket import ClientFactory, ClientProtocol
 from relay_server.origins import Origins
 from relay_server.outbox import Outbox
@@ -39,9 +40,6 @@ class PageDesk(Protocol):
     async def token(self, token: str) -> Principal:
         """The principal of a token."""
 
-    def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call ``listener`` when something about robots may have changed; returns what ends that."""
-
 
 @dataclass(frozen=True)
 class Known(Principal):
@@ -54,12 +52,9 @@ class PageGate:
     """Who may come in: whoever proves who he is. A :class:`relay_server.edges.gate.Gate`.
 
     :param cookie: name of the session cookie
-    :param sources: what is told, by the name of the event
     """
 
-    def __init__(
-        self, clock: Clock, desk: PageDesk, origins: Origins, cookie: str, sources: Mapping[str, Source]
-    ) -> None:
+    def __init__(self, clock: Clock, desk: PageDesk, origins: Origins, cookie: str, sources: Sources) -> None:
         self.accepting = True
         self.clock = clock
         self.desk = desk
@@ -124,9 +119,7 @@ class PageClient:
         self._timing = desk.timing
         self._transport = transport
         self._ended = ended
-        self._telling = Telling(
-            gate.clock, self, lambda: desk.token(token), dict(gate.sources), desk.on_change
-        )
+        self._telling = Telling(gate.clock, self, lambda: desk.token(token), gate.sources)
         self._running: Deferred[None] | None = None
         self._pinging = Round(self._ping, self._timing.client_ping)
         self._heard_at = gate.clock.seconds()
@@ -220,6 +213,7 @@ class PageProtocol(ClientProtocol):
     """The websocket of one page."""
 
     takes = MESSAGE_BYTES
+    is_stream = True
 
     def _asked_for(self, request: ConnectionRequest) -> Opening:
         # All robots: there is none of this name.

@@ -16,7 +16,7 @@ from relay_server.auth import BadCredentials, TooManyTries
 from relay_server.control import NotDone, StoppedSince
 from relay_server.directory.desk import MatchNeeded, TooManyChanges
 from relay_server.directory.entries import TooLarge
-from relay_server.edges.limiting import TooManyRequests
+from relay_server.edges.limiting import TooManyRequests, TooManyStreams
 from relay_server.edges.methods import WrongMethod
 from relay_server.inside import MaybeDone
 from relay_server.memory import Full
@@ -55,6 +55,7 @@ _STATUS: list[tuple[type[SwitchboardError], int]] = [
     (BadCredentials, 401),
     (TooManyTries, 429),
     (TooManyRequests, 429),
+    (TooManyStreams, 429),
     (NotFound, 404),
     (WrongMethod, 405),
     (MomentNeeded, 428),

@@ -149,6 +149,7 @@ class RobotResources:
         query = query_of(request)
         see_known(query, "throttle_ms")
         throttle = number_in(query, "throttle_ms", 0.0, THROTTLE_MS) or 0.0
+        self._api.streams(request, asker.principal)
         left = request.notifyFinish()
         left.addErrback(lambda failure: None)
         # What is there already comes at once.

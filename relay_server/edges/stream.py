@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 
 from twisted.web.server import Request
 
@@ -10,16 +10,14 @@ from relay_protocol.errors import Refused
 from relay_server.access import Principal
 from relay_server.clock import Clock
 from relay_server.edges.flow import Flow
-from relay_server.edges.telling import Source, Telling
-
-__all__ = ["EventStream", "Source"]
+from relay_server.edges.sources import Sources
+from relay_server.edges.telling import Telling
 
 
 class EventStream:
     """The answer to one request.
 
     :param principal: who sends a request
-    :param sources: see :class:`Telling`
     """
 
     def __init__(
@@ -27,11 +25,10 @@ class EventStream:
         clock: Clock,
         request: Request,
         principal: Callable[[Request], Awaitable[Principal]],
-        sources: Mapping[str, Source],
-        on_change: Callable[[Callable[[], None]], Callable[[], None]],
+        sources: Sources,
     ) -> None:
         self._request = request
-        self._telling = Telling(clock, self, lambda: principal(request), sources, on_change)
+        self._telling = Telling(clock, self, lambda: principal(request), sources)
 
     async def run(self) -> None:
         """Until the client leaves, takes nothing any more, or its credentials end."""

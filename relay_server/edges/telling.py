@@ -8,8 +8,8 @@ Nothing here touches a socket. Two edges carry it: ``stream`` as server-sent eve
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Awaitable, Callable
+from typing import Protocol
 
 from twisted.internet.defer import Deferred
 
@@ -17,11 +17,11 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Unavailable
 from relay_server.access import Principal
 from relay_server.clock import Clock, Timer, cancel, sleep
+from relay_server.edges.sources import COALESCE_SECONDS, Shown, Sources
 
 STREAM_SECONDS = 5.0
 """Something is told at least so often (SPEC section 1.7)."""
 
-COALESCE_SECONDS = 0.25
 QUIET_SECONDS = 3.0
 """So long after the last telling it is told again, changed or not."""
 
@@ -34,16 +34,10 @@ STALL_SECONDS = 5.0
 FIRST = "robots"
 """The event that is told without news as well; the others are told when they are another list."""
 
-PASSING = frozenset({"rtt_ms", "last_seen", "last", "count", "text"})
-"""Fields that are other at nearly every look, though nothing happened: alone they are no news before it is time."""
-
 UNKNOWN = "unknown"
 """The event that says that the relay lives and can't tell the others, and why."""
 
 NO_ANSWER = "the database does not answer"
-
-Source = Callable[[Principal], Awaitable[list[dict[str, Any]]]]
-"""What somebody may see of something now."""
 
 
 class Page(Protocol):
@@ -63,7 +57,6 @@ class Telling:
     """Tells one page. Each event has the name of its source, and holds a list under that name.
 
     :param principal: whose page it is; asked again each time, for that may be over
-    :param on_change: has a listener called at every change; returns what ends that
     """
 
     def __init__(
@@ -71,15 +64,13 @@ class Telling:
         clock: Clock,
         page: Page,
         principal: Callable[[], Awaitable[Principal]],
-        sources: Mapping[str, Source],
-        on_change: Callable[[Callable[[], None]], Callable[[], None]],
+        sources: Sources,
     ) -> None:
         self._clock = clock
         self._page = page
         self._principal = principal
         self._sources = sources
-        self._on_change = on_change
-        self._told: dict[str, list[dict[str, Any]]] = {}
+        self._told: dict[str, Shown] = {}
         self._reason = ""
         """What was told to be why the others are not known; empty when they are."""
         self._due = clock.seconds()
@@ -98,11 +89,13 @@ class Telling:
 
         :raises Refused: they have ended
         """
-        forget = self._on_change(self._changed)
+        forget = self._sources.on_change(self._changed)
         try:
             while True:
                 await self._look()
-                await sleep(self._clock, min(COALESCE_SECONDS, self._left()))
+                # Pages look at the same moments, so that what is looked up for one is good for all.
+                rest = COALESCE_SECONDS - self._clock.seconds() % COALESCE_SECONDS
+                await sleep(self._clock, min(rest, self._left()))
                 await self._until_change()
         finally:
             forget()
@@ -133,7 +126,7 @@ class Telling:
         self._expect()
         try:
             principal = await self._principal()
-            found = [(name, await source(principal)) for name, source in self._sources.items()]
+            found = await self._sources.look(principal)
         except Unavailable as error:
             # The next look may do better.
             self._unknown(str(error))
@@ -143,19 +136,22 @@ class Telling:
         due = self._left() == 0
         if due:
             self._put_off()
-        for name, now in found:
+        for now in found:
+            name = now.name
             if not self._waits and self._is_told(name, now, due):
                 self._told[name] = now
                 if name == FIRST:
                     self._reason = ""
                     self._put_off()
-                self._page.tell(name, jsontext.encode({name: now}))
+                self._page.tell(name, now.body)
 
-    def _is_told(self, name: str, now: list[dict[str, Any]], due: bool) -> bool:
+    def _is_told(self, name: str, now: Shown, due: bool) -> bool:
         before = self._told.get(name)
         if before is None or (due and name == FIRST):
             return True
-        return now != before if due else now is not before and _lasting(now) != _lasting(before)
+        if now is before:
+            return False
+        return now.rows != before.rows if due else now.lasting != before.lasting
 
     def _expect(self) -> None:
         """Have it told when what is looked up now does not come in time."""
@@ -203,8 +199,3 @@ class Telling:
         finally:
             self._wake = None
             cancel(timer)
-
-
-def _lasting(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What is told, without what passes."""
-    return [{name: value for name, value in row.items() if name not in PASSING} for row in rows]

@@ -56,6 +56,9 @@ class ClientProtocol(BoundedProtocol):
     takes = limits.CLIENT_MESSAGE
     """Bytes a message may have once a session has begun."""
 
+    is_stream = False
+    """Whether it counts as one of its user's streams."""
+
     def __init__(self) -> None:
         super().__init__()
         self._robot = ""
@@ -68,6 +71,7 @@ class ClientProtocol(BoundedProtocol):
         self._unproved_bytes = 0
         self._deadline: Timer | None = None
         self._place: Place | None = None
+        self._end_stream: Callable[[], None] = lambda: None
         self._asking = False
         self._open = False
         self._opened_ns = 0
@@ -171,6 +175,8 @@ class ClientProtocol(BoundedProtocol):
 
         :raises SwitchboardError: it may not
         """
+        if self.is_stream:
+            self._end_stream = self.factory.limits.stream(principal.user_id)
         return await self.factory.gate.admit(principal, self._robot, self._address())
 
     def _occupant(self, admission: Admission) -> Occupant:
@@ -300,6 +306,7 @@ class ClientProtocol(BoundedProtocol):
     def connectionLost(self, reason: Any = connectionDone) -> None:
         """The connection that began as an HTTP request is gone."""
         self.factory.cap.leave(self._address())
+        self._end_stream()
         self._known()
         self._stop_deadline()
         super().connectionLost(reason)

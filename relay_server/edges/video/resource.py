@@ -204,6 +204,7 @@ class Video(Resource):
             await self._desk.may_view(principal, robot, wanted.camera, transport, _address(request))
             request.setHeader(b"content-type", CONTENT_TYPE)
             return b""
+        request.site.limits.answer_streams(request, principal.user_id)
         screen = Multipart(self._clock, self._rounds, self._turns, self._parts, request)
         # No proxy shall hold it back.
         request.setHeader(b"x-accel-buffering", b"no")

@@ -264,6 +264,7 @@ class VideoClient:
 class VideoProtocol(ClientProtocol):
     """The websocket of one viewer."""
 
+    is_stream = True
     factory: VideoFactory
     _wanted: Asked
     _progress: Progress

@@ -46,4 +46,6 @@ def test_requests_are_limited_unless_they_are_not(cli: Any, began: list[Settings
     cli.ok("serve")
     cli.ok("serve", "--requests-per-second", "0")
     assert [each.requests for each in began] == [500, 0]
+    cli.ok("serve", "--streams-per-user", "0")
+    assert [each.streams for each in began] == [128, 128, 0]
     assert "--requests-per-second must be from 0" in cli.fails("serve", "--requests-per-second", "-1")

@@ -25,6 +25,7 @@ from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.pages import PageFactory, PageGate
 from relay_server.edges.robot_pages import RobotPages
 from relay_server.edges.site import Missing, RelaySite, Robots, Root
+from relay_server.edges.sources import Sources
 from relay_server.edges.static_files import Portal
 from relay_server.edges.websocket import ClientFactory
 from relay_server.origins import Origins
@@ -157,7 +158,7 @@ def api_of(
     origins: Origins,
     below: dict[str, Any] | None = None,
     beside: dict[str, Any] | None = None,
-    events: dict[str, Any] | None = None,
+    sources: Sources | None = None,
     *,
     tls: bool = False,
     limits: RequestLimits | None = None,
@@ -171,9 +172,9 @@ def api_of(
         {} if below is None else below,
         {} if beside is None else beside,
         RobotPages(desk, cast(Any, AtOnce())),
+        sources or Sources(clock, {}, lambda listener: lambda: None),
         cookie="sb",
         secure=tls,
-        events=events,
         limits=limits,
     )
 
@@ -183,6 +184,7 @@ class World:
 
     :param clock: a reactor, for who listens on a real port
     :param rate: requests a second of one user or network; 0 for as many as come
+    :param streams: streams that one user may have open; 0 for as many as come
     :param documented: whether it tells of the API
     """
 
@@ -193,6 +195,7 @@ class World:
         clock: Any = None,
         *,
         rate: float = 0.0,
+        streams: int = 0,
         documented: bool = False,
     ) -> None:
         self.clock: Any = clock or Clock()
@@ -202,16 +205,17 @@ class World:
         self.below: dict[str, Any] = {}
         self.beside: dict[str, Any] = {}
         self.events: dict[str, Any] = {}
-        limits = RequestLimits(rate, self.clock.seconds)
-        parts = self.below, self.beside, self.events
+        limits = RequestLimits(rate, self.clock.seconds, streams)
+        told = ChainMap(self.events, {"robots": self.desk.robots})
+        sources = Sources(self.clock, told, self.desk.on_change)
+        parts = self.below, self.beside, sources
         api = api_of(self.clock, self.desk, origins, *parts, tls=tls, limits=limits)
         websocket = Handshake(ClientFactory(self.clock, lambda: 0, self.desk, self.cap, limits))  # type: ignore[arg-type]
-        sources = ChainMap(self.events, {"robots": self.desk.robots})
         self.pages = PageGate(self.clock, self.desk, origins, "sb", sources)
-        told = Handshake(PageFactory(self.clock, lambda: 0, self.pages, self.cap, limits))
+        pages = Handshake(PageFactory(self.clock, lambda: 0, self.pages, self.cap, limits))
         robots = Robots(websocket, Missing(), "1.2.3")
         documents = Documents(limits, "1.2.3", "sb").app.resource() if documented else None
-        root = Root(robots, api.app.resource(), Missing(), Portal(folder), told, documents)
+        root = Root(robots, api.app.resource(), Missing(), Portal(folder), pages, documents)
         self.site = RelaySite(root, self.clock, self.cap, tls, limits)
 
     def connect(self) -> Transport:

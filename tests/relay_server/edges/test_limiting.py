@@ -14,7 +14,7 @@ from relay_server.edges import control
 from relay_server.edges.api import Api
 from relay_server.edges.limiting import RequestLimits
 from relay_server.moments import Moments
-from tests.relay_server.edges.http_client import World
+from tests.relay_server.edges.http_client import World, parse
 from tests.relay_server.edges.websocket_client import Client, MemoryGate
 
 RATE = 2.0
@@ -148,3 +148,39 @@ def test_a_handshake_counts_as_a_request_of_its_user_or_network() -> None:
     assert status(Authorization="Bearer good") == 429
     clock.advance(1)
     assert status(Authorization="Bearer good") == 101
+
+
+STREAM = b"GET /api/v1/robots/stream HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer %b\r\n\r\n"
+
+
+def test_streams_of_one_user_are_limited(tmp_path: Path) -> None:
+    """The next is refused in words, others open theirs, and one that ends gives its place back."""
+    world = World(tmp_path, streams=2)
+    kept = [world.connect() for _ in range(2)]
+    for each in kept:
+        world.send(each, STREAM % b"ann")
+    refused = world.ask("GET", "/api/v1/robots/stream", **ANN)
+    assert (refused.status, refused.json["code"]) == (429, "too_many_streams")
+    assert "2 streams open" in refused.json["detail"]
+    assert refused.headers["content-type"] == "application/problem+json"
+    other = world.connect()
+    world.send(other, STREAM % b"root")
+    assert parse(other.value()).status == 200
+    kept[0].loseConnection()
+    again = world.connect()
+    world.send(again, STREAM % b"ann")
+    assert parse(again.value()).status == 200
+    for each in (kept[1], again, other):
+        each.loseConnection()
+    assert not world.site.limits._streams
+
+
+def test_a_refused_stream_takes_no_place(tmp_path: Path) -> None:
+    """A client that tries again and again is served when there is room."""
+    world = World(tmp_path, streams=1)
+    kept = world.connect()
+    world.send(kept, STREAM % b"ann")
+    for _ in range(5):
+        assert world.ask("GET", "/api/v1/robots/stream", **ANN).status == 429
+    kept.loseConnection()
+    assert not world.site.limits._streams

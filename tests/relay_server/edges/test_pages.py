@@ -19,6 +19,7 @@ from relay_protocol import limits
 from relay_server import closing
 from relay_server.edges import telling
 from relay_server.edges.pages import MESSAGE_BYTES, PageFactory, PageGate
+from relay_server.edges.sources import Sources
 from relay_server.origins import Origins
 from tests.relay_server.edges.http_client import MemoryDesk, World
 from tests.relay_server.edges.websocket_client import Client
@@ -35,7 +36,7 @@ class Tab:
     def __init__(self, **headers: str) -> None:
         self.clock = Clock()
         self.desk = MemoryDesk()
-        sources = {telling.FIRST: self.desk.robots}
+        sources = Sources(self.clock, {telling.FIRST: self.desk.robots}, self.desk.on_change)
         self.gate = PageGate(self.clock, self.desk, Origins("http", [ORIGIN]), "sb", sources)
         self.client = Client(self.gate, PATH, clock=self.clock, factory=PageFactory, **(headers or TOKEN))
 
@@ -232,7 +233,7 @@ def test_what_fails_in_the_relay_is_told_without_internals() -> None:
     tab = Tab()
     tab.passes(1.0)
     (client,) = tab.gate._open
-    client._telling._sources = {telling.FIRST: broken}
+    client._telling._sources = Sources(tab.clock, {telling.FIRST: broken}, tab.desk.on_change)
     tab.desk.changed()
     tab.client.run()
     assert tab.client.closed == closing.INTERNAL

@@ -9,6 +9,7 @@ import pytest
 
 from relay_server.access import Principal
 from relay_server.edges import telling
+from relay_server.edges.sources import COALESCE_SECONDS
 from tests.relay_server.edges.http_client import ROOT, World, parse
 
 
@@ -52,20 +53,20 @@ def test_it_goes_on(world: World) -> None:
     """At every change of what is seen, and without one."""
     transport = streaming(world)
     events(transport)
-    world.clock.advance(telling.COALESCE_SECONDS)
+    world.clock.advance(COALESCE_SECONDS)
     world.desk.changed()
     assert events(transport) == []
     world.desk.tokens["ann"] = ROOT
-    world.clock.advance(telling.COALESCE_SECONDS)
+    world.clock.advance(COALESCE_SECONDS)
     world.desk.changed()
     assert events(transport) == ["robots"]
-    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
     assert events(transport) == ["robots"]
 
 
 def test_a_client_that_leaves_its_stream_leaves_nothing_behind(world: World) -> None:
     """Neither a listener nor a timer, at whatever moment."""
-    for seconds in (0.0, telling.COALESCE_SECONDS):
+    for seconds in (0.0, COALESCE_SECONDS):
         transport = streaming(world)
         world.clock.advance(seconds)
         transport.loseConnection()
@@ -79,7 +80,7 @@ def test_the_stream_ends_with_the_credentials(world: World) -> None:
     transport = streaming(world)
     del world.desk.tokens["ann"]
     events(transport)
-    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
     assert events(transport) == ["ended"]
     assert world.desk.listeners == []
 
@@ -89,11 +90,11 @@ def test_a_database_that_is_away_does_not_end_the_stream(world: World) -> None:
     transport = streaming(world)
     events(transport)
     world.desk.up = False
-    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
     assert b'event: unknown\ndata: {"reason":"the database does not answer"}\n\n' in transport.value()
     transport.clear()
     world.desk.up = True
-    world.clock.pump([telling.COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
     assert events(transport) == ["robots"]
 
 
@@ -103,7 +104,7 @@ def test_a_client_that_takes_nothing_of_its_stream_is_cut(world: World) -> None:
     events(transport)
     transport.producer.pauseProducing()
     for _ in range(3):
-        world.clock.advance(telling.COALESCE_SECONDS)
+        world.clock.advance(COALESCE_SECONDS)
         world.desk.changed()
     assert transport.value() == b""
     assert transport.connected

@@ -13,6 +13,7 @@ from twisted.internet.task import Clock
 from relay_protocol.errors import Unavailable
 from relay_server.access import BadCredentials, Principal
 from relay_server.edges import telling as module
+from relay_server.edges.sources import COALESCE_SECONDS, Sources
 from relay_server.edges.telling import Telling
 
 ANN = Principal(1, "ann", "main", False, 1, None)
@@ -35,7 +36,9 @@ class Room:
         self.full_after = 1000
         self.during: Callable[[], None] = lambda: None
         sources = {"robots": self._robots, "alerts": self._alerts}
-        self.telling = Telling(self.clock, self, self._principal, sources, self._on_change)
+        self.telling = Telling(
+            self.clock, self, self._principal, Sources(self.clock, sources, self._on_change)
+        )
 
     def begin(self) -> Deferred[None]:
         """Tell from now on."""
@@ -110,20 +113,20 @@ def test_everything_is_told_at_once(room: Room) -> None:
 def test_changes_in_quick_succession_are_told_once(room: Room) -> None:
     """The first of them waits no longer than the others."""
     room.begin()
-    room.passes(module.COALESCE_SECONDS)
+    room.passes(COALESCE_SECONDS)
     room.events()
     room.changed()
     assert room.events() == []
     room.renamed("one")
     assert room.events() == []
-    room.passes(module.COALESCE_SECONDS)
+    room.passes(COALESCE_SECONDS)
     assert room.events() == ["robots"]
     for number in range(10):
         room.renamed(f"robot {number}")
     assert room.events() == []
-    room.passes(module.COALESCE_SECONDS)
+    room.passes(COALESCE_SECONDS)
     assert room.events() == ["robots"]
-    room.passes(module.COALESCE_SECONDS)
+    room.passes(COALESCE_SECONDS)
     assert room.events() == []
 
 
@@ -165,7 +168,7 @@ def test_that_the_database_is_away_is_told_again_only_when_it_is_time(room: Room
     assert room.at[-3:] == [1.0, 1.0 + module.QUIET_SECONDS, 1.0 + 2 * module.QUIET_SECONDS]
     room.error = None
     room.changed()
-    room.passes(module.COALESCE_SECONDS)
+    room.passes(COALESCE_SECONDS)
     assert room.events() == ["robots"]
 
 
@@ -195,7 +198,7 @@ def test_what_changes_while_it_is_looked_up_is_told_after_it(room: Room) -> None
     room.during = change
     room.begin()
     room.events()
-    room.passes(module.COALESCE_SECONDS)
+    room.passes(COALESCE_SECONDS)
     assert room.events() == ["robots"]
 
 
@@ -203,10 +206,10 @@ def test_other_events_are_told_when_they_are_another_list(room: Room) -> None:
     """Robots are told without news as well."""
     room.begin()
     room.events()
-    room.passes(module.COALESCE_SECONDS + module.QUIET_SECONDS)
+    room.passes(COALESCE_SECONDS + module.QUIET_SECONDS)
     assert room.events() == ["robots"]
     room.alerts = [{"id": "a1"}]
-    room.passes(module.COALESCE_SECONDS + module.QUIET_SECONDS)
+    room.passes(COALESCE_SECONDS + module.QUIET_SECONDS)
     assert room.events() == ["robots", "alerts"]
 
 
@@ -240,7 +243,7 @@ def test_a_look_that_hangs_is_the_only_one(room: Room) -> None:
         looks += 1
         return looked()
 
-    room.telling = Telling(room.clock, room, counted, {}, room._on_change)
+    room.telling = Telling(room.clock, room, counted, Sources(room.clock, {}, room._on_change))
     room.answers = Deferred()
     room.begin()
     for _ in range(20):
@@ -253,7 +256,7 @@ def test_a_look_that_hangs_is_the_only_one(room: Room) -> None:
 def test_it_ends_with_the_credentials(room: Room) -> None:
     """The edge is told why, and nothing is left behind."""
     running = room.begin()
-    room.passes(module.COALESCE_SECONDS)
+    room.passes(COALESCE_SECONDS)
     room.error = BadCredentials("your session has ended")
     room.changed()
     failed: list[str] = []
@@ -270,7 +273,7 @@ def test_who_leaves_leaves_nothing_behind(room: Room, when: str) -> None:
         room.answers = Deferred()
     running = room.begin()
     if when == "waiting":
-        room.passes(module.COALESCE_SECONDS + 0.5)
+        room.passes(COALESCE_SECONDS + 0.5)
     running.addErrback(lambda failure: failure.trap(CancelledError))
     running.cancel()
     assert room.listeners == []
