@@ -32,6 +32,7 @@ MEASUREMENTS = {
     "alerts": "from a robot's unplugging to the webhook",
     "apps": "from a word, a stick, a tilt and a scan to what the robot does",
     "unproven": "memory of a connection nobody has proved",
+    "hostile": "what strangers' inputs make others wait",
     "memory": "a million events: asked, written by the thousand, killed",
 }
 

@@ -31,6 +31,7 @@ LEAST_ROWS = {
     "alerts": 5,
     "apps": 15,
     "memory": 10,
+    "hostile": 3,
     "unproven": 7,
 }
 
