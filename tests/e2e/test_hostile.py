@@ -252,8 +252,10 @@ def test_bytes_that_are_no_frames_end_a_robots_link_in_words(
 
 BAD_ROSBRIDGE = {
     "100,000 deep": (b'{"op":"publish","topic":"/cmd_vel","msg":' + DEEP, "deeper than 64"),
-    "NaN": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":NaN}}}', "not JSON"),
-    "Infinity": (b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":Infinity}}}', "not JSON"),
+    "a word that is no number": (
+        b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":nan}}}',
+        "not JSON",
+    ),
     "a key twice": (b'{"op":"publish","topic":"/cmd_vel","topic":"/x","msg":{}}', "'topic' twice"),
     "a key twice in a body": (
         b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":0,"x":1}}}',
