@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 from twisted.logger import Logger
@@ -23,7 +24,7 @@ from robot_client.goals import Goals, refusal
 from robot_client.motion import MOTION_QOS, MotionDesk
 from robot_client.offers import OfferedActions, OfferedServices
 from robot_client.offset import Offset
-from robot_client.platforms.base import Platform, Sink, Source
+from robot_client.platforms.base import OnChange, Platform, Sink, Source
 from robot_client.pursuits import Pursuits
 from robot_client.reactors import Clock
 from robot_client.sending import Sending
@@ -248,6 +249,7 @@ class Channel:
                 latched=source.latched,
                 publishers=source.publishers,
                 replays=source.replays,
+                unmatched=source.unmatched,
             )
         )
 
@@ -279,31 +281,39 @@ class Channel:
         check_room(self._publishing, "publications")
         # What moves is judged by the names that are used in the end: the relay may spell them as it likes.
         on = self._platform.resolve(message.topic, message.type)
+        confirm = partial(self._confirm_advertised, message, on.type)
         if self._motion.concerns(on):
-            self._publishing[number] = publishing = self._advertise_motion(number, on)
+            self._publishing[number] = self._advertise_motion(number, on, confirm)
             self._log.info("{who} may drive by {topic}", who=message.source or "a client", topic=on.topic)
         elif self._goal_topics is not None and self._goal_topics.concern(on):
             # Kept for late joiners, a goal would send the robot off again.
-            sink = self._platform.advertise(*on, False, MOTION_QOS)
+            sink = self._platform.advertise(*on, False, MOTION_QOS, on_change=confirm)
             name = f"{self.name}/{number}"
             self._goal_topics.open(name, on, sink)
-            self._publishing[number] = publishing = _Publishing(sink, on.topic, None, name)
+            self._publishing[number] = _Publishing(sink, on.topic, None, name)
         else:
-            sink = self._platform.advertise(*on, message.latch, message.qos, message.queue_size)
-            self._publishing[number] = publishing = _Publishing(sink, on.topic, None)
+            sink = self._platform.advertise(*on, message.latch, message.qos, message.queue_size, confirm)
+            self._publishing[number] = _Publishing(sink, on.topic, None)
+        confirm()
+
+    def _confirm_advertised(self, message: link.Advertise, type: str) -> None:
+        publishing = self._publishing.get(message.number)
+        if publishing is None:
+            return
         self._wire.say(
             link.Advertised(
-                number=number,
+                number=message.number,
                 topic=message.topic,
-                type=on.type,
+                type=type,
                 encoding=self._platform.encoding,
                 motion=publishing.moves,
+                unmatched=publishing.sink.unmatched,
             )
         )
 
-    def _advertise_motion(self, number: int, on: TypedTopic) -> _Publishing:
+    def _advertise_motion(self, number: int, on: TypedTopic, confirm: OnChange) -> _Publishing:
         name = f"{self.name}/{number}"
-        sink = self._platform.advertise(*on, False, MOTION_QOS)
+        sink = self._platform.advertise(*on, False, MOTION_QOS, on_change=confirm)
         try:
             self._motion.open(name, on, sink)
         except SwitchboardError:

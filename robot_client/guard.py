@@ -45,6 +45,9 @@ LOOK_SELDOM = 500 * MILLI
 NICE = -10
 """The guard does little, and that at once: its scheduling priority, if it may have it (``setpriority(2)``)."""
 
+PUBLISHERS = 4
+"""Most publishers of one topic."""
+
 UNHEARD = 10 * NANO
 """How much longer to repeat while nobody who listens to the topic was found yet, after the daemon's end."""
 
@@ -209,7 +212,9 @@ class RosOutlets:
             self._node: Any = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
         self._unknown = Time() if sim_time else None
         self._types = Types()
-        self._publishers: dict[TypedTopic, Any] = {}
+        self._publishers: dict[TypedTopic, list[tuple[Any, Any]]] = {}
+        """Of each topic the publishers, with their quality of service: one, and one more for subscribers that ask for
+        more."""
         self._clients: dict[TypedTopic, Any] = {}
 
     def open(self, on: TypedTopic) -> None:
@@ -217,15 +222,14 @@ class RosOutlets:
         if on.type == CANCEL_TYPE:
             self._client(on)
         else:
-            self._publisher(on)
+            self._fit(on)
 
     def close(self, on: TypedTopic) -> None:
         """Take it away."""
         client = self._clients.pop(on, None)
         if client is not None:
             self._node.destroy_client(client)
-        publisher = self._publishers.pop(on, None)
-        if publisher is not None:
+        for publisher, _ in self._publishers.pop(on, ()):
             self._node.destroy_publisher(publisher)
 
     def zero(self, on: TypedTopic, rest: bytes) -> bool:
@@ -233,20 +237,31 @@ class RosOutlets:
         if on.type == CANCEL_TYPE:
             return self._cancel(on)
         stamp = self._unknown or self._node.get_clock().now().to_msg()
-        self._publisher(on).publish(self._types.zero(on.type, stamp, rest))
+        zero = self._types.zero(on.type, stamp, rest)
+        for publisher, _ in self._publishers.get(on) or self._fit(on):
+            publisher.publish(zero)
         return self.heard(on)
 
     def heard(self, on: TypedTopic) -> bool:
         """Whether DDS has matched a subscription, or the action's server."""
         if on.type == CANCEL_TYPE:
             return bool(self._client(on).service_is_ready())
-        return bool(self._publisher(on).get_subscription_count())
+        # The latest serves all whom those before it serve.
+        return bool(self._fit(on)[-1][0].get_subscription_count())
 
-    def _publisher(self, on: TypedTopic) -> Any:
-        found = self._publishers.get(on)
-        if found is None:
-            kind = self._types.message(on.type)
-            found = self._publishers[on] = self._node.create_publisher(kind, on.topic, 10)
+    def _fit(self, on: TypedTopic) -> list[tuple[Any, Any]]:
+        """The publishers of a topic, with one more where there are subscribers that the others do not serve."""
+        from relay_protocol.link import QoS
+        from robot_client.platforms import ros2_qos
+
+        found = self._publishers.setdefault(on, [])
+        theirs = [each.qos_profile for each in self._node.get_subscriptions_info_by_topic(on.topic)]
+        left = [each for each in theirs if all(ros2_qos.mismatch(ours, each) for _, ours in found)]
+        if not found or (left and len(found) < PUBLISHERS):
+            profile = ros2_qos.for_publisher(theirs, False, QoS(durability="volatile", depth=10))
+            if not found or not all(ros2_qos.mismatch(profile, each) for each in left):
+                kind = self._types.message(on.type)
+                found.append((self._node.create_publisher(kind, on.topic, profile), profile))
         return found
 
     def _cancel(self, on: TypedTopic) -> bool:

@@ -200,6 +200,11 @@ class Listener:
             for id in self._ids():
                 self._receiver.tell(_LEVELS[flaw], f"{self.topic}: {words}", id)
 
+    def warn(self, words: str) -> None:
+        """Tell the client of something it should know, for each of its subscriptions."""
+        for id in self._ids():
+            self._receiver.tell("warning", f"subscribe {self.topic}: {words}", id)
+
     def fail(self, words: str) -> None:
         """Tell the client that it gets nothing, and why: once for each id, until it asks again or that has passed."""
         for id in self._ids():

@@ -15,7 +15,7 @@ from relay_protocol.ros.fast_writer import LARGEST_BODY
 from relay_protocol.ros_types import Writer
 from relay_server.access import Permit
 from relay_server.channel.definitions import Definitions
-from relay_server.channel.topics import Held, Phase, Publication, Send
+from relay_server.channel.topics import Held, Phase, Publication, Send, unserved
 from relay_server.channel.wire import USER_TOPICS, Ask, ChannelLink, Commander, Member, Wire, resolve
 from relay_server.clock import Clock
 
@@ -72,6 +72,8 @@ class Publications:
         elif ask.latch != publication.latch or ask.qos not in (None, publication.qos):
             member.tell("warning", f"{topic} is advertised already; its first latch and qos stay", ask.id)
         publication.holders.setdefault(member, {})[id] = ""
+        if publication.unmatched:
+            _tell_unmatched(publication, member, id)
         if publication.phase in (Phase.WAITING, Phase.FAILED):
             self._ask(publication)
         return publication
@@ -119,6 +121,14 @@ class Publications:
                 raise Invalid(f"topic {topic} does not exist and no type was given; advertise it first")
             publication = self._join(member, ask, topic, wanted, None)
         return publication
+
+    def unmatched(self, member: Member) -> list[tuple[str, list[str]]]:
+        """Topics that a client has advertised and some nodes do not hear, with these."""
+        return [
+            (each.topic, each.unmatched)
+            for each in self._topics.values()
+            if each.unmatched and member in each.holders
+        ]
 
     def holders(self, topic: str) -> Collection[Member]:
         """Who has advertised a topic."""
@@ -214,6 +224,7 @@ class Publications:
         for publication in self._topics.values():
             publication.enter(Phase.WAITING)
             publication.held.clear()
+            publication.unmatched = []
 
     def typed(self, type_name: str) -> None:
         """A definition has come: what was held for it goes, and what failed without it is tried again."""
@@ -235,6 +246,11 @@ class Publications:
             publication.enter(Phase.ACTIVE)
             for ids in publication.holders.values():
                 ids.update(dict.fromkeys(ids, ""))
+            if message.unmatched != publication.unmatched:
+                publication.unmatched = message.unmatched
+                for member, ids in list(publication.holders.items()) if message.unmatched else ():
+                    for id in list(ids):
+                        _tell_unmatched(publication, member, id)
 
     def refused(self, number: int, reason: str) -> None:
         """The robot could not advertise."""
@@ -344,6 +360,10 @@ def _settle(publication: Publication, ask: rosbridge.Advertise | rosbridge.Publi
     publication.latch = ask.latch
     publication.queue_size = min(ask.queue_size, QUEUE_SIZE) if ask.queue_size > 0 else USUAL_QUEUE_SIZE
     publication.qos = ask.qos
+
+
+def _tell_unmatched(publication: Publication, member: Member, id: rosbridge.Id) -> None:
+    member.tell("warning", f"advertise {publication.topic}: {unserved(publication.unmatched)}", id)
 
 
 def _dropped(publication: Publication, message: Held, reason: str) -> None:

@@ -10,7 +10,7 @@ from relay_protocol import link
 from relay_protocol.errors import Invalid, Refused
 from relay_server.channel.definitions import Definitions
 from relay_server.channel.listener import Listener
-from relay_server.channel.topics import Phase, TopicUplink
+from relay_server.channel.topics import Phase, TopicUplink, unheard
 from relay_server.channel.wire import USER_TOPICS, Ask, Member, Wire
 from relay_server.clock import Timer, cancel
 
@@ -93,6 +93,8 @@ class Subscriptions:
             return
         self._follow_throttle(uplink)
         self._tell_untypeable(uplink, member)
+        if uplink.unmatched and type_name is not None:
+            listener.warn(unheard(uplink.unmatched))
         # Each subscription gets what is latched, also a further one of the same connection, as with rosbridge_suite.
         if type_name is not None and uplink.serves(member):
             if self._silent(topic):
@@ -118,6 +120,14 @@ class Subscriptions:
                 each.phase is Phase.ACTIVE and each.throttle_ms == 0 and not each.latched,
             )
             for each in self._topics.values()
+        ]
+
+    def unmatched(self, member: Member) -> list[tuple[str, list[str]]]:
+        """Topics of a client some of whose publishers are not heard, with these."""
+        return [
+            (each.topic, each.unmatched)
+            for each in self._topics.values()
+            if each.unmatched and member in each.listeners
         ]
 
     def latched(self, topic: str) -> bool:
@@ -218,6 +228,10 @@ class Subscriptions:
             uplink.activate(
                 message.type, message.encoding, message.latched, message.publishers, message.replays
             )
+            if message.unmatched != uplink.unmatched:
+                uplink.unmatched = message.unmatched
+                for listener in list(uplink.listeners.values()) if message.unmatched else ():
+                    listener.warn(unheard(message.unmatched))
             if message.encoding == "cdr":
                 self._definitions.want(message.type)
 

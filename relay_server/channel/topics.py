@@ -67,6 +67,8 @@ class TopicUplink:
         self.retry: Timer | None = None
         self.untypeable = ""
         """Why the type's definition is not to be had."""
+        self.unmatched: list[str] = []
+        """Publishers that are not heard because of the quality of service a client has asked for, with the reason."""
         self.failures = 0
         self.taken = 0
         """Samples that have come."""
@@ -208,6 +210,7 @@ class TopicUplink:
         self.phase = Phase.WAITING
         self.refusals = self.patience = 0
         self.untypeable = ""
+        self.unmatched = []
         self.owed.clear()
         cancel(self.retry)
         self._mended()
@@ -327,6 +330,16 @@ class Held(NamedTuple):
     until: float
 
 
+def unheard(nodes: list[str]) -> str:
+    """What those are told whose quality of service some publishers do not offer."""
+    return f"the quality of service that was asked for keeps these publishers from being heard: {', '.join(nodes)}"
+
+
+def unserved(nodes: list[str]) -> str:
+    """What those are told whose publisher some nodes do not hear."""
+    return f"these nodes ask for another quality of service and get nothing: {', '.join(nodes)}"
+
+
 class Publication:
     """A topic clients publish to, advertised once on the robot."""
 
@@ -345,6 +358,8 @@ class Publication:
         self.holders: dict[Member, dict[rosbridge.Id, str]] = {}
         """Advertisements of each client by id, with why the robot could not, as far as its client was told."""
         self.held: deque[Held] = deque()
+        self.unmatched: list[str] = []
+        """Subscribers that get nothing because of the quality of service, with the reason."""
         self.seen: Topic | None = None
         """The topic in the robot's graph when the robot was last asked."""
 

@@ -103,6 +103,7 @@ Downlink downlink
 uint64 plain_instead
 uint64 refusals
 uint64 stale_commands
+Unmatched[] unmatched
 Uplink uplink
 Video[] video
 Motion motion
@@ -175,6 +176,10 @@ string address
 MSG: switchboard_msgs/msg/TopicDrops
 string topic
 uint64 drops
+{_LINE}
+MSG: switchboard_msgs/msg/Unmatched
+string topic
+string[] nodes
 {_LINE}
 MSG: switchboard_msgs/msg/Uplink
 string state

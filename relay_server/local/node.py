@@ -90,6 +90,11 @@ class RelayNode:
             "plain_instead": session.plain_instead,
             "refusals": session.refusals,
             "stale_commands": session.stale_commands,
+            "unmatched": [
+                {"topic": topic, "nodes": nodes}
+                for part in (session.channel.subscriptions, session.channel.publications)
+                for topic, nodes in part.unmatched(session)
+            ],
             "uplink": self._uplink(session),
             "video": [
                 _shown(stream)

@@ -69,6 +69,8 @@ class Source(Protocol):
     """A topic the daemon listens to."""
 
     type: str
+    unmatched: list[str]
+    """Nodes that publish it and are not heard, because they offer less than was asked for; with the reason."""
     stamp: int
     """Of the sample that is being passed on: nanoseconds since 1970 when it first came, 0 when nobody noted it."""
 
@@ -98,6 +100,9 @@ class Source(Protocol):
 
 class Sink(Protocol):
     """A topic the daemon publishes."""
+
+    unmatched: list[str]
+    """Nodes that subscribe to it and get nothing, because they ask for more than is offered; with the reason."""
 
     def publish(self, body: bytes) -> None:
         """Publish one message in the platform's encoding."""
@@ -195,7 +200,7 @@ class Platform(Protocol):
         """Listen to a topic, present or not yet.
 
         :param type: empty to take the topic's one type from the graph
-        :param on_change: called when :attr:`Source.latched` or :attr:`Source.publishers` changed
+        :param on_change: called when :attr:`Source.latched`, ``publishers`` or ``unmatched`` changed
         """
 
     def after_samples(self, call: Callable[[], None]) -> None:
@@ -215,11 +220,18 @@ class Platform(Protocol):
         """
 
     def advertise(
-        self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
+        self,
+        topic: str,
+        type: str,
+        latch: bool,
+        qos: link.QoS | None,
+        queue_size: int = 0,
+        on_change: OnChange = lambda: None,
     ) -> Sink:
-        """Make a publisher.
+        """Make a publisher. What ``qos`` leaves out follows what the topic's subscribers ask for.
 
         :param queue_size: messages kept for subscribers that are slow, unless ``qos`` says it; the usual below 1
+        :param on_change: called when :attr:`Sink.unmatched` changed
         """
 
     def call(

@@ -51,6 +51,7 @@ class MemorySource:
         self.topic = topic
         self.latched = False
         self.publishers = 1
+        self.unmatched: list[str] = []
         self.on_sample = on_sample
         self.on_change: OnChange = lambda: None
         self.keeps: dict[int, bytes] = {}
@@ -85,6 +86,8 @@ class MemorySink:
         self.latch = latch
         self.qos = qos
         self.queue_size = queue_size
+        self.unmatched: list[str] = []
+        self.on_change: OnChange = lambda: None
         self._platform = platform
 
     def publish(self, body: bytes) -> None:
@@ -293,10 +296,17 @@ class MemoryPlatform(Platform):
         return "/" + name.removeprefix("/")
 
     def advertise(
-        self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
+        self,
+        topic: str,
+        type: str,
+        latch: bool,
+        qos: link.QoS | None,
+        queue_size: int = 0,
+        on_change: OnChange = lambda: None,
     ) -> MemorySink:
         """Make a recording publisher."""
         sink = MemorySink(self, self.resolve(topic, type).topic, latch, qos, queue_size)
+        sink.on_change = on_change
         self.sinks.append(sink)
         return sink
 

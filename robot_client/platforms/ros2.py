@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from twisted.internet.defer import Deferred, fail
 
-try:
-    from rclpy.event_handler import PublisherEventCallbacks
-except ImportError:  # Humble
-    from rclpy.qos_event import PublisherEventCallbacks
-
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from robot_client.alerts import OnAlert, nobody
-from robot_client.platforms import ros2_facts, ros2_graph, ros2_qos
+from robot_client.platforms import ros2_facts, ros2_graph
 from robot_client.platforms.base import (
     Check,
     Facts,
@@ -44,13 +40,11 @@ from robot_client.platforms.ros2_names import action_type, check_name, service_t
 from robot_client.platforms.ros2_nodes import Nodes
 from robot_client.platforms.ros2_offers import Offers
 from robot_client.platforms.ros2_services import RosService
-from robot_client.platforms.ros2_topics import Lingering, RosSink, RosSource, Stamps
+from robot_client.platforms.ros2_topics import Lingering, Offered, RosSink, RosSource, Stamps
 from robot_client.platforms.ros2_types import Types
 from robot_client.ros_log import ensure_log_folder
 from robot_client.topics import TypedTopic
 
-# The executor would hold on to a publisher by its events after its end, and with it to the topic's type.
-_NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 LOOK_EVERY = 3
 """Looks at the graph from one time all subscriptions look at what their publishers offer to the next."""
 
@@ -160,8 +154,8 @@ class Ros2Platform(Platform):
         return view
 
     def _follow(self, view: GraphView) -> None:
-        """Have subscriptions look at their publishers, which costs more than the whole graph: where others publish than
-        before, and all of them now and then, for a node may change its mind.
+        """Have subscriptions look at their publishers, and publishers at their subscribers, which costs more than the
+        whole graph: where there are others than before, and all of them now and then, for a node may change its mind.
         """
         before, self._seen = self._seen, view.topics
         self._looks += 1
@@ -170,6 +164,10 @@ class Ros2Platform(Platform):
             now, then = view.topics.get(source.topic), before.get(source.topic)
             if every or now is None or then is None or now.publishers != then.publishers:
                 source.refresh()
+        for sink in list(self._sinks):
+            now, then = view.topics.get(sink.topic), before.get(sink.topic)
+            if every or now is None or then is None or now.subscribers != then.subscribers:
+                sink.refresh()
 
     def subscribe(
         self, topic: str, type: str, qos: link.QoS | None, on_sample: OnSample, on_change: OnChange
@@ -222,23 +220,45 @@ class Ros2Platform(Platform):
         return check_name(resolve, name, what)
 
     def advertise(
-        self, topic: str, type: str, latch: bool, qos: link.QoS | None, queue_size: int = 0
+        self,
+        topic: str,
+        type: str,
+        latch: bool,
+        qos: link.QoS | None,
+        queue_size: int = 0,
+        on_change: OnChange = lambda: None,
     ) -> RosSink:
         """Make a publisher."""
         topic, full = self.resolve(topic, type)
         kind = self._types.message(full)
         self._lingering.give_way(topic, kind)
-        listening = self._node.get_subscriptions_info_by_topic(topic)
-        profile = ros2_qos.for_publisher([each.qos_profile for each in listening], latch, qos, queue_size)
         with refusals(f"to publish {topic} as {full}"):
-            publisher = self._node.create_publisher(kind, topic, profile, event_callbacks=_NO_EVENTS)
-        sink = RosSink(publisher, self._sunk)
+            sink = RosSink(
+                self._node,
+                self._reactor,
+                kind,
+                topic,
+                Offered(latch, qos, queue_size),
+                partial(self._subscriptions, topic),
+                on_change,
+                self._sunk,
+            )
         self._sinks.append(sink)
         return sink
 
-    def _sunk(self, sink: RosSink) -> None:
-        self._sinks.remove(sink)
-        self._lingering.take(sink.publisher)
+    def _subscriptions(self, topic: str) -> list[Any]:
+        """What the graph tells of a topic's subscriptions, but for our own, which follow the publishers."""
+        return [
+            each
+            for each in self._node.get_subscriptions_info_by_topic(topic)
+            if not ros2_graph.full_name(each.node_name, each.node_namespace).startswith(self._own)
+        ]
+
+    def _sunk(self, sink: RosSink, publishers: list[Any]) -> None:
+        if sink.closed:
+            self._sinks.remove(sink)
+        for each in publishers:
+            self._lingering.take(each)
 
     def call(
         self, service: str, type: str, request: bytes, timeout: float, check: Check | None = None

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 
+from relay_protocol import limits
 from relay_protocol.errors import Invalid
 from relay_protocol.link import QoS
 
@@ -20,6 +30,15 @@ QUEUE_SIZE = 100
 """Messages a publisher keeps for its subscribers when nobody says how many."""
 
 MAX_QUEUE_SIZE = 10_000
+
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
+_NAMELESS = "a participant without a ROS node"
+
+_TIMES = ("deadline", "liveliness_lease_duration")
+"""What is to be no longer than a subscriber asks for."""
+
+_INFINITE = 2**63 - 1
+"""Nanoseconds that stand for no limit (``RMW_DURATION_INFINITE``)."""
 
 
 class Match(NamedTuple):
@@ -74,7 +93,10 @@ def for_recall() -> QoSProfile:
 def for_publisher(
     subscribers: Sequence[QoSProfile], latch: bool, asked: QoS | None, queue_size: int = 0
 ) -> QoSProfile:
-    """The profile to publish with: reliable serves every subscriber; durable if asked or if all want it.
+    """The profile to publish with: it serves every subscriber, but for what is asked for otherwise.
+
+    A subscriber is served by what is at least as strict as it asks for: reliable, durable, with a deadline and a lease
+    of liveliness that are no longer (DDS 1.4, 2.2.3, requested and offered).
 
     :param queue_size: messages kept for subscribers that are slow; the usual below 1. Latched is the last one alone
     :raises Invalid: a wish that can't be met
@@ -82,16 +104,62 @@ def for_publisher(
     if asked is not None and asked.history == "keep_all":
         # The reactor would wait in publish() for as long as one subscriber takes nothing.
         raise Invalid("qos: what is published keeps the last messages (history keep_last), not all of them")
-    durable = latch or (
-        bool(subscribers) and all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in subscribers)
-    )
+    durable = latch or any(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in subscribers)
     profile = QoSProfile(
         depth=1 if latch else _queue(queue_size),
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
     )
+    for name in _TIMES:
+        times = [getattr(each, name).nanoseconds for each in subscribers]
+        shortest = min((each for each in times if 0 < each < _INFINITE), default=0)
+        if shortest:
+            setattr(profile, name, Duration(nanoseconds=shortest))
+    if any(each.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC for each in subscribers):
+        profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
     return _override(profile, asked)
+
+
+def mismatch(publisher: QoSProfile, subscription: QoSProfile) -> str:
+    """Why a subscription gets nothing of a publisher, in the middleware's words; empty when it does."""
+    compatible, reason = qos_check_compatible(_explicit(publisher), _explicit(subscription))
+    if compatible != QoSCompatibility.ERROR:
+        return ""
+    parts = [each.removeprefix("ERROR:").strip() for each in reason.split(";")]
+    return "; ".join(each for each in parts if each) or "their qualities of service do not fit"
+
+
+def _explicit(profile: QoSProfile) -> QoSProfile:
+    """The same with no limit of time spelled out, as in the graph: to the middleware's check 0 is something else."""
+    found = copy.copy(profile)
+    for name in _TIMES:
+        if not 0 < getattr(found, name).nanoseconds < _INFINITE:
+            setattr(found, name, Duration(nanoseconds=_INFINITE))
+    return found
+
+
+def unmatched(publishers: Sequence[Any], subscriptions: Sequence[Any], ours: QoSProfile) -> list[str]:
+    """The nodes that don't hear us, or that we don't hear, with the reasons, sorted.
+
+    :param publishers: what the graph tells of theirs, where ours is a subscription
+    :param subscriptions: what the graph tells of theirs, where ours is a publisher
+    """
+    found = [(each, mismatch(each.qos_profile, ours)) for each in publishers]
+    found += [(each, mismatch(ours, each.qos_profile)) for each in subscriptions]
+    told = {f"{_name(each)}: {reason}"[: limits.NAME] for each, reason in found if reason}
+    return sorted(told)[: limits.FACTS]
+
+
+def named(nodes: list[str]) -> list[str]:
+    """Without those whose name is not known; of a node that has just come that lasts for a moment."""
+    return [each for each in nodes if not each.startswith(_NAMELESS)]
+
+
+def _name(info: Any) -> str:
+    if info.node_name == _UNKNOWN:
+        return _NAMELESS
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
 def _queue(size: int) -> int:

@@ -6,19 +6,21 @@ import contextlib
 import inspect
 import secrets
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
 from rclpy.subscription import Subscription
+from twisted.logger import Logger
 
 try:
-    from rclpy.event_handler import SubscriptionEventCallbacks
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 except ImportError:  # Humble
-    from rclpy.qos_event import SubscriptionEventCallbacks
+    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
 
+from relay_protocol.limits import MIB
 from relay_protocol.link import QoS
 from robot_client.platforms import ros2_qos
 from robot_client.platforms.base import OnChange, OnKept, OnSample
@@ -27,6 +29,13 @@ from robot_client.platforms.ros2_types import Types
 from robot_client.reactors import Clock, Timer
 
 LINGER = 0.5
+
+RENEW_EVERY = 0.02
+RENEW_SECONDS = 1.0
+"""How often it is looked whether a new publisher has found its subscribers, and for how long at most."""
+
+KEPT_BYTES = 4 * MIB
+"""Most bytes of messages of one publisher that the next one is given to keep; the latest may be larger."""
 
 RECALL_SECONDS = 5.0
 """How long publishers have to send what they keep: a lost packet of discovery is sent again after 3 s (Fast DDS)."""
@@ -41,9 +50,15 @@ TELLS_APART = hasattr(Subscription, "CallbackType")
 
 _TWO = inspect.signature(lambda message, info: None)
 
-# What tells of such events ends the process when it goes at the wrong moment; see Nodes.for_actions.
+# What tells of such events ends the process when it goes at the wrong moment; see Nodes.for_actions. So the graph is
+# looked at instead to find out who is not matched.
 _NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 
+# The executor would hold on to a publisher by its events after its end, and with it to the topic's type.
+_NO_EVENTS_OF_OURS = PublisherEventCallbacks(use_default_callbacks=False)
+
+
+_LATCHED = "transient_local"
 
 Identity = tuple[int, int | None]
 """What tells a message from all others of its topic, also when the middleware delivers it again: when its publisher
@@ -131,9 +146,15 @@ class RosSource:
         self._recall: _Recall | None = None
         self._known: OrderedDict[Identity, int] = OrderedDict()
         """Stamps of the latest messages that were passed on."""
+        self.unmatched: list[str] = []
+        self._profile: Any = None
+        self._infos: list[Any] = []
         self._match = self._look()
         self._build()
         self._recall_some()
+        self.unmatched = ros2_qos.named(self._unmatched())
+        self._seen = self.unmatched
+        """What was found at the latest look; what is found twice is told."""
 
     @property
     def latched(self) -> bool:
@@ -153,8 +174,11 @@ class RosSource:
     def refresh(self) -> None:
         """Look at the publishers again; subscribe anew if they want another quality of service."""
         old, new = self._match, self._look()
-        if new == old:
+        before, self._seen = self._seen, self._unmatched()
+        settled = self._seen if self._seen == before else self.unmatched
+        if new == old and settled == self.unmatched:
             return
+        self.unmatched = settled
         if new.publishers == 0:
             # Those that come back are likely to be as before.
             new = old._replace(publishers=0)
@@ -187,16 +211,19 @@ class RosSource:
     def _look(self) -> ros2_qos.Match:
         infos = self._node.get_publishers_info_by_topic(self.topic)
         ignored = self._ignore or None
-        return ros2_qos.match(
-            [each.qos_profile for each in infos if not (ignored and each.node_name.startswith(ignored))]
-        )
+        self._infos = [each for each in infos if not (ignored and each.node_name.startswith(ignored))]
+        return ros2_qos.match([each.qos_profile for each in self._infos])
+
+    def _unmatched(self) -> list[str]:
+        """Publishers that offer less than a client has asked for."""
+        return ros2_qos.unmatched(self._infos, [], self._profile) if self._asked is not None else []
 
     def _build(self) -> None:
         self._generation += 1
-        profile = ros2_qos.for_subscription(self._match, self._asked)
+        self._profile = ros2_qos.for_subscription(self._match, self._asked)
         self._retire()
         self._former = self._subscription
-        self._subscription = self._subscribe(partial(self._deliver, self._generation), profile)
+        self._subscription = self._subscribe(partial(self._deliver, self._generation), self._profile)
 
     def _subscribe(self, deliver: Callable[[Arrived], None], profile: Any) -> Any:
         return self._node.create_subscription(
@@ -299,25 +326,140 @@ def _with_identity(put: Callable[..., None], deliver: Callable[[Arrived], None])
     return arrived
 
 
-class RosSink:
-    """A publisher of CDR bytes.
+class Offered(NamedTuple):
+    """How something is to be published; see :func:`ros2_qos.for_publisher`."""
 
-    :param on_close: takes the publisher over
+    latch: bool
+    asked: QoS | None
+    queue_size: int
+
+
+class RosSink:
+    """A publisher of CDR bytes that follows what the subscribers of its topic ask for.
+
+    :param subscriptions: what the graph tells of the topic's subscriptions, without our own
+    :param on_change: called when :attr:`unmatched` has changed
+    :param on_close: takes publishers over that are not needed any more
+    :raises Invalid: a wish that can't be met
     """
 
-    def __init__(self, publisher: Any, on_close: Callable[[RosSink], None]) -> None:
-        self.publisher = publisher
-        self._on_close: Callable[[RosSink], None] | None = on_close
+    def __init__(
+        self,
+        node: Any,
+        clock: Clock,
+        kind: Any,
+        topic: str,
+        offered: Offered,
+        subscriptions: Callable[[], list[Any]],
+        on_change: OnChange,
+        on_close: Callable[[RosSink, list[Any]], None],
+    ) -> None:
+        self.topic = topic
+        self._node = node
+        self._clock = clock
+        self._kind = kind
+        self._offered = offered
+        self._subscriptions = subscriptions
+        self._on_change = on_change
+        self._on_close: Callable[[RosSink, list[Any]], None] | None = on_close
+        self._log = Logger("ros2")
+        self._latched = offered.latch or (offered.asked is not None and offered.asked.durability == _LATCHED)
+        self._kept: deque[bytes] = deque()
+        """Latched messages, for the next publisher to keep."""
+        self._next: Any = None
+        self._lacking = 0
+        """How many of :attr:`_kept`, from the end, the next publisher does not have."""
+        self._until = 0.0
+        self._timer: Timer | None = None
+        self._profile = self._fit(subscriptions())
+        self.publisher = self._make(self._profile)
+        self.unmatched = ros2_qos.named(ros2_qos.unmatched([], subscriptions(), self._profile))
+        self._seen = self.unmatched
+        """What was found at the latest look; what is found twice is told."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has ended."""
+        return self._on_close is None
 
     def publish(self, body: bytes) -> None:
         """Publish one message."""
         self.publisher.publish(body)
+        if self._latched:
+            self._keep(body)
+
+    def refresh(self) -> None:
+        """Look at the subscribers again; publish anew where there is one that the publisher does not serve."""
+        if self._on_close is None:
+            return
+        infos = self._subscriptions()
+        if self._next is None and ros2_qos.unmatched([], infos, self._profile):
+            profile = self._fit(infos)
+            if len(ros2_qos.unmatched([], infos, profile)) < len(
+                ros2_qos.unmatched([], infos, self._profile)
+            ):
+                self._renew(profile)
+        before, self._seen = self._seen, ros2_qos.unmatched([], infos, self._profile)
+        if self._seen == before != self.unmatched:
+            self.unmatched = self._seen
+            self._on_change()
 
     def close(self) -> None:
         """Take the publisher away."""
         if self._on_close is not None:
             on_close, self._on_close = self._on_close, None
-            on_close(self)
+            if self._timer is not None and self._timer.active():
+                self._timer.cancel()
+            on_close(self, [each for each in (self.publisher, self._next) if each is not None])
+
+    def _fit(self, infos: list[Any]) -> Any:
+        return ros2_qos.for_publisher([each.qos_profile for each in infos], *self._offered)
+
+    def _make(self, profile: Any) -> Any:
+        return self._node.create_publisher(
+            self._kind, self.topic, profile, event_callbacks=_NO_EVENTS_OF_OURS
+        )
+
+    def _keep(self, body: bytes) -> None:
+        self._kept.append(body)
+        self._lacking += 1
+        size = sum(map(len, self._kept))
+        while len(self._kept) > 1 and (len(self._kept) > self._profile.depth or size > KEPT_BYTES):
+            size -= len(self._kept.popleft())
+
+    def _renew(self, profile: Any) -> None:
+        """Make a stricter publisher. Until it has found the subscribers the former one publishes.
+
+        What is latched goes to the next one too: nodes that ask for it may get it twice then, as of a node that starts
+        again.
+        """
+        try:
+            self._next = self._make(profile)
+        except Exception:  # the subscribers that the former one serves must not lose it
+            self._log.failure("{topic} can't be published otherwise", topic=self.topic)
+            return
+        self._profile = profile
+        self._lacking = len(self._kept)
+        self._pass_on()
+        self._until = self._clock.seconds() + RENEW_SECONDS
+        self._look()
+
+    def _pass_on(self) -> None:
+        """Have the next publisher keep what the former one keeps."""
+        for body in list(self._kept)[max(0, len(self._kept) - self._lacking) :]:
+            self._next.publish(body)
+        self._lacking = 0
+
+    def _look(self) -> None:
+        self._timer = None
+        found = self._next.get_subscription_count()
+        if found < self._node.count_subscribers(self.topic) and self._clock.seconds() < self._until:
+            self._timer = self._clock.callLater(RENEW_EVERY, self._look)
+            return
+        self._pass_on()
+        former, self.publisher, self._next = self.publisher, self._next, None
+        if self._on_close is not None:
+            self._on_close(self, [former])
 
 
 class Lingering:

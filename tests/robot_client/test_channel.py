@@ -414,3 +414,22 @@ def test_platform_that_can_not_ask_again_says_so(scene: Scene) -> None:
     assert isinstance(answer, link.Subscribed)
     scene.clock.advance(0)
     assert scene.frames()[-1] == SampleFrame(1, 0, b"")
+
+
+def test_nodes_that_are_not_reached_are_told(scene: Scene) -> None:
+    """By another confirmation, of what is published as of what is subscribed; motion too."""
+    scene.ask(link.Subscribe(number=1, topic="/chat"))
+    scene.ask(link.Advertise(number=5, topic="/cmd_vel", type=TWIST))
+    scene.ask(link.Advertise(number=6, topic="/chat", type=STRING))
+    (source,) = scene.platform.sources
+    motion, chat = scene.platform.sinks
+    for number, end, motion_too in ((1, source, False), (5, motion, True), (6, chat, False)):
+        end.unmatched = ["/odd: its reason"]
+        end.on_change()
+        said = scene.wire.said[-1]
+        assert (said.number, said.unmatched) == (number, ["/odd: its reason"])
+        assert getattr(said, "motion", False) is motion_too
+    scene.channel.handle(link.Unadvertise(number=6))
+    count = len(scene.wire.said)
+    chat.on_change()
+    assert len(scene.wire.said) == count

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 
 from relay_protocol import limits
 from relay_protocol.link.both_ways import BothChannel
-from relay_protocol.link.fields import Label, Name, cut
+from relay_protocol.link.fields import Few, Label, Name, cut
 from relay_protocol.message import Message
 
 
@@ -16,12 +17,14 @@ class Numbered(Message, frozen=True, kw_only=True):
     """Base of answers about a topic: what its number stands for from now on.
 
     :param encoding: ``cdr`` (kind-1 frames), or ``json`` (kind-1 frames with a JSON body)
+    :param unmatched: nodes that are not heard, or do not hear, because of their quality of service, with the reason
     """
 
     number: int
     topic: Name
     type: Name
     encoding: Label
+    unmatched: Few = msgspec.field(default_factory=list)
 
 
 class Subscribed(Numbered, frozen=True, kw_only=True):

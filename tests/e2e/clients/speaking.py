@@ -10,6 +10,7 @@ import sys
 import threading
 
 import rclpy
+from geometry_msgs.msg import Twist
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
@@ -68,10 +69,15 @@ def publish(name: str, topic: str, wishes: dict[str, object], texts: list[str]) 
 
 
 def subscribe(name: str, topic: str, wishes: dict[str, object]) -> None:
+    kind = Twist if wishes.get("kind") == "twist" else String
+
+    def heard(message: object) -> None:
+        tell(node=name, topic=topic, text=message.data if kind is String else str(message.linear.x))
+
     ends[name, topic] = node(name).create_subscription(
-        String,
+        kind,
         topic,
-        lambda message: tell(node=name, topic=topic, text=message.data),
+        heard,
         profile(wishes),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
     )

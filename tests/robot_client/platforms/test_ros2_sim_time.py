@@ -95,7 +95,7 @@ for simulated in (True, False):
     class Publisher:
         def publish(self, body): print(deserialize_message(body, TwistStamped).header.stamp.sec > 0)
         def get_subscription_count(self): return 1
-    outlets._publishers[TypedTopic("/cmd", "{STAMPED}")] = Publisher()
+    outlets._publishers[TypedTopic("/cmd", "{STAMPED}")] = [(Publisher(), None)]
     outlets.zero(TypedTopic("/cmd", "{STAMPED}"), b"")
     import rclpy; rclpy.shutdown()
 """
