@@ -89,6 +89,7 @@ class Settings:
     :param recordings_reserve: bytes of the disk they leave free
     :param events_of_source: events that each source may have in the memory
     :param events_kept: seconds after which the memory lets an event go
+    :param largest_sample: bytes of the largest sample taken from a robot
     :param requests: HTTP requests a second of one user, or of a network in which nobody is known; 0: as many as come
     :param streams: streams that one user may have open; 0: as many as come
     :param alerts: what people are told of, and where that may go
@@ -117,6 +118,7 @@ class Settings:
     control_idle: float = 600.0
     events_of_source: int = 10_000
     events_kept: float = 30 * 86400.0
+    largest_sample: int = limits.ROBOT_SAMPLE
     requests: float = 500.0
     streams: int = 128
     alerts: AlertSettings = field(default_factory=AlertSettings)

@@ -272,6 +272,9 @@ class Outbox:
         if self._data_bytes > DATA_BYTES:
             self._make_room()
         while self._data_bytes > 2 * DATA_BYTES and queue.samples:
+            if len(queue.samples) == 1 and self._data_bytes - queue.bytes <= DATA_BYTES:
+                # However large, one that little else waits beside has room.
+                break
             # Single samples of many topics: even the newest can't all be kept.
             self._drop_oldest(queue)
         if not queue.samples:

@@ -238,7 +238,7 @@ class Relay:
 
     def _robot_factory(self, hall: RobotHall) -> RobotFactory:
         cap = AddressCap(self.settings.connections_per_address)
-        timing = LinkTiming(self.settings.heartbeat)
+        timing = LinkTiming(self.settings.heartbeat, self.settings.largest_sample)
 
         def build() -> RobotConnection:
             return RobotConnection(

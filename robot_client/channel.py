@@ -29,6 +29,7 @@ from robot_client.pursuits import Pursuits
 from robot_client.reactors import Clock
 from robot_client.sending import Sending
 from robot_client.topics import TypedTopic
+from robot_client.uplink import TOO_LARGE
 from robot_client.wire import Wire, check_room
 
 
@@ -44,6 +45,8 @@ class _Listening:
         self._sending = sending
         self.request = request
         self.topic = topic
+        self.too_large = False
+        """Whether the log has been told that a sample was too large."""
 
     def take(self, body: bytes) -> None:
         """Pass a sample on."""
@@ -84,6 +87,7 @@ class Channel:
     :param silent: topics that say nothing now, and whether they say their last value instead
     :param goal_topics: judges what is published where one message sends the robot off
     :param pursuits: sees that goals that move the robot end with the daemon
+    :param sample_limit: largest sample that may go in parts, bytes; 0 for what fits into a frame
     """
 
     def __init__(
@@ -100,6 +104,7 @@ class Channel:
         wall: Callable[[], int] = time.time_ns,
         goal_topics: GoalTopics | None = None,
         pursuits: Pursuits | None = None,
+        sample_limit: int = 0,
     ) -> None:
         self.name = name
         self._goal_topics = goal_topics
@@ -109,7 +114,9 @@ class Channel:
         self._offset = offset
         self._platform = platform
         self._motion = motion
-        self._sending = Sending(wire, clock, platform.after_samples, frame_limit, wall)
+        self._sending = Sending(
+            wire, clock, platform.after_samples, frame_limit, wall, sample_limit=sample_limit, lost=self._lost
+        )
         self.uplink = self._sending.uplink
         self._listening: dict[int, _Listening] = {}
         self._publishing: dict[int, _Publishing] = {}
@@ -252,6 +259,19 @@ class Channel:
                 unmatched=source.unmatched,
             )
         )
+
+    def _lost(self, loss: link.Lost) -> None:
+        """Samples of a subscription were not sent."""
+        self._wire.say(loss)
+        listening = self._listening.get(loss.number)
+        if listening is not None and loss.reason == TOO_LARGE and not listening.too_large:
+            listening.too_large = True
+            self._log.warn(
+                "{topic}: a sample of {size} bytes is too large to be sent ([ros] largest_sample_mb here, "
+                "--largest-sample-mb of the relay); it is not said again of this subscription",
+                topic=listening.topic,
+                size=loss.size,
+            )
 
     def _recall(self, listening: _Listening, known: frozenset[int]) -> None:
         try:

@@ -10,7 +10,14 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from relay_protocol.errors import Invalid
-from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
+from relay_protocol.limits import (
+    COMMAND_DEADLINE_MS,
+    LEAST_SAMPLE,
+    MIB,
+    MOST_SAMPLE,
+    ROBOT_SAMPLE,
+    STOP_WITHIN_MS,
+)
 from relay_protocol.link import MotionPolicy, moving
 from relay_protocol.wildcards import see_cheap
 from robot_client.camera.device import V4L2, read_device
@@ -230,6 +237,7 @@ class Ros(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     :param executor: ``events`` is cheaper, ``single`` is the older one
     :param graph_hz: how often the graph is looked at
     :param battery: whether the first battery topic is listened to
+    :param largest_sample_mb: larger messages are not sent, MiB; the relay may take less
     :param use_sim_time: whether the robot's time is what ``/clock`` says; what stops the robot goes by the machine's
         own clock in any case
     """
@@ -237,6 +245,9 @@ class Ros(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     executor: Literal["events", "single"] = "events"
     graph_hz: Annotated[float, msgspec.Meta(gt=0, le=20)] = 3.0
     battery: bool = True
+    largest_sample_mb: Annotated[int, msgspec.Meta(ge=LEAST_SAMPLE // MIB, le=MOST_SAMPLE // MIB)] = (
+        ROBOT_SAMPLE // MIB
+    )
     use_sim_time: bool = False
 
 

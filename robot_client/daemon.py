@@ -15,7 +15,7 @@ from twisted.python.failure import Failure
 from relay_protocol import link
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import SwitchboardError
-from relay_protocol.limits import HEARTBEAT_SECONDS, ROBOT_FRAME
+from relay_protocol.limits import HEARTBEAT_SECONDS, MIB, ROBOT_FRAME
 from robot_client.alerts import CONTROL, MODULE, AlertMemory
 from robot_client.authority import Authority
 from robot_client.body import Body
@@ -99,6 +99,7 @@ class Daemon(Body):
         self._dropped = 0
         self._heartbeat = HEARTBEAT_SECONDS
         self._frame_limit = ROBOT_FRAME
+        self._sample_limit = 0
         self._told: GraphView | None = None
         self._alerts = AlertMemory(connection, now)
         self._driven = Driven(now)
@@ -144,6 +145,7 @@ class Daemon(Body):
         """Describe the robot."""
         self._heartbeat = welcome.heartbeat
         self._frame_limit = welcome.frame_limit
+        self._sample_limit = min(welcome.sample_limit, self._settings.ros.largest_sample_mb * MIB)
         self._connection.say(self._description())
         self._alerts.registered()
         self._told = self._read_graph() or GraphView()
@@ -274,6 +276,7 @@ class Daemon(Body):
                 self.helm.silent,
                 goal_topics=self._goal_topics,
                 pursuits=self._pursuits,
+                sample_limit=self._sample_limit,
             )
             self._ends[message.channel] = end
             return end

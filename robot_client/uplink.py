@@ -28,6 +28,18 @@ MISSED = 64
 they are not larger than :data:`LANE_BYTES` together."""
 
 
+TOO_LARGE = "too_large"
+SLOW_LINK = "slow_link"
+"""Why a sample was not sent: it is larger than may be, or newer ones took its place."""
+
+
+class Loss(msgspec.Struct):
+    """Samples of one subscription that were not sent for one reason: how many, and the bytes of the largest."""
+
+    count: int = 0
+    size: int = 0
+
+
 class _Sample(msgspec.Struct, frozen=True, gc=False):
     number: int
     arrived: float
@@ -65,14 +77,20 @@ class Uplink:
 
     :param now: clock, seconds
     :param frame_limit: largest frame the relay takes, bytes
+    :param sample_limit: largest sample it takes in parts, bytes; 0 for what fits into a frame
     """
 
-    def __init__(self, now: Callable[[], float], frame_limit: int = ROBOT_FRAME) -> None:
+    def __init__(
+        self, now: Callable[[], float], frame_limit: int = ROBOT_FRAME, sample_limit: int = 0
+    ) -> None:
         self.paused = False
         self.dropped = 0
         self.oversized = 0
+        self.lost: dict[tuple[int, str], Loss] = {}
+        """What was lost and not told yet, by subscription and reason."""
         self._now = now
         self._limit = frame_limit
+        self._largest = max(sample_limit, frame_limit - frames.SAMPLE_HEAD)
         self._lanes: dict[int, _Lane] = {}
         self._small: OrderedDict[int, _Sample] = OrderedDict()
         self._large: OrderedDict[int, _Sample] = OrderedDict()
@@ -80,7 +98,9 @@ class Uplink:
         self._turns: deque[int] = deque()
         """Subscriptions with something in :attr:`_large` or begun, in the order of their turns."""
         self._begun = 0
-        """Bytes of all samples whose parts have begun, whole."""
+        """Bytes of all samples whose parts have begun, whole, without :attr:`_huge`."""
+        self._huge: int | None = None
+        """The subscription that has begun a sample which would not fit into a frame; the relay holds one at a time."""
         self._ends: list[bytes] = []
         self._serial = 0
         self._since = 0.0
@@ -110,7 +130,7 @@ class Uplink:
         if lane.large or lane.begun:
             self._turns.remove(number)
         if lane.begun is not None:
-            self._begun -= len(lane.begun.body)
+            self._ended(number, len(lane.begun.body))
             # SPEC 2.1: what is unfinished would stay with the relay until the link ends.
             self._ends.append(frames.encode_part(number, lane.begun.stamp, 1, 0, b"\0"))
 
@@ -123,9 +143,7 @@ class Uplink:
         lane = self._lanes.get(number)
         if lane is None:
             return False
-        if len(body) + frames.SAMPLE_HEAD > self._limit:
-            self.oversized += 1
-            self.dropped += 1
+        if self._too_large(number, body):
             return False
         now = self._now()
         if lane.muted:
@@ -154,9 +172,7 @@ class Uplink:
         lane = self._lanes.get(number)
         if lane is None:
             return False
-        if len(body) + frames.SAMPLE_HEAD > self._limit:
-            self.oversized += 1
-            self.dropped += 1
+        if self._too_large(number, body):
             return False
         # Muted, what went before is all there is, and only where the last value is held.
         if stamp and lane.muted and (body or lane.instead is None):
@@ -290,14 +306,27 @@ class Uplink:
         if serial in self._small:
             return False  # it came before
         # The relay holds what is unfinished; what fits into one frame it takes together in any case.
-        size = len(self._large[serial].body)
-        if self._begun and self._begun + size > self._limit:
+        sample = self._large[serial]
+        size = len(sample.body)
+        if size + frames.SAMPLE_HEAD > self._limit:
+            if self._huge is not None:
+                return False
+            self._huge = sample.number
+        elif self._begun and self._begun + size > self._limit:
             return False
+        else:
+            self._begun += size
         lane.begun, lane.sent = self._remove(serial), 0
         if not lane.begun.repeat:
             lane.last = lane.begun.body
-        self._begun += size
         return True
+
+    def _ended(self, number: int, size: int) -> None:
+        """A sample of this subscription that has begun is finished, or broken off."""
+        if number == self._huge:
+            self._huge = None
+        else:
+            self._begun -= size
 
     def _part(self, number: int, lane: _Lane) -> bytes:
         assert lane.begun is not None
@@ -311,7 +340,7 @@ class Uplink:
             lane.sent += len(piece)
         if lane.sent >= total:
             lane.begun = None
-            self._begun -= total
+            self._ended(number, total)
             if not lane.large:
                 self._turns.remove(number)
         return frame
@@ -343,7 +372,21 @@ class Uplink:
         lane = self._lanes[sample.number]
         if not lane.large and lane.begun is None and sample.number in self._turns:
             self._turns.remove(sample.number)
+        self._lose(sample.number, SLOW_LINK, len(sample.body))
+
+    def _too_large(self, number: int, body: bytes) -> bool:
+        """Whether the relay would not take a sample; then it is lost."""
+        if len(body) <= self._largest:
+            return False
+        self.oversized += 1
+        self._lose(number, TOO_LARGE, len(body))
+        return True
+
+    def _lose(self, number: int, reason: str, size: int) -> None:
         self.dropped += 1
+        loss = self.lost.setdefault((number, reason), Loss())
+        loss.count += 1
+        loss.size = max(loss.size, size)
 
     def _remove(self, serial: int) -> _Sample:
         large = serial in self._large

@@ -150,6 +150,8 @@ class FrameDecoder:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
+        self.sample_limit = 0
+        """Largest sample accepted in parts, bytes; what fits into a frame is accepted in any case."""
         self._buffer = bytearray()
         self._enough = 0
         """With fewer bytes in the buffer nothing new can be said."""
@@ -178,6 +180,7 @@ class FrameDecoder:
             buffer.clear()
         frames: list[Frame] = []
         start, have, limit = 0, len(data), self.limit
+        largest = max(self.sample_limit, limit - SAMPLE_HEAD)
         while have - start >= 4:
             (length,) = _LENGTH(data, start)
             if length > limit:
@@ -194,7 +197,7 @@ class FrameDecoder:
                 number, stamp = _NUMBERED(data, start + 5)
                 frames.append(SampleFrame(number, stamp, data[start + 17 : end]))
             elif kind == PART:
-                sample = self._parts.join(data, start + 4, end, limit)
+                sample = self._parts.join(data, start + 4, end, limit, largest)
                 if sample is not None:
                     frames.append(sample)
             else:
@@ -219,17 +222,19 @@ class _Parts:
         self.size = 0
         self._unfinished: dict[int, _Unfinished] = {}
 
-    def join(self, buffer: bytes, start: int, end: int, limit: int) -> SampleFrame | None:
-        """Take one part; return the sample it completes."""
+    def join(self, buffer: bytes, start: int, end: int, limit: int, largest: int) -> SampleFrame | None:
+        """Take one part; return the sample it completes.
+
+        :param limit: largest frame
+        :param largest: largest sample
+        """
         if end - start < 22:
             raise MalformedMessage(
                 "a part of a sample needs 20 bytes of head, and at least one of the sample"
             )
         number, stamp, total, offset = _PART.unpack_from(buffer, start + 1)
-        if total > limit - SAMPLE_HEAD:
-            raise FrameTooLarge(
-                f"a sample of {total} bytes was announced; at most {limit - SAMPLE_HEAD} are taken here"
-            )
+        if total > largest:
+            raise FrameTooLarge(f"a sample of {total} bytes was announced; at most {largest} are taken here")
         size = end - start - 21
         body = (
             self._begin(number, stamp, total) if offset == 0 else self._follow(number, stamp, total, offset)
@@ -241,7 +246,9 @@ class _Parts:
             body += memoryview(buffer)[start + 21 : end]
             return SampleFrame(number, stamp, bytes(body))
         self.size += size
-        if self.size > min(PARTS_BYTES, 2 * limit) or len(self._unfinished) > UNFINISHED:
+        # One of the largest, beside those that would fit into a frame.
+        most = min(PARTS_BYTES, 2 * limit) + (largest if largest > limit else 0)
+        if self.size > most or len(self._unfinished) > UNFINISHED:
             raise FrameTooLarge(
                 f"{len(self._unfinished)} samples of {self.size} bytes are unfinished; that is too much"
             )

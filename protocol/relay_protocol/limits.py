@@ -12,6 +12,13 @@ HANDSHAKE_FRAME = 16 * KIB
 ROBOT_FRAME = 16 * MIB
 """Largest frame a proven robot may send on a channel link (a point cloud or a raw picture)."""
 
+ROBOT_SAMPLE = 64 * MIB
+"""Largest sample a robot may send in parts, unless the relay or the robot is set otherwise."""
+
+LEAST_SAMPLE = 1 * MIB
+MOST_SAMPLE = 1024 * MIB
+"""What the largest sample may be set to."""
+
 CONTROL_FRAME = 1 * MIB
 """Largest frame a robot may send on its control link."""
 

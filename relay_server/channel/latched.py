@@ -237,7 +237,8 @@ class Latched:
 
     def _trim(self) -> None:
         """The newest count, as far as they are not too large together."""
-        while self._samples and (len(self._samples) > self._most or self._bytes > KEPT_BYTES):
+        # One is kept however large it is.
+        while len(self._samples) > self._most or (self._bytes > KEPT_BYTES and len(self._samples) > 1):
             self._drop(min(self._samples))
 
     def _drop(self, stamp: int) -> None:

@@ -93,6 +93,7 @@ class Channel:
         )
         self._takers: dict[type, Callable[[Any], None]] = {
             link.Subscribed: self.subscriptions.subscribed,
+            link.Lost: self.subscriptions.not_sent,
             link.Advertised: self.publications.advertised,
             link.ServiceResponse: self._calls.answered,
             link.Interfaces: self._interfaces.told,

@@ -34,7 +34,7 @@ PLAINLY_SECONDS = 60.0
 TOO_SLOW_SECONDS = 10.0
 """How often a client is told that samples of a topic are dropped because its connection is thin."""
 
-_LEVELS = {Flaw.BROKEN: "error", Flaw.NOT_CDR: "error", Flaw.TOO_LARGE: "warning"}
+_LEVELS = {Flaw.BROKEN: "error", Flaw.NOT_CDR: "error", Flaw.TOO_LARGE: "warning", Flaw.NOT_SENT: "error"}
 
 
 class Receiver(Protocol):
@@ -192,6 +192,9 @@ class Listener:
     def replay(self, sample: Sample) -> None:
         """A latched sample for a late joiner; each is of another publisher, so no throttle drops any."""
         self._receiver.deliver(self, sample)
+
+    def missed(self, count: int) -> None:
+        """Samples of the topic did not come from the robot; for who keeps count of them."""
 
     def complain(self, flaw: Flaw, words: str) -> None:
         """Tell the client why it does not get what it asked for: once for each id, until it asks again."""

@@ -51,6 +51,7 @@ class Flaw(enum.Enum):
     BROKEN = "broken"
     NOT_CDR = "not cdr"
     TOO_LARGE = "too large"
+    NOT_SENT = "not sent"
 
 
 class Ready(NamedTuple):

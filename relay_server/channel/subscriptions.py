@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from twisted.logger import Logger
@@ -278,6 +279,17 @@ class Subscriptions:
         uplink = self._numbers.get(number)
         if uplink is not None:
             uplink.sample(body, time, stamp)
+
+    def not_sent(self, loss: link.Lost) -> None:
+        """The robot has not sent some samples."""
+        uplink = self._numbers.get(loss.number)
+        if uplink is not None:
+            uplink.not_sent(loss)
+
+    def losses(self, topic: str) -> Mapping[str, int]:
+        """How many samples of a topic no client got, by the reason."""
+        uplink = self._topics.get(topic)
+        return {} if uplink is None else uplink.losses
 
     # --- late joiners of what is inhibited ----------------------------------------------------------------
 

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import enum
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from relay_protocol import rosbridge
+from relay_protocol import link, rosbridge
 from relay_protocol.link import QoS, Topic
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.channel.latched import KEPT_BYTES, Latched
 from relay_server.channel.listener import Listener
-from relay_server.channel.sample import Converter, Sample
+from relay_server.channel.sample import Converter, Flaw, Sample
 from relay_server.channel.wire import Commander, Member
 from relay_server.clock import Clock, Timer, cancel
 
 UNTYPED = 64
 """Most samples of one topic that wait for its type."""
+
+TOO_LARGE, SLOW_LINK, UNREADABLE, NO_TYPE, OTHER = "too_large", "slow_link", "unreadable", "no_type", "other"
+LOSSES = (TOO_LARGE, SLOW_LINK)
+"""What a robot says of samples it has not sent."""
 
 
 class Phase(enum.Enum):
@@ -69,7 +73,8 @@ class TopicUplink:
         """Why the type's definition is not to be had."""
         self.unmatched: list[str] = []
         """Publishers that are not heard because of the quality of service a client has asked for, with the reason."""
-        self.failures = 0
+        self.losses: Counter[str] = Counter()
+        """Samples that no client got, by the reason (SPEC section 1.7, ``lost``)."""
         self.taken = 0
         """Samples that have come."""
         self.listeners: dict[Member, Listener] = {}
@@ -232,9 +237,22 @@ class TopicUplink:
         return Converter(self._types(), self.type, self.encoding, self._failed)
 
     def _failed(self, reason: str) -> None:
-        self.failures += 1
-        if self.failures == 1:
+        self.losses[UNREADABLE] += 1
+        if self.losses[UNREADABLE] == 1:
             self._broken(self, reason)
+
+    def not_sent(self, loss: link.Lost) -> None:
+        """The robot has not sent some samples."""
+        self.losses[loss.reason if loss.reason in LOSSES else OTHER] += loss.count
+        for listener in list(self.listeners.values()):
+            listener.missed(loss.count)
+        if loss.reason == TOO_LARGE:
+            for listener in list(self.listeners.values()):
+                listener.complain(
+                    Flaw.NOT_SENT,
+                    f"a message of {loss.size} bytes is too large to be sent. Publish it smaller, or raise "
+                    "--largest-sample-mb of the relay and largest_sample_mb of the robot",
+                )
 
     # --- samples ------------------------------------------------------------------------------------------
 
@@ -256,7 +274,7 @@ class TopicUplink:
             for listener in self._live:
                 listener.offer(sample)
             return
-        _keep(self._untyped, sample)
+        self.losses[NO_TYPE] += _keep(self._untyped, sample)
         for listener in self._live:
             if listener.raw:
                 listener.offer(sample)
@@ -303,11 +321,14 @@ class TopicUplink:
                 self.welcome(member, listener, live=True)
 
 
-def _keep(samples: deque[Sample], sample: Sample) -> None:
-    """The newest count, as far as they are not too large together."""
+def _keep(samples: deque[Sample], sample: Sample) -> int:
+    """The newest count, as far as they are not too large together; how many gave way."""
+    gone = int(len(samples) == samples.maxlen)
     samples.append(sample)
-    while sum(each.size for each in samples) > KEPT_BYTES:
+    while len(samples) > 1 and sum(each.size for each in samples) > KEPT_BYTES:
         samples.popleft()
+        gone += 1
+    return gone
 
 
 Send = Callable[[bytes, int, int], None]

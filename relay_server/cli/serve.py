@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from relay_protocol.errors import Invalid
+from relay_protocol.limits import LEAST_SAMPLE, MIB, MOST_SAMPLE, ROBOT_SAMPLE
 from relay_server.cli.app import App, examples, pass_app
 
 if TYPE_CHECKING:
@@ -148,6 +149,13 @@ MOST_REQUESTS = 1_000_000
     type=click.IntRange(min=0),
     help="Streams that one user may have open: events, topics, cameras, pages of the portal. 0: no limit.",
 )
+@click.option(
+    "--largest-sample-mb",
+    type=click.IntRange(LEAST_SAMPLE // MIB, MOST_SAMPLE // MIB),
+    default=ROBOT_SAMPLE // MIB,
+    show_default=True,
+    help="Largest message taken from a robot (a point cloud, a map), MiB. Each takes several times as much memory.",
+)
 @click.option("--log-json", is_flag=True, help="Log one JSON object a line.")
 @click.option("--debug", is_flag=True, help="Log more.")
 @pass_app
@@ -176,6 +184,7 @@ def serve(
     battery_critical: float,
     requests_per_second: float,
     streams_per_user: int,
+    largest_sample_mb: int,
     log_json: bool,
     debug: bool,
 ) -> None:
@@ -224,6 +233,7 @@ def serve(
         control_idle=control_idle,
         events_of_source=events_per_source,
         events_kept=events_days * DAY,
+        largest_sample=largest_sample_mb * MIB,
         requests=requests_per_second,
         streams=streams_per_user,
         alerts=AlertSettings(

@@ -197,12 +197,13 @@ class Opening(Role):
         except Refused as error:
             connection.refuse(link.Refused(reason=str(error), code=error.code))
             return
-        self._joined(channel.name, ChannelEnd(channel, connection), limits.ROBOT_FRAME)
+        end = ChannelEnd(channel, connection)
+        self._joined(channel.name, end, limits.ROBOT_FRAME, connection.timing.largest_sample)
         channel.joined(connection)
 
-    def _joined(self, name: str, end: Role, frame_limit: int) -> None:
+    def _joined(self, name: str, end: Role, frame_limit: int, sample_limit: int = 0) -> None:
         self._connection.send(link.Joined(channel=name, at=self._connection.clock_ns()))
-        self._connection.proven(end, frame_limit)
+        self._connection.proven(end, frame_limit, sample_limit=sample_limit)
 
 
 async def _key_of(hall: RobotHall, hello: link.Hello) -> queries.RobotKeyRecord | None:
@@ -270,7 +271,10 @@ class Control(Role):
         session = secrets.token_hex(4)
         connection.send(
             link.Welcome(
-                session=session, heartbeat=connection.timing.heartbeat, frame_limit=limits.ROBOT_FRAME
+                session=session,
+                heartbeat=connection.timing.heartbeat,
+                frame_limit=limits.ROBOT_FRAME,
+                sample_limit=connection.timing.largest_sample,
             )
         )
         robot.registered_at = now

@@ -77,9 +77,14 @@ class Role(Protocol):
 
 @dataclass(frozen=True)
 class LinkTiming:
-    """Times of a robot's connection, seconds."""
+    """What can be set of a robot's connection.
+
+    :param heartbeat: seconds between pings
+    :param largest_sample: bytes of the largest sample a robot may send in parts
+    """
 
     heartbeat: float
+    largest_sample: int = limits.ROBOT_SAMPLE
 
 
 class RobotConnection(TwistedProtocol):
@@ -238,13 +243,15 @@ class RobotConnection(TwistedProtocol):
             self.send(refusal)
             self._hang_up(refusal.reason)
 
-    def proven(self, role: Role, frame_limit: int, *, measured: bool = False) -> None:
+    def proven(self, role: Role, frame_limit: int, *, measured: bool = False, sample_limit: int = 0) -> None:
         """The robot is known; from now on the connection has this role, heartbeats run both ways.
 
+        :param sample_limit: bytes of the largest sample that may come in parts; 0 for what fits into a frame
         :param measured: whether :meth:`reading` is going to be asked for
         """
         self._role = role
         self._decoder.limit = frame_limit
+        self._decoder.sample_limit = sample_limit
         self._known()
         self._stop_deadline()
         often = min(self.timing.heartbeat, MEASURED_SECONDS) if measured else self.timing.heartbeat

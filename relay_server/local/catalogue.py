@@ -99,6 +99,7 @@ Person[] people
 uint32 more
 uint64 drops
 TopicDrops[] topic_drops
+Lost[] lost
 Downlink downlink
 uint64 plain_instead
 uint64 refusals
@@ -180,6 +181,11 @@ uint64 drops
 MSG: switchboard_msgs/msg/Unmatched
 string topic
 string[] nodes
+{_LINE}
+MSG: switchboard_msgs/msg/Lost
+string topic
+string reason
+uint64 count
 {_LINE}
 MSG: switchboard_msgs/msg/Uplink
 string state

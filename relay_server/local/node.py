@@ -86,6 +86,12 @@ class RelayNode:
             "topic_drops": [
                 {"topic": topic, "drops": drops} for topic, drops in session.listening.drops().items()
             ],
+            "lost": [
+                {"topic": topic, "reason": reason, "count": count}
+                for topic, lost in session.listening.lost().items()
+                for reason, count in lost.items()
+                if count
+            ],
             "downlink": _downlink(session),
             "plain_instead": session.plain_instead,
             "refusals": session.refusals,

@@ -254,6 +254,14 @@ class Recorder:
     def dropped(self, listener: Listener) -> None:
         """A sample gave way before it came here."""
         self._lost += 1
+        self.tell(
+            "warning", f"messages of {listener.topic} were lost because they came faster than they were taken"
+        )
+
+    def missed(self, topic: str, count: int) -> None:
+        """Samples of a topic were not sent by the robot."""
+        self._lost += count
+        self.tell("warning", f"messages of {topic} were lost because the robot did not send them")
 
     def deliver(self, listener: Listener, parcel: Sample) -> None:
         """A sample of a topic, as it comes."""
@@ -283,10 +291,14 @@ class Recorder:
 
     def _hold(self, topic: str, sample: Sample, log_time: int) -> None:
         size = sum(len(each.body) for _, each, _ in self._held) + len(sample.body)
-        if len(self._held) < HELD and size <= HELD_BYTES:
+        if not self._held or (len(self._held) < HELD and size <= HELD_BYTES):
             self._held.append((topic, sample, log_time))
         else:
             self._lost += 1
+            self.tell(
+                "warning",
+                "messages were lost while the recording waited for the robot's time or the database",
+            )
 
     def _track(self, topic: str, converter: Converter) -> Track:
         if not converter.cdr:
@@ -341,6 +353,7 @@ class Recorder:
     def _put(self, message: Message) -> None:
         if not self._writer.put(message):
             self._lost += 1
+            self.tell("warning", "messages were lost because they came faster than the disk takes them")
 
     def watch(self, camera: str, eye: _Eye) -> Stream:
         """Have a camera shown; see :meth:`Videos.watch`."""
@@ -353,6 +366,10 @@ class _Ear(Listener):
     def __init__(self, clock: Clock, recorder: Recorder, topic: str) -> None:
         super().__init__(clock, recorder, topic)
         self._recorder = recorder
+
+    def missed(self, count: int) -> None:
+        """The recording lacks them."""
+        self._recorder.missed(self.topic, count)
 
     def replay(self, sample: Sample) -> None:
         """A latched sample that came long ago: a recording must not seem to have begun then."""

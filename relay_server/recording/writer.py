@@ -124,7 +124,7 @@ class Writer:
             if (
                 self._closing
                 or len(self._waiting) + self._in_hand >= QUEUE_MESSAGES
-                or self._waiting_bytes + len(message.body) > QUEUE_BYTES
+                or (self._waiting_bytes and self._waiting_bytes + len(message.body) > QUEUE_BYTES)
             ):
                 return False
             self._waiting.append(message)

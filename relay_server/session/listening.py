@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from relay_protocol import jsontext, rosbridge
@@ -101,6 +101,11 @@ class Listening:
         return {
             topic: counted[listener] for topic, listener in self._listeners.items() if listener in counted
         }
+
+    def lost(self) -> dict[str, Mapping[str, int]]:
+        """Samples of the subscribed topics that no client got, by topic and reason."""
+        subscriptions = self._session.channel.subscriptions
+        return {topic: subscriptions.losses(topic) for topic in self._listeners}
 
     def judge_again(self) -> None:
         """What the client may not hear any more ends: its rights have changed, or what the topics are."""

@@ -230,7 +230,8 @@ class Hop:
         if size is None:
             size = len(argument)
         with self._lock:
-            if size and self._size + size > BACKLOG:
+            # However large, one that nothing waits before has room.
+            if size and self._size and self._size + size > BACKLOG:
                 self.dropped += 1
                 return
             self._size += size

@@ -141,6 +141,17 @@ def test_single_large_samples_of_many_topics_stay_within_twice_the_bound() -> No
         assert receiver.outbox.waiting_bytes <= 2 * module.DATA_BYTES
 
 
+def test_a_sample_larger_than_all_bounds_has_room_alone() -> None:
+    """An organised cloud beside a few poses, for a client that has just been slow; a second one gives way, counted."""
+    receiver = paused()
+    receiver.outbox.data("pose", bytes(100))
+    receiver.outbox.data("cloud", bytes(20 * MIB))
+    receiver.outbox.data("cloud", bytes(18 * MIB))
+    receiver.outbox.data("other", bytes(18 * MIB))
+    assert receiver.outbox.drops == {"cloud": 1, "other": 1}
+    assert sorted(map(len, receiver.resume())) == [100, 18 * MIB]
+
+
 def test_a_receiver_whose_replies_pile_up_is_cut_once() -> None:
     """Control is never dropped; over the bound the receiver must go, and nothing is kept for it."""
     receiver = paused()

@@ -10,7 +10,7 @@ from twisted.internet.task import Clock
 
 from relay_protocol.frames import PART, SAMPLE, FrameDecoder, SampleFrame
 from relay_protocol.limits import ROBOT_FRAME
-from robot_client.uplink import LANE_BYTES, MAX_BYTES, WHOLE, Uplink
+from robot_client.uplink import LANE_BYTES, MAX_BYTES, SLOW_LINK, TOO_LARGE, WHOLE, Uplink
 from robot_client.uplink import PART as PART_BYTES
 
 
@@ -380,3 +380,42 @@ def test_muting_what_is_not_there_is_passed_over() -> None:
     assert not uplink.unmute(1)
     uplink.open(1)
     assert not uplink.unmute(1)
+
+
+HUGE = 3 * ROBOT_FRAME
+
+
+def test_a_sample_larger_than_a_frame_goes_in_parts() -> None:
+    """Up to the limit of samples; one at a time, and others go on beside it."""
+    link = Uplink(Clock().seconds, ROBOT_FRAME, HUGE)
+    for number in (1, 2, 3):
+        link.open(number)
+    decoder, out, most = FrameDecoder(ROBOT_FRAME), [], 0
+    decoder.sample_limit = HUGE
+    link.offer(1, 5, bytes(HUGE))
+    out += decoder.feed(b"".join(link.take(2**16)))
+    link.offer(2, 6, bytes(HUGE))
+    link.offer(3, 7, bytes(100_000))
+    while chunk := link.take(2**16):
+        out += decoder.feed(b"".join(chunk))
+        most = max(most, decoder.buffered)
+    assert [(each.number, len(each.body)) for each in out if isinstance(each, SampleFrame)] == [
+        (3, 100_000), (1, HUGE), (2, HUGE)
+    ]  # fmt: skip
+    assert most < HUGE + 200_000
+    assert link.dropped == 0
+
+
+def test_what_is_lost_is_told_by_subscription_and_reason() -> None:
+    """How many, and how large: too large for the relay, or too much for the link."""
+    link = Uplink(Clock().seconds, ROBOT_FRAME, HUGE)
+    link.open(1)
+    link.open(2)
+    for size in (HUGE + 1, HUGE + 7):
+        link.offer(1, 0, bytes(size))
+    link.paused = True
+    for _ in range(3):
+        link.offer(2, 0, bytes(LANE_BYTES))
+    told = {key: (loss.count, loss.size) for key, loss in link.lost.items()}
+    assert told == {(1, TOO_LARGE): (2, HUGE + 7), (2, SLOW_LINK): (2, LANE_BYTES)}
+    assert link.dropped == 4

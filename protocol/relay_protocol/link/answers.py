@@ -61,6 +61,20 @@ class Failed(Message, frozen=True, kw_only=True):
         cut(self, "reason", "ref")
 
 
+class Lost(Message, frozen=True, kw_only=True):
+    """Robot: samples of a subscription were not sent, since it last said so.
+
+    :param reason: ``too_large``, or ``slow_link`` when newer ones took their place
+    :param count: how many
+    :param size: bytes of the largest
+    """
+
+    number: int
+    reason: Label
+    count: Annotated[int, Meta(ge=1)]
+    size: Annotated[int, Meta(ge=0)] = 0
+
+
 class AdvertisedService(Message, frozen=True, kw_only=True):
     """Robot: the service stands; ``type`` is the full name of its type."""
 
@@ -101,6 +115,7 @@ RobotChannel = (
     | AdvertisedService
     | AdvertisedAction
     | Failed
+    | Lost
     | TypeDefinition
     | Interfaces
     | BothChannel

@@ -82,11 +82,13 @@ class Welcome(Message, frozen=True, kw_only=True):
     :param session: name of this registration, for logs on both ends
     :param heartbeat: seconds between pings, each way
     :param frame_limit: largest frame the robot may send on its channel links, bytes
+    :param sample_limit: largest sample it may send there in parts, bytes; 0 for what fits into a frame
     """
 
     session: str
     heartbeat: float
     frame_limit: int
+    sample_limit: int = 0
 
 
 Opening = Hello | Prove | Enroll | Join

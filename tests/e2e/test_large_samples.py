@@ -1,0 +1,67 @@
+"""Organised point clouds of a real graph: those that pass, and those of which somebody is told."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cbor2
+import pytest
+from switchboard_client import Client
+from switchboard_processes import Process, ros_environment, running
+from switchboard_robot import Robot
+from websockets.sync.client import connect
+
+MIB = 1024 * 1024
+NODE = Path(__file__).parent / "clients" / "clouds.py"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+PASSES, TOO_LARGE = 18 * MIB, 21 * MIB
+
+
+@pytest.fixture(scope="module")
+def cloudy(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """A robot that sends messages of up to 20 MiB, with a node that has published one of 18 and one of 21."""
+    robot = Robot(world.relay, "cloudy", daemon_env={"SWITCHBOARD_ROBOT_ROS_LARGEST_SAMPLE_MB": "20"})
+    try:
+        world.relay.cli("right", "grant", "operator", "cloudy", "operator")
+        command = [sys.executable, str(NODE), "/organised", str(PASSES), "/enormous", str(TOO_LARGE)]
+        node = Process(command, tmp_path_factory.mktemp("clouds"), "clouds", ros_environment(robot.domain))
+        with running(node):
+            node.wait_to_say("READY")
+            yield robot
+    finally:
+        robot.stop()
+
+
+@pytest.fixture
+def client(world: Any, cloudy: Robot) -> Iterator[Client]:
+    """A client that takes messages of any size and wants to hear of errors."""
+    url = world.relay.url("cloudy")
+    headers = {"Authorization": f"Bearer {world.operator}"}
+    with Client(connect(url, additional_headers=headers, max_size=None)) as client:
+        client.send(op="set_level", level="error")
+        yield client
+
+
+def test_an_organised_cloud_passes(client: Client) -> None:
+    """More than fits into a frame of the robot's link."""
+    for _ in range(2):
+        client.send(op="subscribe", topic="/organised", type=CLOUD, compression="cbor")
+        message = cbor2.loads(client.connection.recv(timeout=60))
+        data = message["msg"]["data"]
+        assert bytes(data.value if hasattr(data, "value") else data) == bytes(range(16)) * (PASSES // 16)
+        client.send(op="unsubscribe", topic="/organised")
+
+
+def test_of_what_is_too_large_the_subscriber_is_told(client: Client, cloudy: Robot) -> None:
+    """Why, and what to do; it is counted in the status, and the robot's log has one line."""
+    client.send(op="subscribe", id="e", topic="/enormous", type=CLOUD)
+    words = client.until(op="status", id="e")["msg"]
+    assert words.startswith("/enormous: a message of 220")
+    assert "raise --largest-sample-mb of the relay and largest_sample_mb of the robot" in words
+    client.send(op="subscribe", topic="/relay/status")
+    lost = client.until(op="publish", topic="/relay/status")["msg"]["lost"]
+    assert lost == [{"topic": "/enormous", "reason": "too_large", "count": 1}]
+    assert cloudy.daemon.log.read_text().count("/enormous: a sample of 220") == 1
