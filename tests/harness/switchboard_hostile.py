@@ -119,13 +119,15 @@ class Attack:
 
     :param robots: goes to the port for robots
     :param data: the bytes, of this part of full size; 1 is all
-    :param waits: whether the connection stays open until the relay has no more to say
+    :param waits: whether the relay ends the connection, however much it says before
+    :param in_turns: it is a thousand requests; others are served between them
     """
 
     name: str
     data: Callable[[float], bytes]
     robots: bool = False
     waits: bool = False
+    in_turns: bool = False
 
 
 def request(method: str, path: bytes, fields: dict[str, bytes], body: bytes = b"") -> bytes:
@@ -292,6 +294,7 @@ def _bodies() -> Iterator[Attack]:
 
 
 _POST = b"POST /api/v1/session HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nConnection: close\r\n"
+_LAST = b"GET / HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n"
 _CHUNKED = _POST + b"Transfer-Encoding: chunked\r\n\r\n"
 
 
@@ -307,11 +310,19 @@ def _framing() -> Iterator[Attack]:
         ("lines of one blank", b"GET / HTTP/1.1\r\nHost: x\r\nA: b\r\n", b" \r\n", b"\r\n", BODY),
         ("continued lines", b"GET / HTTP/1.1\r\nHost: x\r\nA: b\r\n", b" c\r\n", b"\r\n", BODY),
         ("fields without a value", b"GET / HTTP/1.1\r\nHost: x\r\n", b"a:\r\n", b"\r\n", BODY),
-        ("a long name of a field", b"GET / HTTP/1.1\r\nHost: x\r\n", b"a-", b": b\r\n\r\n", HEAD),
-        ("a long method", b"", b"A", b" / HTTP/1.1\r\nHost: x\r\n\r\n", HEAD),
+        (
+            "a long name of a field",
+            b"GET / HTTP/1.1\r\nHost: x\r\n",
+            b"a-",
+            b": b\r\nConnection: close\r\n\r\n",
+            HEAD,
+        ),
+        ("a long method", b"", b"A", b" / HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n", HEAD),
         ("a long length", _POST + b"Content-Length: ", b"9", b"\r\n\r\n", HEAD),
         ("a long line", b"", b"x", b"", BODY),
         ("a long first line", b"GET /", b"x", b"", BODY),
+        ("requests one after another", b"", b"GET /robots/x HTTP/1.1\r\nHost: x\r\n\r\n", _LAST, BODY),
+        ("requests for nothing", b"", b"GET /a HTTP/1.1\r\n\r\n", _LAST, BODY),
         ("no HTTP", b"", b"\x00\xff\x16\x03", b"", BODY),
     ):
         yield Attack(
@@ -320,6 +331,7 @@ def _framing() -> Iterator[Attack]:
                 before + unit * int(size * part / len(unit)) + after
             ),
             waits=True,
+            in_turns=name.startswith("requests"),
         )
 
 
@@ -341,7 +353,8 @@ def _websockets() -> Iterator[Attack]:
 
     def handshaken(frames: Callable[[float], bytes]) -> Callable[[float], bytes]:
         opened = request("GET", b"/robots/rover", UPGRADE)
-        return lambda part: opened + b"\x00" + frames(part)
+        # The relay ends the connection when it has read all of them up to a close.
+        return lambda part: opened + b"\x00" + frames(part) + frame(b"", 8)
 
     texts: dict[str, Callable[[float], bytes]] = {
         f"a token: {shape}": lambda part, made=made: (
@@ -476,12 +489,9 @@ def exchange(connection: socket.socket, data: bytes, *, waits: bool = False) -> 
                 answer += more
             answer, data = b"", frames
         connection.sendall(data)
-        if waits:
-            # What is not answered would wait for the relay's deadline of ten seconds.
-            connection.settimeout(0.3)
         while more := connection.recv(65536):
             answer += more
-            if _is_whole(answer):
+            if not waits and _is_whole(answer):
                 break
     return answer
 
