@@ -50,6 +50,7 @@ from relay_server.edges import directory as directory_edge
 from relay_server.edges.admin import AdminSocket
 from relay_server.edges.api import Api
 from relay_server.edges.caps import AddressCap
+from relay_server.edges.fastpath import Turns
 from relay_server.edges.limiting import RequestLimits
 from relay_server.edges.pages import PageGate
 from relay_server.edges.robot_pages import RobotPages
@@ -239,10 +240,11 @@ class Relay:
     def _robot_factory(self, hall: RobotHall) -> RobotFactory:
         cap = AddressCap(self.settings.connections_per_address)
         timing = LinkTiming(self.settings.heartbeat, self.settings.largest_sample)
+        turns = Turns(self._reactor)
 
         def build() -> RobotConnection:
             return RobotConnection(
-                self._reactor, now_ns, timing, lambda connection: Opening(hall, connection), cap
+                self._reactor, now_ns, timing, lambda connection: Opening(hall, connection), cap, turns
             )
 
         return RobotFactory(build)

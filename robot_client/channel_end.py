@@ -26,6 +26,11 @@ class ChannelEnd(Wire):
         self.protocol.link.say(message)
         self.protocol.flush()
 
+    @property
+    def room(self) -> int:
+        """Bytes of sample frames that should be written now."""
+        return self.protocol.room
+
     def write(self, frames: list[bytes]) -> None:
         """Send sample frames."""
         self.protocol.write(frames)

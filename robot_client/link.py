@@ -22,12 +22,15 @@ from relay_protocol.limits import (
     HEARTBEAT_SECONDS,
     HEARTBEATS_MISSED,
 )
+from relay_protocol.pacing import SendWindow
 from robot_client.offset import Offset
 
 NANO = 1_000_000_000
 ENCODINGS = ["cdr"]
 QUICK_PINGS = 3
 CHANNEL_PING_SECONDS = 1.0
+UPLINK_TARGET = 0.2
+"""Seconds samples may wait in the network before the relay has them. No command waits behind them."""
 
 
 class State(enum.Enum):
@@ -141,6 +144,8 @@ class Link(ABC):
         self.heartbeat = heartbeat
         self.offset = Offset()
         self._frames = frames.FrameDecoder(HANDSHAKE_FRAME)
+        self.window: SendWindow | None = None
+        """How much may be on its way to the relay, where that is limited."""
         self.unsaid: list[bytes] = []
         """What :meth:`take` gives."""
         self._heard = clock()
@@ -158,9 +163,15 @@ class Link(ABC):
         out, self.unsaid = self.unsaid, []
         return out
 
-    def ping(self) -> None:
-        """Ask the relay for its clock."""
-        self.say(link.Ping(t=self.clock()))
+    def ping(self, full: bool = False) -> None:
+        """Ask the relay for its clock.
+
+        :param full: whether samples wait for the window
+        """
+        now = self.clock()
+        if self.window is not None:
+            self.window.probe(now, now / NANO, full=full)
+        self.say(link.Ping(t=now))
 
     def check_silence(self) -> None:
         """Hold the link to its heartbeats.
@@ -204,7 +215,10 @@ class Link(ABC):
         return []
 
     def _on_pong(self, message: link.Pong) -> list[Event]:
-        self.offset.add(message.t, message.at, self.clock())
+        now = self.clock()
+        if self.window is not None:
+            self.window.answered(message.t, now / NANO)
+        self.offset.add(message.t, message.at, now)
         return []
 
     def _on_bye(self, message: link.Bye) -> list[Event]:
@@ -302,6 +316,8 @@ class TicketLink(Link):
     """
 
     ping_every = CHANNEL_PING_SECONDS
+    parts = False
+    """Whether samples in parts are taken."""
 
     def __init__(self, ticket: str, clock: Callable[[], int], heartbeat: float) -> None:
         super().__init__(clock, heartbeat)
@@ -311,7 +327,7 @@ class TicketLink(Link):
 
     def begin(self) -> None:
         self._asked = self.clock()
-        self.say(link.Join(version=PROTOCOL_VERSION, ticket=self._ticket))
+        self.say(link.Join(version=PROTOCOL_VERSION, ticket=self._ticket, parts=self.parts))
 
     def _on_joined(self, message: link.Joined) -> list[Event]:
         self.offset.add(self._asked, message.at, self.clock())
@@ -327,6 +343,12 @@ class TicketLink(Link):
 
 class ChannelLink(TicketLink):
     """A link for one channel."""
+
+    parts = True
+
+    def __init__(self, ticket: str, clock: Callable[[], int], heartbeat: float) -> None:
+        super().__init__(ticket, clock, heartbeat)
+        self.window = SendWindow(UPLINK_TARGET)
 
     def _sample(self, frame: frames.Frame) -> list[Event]:
         if self.state is State.OPEN and isinstance(frame, frames.CommandFrame):

@@ -6,12 +6,10 @@ import time
 from collections.abc import Callable
 
 from relay_protocol import link
-from relay_protocol.limits import KIB
 from robot_client.reactors import Clock, Timer
 from robot_client.uplink import Uplink
 from robot_client.wire import Wire
 
-CHUNK = 64 * KIB
 TELL_SECONDS = 1.0
 """The relay is told no more often what was lost."""
 
@@ -94,7 +92,8 @@ class Sending:
         if self.uplink.lost:
             self._tell_later()
         for _ in range(AT_ONCE):
-            chunk = self.uplink.take(CHUNK)
+            room = self._wire.room
+            chunk = self.uplink.take(room, room)
             if chunk:
                 self._wire.write(chunk)
             if self.uplink.paused or not self.uplink.ready:

@@ -16,12 +16,18 @@ from zope.interface import implementer
 
 from relay_protocol.errors import PeerError, SwitchboardError
 from relay_protocol.limits import KIB, UNPROVEN_SECONDS
-from robot_client.link import Event, Link, State
+from robot_client.link import NANO, Event, Link, State
 from robot_client.reactors import Clock, Timer
 from robot_client.tls import explain
 
 GOODBYE_SECONDS = 2.0
 """How long the last words may take to leave; a relay that takes nothing would hold the connection for ever."""
+
+MOST_AT_ONCE = 64 * KIB
+"""Bytes of samples written at a time."""
+
+_SPACING = KIB
+"""Bytes of samples between two probes, at least; else a quarter of the window."""
 
 _UNSENT = 64 * KIB
 """Bytes the kernel may hold unsent; more would be delay nobody sees."""
@@ -76,6 +82,9 @@ class LinkProtocol(TwistedProtocol):
         self._heard = False
         self._patience: Timer | None = None
         self._reason: SwitchboardError | None = None
+        self._transport_full = self._window_full = False
+        self._probed = 0
+        """Bytes of samples sent when the latest probe was."""
 
     def connectionMade(self) -> None:
         """The connection stands."""
@@ -104,6 +113,7 @@ class LinkProtocol(TwistedProtocol):
                 return  # what came behind the end of the link must not be done any more
             self.owner.on_event(event)
         self.flush()
+        self._look_at_window()
 
     def connectionLost(self, reason: Failure = connectionDone) -> None:
         """The connection is gone."""
@@ -122,9 +132,48 @@ class LinkProtocol(TwistedProtocol):
 
     def write(self, frames: list[bytes]) -> None:
         """Write sample frames behind all that was said before."""
+        size = sum(map(len, frames))
         if self.link.unsaid:
             frames = [*self.link.take(), *frames]
         self._put(b"".join(frames))
+        window = self.link.window
+        if window is None:
+            return
+        window.sent += size
+        full = window.room(self._seconds()) <= 0
+        if full or window.sent - self._probed >= max(_SPACING, window.size / 4):
+            self._probe(full)
+        if full and not self._window_full:
+            self._window_full = True
+            self.owner.on_pause()
+
+    @property
+    def room(self) -> int:
+        """Bytes of samples that should be written now."""
+        window = self.link.window
+        return MOST_AT_ONCE if window is None else min(MOST_AT_ONCE, int(window.room(self._seconds())))
+
+    def _probe(self, full: bool) -> None:
+        """Ping, to learn when all samples before have arrived."""
+        window = self.link.window
+        assert window is not None
+        self._probed = window.sent
+        self.link.ping(full)
+        self.flush()
+
+    def _look_at_window(self) -> None:
+        window = self.link.window
+        if window is None or not self._window_full or self._over():
+            return
+        if window.room(self._seconds()) > 0:
+            self._window_full = False
+            if not self._transport_full:
+                self.owner.on_resume()
+        elif not window.probed:
+            self._probe(True)
+
+    def _seconds(self) -> float:
+        return self.link.clock() / NANO
 
     def _put(self, data: bytes) -> None:
         """Write at once where that can be.
@@ -149,7 +198,7 @@ class LinkProtocol(TwistedProtocol):
         if not transport.producerPaused:
             # Twisted would take some more first; what is small would wait behind it.
             transport.producerPaused = True
-            self.owner.on_pause()
+            self.pauseProducing()
 
     def end(self, reason: SwitchboardError, gently: bool = False) -> None:
         """Close the connection; ``gently`` lets what was written leave first."""
@@ -196,11 +245,14 @@ class LinkProtocol(TwistedProtocol):
 
     def pauseProducing(self) -> None:
         """The transport is full."""
+        self._transport_full = True
         self.owner.on_pause()
 
     def resumeProducing(self) -> None:
         """The transport has room."""
-        self.owner.on_resume()
+        self._transport_full = False
+        if not self._window_full:
+            self.owner.on_resume()
 
     def stopProducing(self) -> None:
         """The transport wants no more."""

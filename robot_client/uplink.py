@@ -23,6 +23,8 @@ WHOLE = 64 * KIB
 """A sample of more bytes goes in parts."""
 
 PART = 32 * KIB
+LEAST_PART = 2 * KIB
+"""Bytes of a part; fewer than :data:`PART` where the link has no room for more."""
 MISSED = 64
 """Latched samples of one subscription that wait while it is muted, one for each publisher; more than one only as far as
 they are not larger than :data:`LANE_BYTES` together."""
@@ -225,9 +227,11 @@ class Uplink:
             if lane.held is not None and lane.next_at <= now:
                 self._admit(lane, lane.held, now)
 
-    def take(self, at_least: int) -> list[bytes]:
+    def take(self, at_least: int, part: int = PART) -> list[bytes]:
         """The next frames to write: small samples up to the one that makes ``at_least`` bytes, then one part of a large
         one. Empty when nothing waits.
+
+        :param part: bytes the part should have at most
         """
         if self.paused:
             return []
@@ -247,7 +251,7 @@ class Uplink:
             taken += len(frame)
             out.append(frame)
         if self._turns:
-            out += self._next_part()
+            out += self._next_part(min(PART, max(LEAST_PART, part)))
         return out
 
     @property
@@ -291,14 +295,14 @@ class Uplink:
             self._trim_lane(lane)
             self._trim_all()
 
-    def _next_part(self) -> list[bytes]:
+    def _next_part(self, size: int) -> list[bytes]:
         """A frame of the first subscription in turn that may send one."""
         for _ in range(len(self._turns)):
             number = self._turns[0]
             self._turns.rotate(-1)
             lane = self._lanes[number]
             if lane.begun is not None or self._begin(lane):
-                return [self._part(number, lane)]
+                return [self._part(number, lane, size)]
         return []
 
     def _begin(self, lane: _Lane) -> bool:
@@ -328,14 +332,14 @@ class Uplink:
         else:
             self._begun -= size
 
-    def _part(self, number: int, lane: _Lane) -> bytes:
+    def _part(self, number: int, lane: _Lane, size: int) -> bytes:
         assert lane.begun is not None
         stamp, body = lane.begun.stamp, lane.begun.body
         total = len(body)
         if total <= WHOLE:
             frame, lane.sent = frames.encode_sample(number, stamp, body), total
         else:
-            piece = body[lane.sent : lane.sent + PART]
+            piece = body[lane.sent : lane.sent + size]
             frame = frames.encode_part(number, stamp, total, lane.sent, piece)
             lane.sent += len(piece)
         if lane.sent >= total:

@@ -21,6 +21,10 @@ _AROUND = 2048
 class Wire(Protocol):
     """What a channel needs of its link."""
 
+    @property
+    def room(self) -> int:
+        """Bytes of sample frames that should be written now."""
+
     def say(self, message: link.Message) -> None:
         """Send a message; it is never dropped."""
 

@@ -40,7 +40,7 @@ MOST = 16 * MIB
 GAIN = 1.25
 """The window in parts of what the link carried: a faster link shows itself only to who sends more."""
 
-RATE_SECONDS = 1.5
+RATE_SECONDS = 0.75
 """The best rate in this time counts."""
 
 STALE_SECONDS = 4.0
@@ -73,7 +73,10 @@ class _Probe(NamedTuple):
 
 
 class SendWindow:
-    """The window of one connection. Sizes are bytes, times are seconds of one monotonic clock."""
+    """The window of one connection. Sizes are bytes, times are seconds of one monotonic clock.
+
+    :param target: seconds that data may wait in the network
+    """
 
     __slots__ = (
         "_arrived_at",
@@ -83,6 +86,7 @@ class SendWindow:
         "_probes",
         "_rates",
         "_slow_at",
+        "_target",
         "arrived",
         "delay",
         "limited",
@@ -91,7 +95,8 @@ class SendWindow:
         "trip",
     )
 
-    def __init__(self) -> None:
+    def __init__(self, target: float = TARGET) -> None:
+        self._target = target
         self.size: float = FIRST
         self.sent = 0
         """Bytes sent so far."""
@@ -135,7 +140,7 @@ class SendWindow:
     @property
     def _small(self) -> float:
         """The window for small messages on a link that has not proved to be thin."""
-        if self.delay <= TARGET:
+        if self.delay <= self._target:
             return max(self.size, SMALL_FIRST)
         return max(self.size, min(SMALL_FIRST, FIRST / 2 + LATE_SECONDS * self._rates[0][1]))
 
@@ -186,16 +191,17 @@ class SendWindow:
             flight / max(now - probe.arrived_at, probe.at - probe.arrived_sent, trip, QUICKEST), now
         )
         if probe.full:
-            self._late = self._late + 1 if delay > TARGET / 2 else 0
-        if delay <= TARGET / 2:
+            self._late = self._late + 1 if delay > self._target / 2 else 0
+        if delay <= self._target / 2:
             if probe.full:
                 self.size = min(MOST, self.size + gained)
             elif now - self._slow_at > LIMITED_SECONDS:
                 self.limited = False
         elif probe.full and self._late > 1:
             self._slow_at = now
-            self.limited = self.limited or delay > TARGET
-            self.size = max(LEAST, min(MOST, GAIN * self._rates[0][1] * (least + TARGET)))
+            self.limited = self.limited or delay > self._target
+            carried = self._rates[0][1] * (least + self._target)
+            self.size = max(LEAST, min(MOST, GAIN * min(carried, self.size)))
 
     def _take_rate(self, rate: float, now: float) -> None:
         """Note a measurement, which is never more than the link carries."""

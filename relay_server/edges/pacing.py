@@ -26,6 +26,9 @@ SPACING = (KIB, 256 * KIB)
 PIECE = 16 * KIB
 """Most bytes of a piece of a large message, and of a small message."""
 
+MORE = 4 * KIB
+"""Bytes of small messages that may be sent between pieces beyond the window."""
+
 SEGMENT = 1400
 """A message of no more bytes, one packet, is never divided."""
 
@@ -140,6 +143,19 @@ class Pacer:
             self._open_later()
         elif not window.probed:
             self._probe()
+
+    def between(self, data: bytes) -> bool:
+        """Send a small message between two pieces of a large one; false where that can't be.
+
+        Only where the pieces leave room for others, as parts of samples do on a robot's link.
+        """
+        window = self.window
+        if self._rest is None or self._outbox.paused_since is not None or len(data) > SEGMENT:
+            return False
+        if window.flight > window.size + MORE:
+            return False
+        self._put(data)
+        return True
 
     def stop(self) -> None:
         """The connection ends; nothing more is sent but what is urgent."""

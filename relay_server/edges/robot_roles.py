@@ -199,6 +199,7 @@ class Opening(Role):
             return
         end = ChannelEnd(channel, connection)
         self._joined(channel.name, end, limits.ROBOT_FRAME, connection.timing.largest_sample)
+        connection.pace(parts=message.parts)
         channel.joined(connection)
 
     def _joined(self, name: str, end: Role, frame_limit: int, sample_limit: int = 0) -> None:

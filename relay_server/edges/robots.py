@@ -22,6 +22,7 @@ from twisted.python.failure import Failure
 from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
 from relay_protocol.frames import (
+    SAMPLE,
     CommandFrame,
     Frame,
     FrameDecoder,
@@ -30,12 +31,15 @@ from relay_protocol.frames import (
     SampleFrame,
     VideoFrame,
     encode_command,
+    encode_part,
     encode_sample,
 )
 from relay_server.clock import Clock, Timer, cancel, looping
 from relay_server.edges.caps import AddressCap, Place
 from relay_server.edges.fastpath import Turns, Writer, writer_for
 from relay_server.edges.flow import Flow
+from relay_server.edges.pacing import Pacer
+from relay_server.edges.tcp import tcp_of
 from relay_server.linkmeter import LinkMeter, Reading
 from relay_server.outbox import Outbox
 
@@ -93,6 +97,7 @@ class RobotConnection(TwistedProtocol):
     :param clock: for deadlines and heartbeats
     :param clock_ns: the relay's monotonic clock, told to robots in ``pong`` and ``joined``
     :param first_role: makes the role a new connection begins with
+    :param turns: shared by all robots' connections
     """
 
     log = Logger()
@@ -106,8 +111,10 @@ class RobotConnection(TwistedProtocol):
         timing: LinkTiming,
         first_role: Callable[[RobotConnection], Role],
         cap: AddressCap,
+        turns: Turns | None = None,
     ) -> None:
         self._clock = clock
+        self._turns = turns or Turns(clock)
         self.clock_ns = clock_ns
         self.timing = timing
         self._cap = cap
@@ -126,6 +133,7 @@ class RobotConnection(TwistedProtocol):
         self._answered = 0
         self.on_round_trip: Callable[[float], None] = lambda seconds: None
         self._outbox = Outbox(_nowhere, clock.seconds, self._overflow)
+        self._pacer: Pacer | None = None
         self.address = ""
 
     # --- Twisted ------------------------------------------------------------------------------------------
@@ -134,9 +142,9 @@ class RobotConnection(TwistedProtocol):
         """A robot has dialled."""
         self.address = getattr(self.transport.getPeer(), "host", "")
         harden(self.transport)
-        self._writer = writer_for(self.transport, Turns(self._clock))
+        self._writer = writer_for(self.transport, self._turns)
         self._outbox.write = self._writer.write
-        self.transport.registerProducer(Flow(self._outbox), True)
+        self.transport.registerProducer(Flow(self), True)
         if not self._cap.enter(self.address):
             self.refuse(link.Refused(reason="too many connections from your address", retry_after=10.0))
             return
@@ -176,9 +184,37 @@ class RobotConnection(TwistedProtocol):
 
     # --- for roles ----------------------------------------------------------------------------------------
 
+    def pace(self, *, parts: bool) -> None:
+        """Keep little on its way to the robot, so that pings and commands wait for little.
+
+        :param parts: whether the robot takes samples in parts
+        """
+        tcp = tcp_of(self.transport)
+        pieces = _Parts if parts else _Whole
+        self._pacer = Pacer(
+            self._writer, self._outbox, self._clock, self._turns.stalls.seconds, self._probe, pieces, tcp
+        )
+
+    def _probe(self) -> None:
+        self._ping(None)
+
+    def pause(self) -> None:
+        """The transport's buffer is full."""
+        self._outbox.pause()
+
+    def resume(self) -> None:
+        """The transport takes bytes again."""
+        self._outbox.resume()
+        if self._pacer is not None:
+            self._pacer.go_on()
+
     def send(self, message: link.Message) -> None:
         """Queue a message that must not be lost."""
-        self._outbox.control(link.frame(message))
+        frame = link.frame(message)
+        if self._outbox.held and self._outbox.paused_since is None and isinstance(message, _AHEAD):
+            self._writer.urgent(frame)
+        else:
+            self._outbox.control(frame)
 
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Queue a sample; when the robot is slow the newest survive."""
@@ -193,7 +229,7 @@ class RobotConnection(TwistedProtocol):
         frame = encode_command(number, stamp, source, body)
         if self._outbox.passing:
             self._outbox.write(frame)
-        else:
+        elif self._pacer is None or not self._pacer.between(frame):
             self._outbox.data(number, frame)
 
     def newest(self, key: str, message: link.Message) -> None:
@@ -297,6 +333,8 @@ class RobotConnection(TwistedProtocol):
         if isinstance(message, link.Ping):
             self.send(link.Pong(t=message.t, at=self.clock_ns()))
         elif message.t in self._pings:
+            if self._pacer is not None:
+                self._pacer.answered(message.t)
             waiting = self._pings.pop(message.t)
             now = self.clock_ns()
             seconds = (now - message.t) / 1e9
@@ -313,6 +351,8 @@ class RobotConnection(TwistedProtocol):
         self._pings[now] = waiting
         while len(self._pings) > PINGS:
             self._give_up(self._pings.popitem(last=False)[1])
+        if self._pacer is not None:
+            self._pacer.probing(now)
         self.send(link.Ping(t=now))
 
     @staticmethod
@@ -380,6 +420,8 @@ class RobotConnection(TwistedProtocol):
     def _end(self, reason: str) -> None:
         role, self._role = self._role, None
         self._stop_deadline()
+        if self._pacer is not None:
+            self._pacer.stop()
         self._outbox.close()
         self._waiting.clear()
         if self._beating.running:
@@ -424,6 +466,53 @@ class _Replaced(Role):
 
     def lost(self, reason: str) -> None:
         """It had been given up before."""
+
+
+_AHEAD = (link.Ping, link.Pong, link.Bye, link.Refused)
+"""Messages that do not wait for what a thin link has yet to carry."""
+
+
+class _Whole:
+    """A frame that is not divided."""
+
+    def __init__(self, frame: bytes) -> None:
+        self._frame = frame
+
+    @property
+    def left(self) -> int:
+        """Bytes that were not taken."""
+        return len(self._frame)
+
+    def take(self, most: int) -> bytes:
+        """All of it."""
+        frame, self._frame = self._frame, b""
+        return frame
+
+
+class _Parts(_Whole):
+    """A frame that is divided where it is a sample (SPEC section 2.1). Other frames may go between two parts."""
+
+    def __init__(self, frame: bytes) -> None:
+        super().__init__(frame)
+        self._number, self._stamp, self._at = 0, 0, 0
+        self._body = memoryview(b"")
+        if frame[4] == SAMPLE:
+            (sample,) = FrameDecoder(len(frame)).feed(frame)
+            assert isinstance(sample, SampleFrame)
+            self._number, self._stamp, self._body = sample.number, sample.stamp, memoryview(sample.body)
+
+    @property
+    def left(self) -> int:
+        """Bytes of the message that were not taken."""
+        return len(self._body) - self._at if self._body else super().left
+
+    def take(self, most: int) -> bytes:
+        """The next part, or all of what is no sample."""
+        if not self._body:
+            return super().take(most)
+        begun, self._at = self._at, min(len(self._body), self._at + most)
+        piece = bytes(self._body[begun : self._at])
+        return encode_part(self._number, self._stamp, len(self._body), begun, piece)
 
 
 def _nowhere(data: bytes) -> None:

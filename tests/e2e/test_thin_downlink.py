@@ -33,7 +33,8 @@ HEAVY_BYTES = 100_000
 class Robot:
     """A robot that speaks JSON: it offers every topic, and publishes a pose and what is heavy when it is told to."""
 
-    def __init__(self, relay: Relay, port: int) -> None:
+    def __init__(self, relay: Relay, port: int, parts: bool = False) -> None:
+        self._parts = parts
         code = relay.cli("robot", "add", "rover")["enrolment_code"]
         key = identity.generate_key()
         with FakeRobot(relay.robots_port) as enrolling:
@@ -46,6 +47,7 @@ class Robot:
         self.channel: FakeRobot | None = None
         self.numbers: dict[str, int] = {}
         self.commands: list[dict[str, Any]] = []
+        self.command_ages: list[float] = []
         self.samples: list[tuple[float, Any]] = []
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -65,7 +67,9 @@ class Robot:
         for message in self._messages(self.control):
             if message["op"] == "open_channel" and self.channel is None:
                 self.channel = FakeRobot(self._port)
-                self.channel.send(link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"]))
+                self.channel.send(
+                    link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"], parts=self._parts)
+                )
                 self._threads.append(threading.Thread(target=self._serve_channel, daemon=True))
                 self._threads[-1].start()
 
@@ -85,6 +89,7 @@ class Robot:
                     body = json.loads(frame.body)
                     if isinstance(frame, frames.CommandFrame):
                         self.commands.append(body)
+                        self.command_ages.append(time.monotonic() - body["angular"]["z"])
                     else:
                         self.samples.append((time.monotonic(), body))
                     continue
@@ -140,14 +145,24 @@ class Ground:
 
 
 @contextlib.contextmanager
-def ground(folder: Path, *options: str) -> Iterator[Ground]:
-    """One, with a line as fast as it goes at first."""
+def ground(
+    folder: Path, *options: str, parts: bool = False, thin_robot: float | None = None
+) -> Iterator[Ground]:
+    """One, with a line as fast as it goes at first.
+
+    :param parts: whether the robot takes samples in parts
+    :param thin_robot: bytes a second of the robot's own downlink
+    """
     relay = Relay(folder, *options)
     with contextlib.ExitStack() as stack:
         stack.enter_context(running(relay))
         proxy = ChaosProxy(relay.http_port)
         stack.callback(proxy.close)
-        robot = Robot(relay, relay.robots_port)
+        far = ChaosProxy(relay.robots_port)
+        stack.callback(far.close)
+        if thin_robot is not None:
+            far.squeeze_down(thin_robot * 8)
+        robot = Robot(relay, far.port, parts)
         stack.callback(robot.stop)
         token = relay.user("driver")
         relay.cli("right", "grant", "driver", "rover", "operator")
@@ -191,7 +206,7 @@ def drive(ground: Ground, socket: Any, seconds: float) -> Seen:
     for topic in ("/pose", "/heavy"):
         say(op="subscribe", topic=topic, type=STRING)
     wait_for("both are subscribed", lambda: {"/pose", "/heavy"} <= robot.numbers.keys())
-    say(op="publish", topic="/cmd_vel", msg={"linear": {"x": 0.0}})
+    say(op="publish", topic="/cmd_vel", msg={"linear": {"x": 0.0}, "angular": {"z": time.monotonic()}})
     wait_for("the first command arrives", lambda: robot.commands)
     reading = threading.Thread(target=read, daemon=True)
     reading.start()
@@ -206,7 +221,8 @@ def drive(ground: Ground, socket: Any, seconds: float) -> Seen:
         if tick % 2:
             robot.publish("/heavy", heavy)
             seen.sent += 1
-            say(op="publish", topic="/cmd_vel", msg={"linear": {"x": 1.0 + seen.sent}})
+            twist = {"linear": {"x": 1.0 + seen.sent}, "angular": {"z": time.monotonic()}}
+            say(op="publish", topic="/cmd_vel", msg=twist)
     wait_for(
         "the last command arrives",
         lambda: any(each["linear"]["x"] == 1.0 + seen.sent for each in robot.commands),
@@ -238,3 +254,36 @@ def test_a_heavy_topic_takes_neither_control_nor_the_small_topics_away(tmp_path:
     assert last["downlink"]["bytes_per_second"] == pytest.approx(rate, rel=0.5)
     assert "throttle_rate" in last["downlink"]["advice"]
     assert {each["topic"] for each in last["topic_drops"]} >= {"/heavy"}
+
+
+@pytest.mark.parametrize("parts", [True, False])
+def test_what_a_client_uploads_does_not_hold_up_commands_on_a_robots_thin_downlink(
+    tmp_path: Path, parts: bool
+) -> None:
+    """Where the robot takes samples in parts, commands go between them; else each waits for a sample or two."""
+    rate = 300_000
+    with ground(tmp_path, parts=parts, thin_robot=rate) as at, at.connect() as socket:
+        robot = at.robot
+
+        def say(**message: Any) -> None:
+            socket.send(json.dumps(message))
+
+        say(op="advertise", topic="/cmd_vel", type=TWIST)
+        say(op="advertise", topic="/upload", type=STRING)
+        say(op="publish", topic="/cmd_vel", msg={"linear": {"x": 0.0}, "angular": {"z": time.monotonic()}})
+        wait_for("the first command arrives", lambda: robot.commands)
+        robot.command_ages.clear()
+        begun = time.monotonic()
+        for tick in range(150):
+            if (wait := begun + tick * 0.1 - time.monotonic()) > 0:
+                time.sleep(wait)
+            say(op="publish", topic="/upload", msg={"data": "x" * HEAVY_BYTES})
+            twist = {"linear": {"x": 1.0 + tick}, "angular": {"z": time.monotonic()}}
+            say(op="publish", topic="/cmd_vel", msg=twist)
+        wait_for(
+            "the last command arrives", lambda: any(each["linear"]["x"] == 150.0 for each in robot.commands)
+        )
+        assert statistics.median(robot.command_ages) <= (1 if parts else 3) * HEAVY_BYTES / rate
+        assert len(robot.command_ages) >= (140 if parts else 40)
+        assert len(robot.samples) >= 15
+        assert robot.samples[-1][1]["data"] == "x" * HEAVY_BYTES

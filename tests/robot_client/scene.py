@@ -17,6 +17,7 @@ from robot_client.motion import MotionDesk
 from robot_client.offset import Offset
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, MemoryPlatform
+from robot_client.transport import MOST_AT_ONCE
 from robot_client.wire import Wire
 
 STRING = "std_msgs/msg/String"
@@ -31,6 +32,11 @@ class Recorder(Wire):
 
     def say(self, message: link.Message) -> None:
         self.said.append(message)
+
+    @property
+    def room(self) -> int:
+        """As much as is written at once."""
+        return MOST_AT_ONCE
 
     def write(self, frames: list[bytes]) -> None:
         self.writes.append(frames)

@@ -52,10 +52,14 @@ class Enrolled(Message, frozen=True, kw_only=True):
 
 
 class Join(Message, frozen=True, kw_only=True):
-    """Robot, on a new connection: this is the channel you asked me to open."""
+    """Robot, on a new connection: this is the channel you asked me to open.
+
+    :param parts: whether the robot takes samples in parts
+    """
 
     version: int
     ticket: Label
+    parts: bool = False
 
 
 class Joined(Message, frozen=True, kw_only=True):
