@@ -5,12 +5,17 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 from switchboard_client import Client
 from switchboard_http import ask
+from switchboard_proxy import ChaosProxy
+from switchboard_relay import Relay
+from switchboard_robot import Robot
 from switchboard_speakers import LATCHED, Speakers, speakers
 from switchboard_waiting import wait_for
 
@@ -162,6 +167,37 @@ def test_recording_has_what_was_published_before_it(
     assert (done["messages"], done["drops"], done["problems"]) == (3, 0, [])
     messages = list(make_reader(io.BytesIO(asked("GET", f"/{id}/file").body)).iter_messages())
     assert sorted(message.data[8:].rstrip(b"\0") for _, _, message in messages) == [b"a", b"b", b"c2"]
+
+
+def test_broken_link_repeats_nothing(tmp_path: Path) -> None:
+    """The robot dials again: clients that stayed get what was published meanwhile, and nothing that they have had."""
+    topics = ("/one", "/two")
+    relay = Relay(tmp_path)
+    with ExitStack() as stack:
+        stack.callback(relay.stop)
+        proxy = ChaosProxy(relay.robots_port)
+        stack.callback(proxy.close)
+        robot = Robot(relay, "rover", port=proxy.port)
+        stack.callback(robot.stop)
+        viewer = relay.user("viewer")
+        relay.cli("right", "grant", "viewer", "rover", "viewer")
+        nodes = stack.enter_context(speakers(robot.domain))
+        for topic in topics:
+            nodes.publish("a", topic, "kept", depth=5, durability="transient_local")
+        client = stack.enter_context(relay.connect("rover", viewer))
+        known(client, topics[1], 1)
+        for topic in topics:
+            client.send(op="subscribe", topic=topic, type=STRING)
+            assert texts(client, topic, 1) == ["kept"]
+        for number in range(3):
+            proxy.reset()
+            # It can come by a new link alone.
+            nodes.publish("a", topics[0], f"meanwhile {number}")
+            assert texts(client, topics[0], 1) == [f"meanwhile {number}"]
+        assert rest(client, topics[1]) == rest(client, topics[0]) == []
+        late = stack.enter_context(relay.connect("rover", viewer))
+        late.send(op="subscribe", topic=topics[0], type=STRING)
+        assert texts(late, topics[0], 4) == ["kept", *(f"meanwhile {number}" for number in range(3))]
 
 
 def test_latched_publisher_among_others(nodes: Speakers, clients: list[Client]) -> None:

@@ -110,6 +110,24 @@ def test_large_sample(relay: LinkRelay, channel: Link) -> None:
     channel.expect("pong", t=1)
 
 
+@case("subscribe", "SPEC 2.5, what publishers keep")
+def test_kept_samples(relay: LinkRelay, channel: Link) -> None:
+    """subscribe with kept repeats latched samples by their stamps, without bodies that are listed; then the end."""
+    topics = relay.graph["topics"]
+    large = next((name for name in topics if name.endswith("/large")), None)
+    if large is None:
+        not_offered("no topic …/large with samples of 1 MB, kept for late joiners")
+    asked = {"number": 1, "topic": large, "type": topics[large]["types"][0]}
+    channel.say("subscribe", **asked)
+    if not channel.expect("subscribed", number=1).get("replays"):
+        not_offered("it does not ask again for what publishers keep (replays)")
+    first = channel.expect_sample(1)
+    for kept, body in (([first.stamp], b""), ([], first.body)):
+        channel.say("subscribe", **asked, kept=kept)
+        assert channel.expect_sample(1) == first._replace(body=body)
+        assert channel.expect_sample(1) == first._replace(stamp=0, body=b"")
+
+
 @case("advertise", "SPEC 2.5 failed")
 def test_advertise_nonsense(channel: Link) -> None:
     """A type that does not exist is answered by failed: what, ref, and a reason."""
