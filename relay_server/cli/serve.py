@@ -139,8 +139,8 @@ MOST_REQUESTS = 1_000_000
     "--requests-per-second",
     default=500.0,
     show_default=True,
-    help="HTTP requests of one user, or of a network in which nobody has logged in; ten times as many at once. "
-    "Never held back: stops. 0: no limit.",
+    help="HTTP requests and handshakes of one user, or of a network in which nobody has logged in; ten times as many "
+    "at once. Never held back: stops. 0: no limit.",
 )
 @click.option(
     "--streams-per-user",
