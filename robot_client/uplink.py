@@ -68,6 +68,8 @@ class _Lane:
         self.last: bytes | None = None
         """What left last."""
         self.muted = False
+        self.stamp = 0
+        """The latest."""
         self.instead: bytes | None = None
         """What is sent in the place of each sample while it is muted."""
         self.missed: deque[_Sample] = deque(maxlen=MISSED)
@@ -156,6 +158,10 @@ class Uplink:
             if lane.instead is None:
                 return False
             body = lane.instead
+            if lane.latched:
+                # The sample itself goes later, and has to be the newer one then (SPEC 2.5, what publishers keep).
+                stamp = lane.stamp + 1
+        lane.stamp = stamp
         sample = _Sample(number, now, stamp, body)
         if lane.throttle and now < lane.next_at:
             self.held += lane.held is None

@@ -212,7 +212,8 @@ class Latched:
                 return False
             known = sample
             self._keep(stamp, sample)
-        self._told.add(stamp)
+        if stamp in self._samples:
+            self._told.add(stamp)
         for joiner in list(self._joiners.values()):
             joiner.give(stamp, known)
         return False

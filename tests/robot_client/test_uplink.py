@@ -373,6 +373,23 @@ def test_latched_samples_that_came_while_muted_go_afterwards() -> None:
     assert went == [SampleFrame(1, 5, b"old"), SampleFrame(1, 6, b"new")]
 
 
+def test_latched_sample_is_newer_than_what_stood_for_it() -> None:
+    """While the last value is held it goes by a stamp before that of the sample, which would be a repetition else."""
+    uplink = Uplink(lambda: 0.0)
+    uplink.open(1, latched=True)
+    uplink.offer(1, 100, b"kept")
+    uplink.take(1)
+    uplink.mute(1, hold=True)
+    uplink.offer(1, 200, b"new")
+    uplink.offer(1, 300, b"newer")
+    uplink.unmute(1)
+    went = FrameDecoder(2**25).feed(b"".join(uplink.take(100)))
+    assert [each.body for each in went] == [b"kept", b"kept", b"new", b"newer"]
+    stamps = [each.stamp for each in went]
+    assert stamps == sorted(set(stamps))
+    assert stamps[2:] == [200, 300]
+
+
 def test_muting_what_is_not_there_is_passed_over() -> None:
     """A subscription that has ended, or was never muted."""
     uplink = Uplink(lambda: 0.0)
