@@ -9,6 +9,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
+from robot_client.platforms import ros2_qos
 from robot_client.platforms.base import Check
 from robot_client.platforms.ros2_errors import in_words
 from robot_client.platforms.ros2_executor import Hop
@@ -29,8 +30,14 @@ IDLE = 30.0
 
 
 class _Client(NamedTuple):
+    """A client of a service.
+
+    :param lossy: whether it takes answers that may be lost, because the service sends no others
+    """
+
     client: Any
     used: list[float]
+    lossy: bool
 
 
 class Calls:
@@ -77,7 +84,7 @@ class Calls:
         """Destroy the clients nobody used for a while."""
         now = self.clock.seconds()
         busy = {call.client for call in self._pending}
-        for key, (client, used) in list(self._clients.items()):
+        for key, (client, used, _) in list(self._clients.items()):
             if key not in self._kept and client not in busy and now - used[0] > IDLE:
                 del self._clients[key]
                 self.node.destroy_client(client)
@@ -86,17 +93,35 @@ class Calls:
         """Give up everything."""
         for call in list(self._pending):
             call.give_up(Unavailable("the robot is shutting down"))
-        for client, _ in self._clients.values():
-            self.node.destroy_client(client)
+        for known in self._clients.values():
+            self.node.destroy_client(known.client)
         self._clients.clear()
         self._kept.clear()
 
     def _client(self, service: str, type: str, kind: Any) -> Any:
         known = self._clients.get((service, type))
-        if known is None:
-            known = self._clients[service, type] = _Client(self.node.create_client(kind, service), [0.0])
+        if known is None or not known.client.service_is_ready():
+            known = self._fitting(service, type, kind, known)
         known.used[0] = self.clock.seconds()
         return known.client
+
+    def _fitting(self, service: str, type: str, kind: Any, known: _Client | None) -> _Client:
+        """A client of the quality of service that the service has, where its node is in the graph."""
+        servers = self.servers(service)
+        lossy = ros2_qos.lossy(servers)
+        if known is not None:
+            busy = any(call.client is known.client for call in self._pending)
+            if busy or not servers or lossy == known.lossy:
+                return known
+            self.node.destroy_client(known.client)
+        client = self.node.create_client(kind, service, qos_profile=ros2_qos.for_service(lossy))
+        made = self._clients[service, type] = _Client(client, [0.0], lossy)
+        return made
+
+    def servers(self, service: str) -> list[Any]:
+        """The ends by which a service gets its requests, as the graph tells of them."""
+        topic = f"rq{self.node.resolve_service_name(service)}Request"
+        return list(self.node.get_subscriptions_info_by_topic(topic, no_mangle=True))
 
 
 class _Call:
@@ -139,9 +164,9 @@ class _Call:
         if self.client.service_is_ready():
             self._ask()
         elif self._calls.clock.seconds() - self._began > APPEAR:
-            self.give_up(
-                NotFound(f"the service {self._service} can't be reached; its node is gone or silent")
-            )
+            why = ros2_qos.unsafe_service(self._calls.servers(self._service))
+            why = why or "its node is gone or silent"
+            self.give_up(NotFound(f"the service {self._service} can't be reached; {why}"))
         else:
             self._next = self._calls.clock.callLater(LOOK, self._look)
 

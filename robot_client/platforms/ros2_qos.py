@@ -15,6 +15,7 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
     qos_check_compatible,
+    qos_profile_services_default,
 )
 
 from relay_protocol import limits
@@ -128,6 +129,29 @@ def mismatch(publisher: QoSProfile, subscription: QoSProfile) -> str:
         return ""
     parts = [each.removeprefix("ERROR:").strip() for each in reason.split(";")]
     return "; ".join(each for each in parts if each) or "their qualities of service do not fit"
+
+
+def lossy(servers: Sequence[Any]) -> bool:
+    """Whether a service answers without sending again what was lost (best effort)."""
+    return any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for each in servers)
+
+
+def for_service(lossy: bool) -> QoSProfile:
+    """The profile of a service's client: the usual, or one that hears a service of best effort."""
+    profile = copy.copy(qos_profile_services_default)
+    if lossy:
+        profile.reliability = ReliabilityPolicy.BEST_EFFORT
+    return profile
+
+
+def unsafe_service(servers: Sequence[Any]) -> str:
+    """Why a service that is there is not called, because of its quality of service; empty where there is no reason."""
+    if any(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in servers):
+        return (
+            "it asks for durability transient_local, by which a service that starts again carries old requests out "
+            "again; let it be volatile"
+        )
+    return ""
 
 
 def _explicit(profile: QoSProfile) -> QoSProfile:

@@ -156,3 +156,21 @@ def test_a_driver_with_a_deadline_is_driven(world: Any, nodes: Speakers) -> None
     for name in ("strict_driver", "durable_driver"):
         nodes.end(name)
     world.left_alone()
+
+
+def test_services_of_other_qualities(nodes: Speakers, client: Client) -> None:
+    """One of best effort is called, also when it comes back otherwise; one that keeps requests is refused, with why."""
+
+    def called(service: str) -> Any:
+        return client.call(service)["values"]
+
+    for qos in ({"depth": 5, "reliability": "best_effort"}, {"depth": 5}):
+        nodes.serve("lossy_server", "/lossy_service", **qos)
+        wait_for(
+            "it is called", lambda: called("/lossy_service") == {"success": True, "message": "lossy_server"}
+        )
+        nodes.end("lossy_server")
+        wait_for("it is gone", lambda: "lossy_server" not in str(called("/lossy_service")))
+    nodes.serve("keeping_server", "/keeping_service", depth=5, durability="transient_local")
+    wait_for("it is refused", lambda: "transient_local" in called("/keeping_service"))
+    assert "carries old requests out again" in called("/keeping_service")

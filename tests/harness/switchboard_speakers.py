@@ -43,6 +43,10 @@ class Speakers:
         """Subscribe."""
         self._do("subscribe", node, topic, qos)
 
+    def serve(self, node: str, service: str, **qos: Any) -> None:
+        """Offer a Trigger."""
+        self._do("serve", node, service, qos)
+
     def end(self, node: str) -> None:
         """Take a node out of the graph."""
         self._do("end", node)

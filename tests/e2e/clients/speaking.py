@@ -2,6 +2,7 @@
 
 ["publish", node, topic, {"depth": 1, "durability": "transient_local", …}, [texts]]
 ["subscribe", node, topic, {…}]
+["serve", node, service, {…}]
 ["end", node]
 """
 
@@ -22,6 +23,7 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 TIMES = ("deadline", "lifespan", "liveliness_lease_duration")
 WORDS = {
@@ -81,6 +83,14 @@ def subscribe(name: str, topic: str, wishes: dict[str, object]) -> None:
         profile(wishes),
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
     )
+
+
+def serve(name: str, service: str, wishes: dict[str, object]) -> None:
+    def answer(request: object, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, name
+        return response
+
+    ends[name, service] = node(name).create_service(Trigger, service, answer, qos_profile=profile(wishes))
 
 
 def end(name: str) -> None:
