@@ -19,7 +19,7 @@ from relay_protocol.limits import KIB, MIB, ROBOT_FRAME
 MAX_AGE = 1.0
 MAX_BYTES = 4 * MIB
 LANE_BYTES = 256 * KIB
-WHOLE = 64 * KIB
+WHOLE = 16 * KIB
 """A sample of more bytes goes in parts."""
 
 PART = 32 * KIB

@@ -28,7 +28,7 @@ from relay_server.edges.asked import (
     wait_preferred,
 )
 from relay_server.edges.dated import dated
-from relay_server.edges.flow import Flow
+from relay_server.edges.flow import NewsFlow
 from relay_server.edges.once import Once, send
 from relay_server.edges.tagged import answers, told_facts
 from relay_server.edges.vanished import notice
@@ -193,7 +193,8 @@ class RobotGoals:
             request.setHeader(name, value)
         request.setHeader(HEADER, self._moments.now())
         reader = _Reader(request)
-        request.registerProducer(Flow(reader), True)
+        flow = NewsFlow(reader, self._clock, request.transport)
+        request.registerProducer(flow, True)
         request.write(b"retry: %d\n: for a minute; who goes on begins anew\n\n" % AGAIN_MS)
         began = proved = self._clock.seconds()
         try:
@@ -213,6 +214,7 @@ class RobotGoals:
             # His token is over, and with it what he may read; or nobody can say.
             return
         finally:
+            flow.end()
             request.unregisterProducer()
 
     @app.route("/<id>", methods=["DELETE"])

@@ -187,6 +187,10 @@ class PageClient:
         head = b'{"event":"' + event.encode() + b'","data":'
         self.outbox.control(wsframe.text_of(head, body, b"}"))
 
+    def moves(self) -> bool:
+        """A page that takes something is never paused for long: little is on its way to it."""
+        return False
+
     def cut(self) -> None:
         """It takes nothing any more."""
         self.close(closing.TOO_SLOW, f"for {STALL_SECONDS:g} s nothing was taken")

@@ -25,7 +25,7 @@ from relay_server.edges import resource_operations as operations
 from relay_server.edges.api import STREAMED, Api, body_of
 from relay_server.edges.asked import WAIT, field, known_tags, number_in, query_of, wait_preferred
 from relay_server.edges.dated import dated_in_form
-from relay_server.edges.flow import Flow
+from relay_server.edges.flow import NewsFlow
 from relay_server.edges.goals import Giving
 from relay_server.edges.methods import not_taken
 from relay_server.edges.once import Once, send
@@ -162,7 +162,8 @@ class RobotResources:
 
         async with self._desk.follow(asker, name, throttle, tell) as following:
             request.write(b": this stream goes on until you leave\n\n")
-            request.registerProducer(Flow(following), True)
+            flow = NewsFlow(following, self._clock, request.transport)
+            request.registerProducer(flow, True)
             looking = LoopingCall(_look, request, following)
             looking.clock = as_twisted(self._clock)
             looking.start(QUIET_SECONDS, now=False)
@@ -170,6 +171,7 @@ class RobotResources:
                 await DeferredList([left, following.over], fireOnOneCallback=True, consumeErrors=True)
             finally:
                 looking.stop()
+                flow.end()
                 request.unregisterProducer()
         if following.reason is not None and not request._disconnected:
             _tell(request, b"ended", jsontext.encode(str(following.reason)))

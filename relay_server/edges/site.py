@@ -19,11 +19,14 @@ from relay_server.edges import head
 from relay_server.edges.caps import AddressCap, Unsent
 from relay_server.edges.limiting import RequestLimits, TooManyRequests
 from relay_server.edges.problems import problem, problem_body, problem_of
-from relay_server.edges.tcp import tcp_of
+from relay_server.edges.tcp import keep_little, tcp_of
 from relay_server.openapi import Answer, Credential, Operation, described
 from relay_server.openapi.answers import About
 
 BODY_BYTES = limits.UNPROVEN_BYTES
+UNSENT_BYTES = 128 * limits.KIB
+"""What the kernel may hold unsent of an answer; without a limit it takes megabytes, which a slow reader gets late."""
+
 CHUNKS = 1024
 """Chunks of one body, and pieces they come in: each costs as much as a large one."""
 
@@ -93,6 +96,7 @@ class DeadlineChannel(HTTPChannel):
         if tcp is not None:
             # Both what is read at a time, and what may wait to be sent before producers are paused.
             tcp.bufferSize = PIECE_BYTES
+            keep_little(tcp, UNSENT_BYTES)
         super().connectionMade()
         self._address = getattr(self.transport.getPeer(), "host", "local")
         if not self.site.cap.enter(self._address):

@@ -9,7 +9,7 @@ from twisted.web.server import Request
 from relay_protocol.errors import Refused
 from relay_server.access import Principal
 from relay_server.clock import Clock
-from relay_server.edges.flow import Flow
+from relay_server.edges.flow import NewsFlow
 from relay_server.edges.sources import Sources
 from relay_server.edges.telling import Telling
 
@@ -27,7 +27,9 @@ class EventStream:
         principal: Callable[[Request], Awaitable[Principal]],
         sources: Sources,
     ) -> None:
+        self._clock = clock
         self._request = request
+        self._flow: NewsFlow | None = None
         self._telling = Telling(clock, self, lambda: principal(request), sources)
 
     async def run(self) -> None:
@@ -35,17 +37,23 @@ class EventStream:
         self._request.setHeader(b"content-type", b"text/event-stream")
         self._request.setHeader(b"cache-control", b"no-store")
         self._request.setHeader(b"x-accel-buffering", b"no")
-        self._request.registerProducer(Flow(self._telling), True)
+        self._flow = NewsFlow(self._telling, self._clock, self._request.transport)
+        self._request.registerProducer(self._flow, True)
         try:
             await self._telling.run()
         except Refused:
             self.tell("ended", b"{}")
         finally:
+            self._flow.end()
             self._request.unregisterProducer()
 
     def tell(self, event: str, body: bytes) -> None:
         """One event."""
         self._request.write(b"event: " + event.encode() + b"\ndata: " + body + b"\n\n")
+
+    def moves(self) -> bool:
+        """Whether it has taken something since this was asked last."""
+        return self._flow is not None and self._flow.moves()
 
     def cut(self) -> None:
         """Whoever takes nothing reads no farewell."""

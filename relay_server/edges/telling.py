@@ -49,6 +49,9 @@ class Page(Protocol):
         :param body: JSON
         """
 
+    def moves(self) -> bool:
+        """Whether it has taken something since this was asked last."""
+
     def cut(self) -> None:
         """It takes nothing any more: end the connection."""
 
@@ -109,7 +112,14 @@ class Telling:
         """The page takes nothing for now."""
         self._waits = True
         if self._stalled is None:
-            self._stalled = self._clock.callLater(STALL_SECONDS, self._page.cut)
+            self._stalled = self._clock.callLater(STALL_SECONDS, self._stall)
+
+    def _stall(self) -> None:
+        self._stalled = None
+        if self._page.moves():
+            self._stalled = self._clock.callLater(STALL_SECONDS, self._stall)
+        else:
+            self._page.cut()
 
     def resume(self) -> None:
         """It does again."""

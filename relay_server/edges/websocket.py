@@ -31,16 +31,13 @@ from relay_server.edges.fastpath import Turns
 from relay_server.edges.gate import HANDSHAKE_STATUS, Gate, Occupant, code_of, identify, status_of
 from relay_server.edges.limiting import RequestLimits, TooManyRequests
 from relay_server.edges.pacing import Pacer
-from relay_server.edges.tcp import keep_little, tcp_of
+from relay_server.edges.tcp import tcp_of
 from relay_server.frontdesk import Admission
 
 T = TypeVar("T")
 
 UNPROVED_BYTES = limits.UNPROVEN_BYTES + 1024
 """Bytes before the session began, with the heads of frames."""
-
-PACED_UNSENT_BYTES = 128 * limits.KIB
-"""Bytes the kernel may hold unsent; what is on its way at all is limited by the pacer."""
 
 EARLY_OVERHEAD = 64
 """What a message before the proof counts for beside its bytes; empty ones take memory too."""
@@ -226,8 +223,6 @@ class ClientProtocol(BoundedProtocol):
     def _pace(self, session: Occupant) -> None:
         """Keep little on its way to the client, so that pings and small messages wait for little."""
         tcp = tcp_of(self.transport)
-        if tcp is not None:
-            keep_little(tcp, PACED_UNSENT_BYTES)
         clock, seconds = self.factory.clock, self.factory.turns.stalls.seconds
         self._pacer = Pacer(
             self._writer, session.outbox, clock, seconds, session.ping, wsframe.Fragments, tcp

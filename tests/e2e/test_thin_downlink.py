@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from switchboard_fake_robot import FakeRobot
 from switchboard_processes import running
@@ -43,7 +44,8 @@ class Robot:
         self.control = FakeRobot(port)
         assert self.control.register("rover", key)["op"] == "welcome"
         self.control.send(link.Describe(platform="test", motion=link.MotionPolicy(types=[TWIST])))
-        self.control.send(link.Graph(full=True))
+        topics = {"/heavy": link.Topic(types=[STRING], publishers=["/camera"])}
+        self.control.send(link.Graph(full=True, topics=topics, nodes={"/camera": {}}))
         self.channel: FakeRobot | None = None
         self.numbers: dict[str, int] = {}
         self.commands: list[dict[str, Any]] = []
@@ -146,17 +148,22 @@ class Ground:
 
 @contextlib.contextmanager
 def ground(
-    folder: Path, *options: str, parts: bool = False, thin_robot: float | None = None
+    folder: Path,
+    *options: str,
+    parts: bool = False,
+    thin_robot: float | None = None,
+    buffer: int | None = None,
 ) -> Iterator[Ground]:
     """One, with a line as fast as it goes at first.
 
     :param parts: whether the robot takes samples in parts
     :param thin_robot: bytes a second of the robot's own downlink
+    :param buffer: of the proxy; by default it acknowledges much that no client has
     """
     relay = Relay(folder, *options)
     with contextlib.ExitStack() as stack:
         stack.enter_context(running(relay))
-        proxy = ChaosProxy(relay.http_port)
+        proxy = ChaosProxy(relay.http_port, buffer)
         stack.callback(proxy.close)
         far = ChaosProxy(relay.robots_port)
         stack.callback(far.close)
@@ -287,3 +294,35 @@ def test_what_a_client_uploads_does_not_hold_up_commands_on_a_robots_thin_downli
         assert len(robot.command_ages) >= (140 if parts else 40)
         assert len(robot.samples) >= 15
         assert robot.samples[-1][1]["data"] == "x" * HEAVY_BYTES
+
+
+def test_a_stream_of_events_tells_what_is_new_and_not_what_waited(tmp_path: Path) -> None:
+    """A heavy topic over HTTP: a message is as old as the line needs for one or two, not as what the kernel takes."""
+    rate = 300_000
+    with ground(tmp_path, buffer=16_384) as at:
+        at.proxy.squeeze_down(rate * 8)
+        ages: list[float] = []
+        over = threading.Event()
+
+        def publish() -> None:
+            while not over.wait(0.1):
+                if "/heavy" in at.robot.numbers:
+                    at.robot.publish("/heavy", {"data": f"{time.monotonic()!r} " + "x" * HEAVY_BYTES})
+
+        publishing = threading.Thread(target=publish, daemon=True)
+        publishing.start()
+        url = f"http://localhost:{at.proxy.port}/api/v1/robots/rover/topics/heavy"
+        headers = {"Authorization": f"Bearer {at.token}", "Accept": "text/event-stream"}
+        begun = time.monotonic()
+        with httpx.stream("GET", url, headers=headers, timeout=PATIENCE) as answer:
+            assert answer.status_code == 200, answer.read()
+            for line in answer.iter_lines():
+                if line.startswith("data: {"):
+                    data = json.loads(line[6:])
+                    ages.append(time.monotonic() - float(data["data"].split()[0]))
+                if time.monotonic() > begun + 15:
+                    break
+        over.set()
+        publishing.join(PATIENCE)
+    assert len(ages) >= 15 / 2 / (HEAVY_BYTES / rate)
+    assert statistics.median(ages) <= 4 * HEAVY_BYTES / rate

@@ -47,9 +47,12 @@ class ChaosProxy:
     """A TCP proxy on loopback that can swallow bytes or be thin in either direction, be far, or reset everything.
 
     :param target: port it leads to
+    :param buffer: bytes its kernel takes from the target before they are passed on, about; else as many as it likes.
+        A network without a proxy acknowledges nothing that the client has not received.
     """
 
-    def __init__(self, target: int) -> None:
+    def __init__(self, target: int, buffer: int | None = None) -> None:
+        self._buffer = buffer
         self._up, self._down = _Line(), _Line()
         self._target = target
         self.seconds_away = 0.0
@@ -106,7 +109,7 @@ class ChaosProxy:
         while not self._closing:
             try:
                 near, _ = self._server.accept()
-                far = socket.create_connection(("127.0.0.1", self._target), timeout=5)
+                far = self._dial()
             except OSError:
                 if self._closing:
                     return
@@ -121,6 +124,18 @@ class ChaosProxy:
             ways = (near, far, self.forward_up, self._up), (far, near, self.forward_down, self._down)
             for way in ways:
                 threading.Thread(target=self._pump, args=way, daemon=True).start()
+
+    def _dial(self) -> socket.socket:
+        far = socket.socket()
+        try:
+            if self._buffer is not None:
+                far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._buffer)
+            far.settimeout(5)
+            far.connect(("127.0.0.1", self._target))
+        except OSError:
+            far.close()
+            raise
+        return far
 
     def _pump(self, source: socket.socket, sink: socket.socket, gate: threading.Event, line: _Line) -> None:
         try:

@@ -250,7 +250,7 @@ def test_old_large_sample_goes() -> None:
 def test_closed_subscription_leaves_nothing_with_the_relay() -> None:
     """A sample that is broken off takes no memory of the relay: what was unfinished is ended."""
     link, decoder = uplink(Clock()), FrameDecoder(ROBOT_FRAME)
-    link.offer(1, 7, bytes(WHOLE + 1))
+    link.offer(1, 7, bytes(PART_BYTES + WHOLE))
     decoder.feed(b"".join(link.take(2**16)))
     assert decoder.buffered
     link.close(1)

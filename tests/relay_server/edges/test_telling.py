@@ -93,6 +93,11 @@ class Room:
         if len(self.at) == self.full_after:
             self.telling.pause()
 
+    def moves(self) -> bool:
+        return self.moving
+
+    moving = False
+
     def cut(self) -> None:
         """It takes nothing."""
         self.cuts += 1
