@@ -108,6 +108,16 @@ class ClientProtocol(BoundedProtocol):
         self._stop_deadline()
         self.dropConnection(abort=True)
 
+    def _fail_connection(self, code: int = closing.GOING_AWAY, reason: str = "") -> None:
+        """Autobahn ends the connection for what the client sent, and warns; those lines are few for all clients."""
+        self.relay_log.info(
+            "a client at {address} is cut: {reason}",
+            address=self._address(),
+            reason=reason,
+            limited=f"failed {code}",
+        )
+        super()._fail_connection(code, reason)
+
     def onConnect(self, request: ConnectionRequest) -> Deferred[str | None]:
         """Find out who it is before the handshake is answered."""
         self._asking = True
