@@ -91,6 +91,7 @@ class Settings:
     :param events_kept: seconds after which the memory lets an event go
     :param largest_sample: bytes of the largest sample taken from a robot
     :param requests: HTTP requests a second of one user, or of a network in which nobody is known; 0: as many as come
+    :param answer_seconds: seconds in which a request by HTTP is answered; 0: no limit
     :param streams: streams that one user may have open; 0: as many as come
     :param alerts: what people are told of, and where that may go
     """
@@ -120,6 +121,7 @@ class Settings:
     events_kept: float = 30 * 86400.0
     largest_sample: int = limits.ROBOT_SAMPLE
     requests: float = 500.0
+    answer_seconds: float = 10.0
     streams: int = 128
     alerts: AlertSettings = field(default_factory=AlertSettings)
 

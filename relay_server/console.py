@@ -31,7 +31,15 @@ NOT_CONFIRMED = (
     "kept the order for when it does"
 )
 
+NO_CONTROL = "you have no control of this robot"
+
 NOT_ALL_KNOWN = f"the database has not told within {LOOKUP_SECONDS:g} s which robots there are"
+
+
+class NoControl(Refused):
+    """What is asked is for the user who has control of the robot, or asks for it."""
+
+    code = "no_control"
 
 
 class Outcome(NamedTuple):
@@ -139,19 +147,22 @@ class Console:
         """Give control back, or a request for it; an owner takes control from anybody.
 
         :raises NotFound: as :meth:`control`
+        :raises NoControl: the user neither has control nor asks for it
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             desk, actor = self._of(admission), _actor(principal, admission.robot, address)
             lease = desk.lease
             held, request = lease.holder or lease.coming, lease.request
-            answer = Answer(False, "you have no control of this robot")
+            answer = None
             asks = request is not None and acts_for(admission.permit, request.client)
             owner = admission.permit.rules.level is Level.OWNER
             if request is not None and asks:
                 answer = desk.release(request.client, why, actor)
             if held is not None and (acts_for(admission.permit, held.client) or owner):
                 answer = desk.release(held.client, why, actor)
-            return answer
+            if answer is None:
+                raise NoControl(NO_CONTROL)
+            return _accepted(answer)
 
     async def grant(
         self, principal: Principal, robot: str, why: str, address: str, client: int = 0
@@ -160,11 +171,12 @@ class Console:
 
         :param client: the number of the connection that is meant, 0 for whoever asks
         :raises NotFound: as :meth:`control`
+        :raises NoControl: the user has no control
+        :raises NotDone: nobody asks for it, or not the one who is meant
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             desk = self._of(admission)
-            holder = _own_holder(desk, admission)
-            return _NOT_YOURS if holder is None else desk.grant(holder, why, client)
+            return _accepted(desk.grant(_needed_holder(desk, admission), why, client))
 
     async def refuse(
         self, principal: Principal, robot: str, why: str, address: str, client: int = 0
@@ -173,11 +185,12 @@ class Console:
 
         :param client: as for :meth:`grant`
         :raises NotFound: as :meth:`control`
+        :raises NoControl: the user has no control
+        :raises NotDone: nobody asks for it, or not the one who is meant
         """
         with self._admitted(await self._desk.admit(principal, robot, address)) as admission:
             desk = self._of(admission)
-            holder = _own_holder(desk, admission)
-            return _NOT_YOURS if holder is None else desk.refuse(holder, why, client)
+            return _accepted(desk.refuse(_needed_holder(desk, admission), why, client))
 
     async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
         """Stop a robot; everybody with any right on it may.
@@ -342,7 +355,14 @@ class Console:
         return topic
 
 
-_NOT_YOURS = Answer(False, "you have no control of this robot")
+def _accepted(answer: Answer) -> Answer:
+    """An answer with success.
+
+    :raises NotDone: it has none
+    """
+    if not answer.success:
+        raise NotDone(answer.message)
+    return answer
 
 
 def _shown(desk: Desk, permit: Permit) -> dict[str, Any]:
@@ -358,6 +378,17 @@ def _own_holder(desk: Desk, admission: Admission) -> Client | None:
     holder = desk.lease.holder
     mine = holder is not None and acts_for(admission.permit, holder.client)
     return holder.client if holder is not None and mine else None
+
+
+def _needed_holder(desk: Desk, admission: Admission) -> Client:
+    """The same where there must be one.
+
+    :raises NoControl: there is none
+    """
+    holder = _own_holder(desk, admission)
+    if holder is None:
+        raise NoControl(NO_CONTROL)
+    return holder
 
 
 def _actor(principal: Principal, robot: Presence, address: str) -> Actor:

@@ -231,7 +231,7 @@ class Relay:
         told = {"robots": desk.overview.shared, "alerts": self._alerts.desk.shown}
         sources = Sources(self._reactor, told, self._registry.on_change)
         served = desk, origins, metrics, below, beside, RobotPages(desk, self._workshop), sources
-        limits = RequestLimits(settings.requests, time.monotonic, settings.streams)
+        limits = RequestLimits(settings.requests, time.monotonic, settings.streams, settings.answer_seconds)
         api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, limits=limits)
         self._pages = PageGate(self._reactor, desk, origins, cookie, sources)
         oauth = OAuthDesk(self._store, self._auth, self._access, self._journal, time.monotonic, time.time)

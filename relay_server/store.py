@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Concatenate, ParamSpec, TypeVar
 
 from sqlalchemy.orm import Session
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IReactorThreads
 from twisted.internet.threads import deferToThreadPool
 from twisted.python.failure import Failure
@@ -59,7 +59,14 @@ class Threads:
         self._under_way += 1
         # Not the thread's own Deferred: cancelling that would free the place while the work goes on.
         waiting: Deferred[T] = Deferred()
-        done = deferToThreadPool(self._reactor, self._pool, work, *args, **kwargs)
+
+        def begin() -> T:
+            if waiting.called:
+                # Nobody waits for it any more: the threads are for others when the database is back.
+                raise CancelledError
+            return work(*args, **kwargs)
+
+        done = deferToThreadPool(self._reactor, self._pool, begin)
         done.addBoth(self._done, waiting)
         return await waiting
 

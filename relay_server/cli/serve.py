@@ -143,6 +143,14 @@ MOST_REQUESTS = 1_000_000
     "at once. Never held back: stops. 0: no limit.",
 )
 @click.option(
+    "--answer-seconds",
+    default=10.0,
+    show_default=True,
+    type=click.FloatRange(min=0),
+    help="Seconds in which a request by HTTP is answered; what is asked of a robot has 15 s more, and what the client "
+    "asks to wait for. 0: no limit.",
+)
+@click.option(
     "--streams-per-user",
     default=128,
     show_default=True,
@@ -183,6 +191,7 @@ def serve(
     battery_low: float,
     battery_critical: float,
     requests_per_second: float,
+    answer_seconds: float,
     streams_per_user: int,
     largest_sample_mb: int,
     log_json: bool,
@@ -235,6 +244,7 @@ def serve(
         events_kept=events_days * DAY,
         largest_sample=largest_sample_mb * MIB,
         requests=requests_per_second,
+        answer_seconds=answer_seconds,
         streams=streams_per_user,
         alerts=AlertSettings(
             _listed(webhook_networks),

@@ -34,6 +34,7 @@ from relay_server.edges.once import see_no_key
 from relay_server.edges.problems import problem, problem_of
 from relay_server.edges.sources import Sources
 from relay_server.edges.stream import EventStream
+from relay_server.edges.time_limit import ROBOT_SECONDS, allow, in_time
 from relay_server.openapi import described
 from relay_server.origins import Origins
 
@@ -247,6 +248,7 @@ class Api:
             raise NothingHere
         # Without this, klein would redirect from the address without a slash at its end.
         request.postpath = request.postpath or [b""]
+        allow(request, ROBOT_SECONDS)
         return self._below[part](self, name)
 
     @app.route("/api/v1/<any(alerts,directory,events,fleet,realm,vocabulary):part>", branch=True)
@@ -312,18 +314,18 @@ class Api:
     def answer(self, request: Request, work: Any, *, lasts: bool = False) -> Deferred[bytes]:
         """Answer a request with what comes of a coroutine: JSON, nothing, :data:`STREAMED`, or an error in words.
 
-        :param lasts: the work goes on when the client leaves, which ends any other. The body has to be read before
-            anything is waited for: it is gone with the client
+        :param lasts: the work goes on when the client leaves or its time is over, which ends any other. The body has
+            to be read before anything is waited for: it is gone with the client
         """
         request.setHeader(b"cache-control", b"no-store")
-        running = Deferred.fromCoroutine(self._finish(request, work))
+        running = Deferred.fromCoroutine(self._finish(request, work, lasts))
         running.addErrback(self._unexpected, request, lasts)
         # Whoever leaves has the Deferred that is returned here cancelled by klein.
         return to_the_end(running) if lasts else running
 
-    async def _finish(self, request: Request, work: Awaitable[Any]) -> bytes:
+    async def _finish(self, request: Request, work: Awaitable[Any], lasts: bool) -> bytes:
         try:
-            result = await work
+            result = await (work if lasts else in_time(request, work))
         except SwitchboardError as error:
             return problem_of(request, error)
         if result is STREAMED:

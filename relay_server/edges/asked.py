@@ -9,6 +9,7 @@ from twisted.web.server import Request
 from werkzeug.http import parse_dict_header, parse_etags
 
 from relay_protocol.errors import Invalid
+from relay_server.edges.time_limit import allow
 from relay_server.openapi import header, query
 from relay_server.resources.forms import EVENTS, JSON, preferred
 from relay_server.resources.listing import LONGEST, PAGE
@@ -91,6 +92,7 @@ def wait_preferred(request: Request, least: float = 0.0) -> float | None:
     if not seconds >= least:
         return None
     seconds = min(seconds, WAIT)
+    allow(request, seconds)
     request.setHeader(APPLIED, f"wait={seconds:g}")
     return seconds
 

@@ -88,7 +88,8 @@ def _change_of(what: str, words: str) -> Operation:
         more="For all connections of the caller.",
         body=Why if what == "release" else Reply,
         optional=True,
-        answers={200: Told("what became of it", ControlAnswer)},
+        answers={200: Told("it is done", ControlAnswer)},
+        errors=(409,),
     )
 
 

@@ -31,6 +31,7 @@ from relay_server.edges.dated import dated
 from relay_server.edges.flow import NewsFlow
 from relay_server.edges.once import Once, send
 from relay_server.edges.tagged import answers, told_facts
+from relay_server.edges.time_limit import allow
 from relay_server.edges.vanished import notice
 from relay_server.openapi import JSON, Answer, described, header, query, raw
 from relay_server.openapi import Operation as Described
@@ -177,6 +178,7 @@ class RobotGoals:
             return STREAMED
         see_known(query, "wait")
         wait = number_in(query, "wait", 0.0, WAIT) or 0.0
+        allow(request, wait)
         told = await self._desk.state(asker, id, wait, known_tags(request))
         if wait:
             # His token may have ended meanwhile.

@@ -49,11 +49,15 @@ class RequestLimits:
 
     :param rate: requests a second of one user or network in the long run; 0 for as many as come
     :param seconds: a monotonic clock
+    :param answer_seconds: a request is answered within that (:mod:`relay_server.edges.time_limit`); 0 for no limit
     :param streams: answers without an end that one user may have open, websockets of pages and cameras among them; 0
         for as many as come
     """
 
-    def __init__(self, rate: float, seconds: Callable[[], float], streams: int = 0) -> None:
+    def __init__(
+        self, rate: float, seconds: Callable[[], float], streams: int = 0, answer_seconds: float = 0.0
+    ) -> None:
+        self.answer_seconds = answer_seconds
         self._rate = rate
         self._most_streams = streams
         self._streams: Counter[int] = Counter()

@@ -24,6 +24,7 @@ from relay_server.access import BadCredentials, Principal
 from relay_server.auth import TooManyTries
 from relay_server.edges.limiting import RequestLimits, TooManyRequests
 from relay_server.edges.problems import problem, problem_of
+from relay_server.edges.time_limit import in_time
 from relay_server.oauth import Digest, Granted, OAuthError, StaleNonce, TokenAsk
 from relay_server.openapi import Answer, Credential, Operation, described
 from relay_server.openapi.told import AboutToken, Introspection, Nothing, OAuthProblem, Token, TokenForm
@@ -191,7 +192,7 @@ class OAuth:
 
     async def _finish(self, request: Request, work: Awaitable[Any]) -> bytes:
         try:
-            result = await work
+            result = await in_time(request, work)
         except SwitchboardError as error:
             return self._refuse(request, error)
         request.setHeader(b"content-type", b"application/json")

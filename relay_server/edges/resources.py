@@ -31,6 +31,7 @@ from relay_server.edges.methods import not_taken
 from relay_server.edges.once import Once, send
 from relay_server.edges.representing import Representing
 from relay_server.edges.resource_operations import LEAST_TIMEOUT, THROTTLE_MS, TIMEOUT, Call
+from relay_server.edges.time_limit import allow
 from relay_server.frontdesk import FrontDesk
 from relay_server.inside import Guests, MaybeDone
 from relay_server.openapi import described
@@ -219,6 +220,7 @@ class RobotResources:
         body, moment = body_of(request, Call, ("args",)), self._moment(request)
         seconds = wait_preferred(request, LEAST_TIMEOUT) if body.timeout is UNSET else body.timeout
         timeout = TIMEOUT if seconds is None else seconds
+        allow(request, timeout)
 
         async def work() -> Reply:
             values = await self._desk.call(asker, name, body.args, body.type, timeout, moment)
@@ -327,6 +329,7 @@ def _wanted(request: Request, form: Form) -> Wanted:
     query = query_of(request)
     see_known(query, "wait", "max_age")
     wait = number_in(query, "wait", 0.0, WAIT)
+    allow(request, Wanted().wait if wait is None else wait)
     return Wanted(
         Wanted().wait if wait is None else wait,
         number_in(query, "max_age", 0.0, 1e9),

@@ -11,8 +11,8 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Principal
-from relay_server.console import CONFIRM_SECONDS, NOT_ALL_KNOWN, NOT_CONFIRMED, Console
-from relay_server.control import Answer
+from relay_server.console import CONFIRM_SECONDS, NOT_ALL_KNOWN, NOT_CONFIRMED, Console, NoControl
+from relay_server.control import Answer, NotDone
 from relay_server.frontdesk import LOOKUP_SECONDS
 from relay_server.inside import Guests
 from tests.relay_server.front_desk import HERE, Desk
@@ -101,8 +101,10 @@ async def test_users_act_for_all_of_their_connections(place: Place) -> None:
     assert told["holder"]["you"] is True
     assert told["you"] == {"client": session.number, "may_control": True, "may_resume": True}
     assert (await console.control(olga, ROBOT, HERE))["you"]["client"] is None
-    assert (await console.grant(olga, ROBOT, "", HERE)) == Answer(False, "you have no control of this robot")
-    assert (await console.refuse(ann, ROBOT, "", HERE)) == Answer(False, "nobody asks for control")
+    with pytest.raises(NoControl, match="you have no control of this robot"):
+        await console.grant(olga, ROBOT, "", HERE)
+    with pytest.raises(NotDone, match="nobody asks for control"):
+        await console.refuse(ann, ROBOT, "", HERE)
     assert (await console.release(ann, ROBOT, "done", HERE)).success
     assert desk.lease.holder is None
 
@@ -115,9 +117,9 @@ async def test_a_token_to_look_does_nothing_with_its_users_control(place: Place)
     session, _ = await place.front.opens(await place.principal("ann"))
     desk = place.world.desks.of(place.world.robot)
     assert (await desk.take(session, "")).success
-    not_yours = Answer(False, "you have no control of this robot")
     for do in (console.release, console.grant, console.refuse):
-        assert await do(looks, ROBOT, "", HERE) == not_yours
+        with pytest.raises(NoControl, match="you have no control of this robot"):
+            await do(looks, ROBOT, "", HERE)
     assert (await console.stop(looks, ROBOT, "smoke", HERE)).done is True
     with pytest.raises(Refused, match="may resume it"):
         await console.resume(looks, ROBOT, "", HERE, LATER)
@@ -133,7 +135,8 @@ async def test_an_owner_takes_control_from_anybody(place: Place) -> None:
     session, _ = await place.front.opens(ann)
     desk = place.world.desks.of(place.world.robot)
     await desk.take(session, "")
-    assert not (await console.release(vic, ROBOT, "", HERE)).success
+    with pytest.raises(NoControl):
+        await console.release(vic, ROBOT, "", HERE)
     assert (await console.release(olga, ROBOT, "enough", HERE)).success
     assert desk.lease.holder is None
     assert place.world.record.notes[-1] == ("control.released", "olga", "enough", {"of": "ann"})

@@ -25,6 +25,7 @@ from relay_server.clock import Clock
 from relay_server.edges.fastpath import Turns
 from relay_server.edges.problems import problem, problem_of
 from relay_server.edges.site import wants_websocket
+from relay_server.edges.time_limit import in_time
 from relay_server.edges.video.multipart import CONTENT_TYPE, Multipart, part
 from relay_server.edges.video.parameters import asked
 from relay_server.edges.video.snapshot import Snapshot
@@ -179,7 +180,8 @@ class Video(Resource):
         )
     )
     async def _cameras(self, request: Request, robot: str) -> bytes:
-        cameras = await self._desk.cameras(await self._principal(request, Opening(robot, video=True)), robot)
+        principal = await self._principal(request, Opening(robot, video=True))
+        cameras = await in_time(request, self._desk.cameras(principal, robot))
         request.setHeader(b"content-type", b"application/json")
         return jsontext.encode({"cameras": cameras})
 
@@ -201,15 +203,20 @@ class Video(Resource):
         principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
         if request.method == b"HEAD":
             transport = wanted.settings.transport
-            await self._desk.may_view(principal, robot, wanted.camera, transport, _address(request))
+            await in_time(
+                request,
+                self._desk.may_view(principal, robot, wanted.camera, transport, _address(request)),
+            )
             request.setHeader(b"content-type", CONTENT_TYPE)
             return b""
         request.site.limits.answer_streams(request, principal.user_id)
         screen = Multipart(self._clock, self._rounds, self._turns, self._parts, request)
         # No proxy shall hold it back.
         request.setHeader(b"x-accel-buffering", b"no")
-        watching = await self._desk.viewing(
-            principal, robot, wanted.camera, wanted.settings, screen, _address(request)
+        # The first picture may take longer.
+        watching = await in_time(
+            request,
+            self._desk.viewing(principal, robot, wanted.camera, wanted.settings, screen, _address(request)),
         )
         request.setHeader(b"content-type", CONTENT_TYPE)
         try:
@@ -255,12 +262,18 @@ class Video(Resource):
         principal = await self._principal(request, Opening(robot, video=True, camera=wanted.camera))
         if request.method == b"HEAD":
             transport = wanted.settings.transport
-            await self._desk.may_view(principal, robot, wanted.camera, transport, _address(request))
+            await in_time(
+                request,
+                self._desk.may_view(principal, robot, wanted.camera, transport, _address(request)),
+            )
             request.setHeader(b"content-type", CONTENT_TYPES[wanted.settings.codec])
             return b""
         screen = Snapshot(self._clock.seconds)
-        watching = await self._desk.viewing(
-            principal, robot, wanted.camera, wanted.settings, screen, _address(request), snapshot=True
+        watching = await in_time(
+            request,
+            self._desk.viewing(
+                principal, robot, wanted.camera, wanted.settings, screen, _address(request), snapshot=True
+            ),
         )
         try:
             picture = await screen.done
@@ -288,13 +301,14 @@ class Video(Resource):
                 request.site.limits.of_network(request)
                 # Who asks for the head wants the rest as well.
                 spend = request.method != b"HEAD"
-                principal = await self._desk.ticket(ticket[0].decode("ascii", "replace"), opens, spend=spend)
+                given = ticket[0].decode("ascii", "replace")
+                principal = await in_time(request, self._desk.ticket(given, opens, spend=spend))
                 # Whoever was given a ticket may be a page of another site, with an <img>.
                 request.setHeader(b"cross-origin-resource-policy", b"cross-origin")
                 return principal
             if request.getHeader(b"sec-fetch-site") not in _OWN_PAGES:
                 raise Refused("pages of other sites may not use your session; they need a ticket")
-        return await self._principal_of(request)
+        return await in_time(request, self._principal_of(request))
 
     # --- answering ----------------------------------------------------------------------------------------
 

@@ -62,7 +62,7 @@ class Console:
     async def grant(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
         """Keep it."""
         self._keep("grant", principal, robot, why, address, client)
-        return Answer(False, "nobody asks for control")
+        raise NotDone("nobody asks for control")
 
     async def refuse(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
         """Keep it."""
@@ -130,7 +130,9 @@ def test_control_is_given_back_handed_over_and_kept(site: Site) -> None:
         "success": True,
         "message": "control is given back",
     }
-    assert site.post("control/grant").json["success"] is False
+    refused = site.post("control/grant")
+    assert (refused.status, refused.json["detail"]) == (409, "nobody asks for control")
+    assert refused.headers["content-type"] == "application/problem+json"
     assert site.post("control/refuse", {"why": "no", "client": 7}).json["success"] is True
     assert site.console.asked == [
         ("release", "rover", "done", "192.0.2.9"),
