@@ -5,6 +5,8 @@ What they say is no secret, so nobody needs to log in to read it.
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from typing import Any
 
 from klein import Klein
@@ -28,11 +30,12 @@ from relay_server.edges.problems import problem, problem_of
 from relay_server.edges.realm import RealmPages
 from relay_server.edges.recordings import RobotRecordings
 from relay_server.edges.resources import RobotResources
-from relay_server.edges.site import Robots
+from relay_server.edges.site import POLICY, SECURITY_HEADERS, Robots
 from relay_server.edges.static_files import StaticFile
 from relay_server.edges.video.resource import Video
 from relay_server.edges.vocabulary import VocabularyPages
 from relay_server.openapi import Answer, Credential, Operation, described, document, operations_in, page
+from relay_server.openapi.style import STYLE
 
 SERVED = (
     Api,
@@ -55,6 +58,8 @@ SERVED = (
 )
 """Whose operations are described."""
 
+STYLE_SOURCE = b"'sha256-%b'" % base64.b64encode(hashlib.sha256(STYLE.encode()).digest())
+
 _CACHED = {"ETag": "names this document in this encoding", "Vary": "`Accept-Encoding`: it may be compressed"}
 
 
@@ -71,7 +76,9 @@ class Documents:
         self._limits = limits
         made = document(operations(), version, cookie)
         self._json = StaticFile(jsontext.encode(made), "application/json")
-        self._page = StaticFile(page(made).encode(), "text/html")
+        # Its only style is in the page itself, named by its hash (CSP level 3, section 2.3.1).
+        policy = SECURITY_HEADERS[POLICY].replace(b"style-src 'self'", b"style-src " + STYLE_SOURCE)
+        self._page = StaticFile(page(made).encode(), "text/html", headers={POLICY: policy})
 
     @app.route("/api/openapi.json", methods=["GET"])
     @described(

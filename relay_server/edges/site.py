@@ -44,9 +44,10 @@ AHEAD_BYTES = 8 * limits.KIB
 STALL_SECONDS = 30.0
 """A client that takes nothing of an answer for so long is cut."""
 
+POLICY = b"content-security-policy"
 SECURITY_HEADERS = {
-    b"content-security-policy": (
-        b"default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+    POLICY: (
+        b"default-src 'self'; img-src 'self' data: blob:; style-src 'self'; "
         b"connect-src 'self' ws: wss:; object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     ),
     b"x-content-type-options": b"nosniff",

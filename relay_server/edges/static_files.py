@@ -5,7 +5,9 @@ from __future__ import annotations
 import gzip
 import hashlib
 import mimetypes
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from twisted.web.server import Request
 from werkzeug.http import parse_accept_header
@@ -30,9 +32,17 @@ class StaticFile:
 
     :param content_type: its media type; text gets a charset
     :param cache_control: how long others may keep it
+    :param headers: further ones
     """
 
-    def __init__(self, content: bytes, content_type: str, cache_control: bytes = REVALIDATED) -> None:
+    def __init__(
+        self,
+        content: bytes,
+        content_type: str,
+        cache_control: bytes = REVALIDATED,
+        headers: Mapping[bytes, bytes] = MappingProxyType({}),
+    ) -> None:
+        self._headers = headers
         self._content = content
         charset = "; charset=utf-8" if content_type.startswith("text/") else ""
         self._content_type = (content_type + charset).encode()
@@ -46,6 +56,8 @@ class StaticFile:
         tags = {f'"{self._tag}"', f'"{self._tag}-gzip"'}
         packed = bool(self._gzip) and prefers_gzip(field(request, "accept-encoding"))
         request.setHeader(b"cache-control", self._cache_control)
+        for name, value in self._headers.items():
+            request.setHeader(name, value)
         # Bytes that differ have entity tags that differ (RFC 9110 section 8.8.3.3).
         request.setHeader(b"etag", f'"{self._tag}-gzip"' if packed else f'"{self._tag}"')
         if self._gzip:

@@ -23,7 +23,8 @@ _PAGE = """<!DOCTYPE html>
 </head>
 <body>
 <header>
-<a class="brand" href="/fleet"><img src="/favicon.svg" alt="" width="28" height="28"><span>Switchboard</span></a>
+<a class="brand" href="/fleet" aria-label="Switchboard, all robots">
+<img src="/favicon.svg" alt="" width="28" height="28"><span>Switchboard</span></a>
 <span class="slash" aria-hidden="true">/</span>
 <h1>HTTP API</h1>
 <a class="plain end" href="/api/openapi.json">openapi.json</a>

@@ -87,7 +87,7 @@ def tokens(world: Any) -> Iterator[dict[str, str]]:
     yield found
     for token in found.values():
         with client_of(world, token) as client:
-            assert client.post("control/release").status_code == 200
+            assert client.post("control/release").status_code in (200, 403)
     world.left_alone()
 
 

@@ -83,7 +83,7 @@ CAMERA_SIZE = (640, 480)
 CAMERA_RATE = 12.0
 LINK = {"rtt_ms": 3.4, "p95_ms": 6.1, "jitter_ms": 0.4, "lost": 0, "quality": "good"}
 CSP = (
-    "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; connect-src 'self' ws: wss:; "
+    "default-src 'self'; img-src 'self' data: blob:; style-src 'self'; connect-src 'self' ws: wss:; "
     "object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
 PILLARS = [(2.5, 1.0, 0.35), (-1.5, -2.0, 0.5), (1.0, -2.5, 0.3)]

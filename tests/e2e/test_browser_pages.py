@@ -1,0 +1,104 @@
+"""Every page of the portal: what a strict CSP lets it do, axe-core's rules, and what it weighs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page
+from switchboard_axe import violations
+from switchboard_browser import lived_in, seen, sound_pages
+from switchboard_relay import Relay
+from switchboard_robot import Robot
+
+PASSWORD = "correct horse"
+WAIT_SECONDS = 60.0
+LOGIN_BYTES = 120_000
+
+SHOWN = {
+    "/login": "login-user",
+    "/fleet": "robot-card",
+    "/cockpit/rover": "camera-fps",
+    "/alerts": "alerts-robot",
+    "/realm/robots": "realm-robot",
+    "/realm/people": "realm-person",
+    "/realm/groups": "",
+    "/realm/rights": "",
+    "/fleet/nothing": "",
+}
+"""What is on a page once it is all there, by its name for tests."""
+
+
+class House:
+    """A relay, a robot with its camera on, an administrator."""
+
+    def __init__(self, folder: Path) -> None:
+        self.relay = Relay(folder)
+        self.robot = Robot(self.relay, "rover", camera=True)
+        self.relay.user("root", admin=True)
+        self.relay.cli("right", "grant", "root", "rover", "owner")
+
+    def stop(self) -> None:
+        """End everything."""
+        self.robot.stop()
+        self.relay.stop()
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    """One house for all."""
+    yield from lived_in(House, tmp_path_factory.mktemp("pages"))
+
+
+@pytest.fixture
+def open_page(browser: Browser, house: House) -> Iterator[Callable[..., Page]]:
+    """Opens pages; an uncaught error or a breach of the CSP in any of them fails the test."""
+    with sound_pages(browser, f"http://127.0.0.1:{house.relay.http_port}", WAIT_SECONDS) as new_page:
+
+        def open_page(path: str, width: int = 1280, height: int = 900) -> Page:
+            page = new_page(width, height)
+            page.goto("/login")
+            if path != "/login":
+                seen(page, "login-user").fill("root")
+                seen(page, "login-password").fill(PASSWORD)
+                seen(page, "login-submit").click()
+                seen(page, "user-menu").wait_for()
+                page.goto(path)
+            if SHOWN.get(path):
+                seen(page, SHOWN[path]).first.wait_for()
+            page.wait_for_load_state("load")
+            return page
+
+        yield open_page
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("path", SHOWN)
+def test_no_page_breaks_a_rule_of_axe(open_page: Callable[..., Page], path: str, width: int) -> None:
+    """On a phone and on a desk; menus and folded parts open, too."""
+    page = open_page(path, width)
+    assert violations(page) == []
+    if path != "/login":
+        seen(page, "user-menu").click()
+        assert violations(page) == []
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_pages_that_the_relay_makes_itself_break_no_rule(
+    open_page: Callable[..., Page], width: int
+) -> None:
+    """The description of the API has its own style."""
+    page = open_page("/api/docs", width)
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") != "rgba(0, 0, 0, 0)"
+    assert violations(page) == []
+
+
+def test_little_goes_over_the_wire_to_the_login_page(open_page: Callable[..., Page]) -> None:
+    """Heads and bodies, compressed."""
+    page = open_page("/login")
+    sizes = page.evaluate(
+        "[...performance.getEntriesByType('navigation'), ...performance.getEntriesByType('resource')]"
+        ".map(({ transferSize }) => transferSize)"
+    )
+    assert 0 < sum(sizes) <= LOGIN_BYTES
