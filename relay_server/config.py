@@ -89,6 +89,7 @@ class Settings:
     :param recordings_reserve: bytes of the disk they leave free
     :param events_of_source: events that each source may have in the memory
     :param events_kept: seconds after which the memory lets an event go
+    :param largest_message: bytes of the largest websocket message taken from a client that has logged in
     :param largest_sample: bytes of the largest sample taken from a robot
     :param requests: HTTP requests a second of one user, or of a network in which nobody is known; 0: as many as come
     :param answer_seconds: seconds in which a request by HTTP is answered; 0: no limit
@@ -119,6 +120,7 @@ class Settings:
     control_idle: float = 600.0
     events_of_source: int = 10_000
     events_kept: float = 30 * 86400.0
+    largest_message: int = limits.CLIENT_MESSAGE
     largest_sample: int = limits.ROBOT_SAMPLE
     requests: float = 500.0
     answer_seconds: float = 10.0

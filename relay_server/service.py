@@ -185,7 +185,9 @@ class Relay:
             self._desks,
             self._journal,
             origins,
-            Timing(settings.client_ping, settings.driving_ping, settings.stall_limit),
+            Timing(
+                settings.client_ping, settings.driving_ping, settings.stall_limit, settings.largest_message
+            ),
             cookie=cookie,
             clock_ns=now_ns,
             wall=time.time,

@@ -21,6 +21,7 @@ from relay_protocol.limits import (
     HANDSHAKE_FRAME,
     HEARTBEAT_SECONDS,
     HEARTBEATS_MISSED,
+    ROBOT_MESSAGE,
 )
 from relay_protocol.pacing import SendWindow
 from robot_client.offset import Offset
@@ -332,7 +333,7 @@ class TicketLink(Link):
     def _on_joined(self, message: link.Joined) -> list[Event]:
         self.offset.add(self._asked, message.at, self.clock())
         self.state = State.OPEN
-        self._frames.limit = COMMAND_FRAME
+        self._frames.limit = ROBOT_MESSAGE
         for _ in range(QUICK_PINGS):
             self.ping()
         return [JoinedChannel(message.channel)]

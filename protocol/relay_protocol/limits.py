@@ -65,13 +65,13 @@ WORDS = 4096
 """Longest sentence for people that comes over a robot link, in characters; longer ones are cut."""
 
 COMMAND_FRAME = 4 * MIB
-"""Largest frame the relay sends to a robot."""
+"""Largest JSON message the relay sends to a robot."""
 
-CLIENT_MESSAGE = 1 * MIB
-"""Largest websocket message a client may send."""
+ROBOT_MESSAGE = 16 * MIB
+"""Largest sample or command the relay sends to a robot, with the head of its frame."""
 
-CLIENT_FRAME = 1 * MIB
-"""Largest websocket frame a client may send."""
+CLIENT_MESSAGE = 10_000_000
+"""Largest websocket message, and frame, a client may send, unless the relay is set otherwise; as rosbridge_server's."""
 
 UNPROVEN_BYTES = 64 * KIB
 """What a connection may send before it is authenticated."""

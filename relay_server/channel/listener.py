@@ -200,17 +200,17 @@ class Listener:
         """Tell the client why it does not get what it asked for: once for each id, until it asks again."""
         if flaw not in self._told:
             self._told.add(flaw)
-            for id in self._ids():
+            for id in self.ids:
                 self._receiver.tell(_LEVELS[flaw], f"{self.topic}: {words}", id)
 
     def warn(self, words: str) -> None:
         """Tell the client of something it should know, for each of its subscriptions."""
-        for id in self._ids():
+        for id in self.ids:
             self._receiver.tell("warning", f"subscribe {self.topic}: {words}", id)
 
     def fail(self, words: str) -> None:
         """Tell the client that it gets nothing, and why: once for each id, until it asks again or that has passed."""
-        for id in self._ids():
+        for id in self.ids:
             if id not in self._failed:
                 self._failed |= {id}
                 self._receiver.tell("error", f"subscribe {self.topic}: {words}", id)
@@ -224,7 +224,9 @@ class Listener:
         """The id of the latest subscription."""
         return next(reversed(self._asks))[1]
 
-    def _ids(self) -> list[rosbridge.Id]:
+    @property
+    def ids(self) -> list[rosbridge.Id]:
+        """Of its subscriptions."""
         return list(dict.fromkeys(id for _, id in self._asks))
 
     def plainly(self) -> None:
@@ -233,7 +235,7 @@ class Listener:
         now = self._clock.seconds()
         if now >= self._plainly_at + PLAINLY_SECONDS:
             self._plainly_at = now
-            self._receiver.tell("warning", f"{self.topic}: {TOO_COSTLY}")
+            self._receiver.tell("warning", f"{self.topic}: {TOO_COSTLY}", self.latest)
 
     def too_slow(self, words: str) -> None:
         """A sample is dropped because the client's connection is thin: tell the client now and then.

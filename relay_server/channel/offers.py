@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from relay_protocol import link
+from relay_protocol import link, rosbridge
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.rights import Operation
 from relay_server.access import Permit
@@ -74,10 +74,20 @@ class Offer:
 
     :param written: its name as the client writes it
     :param written_type: its type as the client writes it; rosbridge hands both back so
+    :param id: of the client's request
     """
 
-    def __init__(self, name: str, written: str, type_name: str, written_type: str, member: Provider) -> None:
+    def __init__(
+        self,
+        name: str,
+        written: str,
+        type_name: str,
+        written_type: str,
+        member: Provider,
+        id: rosbridge.Id = None,
+    ) -> None:
         self.name = name
+        self.id = id
         self.written = written
         self.type = type_name
         self.written_type = written_type
@@ -116,7 +126,15 @@ class Offers:
         if self.standing(offer.name) is not offer:
             raise NotFound(f"the client that offered {offer.name} does so no more")
 
-    def advertise(self, member: Provider, name: str, written: str, type_name: str, written_type: str) -> None:
+    def advertise(
+        self,
+        member: Provider,
+        name: str,
+        written: str,
+        type_name: str,
+        written_type: str,
+        id: rosbridge.Id = None,
+    ) -> None:
         """A client offers something. The same once more changes its spelling at most.
 
         :raises Refused: the name is the relay's own; the client or its user offers too much
@@ -140,7 +158,7 @@ class Offers:
             raise Invalid(f"the robot offers the {word} {name} itself")
         self._check_room(member)
         self._wire.take_name()
-        offer = self._offers[name] = Offer(name, written, type_name, written_type, member)
+        offer = self._offers[name] = Offer(name, written, type_name, written_type, member, id)
         self._ask(offer)
 
     def unadvertise(self, member: Provider, name: str) -> None:
@@ -166,7 +184,7 @@ class Offers:
                 verdict = permit.judge(Operation.PROVIDE, offer.name)
                 if not verdict.allowed:
                     self._end(offer, f"the client that offered {offer.name} may not do so any more")
-                    member.tell("error", f"unadvertised {offer.name}: {verdict.reason}")
+                    member.tell("error", f"unadvertised {offer.name}: {verdict.reason}", offer.id)
 
     def shut(self) -> None:
         """The channel is over."""
@@ -237,7 +255,7 @@ class Offers:
         offer.phase = Phase.FAILED
         if offer.trouble != reason:
             offer.trouble = reason
-            offer.member.tell("error", f"{self._kind.op} {offer.name}: {reason}")
+            offer.member.tell("error", f"{self._kind.op} {offer.name}: {reason}", offer.id)
 
     def _provided(self, offer: Offer) -> bool:
         return self._kind.provided(self._wire.robot.graph, offer.name)

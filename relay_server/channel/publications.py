@@ -106,8 +106,10 @@ class Publications:
             if member in publication.holders:
                 verdict = permit.judge(Operation.PUBLISH, publication.topic)
                 if not verdict.allowed:
+                    ids = list(publication.holders[member])
                     self._let_go(publication, member)
-                    member.tell("error", f"unadvertised {publication.topic}: {verdict.reason}")
+                    for id in ids:
+                        member.tell("error", f"unadvertised {publication.topic}: {verdict.reason}", id)
 
     def get(self, member: Member, ask: rosbridge.Publish, topic: str, type_name: str) -> Publication:
         """The publication a client publishes to, advertised now, as the message says, if it was not.
@@ -196,7 +198,9 @@ class Publications:
             for each in topic.held
             if each.member is message.member
         )
-        if sum(mine) + len(message.body) > HELD_BYTES:
+        # However large, one has room alone.
+        held = sum(mine)
+        if held and held + len(message.body) > HELD_BYTES:
             _dropped(publication, message, "too much waits for the robot already; dropped")
             return
         publication.held.append(message)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from relay_protocol.errors import Invalid
-from relay_protocol.limits import LEAST_SAMPLE, MIB, MOST_SAMPLE, ROBOT_SAMPLE
+from relay_protocol.limits import CLIENT_MESSAGE, LEAST_SAMPLE, MIB, MOST_SAMPLE, ROBOT_SAMPLE
 from relay_server.cli.app import App, examples, pass_app
 
 if TYPE_CHECKING:
@@ -158,6 +158,14 @@ MOST_REQUESTS = 1_000_000
     help="Streams that one user may have open: events, topics, cameras, pages of the portal. 0: no limit.",
 )
 @click.option(
+    "--largest-message-mb",
+    type=click.FloatRange(0.1, 100),
+    default=CLIENT_MESSAGE / 10**6,
+    show_default=True,
+    help="Largest websocket message taken from a client that has logged in, MB, as max_message_size of "
+    "rosbridge_server.",
+)
+@click.option(
     "--largest-sample-mb",
     type=click.IntRange(LEAST_SAMPLE // MIB, MOST_SAMPLE // MIB),
     default=ROBOT_SAMPLE // MIB,
@@ -193,6 +201,7 @@ def serve(
     requests_per_second: float,
     answer_seconds: float,
     streams_per_user: int,
+    largest_message_mb: float,
     largest_sample_mb: int,
     log_json: bool,
     debug: bool,
@@ -242,6 +251,7 @@ def serve(
         control_idle=control_idle,
         events_of_source=events_per_source,
         events_kept=events_days * DAY,
+        largest_message=round(largest_message_mb * 10**6),
         largest_sample=largest_sample_mb * MIB,
         requests=requests_per_second,
         answer_seconds=answer_seconds,

@@ -360,6 +360,14 @@ STREAMED = object()
 """Result of a handler that has written the answer itself."""
 
 
+def is_empty(request: Request) -> bool:
+    """Whether a request has no body; what there is stays to be read."""
+    request.content.seek(0)
+    empty = not request.content.read(1)
+    request.content.seek(0)
+    return empty
+
+
 def body_of(request: Request, kind: type[T], numbers: Container[str] = ()) -> T:
     """A request's JSON, checked.
 

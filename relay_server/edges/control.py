@@ -19,7 +19,7 @@ from relay_protocol.limits import NAME, WORDS
 from relay_server.access import Principal
 from relay_server.console import Outcome, Taken
 from relay_server.control import Answer, NotDone, reason_of
-from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.api import STREAMED, Api, body_of, is_empty
 from relay_server.edges.asked import APPLIED, wait_preferred
 from relay_server.edges.dated import dated
 from relay_server.edges.methods import not_taken
@@ -349,10 +349,7 @@ class RobotControl:
 
 def _body(request: Request, kind: type[T]) -> T:
     """What may be left out as a whole: nobody who stops a robot should have to think of a header."""
-    request.content.seek(0)
-    empty = not request.content.read(1)
-    request.content.seek(0)
-    return kind() if empty else body_of(request, kind)
+    return kind() if is_empty(request) else body_of(request, kind)
 
 
 def _reason(request: Request) -> str:

@@ -22,7 +22,7 @@ from relay_server.channel import resolve
 from relay_server.clock import Clock, as_twisted
 from relay_server.edges import cameras, goals, modules
 from relay_server.edges import resource_operations as operations
-from relay_server.edges.api import STREAMED, Api, body_of
+from relay_server.edges.api import STREAMED, Api, body_of, is_empty
 from relay_server.edges.asked import WAIT, field, known_tags, number_in, query_of, wait_preferred
 from relay_server.edges.dated import dated_in_form
 from relay_server.edges.flow import NewsFlow
@@ -217,7 +217,8 @@ class RobotResources:
 
     async def _call(self, request: Request, name: str) -> Any:
         asker = await self._asker(request, passes=resolve(name) in URGENT)
-        body, moment = body_of(request, Call, ("args",)), self._moment(request)
+        moment = self._moment(request)
+        body = Call() if is_empty(request) else body_of(request, Call, ("args",))
         seconds = wait_preferred(request, LEAST_TIMEOUT) if body.timeout is UNSET else body.timeout
         timeout = TIMEOUT if seconds is None else seconds
         allow(request, timeout)

@@ -485,9 +485,10 @@ class Robots(ReadOnly):
     def getChild(self, path: bytes, request: Request) -> IResource:
         if request.postpath[:1] == [b"video"]:
             return self._video
-        if wants_websocket(request) and not request.postpath:
-            return self._websocket
-        return self if not request.postpath else Missing()
+        # A slash at the end makes no other address.
+        if request.postpath not in ([], [b""]):
+            return Missing()
+        return self._websocket if wants_websocket(request) else self
 
     @described(
         Operation(

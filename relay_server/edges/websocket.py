@@ -50,8 +50,8 @@ class ClientProtocol(BoundedProtocol):
     """Autobahn warns in ``log``, which is limited as a library's (:mod:`relay_server.logs`)."""
     factory: ClientFactory
     vouches = True
-    takes = limits.CLIENT_MESSAGE
-    """Bytes a message may have once a session has begun."""
+    takes: int | None = None
+    """Bytes a message may have once a session has begun; ``None`` for as many as the relay is set to."""
 
     is_stream = False
     """Whether it counts as one of its user's streams."""
@@ -175,7 +175,7 @@ class ClientProtocol(BoundedProtocol):
 
         :raises SwitchboardError: what it asks for makes no sense
         """
-        return Opening(unquote(request.path.removeprefix("/robots/")))
+        return Opening(unquote(request.path.removeprefix("/robots/").removesuffix("/")))
 
     async def _admit(self, principal: Principal) -> Admission:
         """Whether it may come in.
@@ -219,7 +219,7 @@ class ClientProtocol(BoundedProtocol):
         admission, self._admission = self._admission, None
         self._stop_deadline()
         self._known()
-        self.take_at_most(self.takes)
+        self.take_at_most(self.factory.largest_message if self.takes is None else self.takes)
         session = self._session = self._occupant(admission)
         # What the session sends goes to the socket without a look at the state; see nothing_more.
         session.outbox.write = self._writer.write
@@ -397,6 +397,7 @@ class ClientFactory(WebSocketServerFactory):
 
     :param cap: where the site has counted the connections that become websockets
     :param request_limits: handshakes count as requests
+    :param largest_message: bytes a message may have once a session has begun
     """
 
     protocol = ClientProtocol
@@ -408,8 +409,10 @@ class ClientFactory(WebSocketServerFactory):
         gate: Gate,
         cap: AddressCap,
         request_limits: RequestLimits,
+        largest_message: int = limits.CLIENT_MESSAGE,
     ) -> None:
         super().__init__(reactor=clock)
+        self.largest_message = largest_message
         self.cap = cap
         self.limits = request_limits
         self.clock = clock

@@ -41,7 +41,7 @@ def site_of(
     :param cookie: name of the session cookie
     """
     cap, rounds = AddressCap(settings.connections_per_address), Rounds(reactor)
-    clients = Handshake(ClientFactory(reactor, clock_ns, desk, cap, limits))
+    clients = Handshake(ClientFactory(reactor, clock_ns, desk, cap, limits, settings.largest_message))
     pictures = Handshake(VideoFactory(reactor, clock_ns, desk, cap, rounds, limits))
     told = Handshake(PageFactory(reactor, clock_ns, pages, cap, limits))
     video = Video(reactor, rounds, desk, api.principal, pictures)

@@ -127,8 +127,9 @@ class Session:
         self.outbox.on_drop = self._sample_dropped
         self._rounds = rounds
         self._pinging = Pinging(self, clock, transport, freshness, timing)
+        tell = partial(self.tell, "error")
         self.incoming = Incoming(
-            clock, lambda: freshness.not_before, self._joined, partial(self.tell, "error")
+            clock, lambda: freshness.not_before, self._joined, tell, timing.largest_message
         )
         self.listening = Listening(self, clock, local, rounds)
         self.publishing = Publishing(self, freshness)

@@ -6,6 +6,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
+from relay_protocol import limits
+
 if TYPE_CHECKING:
     from relay_server.session.core import Session
 
@@ -54,8 +56,9 @@ def unnoticed(kind: str, **data: Any) -> None:
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of a session, seconds; see :class:`relay_server.config.Settings`."""
+    """Times of a session, seconds, and bytes of a message; see :class:`relay_server.config.Settings`."""
 
     client_ping: float
     driving_ping: float
     stall_limit: float
+    largest_message: int = limits.CLIENT_MESSAGE

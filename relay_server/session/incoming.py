@@ -32,6 +32,7 @@ class Incoming:
         :class:`relay_server.freshness.Freshness`
     :param finished: takes the text of a message that is whole, and that moment for its first fragment: a
         command is as old as its beginning
+    :param most: bytes that may have come of all of them
     :param given_up: takes the words about one that is not, and its id
     """
 
@@ -42,6 +43,7 @@ class Incoming:
         "_dropped",
         "_finished",
         "_given_up",
+        "_most",
         "_not_before",
         "_parts",
         "_timer",
@@ -54,11 +56,13 @@ class Incoming:
         not_before: Callable[[], int],
         finished: Callable[[bytes, int], None],
         given_up: Callable[[str, rosbridge.Id], None],
+        most: int = limits.CLIENT_MESSAGE,
     ) -> None:
         self._clock = clock
         self._not_before = not_before
         self._finished = finished
         self._given_up = given_up
+        self._most = most
         self._unfinished: dict[str | int, _Unfinished] = {}
         self._dropped: dict[str | int, None] = {}
         self._parts = 0
@@ -104,8 +108,8 @@ class Incoming:
             raise Invalid(f"'total' was {message.total} before and is {part.total} now")
         if part.num in message.parts:
             raise Invalid(f"fragment {part.num} came twice")
-        if self._bytes + len(data) > limits.CLIENT_MESSAGE:
-            raise Refused(f"messages in fragments have more than {limits.CLIENT_MESSAGE} bytes together")
+        if self._bytes + len(data) > self._most:
+            raise Refused(f"messages in fragments have more than {self._most} bytes together")
         if self._parts >= PARTS:
             raise Refused(f"messages in fragments have more than {PARTS} fragments together")
         message.parts[part.num] = data

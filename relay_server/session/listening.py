@@ -112,8 +112,10 @@ class Listening:
         for topic in list(self._listeners):
             verdict = self._judged(topic)
             if not verdict.allowed:
+                ids = self._listeners[topic].ids
                 self._drop(topic)
-                self._session.tell("error", f"unsubscribed from {topic}: {verdict.reason}")
+                for id in ids:
+                    self._session.tell("error", f"unsubscribed from {topic}: {verdict.reason}", id)
 
     def _judged(self, topic: str, type_name: str = "") -> Verdict:
         session = self._session

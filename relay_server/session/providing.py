@@ -23,7 +23,9 @@ class Providing:
         """The client offers a service."""
         session, name = self._session, resolve(ask.service)
         session.judge(Operation.PROVIDE, name)
-        session.channel.services.advertise(session, name, ask.service, normal_type(ask.type, "srv"), ask.type)
+        session.channel.services.advertise(
+            session, name, ask.service, normal_type(ask.type, "srv"), ask.type, ask.id
+        )
 
     def unadvertise_service(self, ask: rosbridge.UnadvertiseService) -> None:
         """The client takes its service back."""
@@ -38,7 +40,7 @@ class Providing:
         session, name = self._session, resolve(ask.action)
         session.judge(Operation.PROVIDE, name)
         session.channel.actions.advertise(
-            session, name, ask.action, normal_type(ask.type, "action"), ask.type
+            session, name, ask.action, normal_type(ask.type, "action"), ask.type, ask.id
         )
 
     def unadvertise_action(self, ask: rosbridge.UnadvertiseAction) -> None:

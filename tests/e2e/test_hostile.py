@@ -365,7 +365,7 @@ def test_text_that_is_not_utf8_closes_every_websocket(
 
 
 @pytest.mark.parametrize("fragments", [1, 4], ids=["one frame", "fragments"])
-def test_a_message_over_a_mebibyte_ends_the_connection(world: Any, fragments: int) -> None:
+def test_a_message_over_ten_megabytes_ends_the_connection(world: Any, fragments: int) -> None:
     """1009 and words for what is too big, whole or in pieces."""
     since = len(world.relay.log)
     text = '{"op":"publish","topic":"/x","msg":{"data":"' + "x" * limits.CLIENT_MESSAGE + '"}}'

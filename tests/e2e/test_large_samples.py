@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,3 +67,26 @@ def test_of_what_is_too_large_the_subscriber_is_told(client: Client, cloudy: Rob
     lost = client.until(op="publish", topic="/relay/status")["msg"]["lost"]
     assert lost == [{"topic": "/enormous", "reason": "too_large", "count": 1}]
     assert cloudy.daemon.log.read_text().count("/enormous: a sample of 220") == 1
+
+
+def test_a_client_publishes_as_much_as_rosbridge_takes(client: Client) -> None:
+    """A message of nearly 10 MB reaches the robot's graph, and comes back from it."""
+    data = bytes(range(256)) * 28_000
+    client.send(op="advertise", topic="/picture", type="sensor_msgs/msg/Image")
+    client.send(op="subscribe", topic="/picture", type="sensor_msgs/msg/Image", compression="cbor")
+    message = {
+        "width": 256,
+        "height": 28_000,
+        "step": 256,
+        "encoding": "mono8",
+        "data": base64.b64encode(data).decode(),
+    }
+    heard = None
+    for _ in range(20):
+        # Until the publisher and the subscription have found each other.
+        client.send(op="publish", topic="/picture", msg=message)
+        with contextlib.suppress(TimeoutError):
+            heard = cbor2.loads(client.connection.recv(timeout=3))["msg"]["data"]
+            break
+    assert heard is not None
+    assert bytes(heard.value if hasattr(heard, "value") else heard) == data

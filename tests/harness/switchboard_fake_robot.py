@@ -27,7 +27,7 @@ class FakeRobot:
 
     def __init__(self, port: int, source: str = "127.0.0.1") -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), PATIENCE, source_address=(source, 0))
-        self._decoder = FrameDecoder(limits.COMMAND_FRAME)
+        self._decoder = FrameDecoder(limits.ROBOT_MESSAGE)
         self._heard: list[dict[str, Any]] = []
 
     def __enter__(self) -> FakeRobot:

@@ -182,11 +182,11 @@ def test_small_bytes_can_not_become_a_million_objects(text: str) -> None:
 def test_few_bytes_of_json_can_not_become_a_huge_message() -> None:
     """A list of empty objects stands for defaults, whose size is bounded."""
     types = registry(B=f"E[] x\n{LINE}\nMSG: a/E\nfloat64[100000] e", C="float64[] x")
-    with pytest.raises(Invalid, match="x makes a message of more than 4194304 bytes"):
+    with pytest.raises(Invalid, match="x makes a message of more than 16777216 bytes"):
         types.from_json("a/msg/B", {"x": [{}] * 300_000}, 0)
-    with pytest.raises(Invalid, match="a robot takes at most 4194287"):
-        types.from_json("a/msg/C", {"x": [0] * 524_288}, 0)
-    assert len(types.from_json("a/msg/C", {"x": [0] * 524_284}, 0)) < 4 * 1024 * 1024
+    with pytest.raises(Invalid, match="a robot takes at most 16777199"):
+        types.from_json("a/msg/C", {"x": [0] * 2_097_152}, 0)
+    assert len(types.from_json("a/msg/C", {"x": [0] * 2_097_148}, 0)) < 16 * 1024 * 1024
 
 
 def test_big_endian_is_read() -> None:

@@ -70,12 +70,15 @@ def test_the_version_and_the_words_of_rights_are_the_codes() -> None:
         (f"cameras of a robot | {limits.CAMERAS}", 256),
         (f"one link, unfinished | {limits.PARTS_BYTES // limits.MIB} MiB", 32),
         (
-            f"one client, unfinished | {limits.FRAGMENTS}, {limits.CLIENT_MESSAGE // limits.MIB} MiB together, "
+            f"one client, unfinished | {limits.FRAGMENTS}, {limits.CLIENT_MESSAGE // 10**6} MB together, "
             f"{limits.FRAGMENT_SECONDS:g} s",
             10,
         ),
-        (f"frame to a robot | {limits.COMMAND_FRAME // limits.MIB} MiB", 4),
-        (f"message and frame from a client | {limits.CLIENT_MESSAGE // limits.MIB} MiB", 1),
+        (f"JSON message to a robot | {limits.COMMAND_FRAME // limits.MIB} MiB", 4),
+        (f"sample or command to a robot | {limits.ROBOT_MESSAGE // limits.MIB} MiB", 16),
+        (f"sample from a robot | {limits.ROBOT_SAMPLE // limits.MIB} MiB", 64),
+        (f"1 to {limits.MOST_SAMPLE // limits.MIB} MiB", 1024),
+        (f"message and frame from a client | {limits.CLIENT_MESSAGE // 10**6} MB", 10),
         (f"{limits.UNPROVEN_SECONDS:g} s, {limits.UNPROVEN_BYTES // limits.KIB} KiB", 64),
         (f"nesting of JSON | {limits.JSON_DEPTH}", 64),
         (f"all it contains | {limits.TYPE_DEFINITION // limits.KIB} KiB", 256),
@@ -89,12 +92,23 @@ def test_the_version_and_the_words_of_rights_are_the_codes() -> None:
         (f"standstill after the last motion command | {limits.STOP_WITHIN_MS} ms", 500),
         (f"closed after {limits.LINGER_SECONDS:g} s", 5),
         (f"without timeout | {limits.CALL_SECONDS:g} s", 30),
+        (f"{limits.LEAST_SAMPLE // limits.MIB} to {limits.MOST_SAMPLE // limits.MIB} MiB", 1),
+        (f"a suppression | {limits.SUPPRESS_MS[0]} to {limits.SUPPRESS_MS[1]} ms", 200),
+        (f"an inhibition | at most {limits.INHIBIT_MS // 1000} s", 60),
+        (f"connections of a suppression | {limits.SOURCES}", 256),
+        (f"as it is sent | {limits.NAME_BYTES} bytes", 256),
     ],
 )
 def test_limits_are_those_of_the_code(row: str, value: int) -> None:
     """A limit that is changed in the code must be changed in the text."""
     assert row in SPEC
     assert value
+
+
+def test_every_limit_is_in_the_text() -> None:
+    """A limit that is new in the code must be told: each has a row above."""
+    above = set(re.findall(r"limits\.([A-Z_]+)", Path(__file__).read_text()))
+    assert {each for each in vars(limits) if each.isupper()} - above == set()
 
 
 def hex_blocks() -> list[bytes]:

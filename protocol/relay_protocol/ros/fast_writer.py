@@ -15,7 +15,7 @@ import msgspec
 import pybase64
 from msgspec import UNSET
 
-from relay_protocol.limits import COMMAND_FRAME
+from relay_protocol.limits import ROBOT_MESSAGE
 from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, Shape
 from relay_protocol.ros.reader import HEAD
 from relay_protocol.ros.shapes import Shapes
@@ -24,7 +24,7 @@ from relay_protocol.ros.structs import Structs, is_stamp, is_time
 
 Write = Callable[[Any, int], bytes]
 
-LARGEST_BODY = COMMAND_FRAME - 17
+LARGEST_BODY = ROBOT_MESSAGE - 17
 """What is left of a frame to a robot after kind, number, stamp and encapsulation header; bytes."""
 
 _UNROLLED = 4
@@ -173,7 +173,7 @@ class _Walk(Cursor):
 
     def _wide(self, kind: FieldType, value: str) -> None:
         name = self.source.fresh()
-        self.source.line(f"{name} = {self.source.constant(_wide)}({value}, {kind.bound or COMMAND_FRAME})")
+        self.source.line(f"{name} = {self.source.constant(_wide)}({value}, {kind.bound or ROBOT_MESSAGE})")
         self.add("I", 4, 4, f"len({name}) // 4")
         self._flush()
         self.source.line(f"out += {name}")
@@ -232,7 +232,7 @@ class _Walk(Cursor):
             self._one(kind, element)
             self._flush()
             # A few bytes of JSON can stand for a large message of defaults.
-            self.source.line(f"if len(out) > {COMMAND_FRAME}: raise Unusual")
+            self.source.line(f"if len(out) > {ROBOT_MESSAGE}: raise Unusual")
         self.lost(min(known, 4))
 
 

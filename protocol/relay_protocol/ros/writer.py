@@ -18,7 +18,7 @@ from typing import Any
 import pybase64
 
 from relay_protocol.errors import Invalid
-from relay_protocol.limits import COMMAND_FRAME
+from relay_protocol.limits import ROBOT_MESSAGE
 from relay_protocol.nonfinite import NUMBERS, shown
 from relay_protocol.ros.definition import BYTES, HEADER, Definition, Field, FieldType, Primitive, Shape
 from relay_protocol.ros.reader import Run, group_numbers, layouts
@@ -321,8 +321,8 @@ def _many(kind: FieldType, one: Write) -> Write:
             except Mismatch as error:
                 raise error.within(f"[{index}]") from None
             # A few bytes of JSON can stand for a large message of defaults.
-            if len(out) > COMMAND_FRAME:
-                raise Mismatch(f"makes a message of more than {COMMAND_FRAME} bytes")
+            if len(out) > ROBOT_MESSAGE:
+                raise Mismatch(f"makes a message of more than {ROBOT_MESSAGE} bytes")
 
     return write
 

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import msgspec
 from autobahn.websocket.types import ConnectionRequest
 
-from relay_protocol import jsontext, link
+from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage, Refused, SwitchboardError
 from relay_protocol.message import Message
 from relay_server import closing, wsframe
@@ -265,6 +265,7 @@ class VideoProtocol(ClientProtocol):
     """The websocket of one viewer."""
 
     is_stream = True
+    takes = limits.UNPROVEN_BYTES
     factory: VideoFactory
     _wanted: Asked
     _progress: Progress

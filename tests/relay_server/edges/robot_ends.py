@@ -114,7 +114,7 @@ class Robot:
         self.transport = Transport(peerAddress=IPv4Address("TCP", address, 54321))
         self.connection = hall.factory.buildProtocol(None)
         self.transport.protocol = self.connection
-        self._decoder = FrameDecoder(limits.COMMAND_FRAME)
+        self._decoder = FrameDecoder(limits.ROBOT_MESSAGE)
         self.connection.makeConnection(self.transport)
 
     def says(self, message: link.Message) -> None:

@@ -147,6 +147,12 @@ def test_a_call_takes_as_long_as_is_said(
     assert answer.headers.get("preference-applied") == applied
 
 
+def test_a_call_without_a_body_has_an_empty_request(world: World) -> None:
+    """Nor need it say that nothing is JSON."""
+    answer = world.ask("POST", f"{HERE}/services/reset", **ANN)
+    assert (answer.status, answer.json) == (200, {"values": 10.0})
+
+
 @pytest.mark.parametrize("media", MEDIA)
 @pytest.mark.parametrize(
     "address", ["topics", "topics/said", "services/reset", "actions/reset", "params/node:truth"]

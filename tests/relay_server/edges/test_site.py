@@ -190,7 +190,9 @@ def test_a_plain_get_of_a_robot_tells_what_speaks_there(world: World) -> None:
     """And nothing below it is there."""
     about = world.ask("GET", "/robots/rover").json
     assert (about["product"], about["version"], about["protocol"]) == ("switchboard", "1.2.3", "rosbridge v2")
+    assert world.ask("GET", "/robots/rover/").json == about
     assert world.ask("GET", "/robots/rover/more").status == 404
+    assert world.ask("GET", "/robots/rover//").status == 404
 
 
 @pytest.mark.parametrize(

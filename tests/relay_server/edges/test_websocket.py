@@ -36,6 +36,8 @@ def gate() -> MemoryGate:
         ("/robots/rover", {"Cookie": "good", "Origin": "http://relay:9090"}, ("cookie", "good")),
         ("/robots/rover?ticket=bad", {"Authorization": "Bearer good"}, ("bearer", "good")),
         ("/robots/%72over", {"Authorization": "Bearer good"}, ("bearer", "good")),
+        ("/robots/rover/", {"Authorization": "Bearer good"}, ("bearer", "good")),
+        ("/robots/rover/?ticket=good", {}, ("ticket", "good", Opening("rover"))),
     ],
 )
 def test_credentials_of_the_handshake_let_a_client_in(
