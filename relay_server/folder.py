@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 import secrets
 from pathlib import Path
 from typing import BinaryIO
 
+from relay_protocol import limits
 from relay_protocol.errors import Invalid, Unavailable
+from relay_protocol.text import legible
 
 
 def private(path: Path) -> BinaryIO:
@@ -28,12 +29,18 @@ class DataFolder:
     The kernel keeps the lock, so it ends with the process however that ends; a file with a process id in it would
     outlive a power cut and then name somebody else's process.
 
-    :raises Unavailable: another relay runs on this folder
+    :raises Unavailable: another relay runs on this folder, or it can't be written
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._lock = os.open(path / "relay.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        try:
+            self._lock = os.open(path / "relay.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise Unavailable(
+                f"the data folder {path} can't be written: {error.strerror}; check its owner and mode, or give "
+                "another --data"
+            ) from None
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -43,25 +50,35 @@ class DataFolder:
             ) from None
 
     def clear_socket(self, socket: Path) -> None:
-        """Take away a socket that a killed relay left behind; only the holder of the lock can have one."""
-        with contextlib.suppress(FileNotFoundError):
-            socket.unlink()
+        """Take away a socket that a killed relay left behind; only the holder of the lock can have one.
+
+        :raises Invalid: it can't be taken away
+        """
+        try:
+            socket.unlink(missing_ok=True)
+        except OSError as error:
+            raise Invalid(f"{socket.name} in the data folder can't be replaced: {error.strerror}") from None
 
     def relay_name(self) -> str:
         """What robots sign for, made up once.
 
-        :raises Invalid: it can't be read
+        :raises Invalid: it can't be read, or is no name
         """
         path = self.path / "relay.name"
         try:
-            return path.read_text().strip()
+            name = path.read_bytes().decode(errors="replace").strip()
         except FileNotFoundError:
             name = f"relay-{secrets.token_hex(8)}"
             with private(path) as stream:
                 stream.write(f"{name}\n".encode())
-            return name
         except OSError as error:
             raise Invalid(f"the relay's name can't be read from {path.name}: {error.strerror}") from None
+        if not 0 < len(name) <= limits.LABEL or not legible(name):
+            raise Invalid(
+                f"{path.name} in the data folder is no name, one printable line of at most {limits.LABEL} characters; "
+                "restore it from a backup, or give the name that robots know by --name"
+            )
+        return name
 
     def release(self) -> None:
         """Let another relay have the folder."""

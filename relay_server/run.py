@@ -115,4 +115,6 @@ def _sentence(failure: Failure) -> str:
         return f"can't listen on {error.interface or 'any address'} port {error.port}: {reason}"
     if isinstance(error, SwitchboardError):
         return str(error)
+    if isinstance(error, OSError):
+        return f"it can't start: {error.strerror or error}{f': {error.filename}' if error.filename else ''}"
     return f"it failed to start: {failure.getTraceback()}"

@@ -63,6 +63,8 @@ def in_words(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.version_option(package_name="robot-switchboard", message="%(version)s")
 def main() -> None:
     """Bring this robot to a Switchboard relay."""
+    # Whatever the umask was: what is made here is its owner's alone.
+    os.umask(0o077)
 
 
 @main.command(epilog=examples(*_ENROLL))

@@ -379,7 +379,7 @@ def _from_file(path: Path) -> dict[str, dict[str, Any]]:
         tables = msgspec.toml.decode(path.read_bytes())
     except OSError as error:
         raise Invalid(f"the settings file {path} can't be read: {error.strerror}") from None
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise Invalid(f"the settings file {path} is not TOML: {error}") from None
     for name, table in tables.items():
         if not isinstance(table, dict):

@@ -63,7 +63,7 @@ class StateFolder:
             ) from None
         except OSError as error:
             raise StateError(f"the state in {self.path} can't be read: {error.strerror}") from None
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             raise StateError(f"{self.path / STATE} is damaged: {error}; enrol this robot again") from None
         if mode & 0o077:
             raise StateError(f"others may read the key {self.path / KEY}; run: chmod 600 {self.path / KEY}")
@@ -101,12 +101,21 @@ class Preparation:
         self.public_key = identity.public_half(key)
 
     def commit(self, enrolment: Enrolment) -> None:
-        """The relay said yes: this key and this enrolment are the robot's now."""
+        """The relay said yes: this key and this enrolment are the robot's now.
+
+        :raises Invalid: they can't be stored; the code is spent
+        """
         pending = self._path / (STATE + ".pending")
-        _write(pending, msgspec.json.format(msgspec.json.encode(enrolment), indent=2) + b"\n")
-        (self._path / _PENDING).replace(self._path / KEY)
-        pending.replace(self._path / STATE)
-        _sync_folder(self._path)
+        try:
+            _write(pending, msgspec.json.format(msgspec.json.encode(enrolment), indent=2) + b"\n")
+            (self._path / _PENDING).replace(self._path / KEY)
+            pending.replace(self._path / STATE)
+            _sync_folder(self._path)
+        except OSError as error:
+            raise Invalid(
+                f"the enrolment can't be stored in {self._path}: {error.strerror}; free some space, and enroll again "
+                "with a new code"
+            ) from None
 
     def abandon(self) -> None:
         """The relay said no: leave nothing."""

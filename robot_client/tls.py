@@ -56,17 +56,21 @@ def endpoint(reactor: Any, host: str, port: int, tls: bool, ca: str = "", server
 
     :param ca: PEM file of the only authorities trusted; empty for the system's
     :param server_name: name the certificate must bear; empty for ``host``
-    :raises Invalid: the CA file can't be used
+    :raises Invalid: the CA file, or the name, can't be used
     """
     plain: Any = HostnameEndpoint(reactor, host, port, timeout=CONNECT_SECONDS)
     if not tls:
         return cast(Endpoint, plain)
     name = server_name or host
-    options = ssl.optionsForClientTLS(
-        name,
-        trustRoot=trust_root(ca) if ca else None,
-        extraCertificateOptions={"raiseMinimumTo": ssl.TLSVersion.TLSv1_2},
-    )
+    trusted = trust_root(ca) if ca else None
+    try:
+        options = ssl.optionsForClientTLS(
+            name,
+            trustRoot=trusted,
+            extraCertificateOptions={"raiseMinimumTo": ssl.TLSVersion.TLSv1_2},
+        )
+    except ValueError:  # that of idna, too
+        raise Invalid(f"'{name}' can't be the name in a certificate; see --server-name") from None
     return cast(Endpoint, wrapClientTLS(cast(Any, _InWords(options, name)), plain))
 
 
@@ -181,6 +185,12 @@ def split_address(text: str, default_port: int = 9091) -> tuple[str, int]:
         host, port = text, str(default_port)
     elif ":" in host and not host.startswith("["):
         host, port = text, str(default_port)  # a bare IPv6 address
-    if not host.strip("[]") or not port.isascii() or not port.isdigit() or not 0 < int(port) < 65536:
+    if (
+        not host.strip("[]")
+        or any(each == "/" or each.isspace() for each in host)
+        or not port.isascii()
+        or not port.isdigit()
+        or not 0 < int(port) < 65536
+    ):
         raise Invalid(f"'{text}' is no address; write host:port, as in relay.example:{default_port}")
     return host.strip("[]"), int(port)

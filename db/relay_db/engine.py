@@ -101,7 +101,7 @@ def _parse(url: str) -> URL:
         return URL.create("sqlite", database=path)
     try:
         parsed = make_url(url)
-    except ArgumentError:
+    except (ArgumentError, ValueError):  # the second for a port that is no number
         raise Invalid(
             "this is no database URL; write sqlite:///FILE or postgresql://USER@HOST/NAME"
         ) from None

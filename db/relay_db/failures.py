@@ -40,6 +40,12 @@ _POSTGRES = {
 
 _PRIMARY = 0xFF
 
+_NO_SUCH_TABLE = "no such "
+"""How SQLite's message begins when a table or column is missing; its code is that of any wrong query."""
+
+_INCOMPLETE = "the database lacks tables of this version; restore a backup, or give an empty one"
+_SETTING = "the database URL has a setting that PostgreSQL's driver does not take; check what follows '?'"
+
 
 @contextmanager
 def in_words() -> Iterator[None]:
@@ -65,16 +71,20 @@ def in_words() -> Iterator[None]:
 def _sentence(error: exc.DBAPIError | sqlite3.Error) -> str | None:
     original = error if isinstance(error, sqlite3.Error) else error.orig
     if isinstance(original, sqlite3.Error):
+        if str(original).startswith(_NO_SUCH_TABLE):
+            return _INCOMPLETE
         code = getattr(original, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
         return _SQLITE.get(code & _PRIMARY)
     state = getattr(original, "sqlstate", None)
     if state is None and isinstance(error, exc.DBAPIError):
         return _unconnected(error)
-    return _POSTGRES.get(str(state)[:2])
+    return _INCOMPLETE if state in ("42P01", "42703") else _POSTGRES.get(str(state)[:2])
 
 
 def _unconnected(error: exc.DBAPIError) -> str | None:
     """libpq gives no SQLSTATE for what goes wrong while connecting; FATAL is a server that says no."""
+    if isinstance(error, exc.ProgrammingError):
+        return _SETTING
     if not isinstance(error, (exc.OperationalError, exc.InterfaceError)) and not error.connection_invalidated:
         return None
     return _POSTGRES["28"] if "FATAL" in str(error.orig) else _POSTGRES["08"]

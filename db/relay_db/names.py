@@ -9,6 +9,7 @@ from relay_db.models import LABEL, NAME
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import NAME_BYTES
 from relay_protocol.realms import full_name, parted
+from relay_protocol.text import legible
 
 _HEX = re.compile(r"[0-9a-f]{1,64}\Z")
 
@@ -17,7 +18,7 @@ def normal_name(text: str, what: str = "name") -> str:
     """The one form of a name: NFKC, lower case. ``Ann`` and ``ann`` are the same person.
 
     :param what: whose name it is, for the error
-    :raises Invalid: empty, over 63 characters, not printable, with blanks or ``@``, or beginning with ``-``
+    :raises Invalid: empty, over 63 characters, not :func:`legible`, with blanks or ``@``, or beginning with ``-``
     """
     # Normalising takes quadratic time where many marks stand on one letter.
     if len(text) > NAME_BYTES or len(text.encode("utf-8", "surrogatepass")) > NAME_BYTES:
@@ -25,8 +26,11 @@ def normal_name(text: str, what: str = "name") -> str:
     name = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
     if not 0 < len(name) <= NAME:
         raise Invalid(f"the {what} must have 1 to {NAME} characters")
-    if not name.isprintable() or any(character.isspace() for character in name):
-        raise Invalid(f"the {what} must be printable, without spaces, line breaks or control characters")
+    if not legible(name) or any(character.isspace() for character in name):
+        raise Invalid(
+            f"the {what} must be printable, without spaces, line breaks, control characters and U+FFFD, which "
+            "stands for bytes that are no text"
+        )
     if "@" in name:
         raise Invalid(f"the {what} must not have an '@' in it: what follows one is a realm, as in toad@lab1")
     if name[0] == "-":
@@ -62,9 +66,9 @@ def findable_hex(text: str) -> str:
 def label(text: str, what: str) -> str:
     """Free text of one line that a person gave, checked.
 
-    :raises Invalid: over 255 characters, or with control characters
+    :raises Invalid: over 255 characters, or not :func:`legible`
     """
-    if len(text) > LABEL or not text.isprintable():
+    if len(text) > LABEL or not legible(text):
         raise Invalid(f"the {what} must be one printable line of at most {LABEL} characters")
     return text
 

@@ -55,7 +55,7 @@ def _prepare(path: Path) -> None:
         if not path.exists():
             os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, _FILE_MODE))
         for each in (path, Path(f"{path}-wal"), Path(f"{path}-shm")):
-            if each.exists() and each.stat().st_mode & _OTHERS:
+            if each.is_file() and each.stat().st_mode & _OTHERS:
                 each.chmod(each.stat().st_mode & 0o770)
         # By SQLite alone: whoever else opens and closes the file drops all locks this process has on it
         # (https://www.sqlite.org/howtocorrupt.html, 2.2), and the next process believes it is alone.

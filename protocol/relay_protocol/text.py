@@ -1,4 +1,4 @@
-"""What others wrote, made harmless for logs and terminals."""
+"""What others wrote: whether it can be a name, and made harmless for logs and terminals."""
 
 from __future__ import annotations
 
@@ -15,6 +15,14 @@ def inert(text: str, longest: int | None = None) -> str:
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else _escaped(each) for each in text)
+
+
+def legible(text: str) -> bool:
+    """Whether names may be written so: printable, and without U+FFFD, which stands for bytes that were no text.
+
+    Two names that differ in such bytes would look the same, and be the same.
+    """
+    return text.isprintable() and "\ufffd" not in text
 
 
 def _escaped(character: str) -> str:

@@ -15,6 +15,7 @@ from msgspec import Meta
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import Invalid
 from relay_protocol.rights import Operation, Rules
+from relay_protocol.text import legible
 from relay_protocol.wildcards import see_cheap
 from relay_server.alerts import kinds
 from relay_server.alerts.kinds import Event
@@ -70,7 +71,7 @@ def check(ask: Ask, channels: Collection[str]) -> None:
         raise Invalid(f"this relay has no '{ask.channel}'; its administrator can switch it on")
     if ask.level not in kinds.LEVELS:
         raise Invalid(f"'level' is one of {', '.join(kinds.LEVELS)}, not '{ask.level[:32]}'")
-    if not all(each.isprintable() for each in (ask.label, ask.robots, *ask.kinds)):
+    if not all(legible(each) for each in (ask.label, ask.robots, *ask.kinds)):
         raise Invalid("'label', 'robots' and 'kinds' must be printable lines")
     see_cheap(ask.robots)
     if "@" in ask.robots:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import click
@@ -76,4 +77,6 @@ def main(ctx: click.Context, data: Path, db: str | None) -> None:
 
     Changes take effect at once, also in a relay that is running and in what is open there.
     """
+    # Whatever the umask was: what is made here is its owner's alone.
+    os.umask(0o077)
     ctx.obj = App(data.expanduser(), db)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -20,9 +21,18 @@ from relay_server.cli.relaysocket import give_order
 SECONDS = 10.0
 """What each robot has where nothing else is said. A stop and a resume have their own time."""
 
+
+def _number(value: float) -> float:
+    """Click takes NaN for a number within any bounds."""
+    if math.isnan(value):
+        raise click.BadParameter("nan is no number")
+    return value
+
+
 timeout_option: Callable[[Any], Any] = click.option(
     "--timeout",
     type=click.FloatRange(0.1, 300),
+    callback=lambda _context, _option, seconds: _number(seconds),
     default=SECONDS,
     show_default=True,
     help="Seconds each robot has.",

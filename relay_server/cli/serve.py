@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from relay_protocol.errors import Invalid
-from relay_protocol.limits import CLIENT_MESSAGE, LEAST_SAMPLE, MIB, MOST_SAMPLE, ROBOT_SAMPLE
+from relay_protocol.errors import Invalid, Unavailable
+from relay_protocol.limits import CLIENT_MESSAGE, LABEL, LEAST_SAMPLE, MIB, MOST_SAMPLE, ROBOT_SAMPLE
+from relay_protocol.text import legible
 from relay_server.cli.app import App, examples, pass_app
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ YEARS = 3650
 """Longest that events are kept, days."""
 
 MOST_REQUESTS = 1_000_000
+MOST_HEARTBEAT = 60.0
+MOST_GB = 1e9
 
 
 @click.command(
@@ -219,10 +222,12 @@ def serve(
         app.data = data
     if (tls_cert is None) != (tls_key is None):
         raise Invalid("--tls-cert and --tls-key go together")
-    if heartbeat <= 0:
-        raise Invalid("--heartbeat must be more than 0 s")
-    if recordings_gb < 0 or recordings_reserve_gb < 0:
-        raise Invalid("--recordings-gb and --recordings-reserve-gb must not be less than 0")
+    if not 0 < heartbeat <= MOST_HEARTBEAT:
+        raise Invalid(f"--heartbeat must be more than 0 and at most {MOST_HEARTBEAT:g} s")
+    if not (0 <= recordings_gb <= MOST_GB and 0 <= recordings_reserve_gb <= MOST_GB):
+        raise Invalid(f"--recordings-gb and --recordings-reserve-gb must be from 0 to {MOST_GB:g}")
+    if len(name) > LABEL or not legible(name):
+        raise Invalid(f"--name must be one printable line of at most {LABEL} characters, without U+FFFD")
     if not 0 < events_days <= YEARS:
         raise Invalid(f"--events-days must be more than 0 and at most {YEARS}")
     if not 0 <= requests_per_second <= MOST_REQUESTS:
@@ -232,7 +237,12 @@ def serve(
         battery_critical = 0.0
     if not 0 <= battery_critical <= battery_low <= 100:
         raise Invalid("--battery-critical and --battery-low are percent, the first not above the second")
-    app.data.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        app.data.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise Unavailable(
+            f"the data folder {app.data} can't be made: {error.strerror}; give another --data"
+        ) from None
     settings = Settings(
         data=app.data,
         database=app.database_url,

@@ -18,6 +18,7 @@ from relay_db.queries.recalling import OURS
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import ROBOT_NAME
+from relay_protocol.text import legible
 from relay_protocol.wildcards import see_cheap
 from relay_server.directory.limits import (
     ADDRESS,
@@ -78,7 +79,7 @@ def check_words(new: Registration) -> None:
             f"what is of the kind '{new.kind}' the directory knows from robots; nobody registers it"
         )
     for what, text in (("name", new.name), ("description", new.description)):
-        if not text.isprintable():
+        if not legible(text):
             raise Invalid(f"'{what}' must be one printable line")
     if new.name != new.name.strip():
         raise Invalid("'name' must not begin or end with a blank")

@@ -22,6 +22,7 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
 from relay_protocol.limits import ROBOT_NAME
 from relay_protocol.rights import Rules
+from relay_protocol.text import legible
 from relay_server.access import NO_ROBOT, Access, Principal
 from relay_server.memory import guarding
 from relay_server.memory.asks import Ask, Forms, chosen
@@ -215,7 +216,7 @@ class MemoryDesk:
         self, principal: Principal, event: NewEvent, robots: Mapping[str, int], own: str, now: float
     ) -> NewMemory:
         source = event.source or own
-        if not source.isprintable() or not event.kind.isprintable():
+        if not legible(source) or not legible(event.kind):
             raise Invalid("'source' and 'kind' must be printable")
         if source.startswith(OURS):
             raise Refused(f"sources that begin with '{OURS}' are the relay's own; give another 'source'")

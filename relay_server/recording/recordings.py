@@ -17,6 +17,7 @@ from twisted.logger import Logger
 
 from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_protocol.limits import NAME
+from relay_protocol.text import legible
 from relay_server.access import Permit
 from relay_server.channel import Channels, resolve
 from relay_server.clock import Clock, as_twisted, to_the_end
@@ -393,6 +394,6 @@ def _camera(name: str) -> str:
     :raises Invalid: no name a camera could have
     """
     full = name if name.startswith("/") else f"/{name}"
-    if not full.strip("/") or len(full) > NAME or not full.isprintable():
+    if not full.strip("/") or len(full) > NAME or not legible(full):
         raise Invalid(f"the name of a camera has at most {NAME} characters that can be printed")
     return full

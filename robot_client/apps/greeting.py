@@ -22,6 +22,7 @@ from robot_client.apps.line import Line, Pulse, in_words, token
 from robot_client.apps.memory import Memory, Unanswered
 from robot_client.apps.status import StatusLine
 from robot_client.apps.staying import Ending, stay
+from robot_client.numbers import Number
 
 LOOK = 0.25
 BEGUN, GREETED = "greeting.begun", "greeted"
@@ -200,7 +201,7 @@ class Greeting:
 @click.option("--say", default="/say", show_default=True, metavar="TOPIC", help="Of the service 'speech'.")
 @click.option(
     "--within",
-    type=click.FloatRange(1, 86400),
+    type=Number(1, 86400),
     default=Manners().within,
     show_default=True,
     metavar="S",

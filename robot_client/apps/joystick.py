@@ -22,6 +22,7 @@ from robot_client.apps.options import driving
 from robot_client.apps.pads import Layout, Pad, Pads
 from robot_client.apps.status import StatusLine
 from robot_client.apps.staying import Ending, stay
+from robot_client.numbers import Number
 
 NAME = "joystick"
 LOOK = 0.02
@@ -150,14 +151,14 @@ class Joystick:
 @driving
 @click.option(
     "--dead",
-    type=click.FloatRange(0.0, 0.9),
+    type=Number(0.0, 0.9),
     default=Curve().dead,
     show_default=True,
     help="Of the stick's way: its middle.",
 )
 @click.option(
     "--expo",
-    type=click.FloatRange(0.0, 1.0),
+    type=Number(0.0, 1.0),
     default=Curve().expo,
     show_default=True,
     help="0: in proportion; 1: gentle near the middle.",

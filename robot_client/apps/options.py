@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import click
 
 from robot_client.apps.driver import Limits
+from robot_client.numbers import Number
 
 AnyCommand = TypeVar("AnyCommand", bound=Callable[..., Any])
 
@@ -24,7 +25,7 @@ def driving(command: AnyCommand) -> AnyCommand:
         ),
         click.option(
             "--speed",
-            type=click.FloatRange(0.01, 10.0),
+            type=Number(0.01, 10.0),
             default=USUAL.speed,
             show_default=True,
             metavar="M/S",
@@ -32,7 +33,7 @@ def driving(command: AnyCommand) -> AnyCommand:
         ),
         click.option(
             "--turn",
-            type=click.FloatRange(0.01, 10.0),
+            type=Number(0.01, 10.0),
             default=USUAL.turn,
             show_default=True,
             metavar="RAD/S",

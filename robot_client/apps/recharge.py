@@ -34,6 +34,7 @@ from robot_client.apps.line import Line, in_words, token
 from robot_client.apps.options import driving
 from robot_client.apps.status import StatusLine
 from robot_client.apps.staying import Ending, stay
+from robot_client.numbers import Number
 
 NAME = "recharge"
 LOOK = EVERY = 0.05
@@ -320,7 +321,7 @@ class Recharge:
 @click.option("--marker", type=click.IntRange(0), default=7, show_default=True, help="The charger's.")
 @click.option(
     "--low",
-    type=click.FloatRange(0, 100),
+    type=Number(0, 100),
     default=20.0,
     show_default=True,
     metavar="PERCENT",
@@ -328,7 +329,7 @@ class Recharge:
 )
 @click.option(
     "--enough",
-    type=click.FloatRange(0, 100),
+    type=Number(0, 100),
     default=80.0,
     show_default=True,
     metavar="PERCENT",
@@ -336,7 +337,7 @@ class Recharge:
 )
 @click.option(
     "--distance",
-    type=click.FloatRange(0.1, 10),
+    type=Number(0.1, 10),
     default=0.45,
     show_default=True,
     metavar="M",
@@ -344,7 +345,7 @@ class Recharge:
 )
 @click.option(
     "--clear",
-    type=click.FloatRange(0.05, 10),
+    type=Number(0.05, 10),
     default=0.3,
     show_default=True,
     metavar="M",

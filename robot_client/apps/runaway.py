@@ -24,6 +24,7 @@ from robot_client.apps.driver import SILENT, STILL, Command, twist
 from robot_client.apps.line import Line, Pulse, Refused, in_words, token
 from robot_client.apps.status import StatusLine
 from robot_client.apps.staying import Ending, stay
+from robot_client.numbers import Number
 
 REACH = 1.5
 """Metres beyond which nothing pushes."""
@@ -295,12 +296,8 @@ class Program:
 @click.argument("url")
 @click.option("--scan", default="/scan", show_default=True, help="Topic of the scanner.")
 @click.option("--command", default="/cmd_vel", show_default=True, help="Topic of the commands.")
-@click.option(
-    "--near", type=click.FloatRange(0.1, 1.4), default=Manners().near, show_default=True, metavar="M"
-)
-@click.option(
-    "--clear", type=click.FloatRange(0.1, 1.5), default=Manners().clear, show_default=True, metavar="M"
-)
+@click.option("--near", type=Number(0.1, 1.4), default=Manners().near, show_default=True, metavar="M")
+@click.option("--clear", type=Number(0.1, 1.5), default=Manners().clear, show_default=True, metavar="M")
 def main(url: str, scan: str, command: str, near: float, clear: float) -> None:
     """Keep the robot at URL (ws://relay/robots/NAME) away from what is in its way.
 

@@ -29,6 +29,7 @@ from robot_client.apps.options import driving
 from robot_client.apps.status import StatusLine
 from robot_client.apps.staying import Ending, stay
 from robot_client.apps.words import MOVES, SECONDS, Orders, Word
+from robot_client.numbers import Number
 
 NAME = "voice"
 LOOK = 0.02
@@ -264,7 +265,7 @@ class Voice:
 @click.option("--latch", is_flag=True, help="Have 'stop' stop the robot until somebody resumes it, always.")
 @click.option(
     "--seconds",
-    type=click.FloatRange(0.3, 5.0),
+    type=Number(0.3, 5.0),
     default=SECONDS,
     show_default=True,
     help="How long a word acts.",

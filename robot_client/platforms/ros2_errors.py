@@ -6,6 +6,9 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from rclpy.exceptions import NameValidationException
+from rclpy.validate_namespace import validate_namespace
+
 from relay_protocol.errors import Invalid, SwitchboardError
 
 _PLACE = re.compile(r", at \.{0,2}/")
@@ -33,3 +36,21 @@ def refusals(what: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise Invalid(f"ROS 2 refuses {what}: {in_words(error)}") from None
+
+
+def check_namespace(namespace: str) -> None:
+    """See that nodes can have this namespace; rclpy would find out only when half of a node is there.
+
+    :param namespace: with or without a slash in front; empty for none
+    :raises Invalid: it can't be one
+    """
+    try:
+        validate_namespace(namespace if namespace.startswith("/") else f"/{namespace}")
+    except NameValidationException as error:
+        raise Invalid(f"'{namespace}' is no ROS namespace: {in_one_line(error)}") from None
+
+
+def in_one_line(error: Exception) -> str:
+    """What rclpy says of a name that can't be, without the arrow it draws below."""
+    reason, *name = str(error).splitlines()[:2]
+    return ": ".join((reason.rstrip(":."), *(each.strip() for each in name)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ import click
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.text import inert
 from robot_client.helptext import examples
+from robot_client.numbers import Number
 from robot_client.services.gps_source import BAUDS, opener
 from robot_client.services.options import camera, lens
 
@@ -31,6 +33,8 @@ def main() -> None:
 
     Each prints READY when its topics are there, says on /diagnostics how it is, and ends by SIGINT or SIGTERM.
     """
+    # Whatever the umask was: what is made here is its owner's alone.
+    os.umask(0o077)
 
 
 def service(*lines: str) -> Callable[[Callable[..., None]], click.Command]:
@@ -99,7 +103,7 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Asked
 )
 @click.option(
     "--near",
-    type=click.FloatRange(0.01, 100),
+    type=Number(0.01, 100),
     default=0.5,
     show_default=True,
     metavar="M",
@@ -107,7 +111,7 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Asked
 )
 @click.option(
     "--height",
-    type=click.FloatRange(0, 10),
+    type=Number(0, 10),
     default=0.2,
     show_default=True,
     metavar="M",
@@ -115,7 +119,7 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Asked
 )
 @click.option(
     "--low",
-    type=click.FloatRange(0, 10),
+    type=Number(0, 10),
     default=0.05,
     show_default=True,
     metavar="M",
@@ -123,7 +127,7 @@ def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Asked
 )
 @click.option(
     "--high",
-    type=click.FloatRange(0, 10),
+    type=Number(0, 10),
     default=1.5,
     show_default=True,
     metavar="M",
@@ -173,7 +177,7 @@ def obstacles(
 )
 @click.option(
     "--low",
-    type=click.FloatRange(0, 100),
+    type=Number(0, 100),
     default=20.0,
     show_default=True,
     metavar="PERCENT",
@@ -181,7 +185,7 @@ def obstacles(
 )
 @click.option(
     "--critical",
-    type=click.FloatRange(0, 100),
+    type=Number(0, 100),
     default=10.0,
     show_default=True,
     metavar="PERCENT",
@@ -190,14 +194,14 @@ def obstacles(
 @click.option(
     "--volts",
     nargs=2,
-    type=float,
+    type=Number(),
     default=(0.0, 0.0),
     metavar="EMPTY FULL",
     help="For batteries that tell their voltage alone.",
 )
 @click.option(
     "--period",
-    type=click.FloatRange(0.1, 3600),
+    type=Number(0.1, 3600),
     default=5.0,
     show_default=True,
     metavar="S",
@@ -243,7 +247,7 @@ def battery(
 @click.option("--frame", default="gps", show_default=True, help="Of the antenna.")
 @click.option(
     "--pace",
-    type=click.FloatRange(0, 60),
+    type=Number(0, 60),
     default=1.0,
     show_default=True,
     metavar="S",
@@ -269,7 +273,7 @@ def gps(namespace: str, source: str, baud: str, frame: str, pace: float) -> None
 @camera
 @click.option(
     "--size",
-    type=click.FloatRange(0.001, 100),
+    type=Number(0.001, 100),
     required=True,
     metavar="M",
     help="Side of the markers' black square.",
@@ -310,14 +314,14 @@ def markers(
 )
 @click.option(
     "--alike",
-    type=click.FloatRange(0, 1),
+    type=Number(0, 1),
     default=0.7,
     show_default=True,
     help="How alike a face must be to a person's picture.",
 )
 @click.option(
     "--rate",
-    type=click.FloatRange(0.1, 30),
+    type=Number(0.1, 30),
     default=5.0,
     show_default=True,
     help="Pictures per second that are looked at, at most.",

@@ -6,6 +6,8 @@ from typing import Any
 
 import click
 
+from robot_client.numbers import Number
+
 
 def lens(function: Any) -> Any:
     """Options that say how a camera looks at the world."""
@@ -17,7 +19,7 @@ def lens(function: Any) -> Any:
     )
     view = click.option(
         "--view",
-        type=click.FloatRange(1, 170),
+        type=Number(1, 170),
         metavar="DEG",
         help="Degrees from the left edge of its pictures to the right, for cameras without a CameraInfo.",
     )

@@ -10,11 +10,12 @@ from typing import Any, Protocol
 import click
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.exceptions import InvalidNamespaceException
+from rclpy.exceptions import NameValidationException
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from relay_protocol.errors import Unavailable
+from relay_protocol.errors import Invalid, Unavailable
+from robot_client.platforms.ros2_errors import check_namespace, in_one_line
 from robot_client.platforms.ros2_executor import make_executor
 from robot_client.platforms.ros2_transport import without_shared_memory
 from robot_client.ros_log import ensure_log_folder
@@ -49,10 +50,14 @@ def run(name: str, namespace: str, build: Callable[[Any], Service]) -> None:
     :param namespace: before all its names; empty for none
     :param build: makes the service
     :raises click.BadParameter: there can be no such namespace
+    :raises Invalid: a topic can't have such a name
     :raises Unavailable: ROS 2 does not start, or the service lacks something
     """
     with _stop_requested() as stop, _node(name, namespace) as (node, executor):
-        service = build(node)
+        try:
+            service = build(node)
+        except NameValidationException as error:
+            raise Invalid(in_one_line(error)) from None
         with contextlib.closing(service):
             health = Health(node, service.finding)
             health.tell()
@@ -106,6 +111,10 @@ class Health:
 
 @contextlib.contextmanager
 def _node(name: str, namespace: str) -> Iterator[tuple[Any, Any]]:
+    try:
+        check_namespace(namespace)
+    except Invalid as error:
+        raise click.BadParameter(str(error)) from None
     ensure_log_folder()
     context = rclpy.Context()
     try:
@@ -114,9 +123,6 @@ def _node(name: str, namespace: str) -> Iterator[tuple[Any, Any]]:
             node: Any = rclpy.create_node(
                 name, context=context, namespace=namespace, start_parameter_services=False
             )
-    except InvalidNamespaceException as error:
-        rclpy.try_shutdown(context=context)
-        raise click.BadParameter(f"'{namespace}' is no ROS namespace: {error}") from None
     except Unavailable:
         raise
     except Exception as error:

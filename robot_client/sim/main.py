@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import os
 import re
 import signal
 import time
@@ -13,7 +14,9 @@ from typing import IO, Any
 
 import click
 
+from relay_protocol.errors import Invalid
 from robot_client.helptext import examples
+from robot_client.numbers import Number
 from robot_client.ros_log import ensure_log_folder
 
 try:
@@ -57,7 +60,9 @@ def _size(text: str) -> tuple[int, int]:
     type=click.Path(dir_okay=False, path_type=Path),
     help="Append what the robot was told and did to this file, one JSON object per line.",
 )
-@click.option("--seed", type=int, help="Seed of the scanner's noise; without it every run differs.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), help="Seed of the scanner's noise; without it every run differs."
+)
 @click.option("--world", type=click.Choice(sorted(WORLDS)), default="default", show_default=True)
 @click.option("--camera/--no-camera", default=True, help="Offer pictures (drawn only while somebody looks).")
 @click.option(
@@ -73,7 +78,7 @@ def _size(text: str) -> tuple[int, int]:
 )
 @click.option(
     "--charge",
-    type=click.FloatRange(0, 100),
+    type=Number(0, 100),
     default=100.0,
     show_default=True,
     metavar="PERCENT",
@@ -102,6 +107,8 @@ def main(
             f"there is no ROS 2 for this Python ({error}): "
             "source your ROS installation, or install 'robot-switchboard[robot,sim,ros]'"
         ) from None
+    # Whatever the umask was: what is made here is its owner's alone.
+    os.umask(0o077)
     faulthandler.enable()  # a crash in the middleware's C++ leaves a trace instead of silence
     with _opened(record) as stream, _stop_requested() as stop:
         _run(namespace, stream, seed, world, camera_size if camera else None, camera_fps, charge / 100, stop)
@@ -124,24 +131,24 @@ def _run(
     """Imports late: `--help` and a missing ROS must not wait for, or fall over, OpenCV and rclpy."""
     import cv2
     import rclpy
-    from rclpy.exceptions import InvalidNamespaceException
     from rclpy.signals import SignalHandlerOptions
 
+    from robot_client.platforms.ros2_errors import check_namespace
     from robot_client.sim.camera import Camera
     from robot_client.sim.node import SimNode
     from robot_client.sim.recorder import Recorder
     from robot_client.sim.robot import Robot
 
+    try:
+        check_namespace(namespace)
+    except Invalid as error:
+        raise click.BadParameter(str(error)) from None
     cv2.setNumThreads(1)  # pictures are small: threads would cost more than they give
     place = WORLDS[world]()
     robot = Robot(place, Recorder(stream), seed, time.monotonic, charge)
     ensure_log_folder()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = SimNode(robot, Camera(place, *size) if size else None, fps, namespace)
-    except InvalidNamespaceException as error:
-        rclpy.try_shutdown()
-        raise click.BadParameter(f"'{namespace}' is no ROS namespace: {error}") from None
+    node = SimNode(robot, Camera(place, *size) if size else None, fps, namespace)
     executor = _executor()
     executor.add_node(node)
     try:

@@ -31,6 +31,7 @@ def test_a_name_has_one_form(written: str, name: str) -> None:
         "a\u202eb",
         "a\u200bb",
         "\ud800",
+        "a\ufffd",
         "@lab",
         "a@b.c",
         "a\uff20b",
@@ -58,7 +59,7 @@ def test_the_form_of_a_name_is_final(text: str) -> None:
 def test_a_label_is_one_printable_line() -> None:
     """Labels are taken as they are or refused."""
     assert label("Lab 3, left", "label") == "Lab 3, left"
-    for bad in ("two\nlines", "\x1b[2J", "x" * 256):
+    for bad in ("two\nlines", "\x1b[2J", "a\ufffd", "x" * 256):
         with pytest.raises(Invalid, match="the label must be one printable line"):
             label(bad, "label")
 

@@ -244,3 +244,19 @@ def test_a_token_without_rights_shows_no_robot(labs: Labs) -> None:
     """What an administrator of one realm may do opens nothing of the other."""
     with pytest.raises(InvalidStatus):
         labs.relay.connect("mole", labs.tokens["root@lab1"])
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/users", {"name": "a\ufffd"}),
+        ("/groups", {"name": "a\ufffd"}),
+        ("/robots", {"name": "a\ufffd"}),
+        ("/robot-groups", {"name": "a\ufffd"}),
+        ("/users/mole/programs", {"label": "a\ufffd"}),
+    ],
+)
+def test_a_name_with_the_mark_of_bytes_that_are_no_text_is_refused(labs: Labs, path: str, body: Any) -> None:
+    """Two that differ in such bytes would be one."""
+    answer = labs.ask("root@lab2", "POST", path, body)
+    assert answer.status == 400, answer.body

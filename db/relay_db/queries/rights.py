@@ -16,6 +16,7 @@ from relay_db.queries.state import bump
 from relay_db.queries.users import live_user
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.rights import Grant, Level, parse_level, parse_pattern
+from relay_protocol.text import legible
 
 PATTERNS = 64
 """Most allow or deny patterns of one right: all of them are asked for every new resource."""
@@ -225,6 +226,6 @@ def _patterns(texts: Iterable[str]) -> list[str]:
     if len(patterns) > PATTERNS:
         raise Invalid(f"a right has at most {PATTERNS} allow and {PATTERNS} deny patterns")
     for each in patterns:
-        if len(each) > _PATTERN_LENGTH or not each.isprintable():
+        if len(each) > _PATTERN_LENGTH or not legible(each):
             raise Invalid(f"a pattern is one printable line of at most {_PATTERN_LENGTH} characters")
     return patterns

@@ -9,6 +9,7 @@ from urllib.parse import parse_qs
 
 from relay_protocol import limits, link
 from relay_protocol.errors import Invalid
+from relay_protocol.text import legible
 
 T = TypeVar("T")
 
@@ -145,7 +146,7 @@ def _camera(topic: str) -> str:
     if not topic.strip("/"):
         raise Invalid("'topic' is missing: the name of the camera")
     name = topic if topic.startswith("/") else f"/{topic}"
-    if len(name) > limits.NAME or not name.isprintable():
+    if len(name) > limits.NAME or not legible(name):
         raise Invalid(f"'topic' is a name of at most {limits.NAME} characters")
     return name
 
