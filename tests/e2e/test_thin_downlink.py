@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import select
 import ssl
 import statistics
 import threading
@@ -23,9 +24,11 @@ from switchboard_processes import running
 from switchboard_proxy import ChaosProxy
 from switchboard_relay import Relay
 from switchboard_waiting import PATIENCE, wait_for
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from relay_protocol import PROTOCOL_VERSION, frames, identity, link
+from tests.e2e.test_tls import Authority
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 HEAVY_BYTES = 100_000
@@ -34,14 +37,17 @@ HEAVY_BYTES = 100_000
 class Robot:
     """A robot that speaks JSON: it offers every topic, and publishes a pose and what is heavy when it is told to."""
 
-    def __init__(self, relay: Relay, port: int, parts: bool = False) -> None:
+    def __init__(
+        self, relay: Relay, port: int, parts: bool = False, tls: ssl.SSLContext | None = None
+    ) -> None:
         self._parts = parts
+        self._tls = tls
         code = relay.cli("robot", "add", "rover")["enrolment_code"]
         key = identity.generate_key()
-        with FakeRobot(relay.robots_port) as enrolling:
+        with self._dial(relay.robots_port) as enrolling:
             assert enrolling.enroll("rover", code, key)["op"] == "enrolled"
         self._port = port
-        self.control = FakeRobot(port)
+        self.control = self._dial(port)
         assert self.control.register("rover", key)["op"] == "welcome"
         self.control.send(link.Describe(platform="test", motion=link.MotionPolicy(types=[TWIST])))
         topics = {"/heavy": link.Topic(types=[STRING], publishers=["/camera"])}
@@ -56,6 +62,12 @@ class Robot:
         self._threads = [threading.Thread(target=self._serve_control, daemon=True)]
         self._threads[0].start()
 
+    def _dial(self, port: int) -> FakeRobot:
+        end = FakeRobot(port)
+        if self._tls is not None:
+            end.socket = self._tls.wrap_socket(end.socket, server_hostname="127.0.0.1")
+        return end
+
     def stop(self) -> None:
         """Leave."""
         self._over.set()
@@ -68,7 +80,7 @@ class Robot:
     def _serve_control(self) -> None:
         for message in self._messages(self.control):
             if message["op"] == "open_channel" and self.channel is None:
-                self.channel = FakeRobot(self._port)
+                self.channel = self._dial(self._port)
                 self.channel.send(
                     link.Join(version=PROTOCOL_VERSION, ticket=message["ticket"], parts=self._parts)
                 )
@@ -77,9 +89,13 @@ class Robot:
 
     def _messages(self, end: FakeRobot) -> Iterator[dict[str, Any]]:
         while not self._over.is_set():
-            end.socket.settimeout(0.2)
             try:
-                data = end.socket.recv(65536)
+                if not select.select([end.socket], [], [], 0.05)[0]:
+                    continue
+                # One thread at a time: a TLS connection is not for two.
+                with self._lock:
+                    end.socket.settimeout(0.01)
+                    data = end.socket.recv(1 << 20)
             except TimeoutError:
                 continue
             except OSError:
@@ -104,8 +120,12 @@ class Robot:
                     yield message
 
     def _send(self, end: FakeRobot, message: link.Message) -> None:
+        self._send_bytes(end, link.frame(message))
+
+    def _send_bytes(self, end: FakeRobot, data: bytes) -> None:
         with self._lock:
-            end.send(message)
+            end.socket.settimeout(PATIENCE)
+            end.send_bytes(data)
 
     def _serve_channel(self) -> None:
         channel = self.channel
@@ -122,27 +142,28 @@ class Robot:
         """One sample."""
         assert self.channel is not None
         frame = frames.encode_sample(self.numbers[topic], time.time_ns(), json.dumps(body).encode())
-        with self._lock:
-            self.channel.send_bytes(frame)
+        self._send_bytes(self.channel, frame)
 
 
 class Ground:
     """A relay, its robot, and an operator; clients come by a proxy."""
 
-    def __init__(self, relay: Relay, robot: Robot, proxy: ChaosProxy, token: str) -> None:
-        self.relay, self.robot, self.proxy, self.token = relay, robot, proxy, token
+    def __init__(
+        self, relay: Relay, robot: Robot, proxy: ChaosProxy, token: str, tls: ssl.SSLContext | None
+    ) -> None:
+        self.relay, self.robot, self.proxy, self.token, self._tls = relay, robot, proxy, token, tls
 
-    def connect(self, tls: ssl.SSLContext | None = None) -> Any:
+    def connect(self) -> Any:
         """A client's websocket over the thin line."""
-        scheme = "ws" if tls is None else "wss"
+        scheme = "ws" if self._tls is None else "wss"
         return connect(
-            f"{scheme}://localhost:{self.proxy.port}/robots/rover",
+            f"{scheme}://127.0.0.1:{self.proxy.port}/robots/rover",
             additional_headers={"Authorization": f"Bearer {self.token}"},
             open_timeout=PATIENCE,
             max_queue=None,
             max_size=None,
             compression=None,
-            ssl=tls,
+            ssl=self._tls,
         )
 
 
@@ -153,6 +174,7 @@ def ground(
     parts: bool = False,
     thin_robot: float | None = None,
     buffer: int | None = None,
+    tls: ssl.SSLContext | None = None,
 ) -> Iterator[Ground]:
     """One, with a line as fast as it goes at first.
 
@@ -169,12 +191,12 @@ def ground(
         stack.callback(far.close)
         if thin_robot is not None:
             far.squeeze_down(thin_robot * 8)
-        robot = Robot(relay, far.port, parts)
+        robot = Robot(relay, far.port, parts, tls)
         stack.callback(robot.stop)
         token = relay.user("driver")
         relay.cli("right", "grant", "driver", "rover", "operator")
         wait_for("the robot is online", lambda: relay.state_of("rover") != "offline")
-        yield Ground(relay, robot, proxy, token)
+        yield Ground(relay, robot, proxy, token, tls)
 
 
 class Seen:
@@ -187,6 +209,12 @@ class Seen:
         self.told: list[dict[str, Any]] = []
 
 
+def messages(socket: Any) -> Iterator[str]:
+    """What comes, until the connection ends in whatever way."""
+    with contextlib.suppress(ConnectionClosed):
+        yield from socket
+
+
 def drive(ground: Ground, socket: Any, seconds: float) -> Seen:
     """Commands at 10 Hz on a connection that has also subscribed to 100 kB at 10 Hz and to a pose at 20 Hz."""
     robot, seen = ground.robot, Seen()
@@ -195,8 +223,7 @@ def drive(ground: Ground, socket: Any, seconds: float) -> Seen:
         socket.send(json.dumps(message))
 
     def read() -> None:
-        # The iteration ends with an orderly close, and fails otherwise.
-        for text in socket:
+        for text in messages(socket):
             message = json.loads(text)
             if message["op"] == "status":
                 seen.statuses.append(message["msg"])
@@ -238,13 +265,23 @@ def drive(ground: Ground, socket: Any, seconds: float) -> Seen:
     return seen
 
 
-@pytest.mark.parametrize("rate", [300_000, 100_000])
-def test_a_heavy_topic_takes_neither_control_nor_the_small_topics_away(tmp_path: Path, rate: int) -> None:
+@pytest.mark.parametrize(("rate", "secure"), [(300_000, False), (100_000, False), (300_000, True)])
+def test_a_heavy_topic_takes_neither_control_nor_the_small_topics_away(
+    tmp_path: Path, rate: int, secure: bool
+) -> None:
     """All commands arrive, the pose is as old as one heavy sample makes it at most, and the heavy topic still comes."""
-    with ground(tmp_path) as at:
+    options, tls = [], None
+    if secure:
+        authority = Authority(tmp_path, "ca")
+        cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+        authority.certify(cert, key)
+        options = ["--tls-cert", str(cert), "--tls-key", str(key)]
+        tls = ssl.create_default_context(cafile=str(authority.path))
+    with ground(tmp_path, *options, tls=tls) as at:
         at.proxy.squeeze_down(rate * 8)
         with at.connect() as socket:
             seen = drive(at, socket, 20)
+        assert secure or socket.protocol.close_rcvd is not None, "the answer to the close frame was lost"
     arrived = {each["linear"]["x"] for each in at.robot.commands}
     lost = [number for number in range(1, seen.sent + 1) if 1.0 + number not in arrived]
     # A machine that stands still makes commands old, but no line does.
@@ -261,6 +298,37 @@ def test_a_heavy_topic_takes_neither_control_nor_the_small_topics_away(tmp_path:
     assert last["downlink"]["bytes_per_second"] == pytest.approx(rate, rel=0.5)
     assert "throttle_rate" in last["downlink"]["advice"]
     assert {each["topic"] for each in last["topic_drops"]} >= {"/heavy"}
+
+
+def test_a_client_that_takes_nothing_learns_from_a_close_frame_why_it_is_cut(tmp_path: Path) -> None:
+    """It finds the frame behind the little that was on its way when it reads again."""
+    with ground(tmp_path) as at:
+        at.proxy.squeeze_down(300_000 * 8)
+        with at.connect() as socket:
+            for topic in ("/pose", "/heavy"):
+                socket.send(json.dumps({"op": "subscribe", "topic": topic, "type": STRING}))
+            wait_for("both are subscribed", lambda: {"/pose", "/heavy"} <= at.robot.numbers.keys())
+            over = threading.Event()
+
+            def publish() -> None:
+                while not over.wait(0.1):
+                    at.robot.publish("/heavy", {"data": "x" * HEAVY_BYTES})
+
+            publishing = threading.Thread(target=publish, daemon=True)
+            publishing.start()
+            for _ in range(5):
+                socket.recv(timeout=PATIENCE)
+            at.proxy.forward_down.clear()
+            wait_for("it is cut", lambda: "no answer to pings" in at.relay.log)
+            at.proxy.forward_down.set()
+            with pytest.raises(ConnectionClosed) as closed:
+                while True:
+                    socket.recv(timeout=PATIENCE)
+            over.set()
+            publishing.join(PATIENCE)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 4408
+    assert "no answer to pings" in closed.value.rcvd.reason
 
 
 @pytest.mark.parametrize("parts", [True, False])

@@ -121,7 +121,11 @@ class ChaosProxy:
                 each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with self._lock:
                 self._open |= {near, far}
-            ways = (near, far, self.forward_up, self._up), (far, near, self.forward_down, self._down)
+            over: list[int] = []
+            ways = (
+                (near, far, self.forward_up, self._up, over),
+                (far, near, self.forward_down, self._down, over),
+            )
             for way in ways:
                 threading.Thread(target=self._pump, args=way, daemon=True).start()
 
@@ -137,20 +141,32 @@ class ChaosProxy:
             raise
         return far
 
-    def _pump(self, source: socket.socket, sink: socket.socket, gate: threading.Event, line: _Line) -> None:
+    def _pump(
+        self, source: socket.socket, sink: socket.socket, gate: threading.Event, line: _Line, over: list[int]
+    ) -> None:
+        how = socket.SHUT_RDWR
         try:
             while data := source.recv(65536):
                 gate.wait()
                 # What comes meanwhile goes together with what comes next.
                 time.sleep(self.seconds_away)
                 line.send(sink, data)
+            # The other direction may go on.
+            how = socket.SHUT_WR
         except OSError:
             pass
         finally:
             gate.wait()
-            with self._lock:
-                self._open -= {source}
-            for each in (source, sink):
+            with contextlib.suppress(OSError):
+                sink.shutdown(how)
+            if how == socket.SHUT_RDWR:
                 with contextlib.suppress(OSError):
-                    each.shutdown(socket.SHUT_RDWR)
-            source.close()
+                    source.shutdown(how)
+            with self._lock:
+                over.append(1)
+                last = len(over) == 2
+                if last:
+                    self._open -= {source, sink}
+            if last:
+                source.close()
+                sink.close()
