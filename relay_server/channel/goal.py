@@ -45,6 +45,9 @@ class Asker(Protocol):
     def feedback(self, values: bytes) -> None:
         """How far the goal has come, JSON."""
 
+    def unreadable(self, words: str) -> None:
+        """Something that came of the goal can't be handed on, and why."""
+
     def ended(self, status: int, result: bool, values: bytes) -> None:
         """The goal is over; called once.
 
@@ -136,7 +139,7 @@ class ClientGoal(Goal):
         try:
             values = self._bodies.to_client(f"{self.type}_Feedback", body)
         except SwitchboardError as error:
-            self.member.tell("warning", f"feedback of {self.action} is left out: {error}")
+            self._asker.unreadable(f"feedback of {self.action} is left out: {error}")
             return
         self._asker.feedback(values)
 

@@ -46,6 +46,10 @@ class _Goal:
         """How far it has come."""
         self._desk.tell_feedback(self, values)
 
+    def unreadable(self, words: str) -> None:
+        """Something of it can't be told."""
+        self._desk.tell_trouble(self, words)
+
     def ended(self, status: int, result: bool, values: bytes) -> None:
         """It is over."""
         self._desk.goal_ended(self, status, result, values)
@@ -131,6 +135,10 @@ class Pursuing:
         """Tell the client that one of its goals is over, in the form it asked for."""
         message = rosbridge.action_result(ask.action, ask.id, status, result, values)
         self._session.say(message, asked(ask, untold) if form is None else form)
+
+    def tell_trouble(self, goal: _Goal, words: str) -> None:
+        """Something of a goal can't be told to the client."""
+        self._session.tell("warning", words, goal.ask.id)
 
     def tell_feedback(self, goal: _Goal, values: bytes) -> None:
         """Tell how far a goal has come. To a client that reads slowly, the newest counts."""
