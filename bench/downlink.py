@@ -130,7 +130,7 @@ def run(options: Options) -> list[Row]:
     seconds = options.pick(3, 30)
     for kilobytes in KILOBYTES[:1] if options.quick else KILOBYTES:
         with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
-            relay = Relay(Path(name), "--heartbeat", "120")
+            relay = Relay(Path(name), "--heartbeat", "60")
             stack.enter_context(running(relay))
             loop = Loop()
             stack.callback(loop.close)

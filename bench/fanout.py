@@ -107,7 +107,7 @@ def run(options: Options) -> list[Row]:
     loop = Loop()
     with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        relay = Relay(folder, "--heartbeat", "120")
+        relay = Relay(folder, "--heartbeat", "60")
         stack.enter_context(running(relay))
         stack.callback(loop.close)
         ours = relay_side(loop, relay, folder, clients)

@@ -235,7 +235,7 @@ def run(options: Options) -> list[Row]:
     loop = Loop()
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         # Heartbeats are rare, because nobody turns the loop while robots and users are added.
-        relay = Relay(Path(folder), "--heartbeat", "120")
+        relay = Relay(Path(folder), "--heartbeat", "60")
         with running(relay), contextlib.closing(loop):
             ground = Ground(loop, relay)
             with proxies(loop) as proxy:

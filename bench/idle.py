@@ -36,7 +36,7 @@ def run(options: Options) -> list[Row]:
     seconds = options.pick(0.5, SETTLE_SECONDS)
     with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        relay = Relay(folder, "--heartbeat", "120")
+        relay = Relay(folder, "--heartbeat", "60")
         stack.enter_context(running(relay))
         pid = relay.pid
         loop = Loop()

@@ -83,7 +83,7 @@ def run(options: Options) -> list[Row]:
     executable()
     loop = Loop()
     with tempfile.TemporaryDirectory(prefix="bench-") as name, contextlib.ExitStack() as stack:
-        relay = Relay(Path(name), "--heartbeat", "120")
+        relay = Relay(Path(name), "--heartbeat", "60")
         stack.enter_context(running(relay))
         stack.callback(loop.close)
         ground = Ground(loop, relay)
