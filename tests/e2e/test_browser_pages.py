@@ -67,7 +67,9 @@ def open_page(browser: Browser, house: House) -> Iterator[Callable[..., Page]]:
                 page.goto(path)
             if SHOWN.get(path):
                 seen(page, SHOWN[path]).first.wait_for()
-            page.wait_for_load_state("load")
+            # Not before: a page whose part is still being loaded has no content yet.
+            page.locator("main").first.wait_for()
+            page.locator("h1").first.wait_for(state="attached")
             return page
 
         yield open_page
