@@ -211,7 +211,8 @@ class RobotConnection(TwistedProtocol):
     def send(self, message: link.Message) -> None:
         """Queue a message that must not be lost."""
         frame = link.frame(message)
-        if self._outbox.held and self._outbox.paused_since is None and isinstance(message, _AHEAD):
+        # A ping that counted against the budget would ask for another one.
+        if self._role is not None and self._outbox.paused_since is None and isinstance(message, _AHEAD):
             self._writer.urgent(frame)
         else:
             self._outbox.control(frame)

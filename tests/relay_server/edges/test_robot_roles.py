@@ -290,3 +290,18 @@ async def test_the_log_says_of_which_realm_a_robot_is_that_tells_of_something_wr
     await until(lambda: hall.journal._waiting == 0)
     (event,) = await hall.store.read(queries.list_events, kind="robot.alert")
     assert event.source == "robot:r2-d2"
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_channel_carries_any_number_of_commands(hall: Hall) -> None:
+    """What is on its way is measured by pings, which do not count themselves."""
+    _, ticket = await asked_to_join(hall)
+    end = hall.dial()
+    end.says(link.Join(version=1, ticket=ticket))
+    end.pongs()
+    for number in range(3000):
+        end.connection.command(1, number, 7, bytes(60))
+        if not number % 50:
+            end.pongs()
+    assert not end.connection.ended
+    assert not end.connection._outbox.dropped
