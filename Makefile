@@ -6,7 +6,7 @@ export ROS_LOG_DIR ?= $(CURDIR)/build/ros-log
 NPM := scripts/with-node.sh npm --silent --prefix web_client
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test conformance robot-conformance bench stills lint types web clean
+.PHONY: help setup demo test conformance robot-conformance bench stills house lint types web clean
 
 help: ## list these commands
 	@echo 'make <command>:'
@@ -41,6 +41,9 @@ bench: ## measure beside alternatives, all of it in two hours (options: BENCH='h
 stills: setup ## draw a still of every encoding of pictures as a viewer gets it: build/stills.png, to be looked at
 	@mkdir -p build
 	$(BIN)/python -m tests.robot_client.camera.contact_sheet build/stills.png
+
+house: setup ## count what makes the code hard to find one's way in (options: HOUSE=--all)
+	$(BIN)/python scripts/house.py $(HOUSE)
 
 lint: setup ## style and import rules
 	$(BIN)/ruff check .

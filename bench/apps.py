@@ -197,13 +197,13 @@ def looks(runs: int) -> list[float]:
     import cv2
     from skimage import data
 
-    from robot_client.services.faces import Finder, People, grey_of, look
-    from robot_client.services.lens import of_view
+    from robot_client.services.camera_model import of_view
+    from robot_client.services.faces import Finder, KnownFaces, grey_of, look
 
     cv2.setNumThreads(1)
     pixels = np.full((480, 640, 3), 110, np.uint8)
     pixels[:, :512] = data.astronaut()[:480, :, ::-1]
-    finder, people, lens = Finder(), People(), of_view(640, 480, 75)
+    finder, people, lens = Finder(), KnownFaces(), of_view(640, 480, 75)
     people.add("eileen", grey_of(pixels), finder.find(grey_of(pixels))[0])
     took = []
     for _ in range(runs):

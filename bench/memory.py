@@ -25,7 +25,7 @@ from bench.report import Options, Row
 from relay_db import queries
 from relay_db.base import canonical_json
 from relay_db.engine import Database
-from relay_db.queries import NewMemory
+from relay_db.queries import NewStoredEvent
 
 EVENTS = "/api/v1/events"
 SHARE = 5000
@@ -171,10 +171,10 @@ def fill(relay: Relay, count: int) -> None:
     database.close()
 
 
-def _event(number: int, at: float, rover: int) -> NewMemory:
+def _event(number: int, at: float, rover: int) -> NewStoredEvent:
     data = canonical_json({"n": number, "person": f"p{number % 97}"})
     robot = rover + number % 20 if number % 3 == 0 else None
-    return NewMemory(
+    return NewStoredEvent(
         "default", at, f"filled{number % 250}", f"k{number % 50}", robot, f"user{number % 40}", data
     )
 

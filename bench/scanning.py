@@ -15,8 +15,8 @@ from switchboard_client import Client
 from switchboard_waiting import wait_for
 
 from bench.relay import Relay
-from robot_client.apps.line import Line
-from robot_client.apps.runaway import Link, Manners, Runaway
+from robot_client.apps.collision_avoidance import AvoidanceConfig, AvoidanceLink, CollisionAvoidance
+from robot_client.apps.connection import RosbridgeConnection
 
 SCAN, COMMAND = "/scan", "/cmd_vel"
 RAYS = 360
@@ -72,9 +72,11 @@ class Kept:
         return int(stamp["sec"]) * 10**9 + int(stamp["nanosec"])
 
 
-def program(connection: Any) -> tuple[Link, Runaway]:
+def program(connection: Any) -> tuple[AvoidanceLink, CollisionAvoidance]:
     """The parts of ``runaway`` that read and decide, on a websocket."""
-    return Link(Line(connection), SCAN, COMMAND), Runaway(Manners())
+    return AvoidanceLink(RosbridgeConnection(connection), SCAN, COMMAND), CollisionAvoidance(
+        AvoidanceConfig()
+    )
 
 
 def constant(runs: int) -> list[float]:

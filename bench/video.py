@@ -32,7 +32,7 @@ from bench.child import Child
 from bench.cpu import measured
 from bench.relay import Relay
 from bench.report import Options, Row, Unavailable
-from relay_protocol.pictures import look_at
+from relay_protocol.image_check import look_at
 
 VIEWERS = (1, 10, 50)
 GROUP = 25

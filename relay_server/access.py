@@ -1,15 +1,11 @@
-"""The only judge: may this principal do this to that resource of that robot?
-
-A session asks its :class:`Permit` at every message. Permits live here: when rights change in the database they are
-compiled anew in place, and whoever holds one is told.
-"""
+"""Who may have a robot's pictures, by whichever road: a topic that carries them takes the right to view them too."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -21,8 +17,9 @@ from relay_protocol.errors import Refused
 from relay_protocol.realms import full_name
 from relay_protocol.rights import Grant, Operation, Rules, Verdict
 from relay_protocol.scopes import Scope
-from relay_server.clock import Coalesced
-from relay_server.store import Store
+from relay_server.common.clock import SingleFlight
+from relay_server.common.database import AsyncDatabase
+from relay_server.robots.registry import RobotState
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -131,7 +128,7 @@ class Access:
     """
 
     def __init__(
-        self, store: Store, wall: Callable[[], float], seconds: Callable[[], float] = time.monotonic
+        self, store: AsyncDatabase, wall: Callable[[], float], seconds: Callable[[], float] = time.monotonic
     ) -> None:
         self._store = store
         self._wall = wall
@@ -142,7 +139,7 @@ class Access:
         self._robots: OrderedDict[tuple[int, str | None], list[tuple[RobotRecord, Rules]]] = OrderedDict()
         """By user and scope; those of the longest unchanged are forgotten first."""
         self._refreshed = 0
-        self._refreshing = Coalesced(self._refresh)
+        self._refreshing = SingleFlight(self._refresh)
         self._proved: OrderedDict[str, Principal] = OrderedDict()
         """By the hash of a token, who it proved. Kept in step with the database as permits are."""
         self._admitted: OrderedDict[tuple[int, str | None, int], None] = OrderedDict()
@@ -347,3 +344,42 @@ def _standing_on(
     robot = find(session)
     key = principal.user_id, principal.token_id, _NOBODYS if robot is None else robot.id
     return robot, _standing(session, {key}, now)[key]
+
+
+Judge = Callable[[Operation, str], Verdict]
+"""Says whether somebody may do something to a resource of a robot: a permit's or rules' ``judge``."""
+
+PICTURES = frozenset(
+    {
+        "sensor_msgs/msg/Image",
+        "sensor_msgs/msg/CompressedImage",
+        "stereo_msgs/msg/DisparityImage",
+        "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+        "theora_image_transport/msg/Packet",
+        "foxglove_msgs/msg/CompressedImage",
+        "foxglove_msgs/msg/CompressedVideo",
+        "foxglove_msgs/msg/RawImage",
+    }
+)
+"""Types of topics that carry pictures."""
+
+
+def is_image_topic(robot: RobotState, topic: str, said: Collection[str] = ()) -> bool:
+    """Whether a topic of a robot shows what a camera sees, as far as anybody knows; without a type it may.
+
+    :param said: its types for those who hear it, where the robot's graph does not have it
+    """
+    known = robot.graph.topics.get(topic)
+    types = (known.types if known is not None else ()) or said
+    return not types or not PICTURES.isdisjoint(types) or any(each.name == topic for each in robot.cameras)
+
+
+def may_subscribe(judge: Judge, robot: RobotState, topic: str, said: Collection[str] = ()) -> Verdict:
+    """May somebody hear a topic of a robot?
+
+    :param said: as for :func:`is_image_topic`
+    """
+    verdict = judge(Operation.SUBSCRIBE, topic)
+    if verdict.allowed and is_image_topic(robot, topic, said):
+        return judge(Operation.VIEW, topic)
+    return verdict

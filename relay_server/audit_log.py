@@ -20,9 +20,9 @@ from twisted.python.failure import Failure
 
 from relay_db import queries
 from relay_protocol.errors import SwitchboardError
-from relay_server.clock import Clock, Timer, within
-from relay_server.folder import private
-from relay_server.store import Store
+from relay_server.common.clock import Clock, Timer, with_timeout
+from relay_server.common.data_dir import private
+from relay_server.common.database import AsyncDatabase
 
 WAITING = 4096
 """Entries that wait at most. Later ones are lost, and counted in one entry that stands where they would."""
@@ -49,8 +49,8 @@ Notify = Callable[[str, int], None]
 """Is given :data:`LOST` or :data:`WRITTEN`, and the number of a robot."""
 
 
-class Entry(msgspec.Struct):
-    """One entry; see :func:`relay_db.queries.append_audit`.
+class AuditLogEntry(msgspec.Struct):
+    """One entry; see :func:`relay_db.queries.history.append_audit`.
 
     :param at: Unix seconds at which it happened
     :param robots: numbers of the robots it is about
@@ -74,12 +74,12 @@ class AuditLog(Collector):
 
     log = Logger()
 
-    def __init__(self, clock: Clock, store: Store, folder: Path, notify: Notify) -> None:
+    def __init__(self, clock: Clock, store: AsyncDatabase, folder: Path, notify: Notify) -> None:
         self._clock = clock
         self._store = store
         self._path = folder / FILE
         self._notify = notify
-        self._entries: deque[Entry] = deque()
+        self._entries: deque[AuditLogEntry] = deque()
         self._under_way = 0
         """How many of them, from the first, are in the transaction under way."""
         self._unsure = 0
@@ -100,7 +100,7 @@ class AuditLog(Collector):
         yield GaugeMetricFamily("switchboard_audit_waiting", "Audit entries not in the database yet", waiting)
         yield CounterMetricFamily("switchboard_audit_lost", "Audit entries lost", self.lost)
 
-    def append(self, entry: Entry) -> None:
+    def append(self, entry: AuditLogEntry) -> None:
         """Write an entry as soon as the database takes it."""
         if len(self._entries) >= WAITING:
             self._lose(entry)
@@ -121,7 +121,7 @@ class AuditLog(Collector):
             return
         for line in lines[: WAITING + 1]:
             try:
-                self._entries.append(msgspec.json.decode(line, type=Entry))
+                self._entries.append(msgspec.json.decode(line, type=AuditLogEntry))
             except (msgspec.MsgspecError, UnicodeDecodeError):
                 self.log.error("an audit entry in {file} can't be read: {line}", file=FILE, line=line[:500])
         self._restored = True
@@ -132,7 +132,7 @@ class AuditLog(Collector):
         """Write what waits, into the database or else into a file that the next relay reads."""
         late = f"the database has not taken them within {KEEP_SECONDS:g} s"
         try:
-            await within(self._clock, KEEP_SECONDS, self.flush(), late)
+            await with_timeout(self._clock, KEEP_SECONDS, self.flush(), late)
         except SwitchboardError as error:
             reason = str(error)
         else:
@@ -170,7 +170,7 @@ class AuditLog(Collector):
 
     # --- writing ------------------------------------------------------------------------------------------
 
-    def _lose(self, entry: Entry) -> None:
+    def _lose(self, entry: AuditLogEntry) -> None:
         """Count an entry that finds no room, in the entry about lost ones at the end."""
         self.lost += 1
         self.log.error(
@@ -181,7 +181,7 @@ class AuditLog(Collector):
         )
         last = self._entries[-1]
         if last.action != LOST or len(self._entries) == self._under_way:
-            last = Entry(entry.at, "relay", LOST, "audit log", data={"count": 0})
+            last = AuditLogEntry(entry.at, "relay", LOST, "audit log", data={"count": 0})
             self._entries.append(last)
         self._entries[-1] = msgspec.structs.replace(
             last,
@@ -202,7 +202,7 @@ class AuditLog(Collector):
         writing.addErrback(lambda failure: self.log.failure("writing the audit log failed", failure))
         writing.addBoth(lambda _: self._go_on())
 
-    def _done(self, _: object, batch: Collection[Entry]) -> None:
+    def _done(self, _: object, batch: Collection[AuditLogEntry]) -> None:
         self._take_out(len(batch))
         self._batch = BATCH
         if self._behind and not self._entries:
@@ -212,7 +212,7 @@ class AuditLog(Collector):
             for robot in entry.robots if entry.action == LOST else ():
                 self._notify(WRITTEN, robot)
 
-    def _failed(self, failure: Failure, batch: list[Entry]) -> None:
+    def _failed(self, failure: Failure, batch: list[AuditLogEntry]) -> None:
         self._unsure = max(self._unsure, len(batch))
         if failure.check(SwitchboardError):
             if not self._behind:
@@ -253,7 +253,7 @@ class AuditLog(Collector):
                     each.callback(None)
 
 
-def _append(s: Session, batch: list[Entry], unsure: int) -> None:
+def _append(s: Session, batch: list[AuditLogEntry], unsure: int) -> None:
     """:param unsure: so many of them, from the first, may be there already"""
     kept = queries.audited_lately(s, min(entry.at for entry in batch)) if unsure else frozenset()
     for number, entry in enumerate(batch):

@@ -12,14 +12,14 @@ from relay_protocol.errors import Invalid
 
 
 @dataclass(frozen=True)
-class Endpoint:
+class ListenAddress:
     """Where to listen: a host (name or address) and a TCP port, 0 for any free one."""
 
     host: str
     port: int
 
     @classmethod
-    def parse(cls, text: str) -> Endpoint:
+    def parse(cls, text: str) -> ListenAddress:
         """``HOST:PORT``, with an IPv6 address in brackets.
 
         :raises Invalid: not of that form
@@ -68,7 +68,7 @@ class AlertSettings:
 
 
 @dataclass(frozen=True)
-class Settings:
+class RelaySettings:
     """What an operator can set.
 
     :param data: folder of the embedded database, the local socket and the pid file
@@ -99,8 +99,8 @@ class Settings:
 
     data: Path
     database: str
-    http: Endpoint
-    robots: Endpoint
+    http: ListenAddress
+    robots: ListenAddress
     tls_cert: Path | None = None
     tls_key: Path | None = None
     origins: tuple[str, ...] = field(default=())

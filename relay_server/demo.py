@@ -1,4 +1,4 @@
-"""``switchboard demo``: a relay, two simulated robots with their daemons, three users; everything reaped at the end."""
+"""Runs the demo: the relay in this process, the robots in their own."""
 
 from __future__ import annotations
 
@@ -13,12 +13,23 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import click
+from twisted.internet.defer import Deferred
+from twisted.internet.threads import deferToThread
+from twisted.python.failure import Failure
 
 from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_protocol.rights import Level
-from relay_server import passwords
+from relay_server import logs
+from relay_server.auth import passwords
+from relay_server.common.clock import looping
+from relay_server.config import ListenAddress, RelaySettings
+from relay_server.run import leave, monotonic_reactor, run
+from relay_server.service import Relay
 
 ROBOTS = ("robot-one", "robot-two")
 USERS = ("admin", "driver", "viewer")
@@ -29,7 +40,7 @@ DOMAINS = range(1, 100)
 
 
 @dataclass(frozen=True)
-class Login:
+class DemoUser:
     """A user of the demo."""
 
     name: str
@@ -37,10 +48,10 @@ class Login:
     may: str
 
 
-def prepare(database: Database) -> list[Login]:
+def prepare(database: Database) -> list[DemoUser]:
     """Users, robots and rights of the demo; on a folder used before, users get new passwords."""
     database.upgrade()
-    logins = [Login(name, secrets.token_urlsafe(9), _MAY[name]) for name in USERS]
+    logins = [DemoUser(name, secrets.token_urlsafe(9), _MAY[name]) for name in USERS]
     with database.begin() as session:
         for login in logins:
             hashed = passwords.hash_password(login.password)
@@ -71,7 +82,7 @@ _RIGHTS = (
 )
 
 
-class Fleet:
+class DemoRobots:
     """The processes of the simulated robots.
 
     :param data: folder; each robot's state and logs go below it
@@ -190,3 +201,85 @@ def _free_domains(count: int) -> list[int]:
         if len(found) == count:
             return found
     raise Unavailable("no free ROS domain was found on this machine")
+
+
+ONLINE_SECONDS = 90.0
+
+
+def run_demo(folder: Path, http: ListenAddress, robots: ListenAddress) -> int:
+    """Run until a signal ends it.
+
+    :param folder: for the database, the robots' state and all logs
+    :returns: exit code
+    """
+    url = f"sqlite:///{folder / 'switchboard.db'}"
+    log = (folder / "relay.log").open("a")
+    logs.begin(as_json=False, out=log, later=logs.later)
+    reactor = monotonic_reactor()
+    database = Database(url)
+    logins = prepare(database)
+    fleet = DemoRobots(folder, _say)
+    failed: list[str] = []
+
+    def broken(failure: Failure) -> None:
+        failed.append(failure.getErrorMessage())
+        leave(reactor)
+
+    def ready(relay: Relay, _: str | None) -> None:
+        _say(f"the relay listens at {relay.url}")
+        launching = deferToThread(fleet.launch, database, relay.robots_port)
+        launching.addCallback(lambda _: Deferred.fromCoroutine(_all_online(reactor, relay, fleet)))
+        launching.addCallback(lambda _: Deferred.fromCoroutine(_welcome(relay, logins, folder)))
+        launching.addErrback(broken)
+
+    reactor.addSystemEventTrigger("before", "shutdown", lambda: deferToThread(fleet.stop))
+    try:
+        code = run(
+            RelaySettings(data=folder, database=url, http=http, robots=robots), ready, hangup_ends=True
+        )
+    finally:
+        fleet.stop()
+        database.close()
+        log.close()
+    if failed:
+        click.echo(f"The demo failed: {failed[0]}", err=True)
+        for path in [folder / "relay.log", *sorted((folder / "logs").glob("*.log"))]:
+            for line in path.read_text(errors="replace").splitlines()[-5:]:
+                click.echo(f"  {path.name}: {line}", err=True)
+    return code or bool(failed)
+
+
+async def _all_online(reactor: Any, relay: Relay, fleet: DemoRobots) -> None:
+    since = time.monotonic()
+    done: Deferred[None] = Deferred()
+
+    def look() -> None:
+        online = [robot["name"] for robot in relay.status()["robots"] if robot["state"] != "offline"]
+        dead = fleet.dead()
+        if dead is not None:
+            done.errback(Unavailable(dead))
+        elif len(online) == len(ROBOTS):
+            done.callback(None)
+        elif time.monotonic() - since > ONLINE_SECONDS:
+            done.errback(Unavailable(f"not all robots came online within {ONLINE_SECONDS:g} s"))
+
+    loop = looping(reactor, look)
+    loop.start(0.2)
+    try:
+        await done
+    finally:
+        loop.stop()
+
+
+async def _welcome(relay: Relay, logins: list[DemoUser], folder: Path) -> None:
+    link = await relay.login_link("admin")
+    width = max(len(login.name) for login in logins)
+    lines = [f"  {login.name:<{width}}  {login.password}   {login.may}" for login in logins]
+    click.echo("\n".join(["", "Users and passwords of this demo:", *lines, ""]))
+    click.echo(f"Log in as admin with this link, once:\n  {link}\n")
+    click.echo(f"Logs are in {folder}. Ctrl-C ends everything.")
+    click.echo(f"READY {relay.url}")
+
+
+def _say(text: str) -> None:
+    click.echo(f"… {text}")

@@ -65,7 +65,7 @@ def later(seconds: float, work: Callable[[], None]) -> None:
 
 
 @dataclass
-class _Kind:
+class _LineKind:
     """Lines of one kind in one window.
 
     :param began: seconds
@@ -87,7 +87,7 @@ class _Writer:
         self._as_json = as_json
         self._debug = debug
         self._later = later
-        self._kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
+        self._kinds: OrderedDict[Hashable, _LineKind] = OrderedDict()
         # Garbage collection may log in the middle of it.
         self._lock = RLock()
 
@@ -116,7 +116,7 @@ class _Writer:
             self._close_windows(now)
             counted = self._kinds.get(kind)
             if counted is None:
-                counted = self._kinds[kind] = _Kind(now, level.name, namespace, text)
+                counted = self._kinds[kind] = _LineKind(now, level.name, namespace, text)
             if counted.written < most:
                 counted.written += 1
                 if failure is not None and level >= LogLevel.critical:

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Iterator
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector, CollectorRegistry
 
-from relay_server.channel import Channels
-from relay_server.registry import Registry, State
-from relay_server.session import Session
-from relay_server.video import Videos
+from relay_server.channels.channels import Channels
+from relay_server.robots.registry import Availability, RobotRegistry
+from relay_server.sessions.session import Session
+from relay_server.video.streams import CameraStreams
 
 
 class RelayCollector(Collector):
@@ -18,9 +18,9 @@ class RelayCollector(Collector):
 
     def __init__(
         self,
-        registry: Registry,
+        registry: RobotRegistry,
         channels: Channels,
-        videos: Videos,
+        videos: CameraStreams,
         sessions: Callable[[], Iterable[Session]],
     ) -> None:
         self._registry = registry
@@ -32,7 +32,7 @@ class RelayCollector(Collector):
         """One reading."""
         robots = GaugeMetricFamily("switchboard_robots", "Robots by state", labels=["state"])
         states = [robot.state for robot in self._registry]
-        for state in State:
+        for state in Availability:
             robots.add_metric([state.value], states.count(state))
         yield robots
         sessions = list(self._sessions())

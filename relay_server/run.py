@@ -17,7 +17,7 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import SwitchboardError, Unavailable
-from relay_server.config import Settings
+from relay_server.config import RelaySettings
 from relay_server.service import Relay
 
 STOP_SECONDS = 8.0
@@ -25,7 +25,9 @@ _ENDING = (signal.SIGTERM, signal.SIGINT)
 log = Logger()
 
 
-def run(settings: Settings, ready: Callable[[Relay, str | None], None], *, hangup_ends: bool = False) -> int:
+def run(
+    settings: RelaySettings, ready: Callable[[Relay, str | None], None], *, hangup_ends: bool = False
+) -> int:
     """Serve until SIGTERM or SIGINT.
 
     :param ready: called once everything listens, with the first login link if nobody can log in yet

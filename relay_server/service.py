@@ -23,61 +23,64 @@ from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Invalid, SwitchboardError
-from relay_server import VERSION, invitation, passwords
+from relay_server import VERSION
 from relay_server.access import Access
-from relay_server.administration.desk import RealmDesk
-from relay_server.alerts import AlertHouse
+from relay_server.alerts import http as alerts
+from relay_server.alerts.build import AlertParts
 from relay_server.audit_log import AuditLog
-from relay_server.auth import Authenticator
-from relay_server.channel import Channels
-from relay_server.config import Endpoint, Settings
-from relay_server.console import Console
-from relay_server.control import ControlRules, DatabaseRecord, Desks
-from relay_server.directory.house import DirectoryHouse
-from relay_server.edges import (
-    alerts,
-    events,
-    fleet,
-    presence,
-    realm,
-    recordings,
-    representing,
-    resources,
-    vocabulary,
-)
-from relay_server.edges import control as control_edge
-from relay_server.edges import directory as directory_edge
-from relay_server.edges.admin import AdminSocket
-from relay_server.edges.api import Api
-from relay_server.edges.caps import AddressCap
-from relay_server.edges.fastpath import Turns
-from relay_server.edges.limiting import RequestLimits
-from relay_server.edges.pages import PageGate
-from relay_server.edges.robot_pages import RobotPages
-from relay_server.edges.robot_roles import Opening, RobotHall
-from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
-from relay_server.edges.site import RelaySite
-from relay_server.edges.sources import Sources
-from relay_server.edges.whole import site_of
-from relay_server.fleet import FleetDesk
-from relay_server.folder import DataFolder
-from relay_server.frontdesk import FrontDesk
-from relay_server.inside import Guests
-from relay_server.journal import Journal
-from relay_server.memory import MemoryHouse
+from relay_server.auth import login_links, passwords
+from relay_server.auth.authenticator import Authenticator
+from relay_server.auth.origins import Origins
+from relay_server.change_watcher import ChangeWatcher, RealmCaches
+from relay_server.channels.channels import Channels
+from relay_server.common.data_dir import DataDir
+from relay_server.common.database import AsyncDatabase
+from relay_server.common.freshness_tokens import FreshnessTokens
+from relay_server.common.socket_writer import FlushScheduler
+from relay_server.config import ListenAddress, RelaySettings
+from relay_server.control import http as control_edge
+from relay_server.control.audit import DatabaseAuditSink
+from relay_server.control.controllers import Controllers
+from relay_server.control.service import ControlService
+from relay_server.control.types import ControlRules
+from relay_server.events import http as events
+from relay_server.events.build import EventParts
+from relay_server.events.bus import EventBus
+from relay_server.fleet import http as fleet
+from relay_server.fleet.service import FleetService
+from relay_server.http import negotiation
+from relay_server.http.admin_socket import AdminSocket
+from relay_server.http.api import Api
+from relay_server.http.build import build_site
+from relay_server.http.connection_limits import ConnectionLimits
+from relay_server.http.idempotency import Idempotency
+from relay_server.http.rate_limits import RequestLimits
+from relay_server.http.rdf import http as vocabulary
+from relay_server.http.site import RelaySite
+from relay_server.http.update_sources import Sources
+from relay_server.http_sessions.pool import SessionPool
 from relay_server.metrics import RelayCollector, registry_of
-from relay_server.moments import Moments
-from relay_server.oauth import OAuthDesk
-from relay_server.origins import Origins
-from relay_server.recording import FOLDER, Library, RecordingDesk, Recordings, sweep
-from relay_server.registry import Registry
-from relay_server.resources import Idempotency
-from relay_server.retiring import Realms
-from relay_server.session import Timing
-from relay_server.store import Store
-from relay_server.taking_up import TakingUp
+from relay_server.oauth.service import OAuthService
+from relay_server.realms import http as realm
+from relay_server.realms.service import RealmService
+from relay_server.recordings import http as recordings
+from relay_server.recordings.library import FOLDER, Library
+from relay_server.recordings.recordings import Recordings
+from relay_server.recordings.retention import sweep
+from relay_server.recordings.service import RecordingService
+from relay_server.registry import http as directory_edge
+from relay_server.registry.build import RegistryParts
+from relay_server.resources import http as resources
+from relay_server.resources import people_http
+from relay_server.resources.robots_http import RobotResource
+from relay_server.robots.connection import LinkTiming, RobotConnection, RobotFactory
+from relay_server.robots.link_roles import HandshakeRole, RobotLinkContext
+from relay_server.robots.registry import RobotRegistry
+from relay_server.sessions.manager import SessionManager
+from relay_server.sessions.ports import Timing
 from relay_server.tls import ServerTls
-from relay_server.video import Videos
+from relay_server.video.streams import CameraStreams
+from relay_server.ws.updates import UpdatesGate
 
 PURGE_SECONDS = 3600.0
 EVENT_SECONDS = 30 * 86400.0
@@ -92,45 +95,47 @@ class Relay:
 
     log = Logger()
 
-    def __init__(self, reactor: Any, settings: Settings) -> None:
+    def __init__(self, reactor: Any, settings: RelaySettings) -> None:
         self._reactor = reactor
         self.settings = settings
-        self._folder = DataFolder(settings.data)
+        self._folder = DataDir(settings.data)
         self._database = Database(settings.database)
-        self._store = Store(reactor, self._database)
+        self._store = AsyncDatabase(reactor, self._database)
         self._tls = (
             ServerTls(settings.tls_cert, settings.tls_key) if settings.tls_cert and settings.tls_key else None
         )
-        self._workshop = representing.Workshop(reactor)
+        self._workshop = negotiation.ConversionPool(reactor)
         self._auth = Authenticator(reactor, self._store, time.monotonic, time.time)
         self._access = Access(self._store, time.time)
-        self._registry = Registry(time.time)
+        self._registry = RobotRegistry(time.time)
         self._channels = Channels(
             reactor, linger=settings.linger, new_ticket=passwords.new_token, wall_ns=time.time_ns
         )
-        self._videos = Videos(reactor, new_ticket=passwords.new_token)
+        self._videos = CameraStreams(reactor, new_ticket=passwords.new_token)
         library = Library(settings.data / FOLDER, settings.recordings, settings.recordings_reserve)
         self._recordings = Recordings(reactor, reactor, library, self._channels, self._videos, time.time)
-        self._journal = Journal(self._store, time.time)
+        self._journal = EventBus(self._store, time.time)
         self._audit = AuditLog(reactor, self._store, settings.data, self._journal.tell)
-        record = DatabaseRecord(self._store, self._journal, self._audit, time.time)
-        self._desks = Desks(reactor, record, ControlRules.of(settings), self._registry.changed, time.time)
+        record = DatabaseAuditSink(self._store, self._journal, self._audit, time.time)
+        self._desks = Controllers(
+            reactor, record, ControlRules.of(settings), self._registry.changed, time.time
+        )
         judged = self._store, self._access, self._registry
-        self._alerts = AlertHouse(reactor, *judged, self._channels, self._desks, self._journal, settings)
+        self._alerts = AlertParts(reactor, *judged, self._channels, self._desks, self._journal, settings)
         told = self._journal, self._alerts.alerts
-        self._memory = MemoryHouse(reactor, *judged, *told, settings)
-        self._directory = DirectoryHouse(reactor, *judged, self._channels, self._memory.note)
-        realms = Realms(self._store, self._memory.realms, self._directory.realms)
+        self._memory = EventParts(reactor, *judged, *told, settings)
+        self._directory = RegistryParts(reactor, *judged, self._channels, self._memory.note)
+        realms = RealmCaches(self._store, self._memory.realms, self._directory.realms)
         concerned = self._registry, self._desks, self._videos, self._alerts.alerts, self._directory.leases
-        self._taking_up = TakingUp(self._store, self._access, realms, *concerned, self._sweep)
+        self._taking_up = ChangeWatcher(self._store, self._access, realms, *concerned, self._sweep)
         self._ports: list[Any] = []
         self._polling = LoopingCall(self._poll)
         self._purging = LoopingCall(self._purge)
         self._database_fine = True
-        self._desk: FrontDesk | None = None
-        self._pages: PageGate | None = None
-        self._fleet: FleetDesk | None = None
-        self._console: Console | None = None
+        self._desk: SessionManager | None = None
+        self._pages: UpdatesGate | None = None
+        self._fleet: FleetService | None = None
+        self._console: ControlService | None = None
         self.http_port = 0
         self.robots_port = 0
         self._started = time.monotonic()
@@ -158,7 +163,7 @@ class Relay:
         await self._alerts.start(name)
         self.http_port = (await self._listen(self.settings.http, self._site(name))).getHost().port
         rooms = self._store, self._registry, self._channels, self._videos, self._desks, self._journal
-        hall = RobotHall(name, *rooms, time.monotonic, time.time)
+        hall = RobotLinkContext(name, *rooms, time.monotonic, time.time)
         robots = await self._listen(self.settings.robots, self._robot_factory(hall))
         self.robots_port = robots.getHost().port
         await self._listen_locally()
@@ -174,7 +179,7 @@ class Relay:
         origins = Origins(settings.scheme, settings.origins)
         # Cookies know no ports: relays side by side on one host must not overwrite each other's.
         cookie = f"switchboard_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-        self._desk = FrontDesk(
+        self._desk = SessionManager(
             self._reactor,
             self._store,
             self._auth,
@@ -192,25 +197,25 @@ class Relay:
             clock_ns=now_ns,
             wall=time.time,
         )
-        desk, moments = self._desk, Moments(now_ns)
+        desk, moments = self._desk, FreshnessTokens(now_ns)
         collector = RelayCollector(self._registry, self._channels, self._videos, lambda: desk)
         metrics = registry_of(collector, self._memory, self._audit)
-        keeper = RecordingDesk(desk, self._recordings, self._store, self._journal, time.time)
-        guests = Guests(self._reactor, desk, now_ns)
+        keeper = RecordingService(desk, self._recordings, self._store, self._journal, time.time)
+        guests = SessionPool(self._reactor, desk, now_ns)
         offices = self._access, self._desks, self._registry, self._store
-        self._console = Console(self._reactor, desk, *offices, guests)
+        self._console = ControlService(self._reactor, desk, *offices, guests)
         # What is written down often is not to crowd out what robots have been asked to do.
         keys, robots_keys = Idempotency(self._reactor), Idempotency(self._reactor)
         making = robots_keys, self._workshop, moments, now_ns, time.time
         below = {
             "recordings": partial(recordings.below, self._reactor, keeper, keys),
-            "people": partial(presence.below, desk.overview),
+            "people": partial(people_http.below, desk.overview),
             **resources.parts(self._reactor, desk, guests, *making),
             **{
                 part: partial(control_edge.below, self._console, moments, part) for part in control_edge.PARTS
             },
         }
-        self._fleet = FleetDesk(
+        self._fleet = FleetService(
             self._reactor,
             desk,
             self._access,
@@ -220,8 +225,10 @@ class Relay:
             self._journal,
             self._audit,
         )
-        meanings = vocabulary.Meanings(self._access, self._registry, self._workshop)
-        realms = RealmDesk(self._store, self._auth, self._recordings, self.refresh, lambda: self.robots_port)
+        meanings = vocabulary.TypeDocs(self._access, self._registry, self._workshop)
+        realms = RealmService(
+            self._store, self._auth, self._recordings, self.refresh, lambda: self.robots_port
+        )
         beside = {
             "alerts": partial(alerts.beside, self._alerts.desk),
             "directory": partial(directory_edge.beside, self._reactor, self._directory.desk),
@@ -232,26 +239,26 @@ class Relay:
         }
         told = {"robots": desk.overview.shared, "alerts": self._alerts.desk.shown}
         sources = Sources(self._reactor, told, self._registry.on_change)
-        served = desk, origins, metrics, below, beside, RobotPages(desk, self._workshop), sources
+        served = desk, origins, metrics, below, beside, RobotResource(desk, self._workshop), sources
         limits = RequestLimits(settings.requests, time.monotonic, settings.streams, settings.answer_seconds)
         api = Api(self._reactor, *served, cookie=cookie, secure=settings.tls, limits=limits)
-        self._pages = PageGate(self._reactor, desk, origins, cookie, sources)
-        oauth = OAuthDesk(self._store, self._auth, self._access, self._journal, time.monotonic, time.time)
-        return site_of(self._reactor, now_ns, desk, api, oauth, self._pages, settings, limits, cookie)
+        self._pages = UpdatesGate(self._reactor, desk, origins, cookie, sources)
+        oauth = OAuthService(self._store, self._auth, self._access, self._journal, time.monotonic, time.time)
+        return build_site(self._reactor, now_ns, desk, api, oauth, self._pages, settings, limits, cookie)
 
-    def _robot_factory(self, hall: RobotHall) -> RobotFactory:
-        cap = AddressCap(self.settings.connections_per_address)
+    def _robot_factory(self, hall: RobotLinkContext) -> RobotFactory:
+        cap = ConnectionLimits(self.settings.connections_per_address)
         timing = LinkTiming(self.settings.heartbeat, self.settings.largest_sample)
-        turns = Turns(self._reactor)
+        turns = FlushScheduler(self._reactor)
 
         def build() -> RobotConnection:
             return RobotConnection(
-                self._reactor, now_ns, timing, lambda connection: Opening(hall, connection), cap, turns
+                self._reactor, now_ns, timing, lambda connection: HandshakeRole(hall, connection), cap, turns
             )
 
         return RobotFactory(build)
 
-    async def _listen(self, where: Endpoint, factory: Any) -> Any:
+    async def _listen(self, where: ListenAddress, factory: Any) -> Any:
         kind: Any = TCP6ServerEndpoint if ":" in where.host else TCP4ServerEndpoint
         endpoint: Any = kind(self._reactor, where.port, interface=where.host)
         if self._tls is not None:
@@ -272,14 +279,14 @@ class Relay:
 
     async def first_login(self) -> str | None:
         """A one-time login link for the administrator of a relay nobody can log in to yet."""
-        return await invitation.first_login(self._store, self.url)
+        return await login_links.first_login(self._store, self.url)
 
     async def login_link(self, user: str) -> str:
         """A one-time login link for a user.
 
         :raises Invalid: no such user
         """
-        return await invitation.login_link(self._store, self.url, user)
+        return await login_links.login_link(self._store, self.url, user)
 
     @property
     def url(self) -> str:

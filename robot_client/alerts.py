@@ -32,7 +32,7 @@ def nobody(level: str, text: str, kind: str = "", about: str = "", over: bool = 
     """Nobody is there to be told."""
 
 
-class Concern:
+class AlertCondition:
     """One thing that may be wrong for a while: a person hears when it begins, when it is another, and when it is over.
 
     :param alert: tells a person

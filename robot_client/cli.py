@@ -19,13 +19,13 @@ from relay_protocol.identity import check_robot_name
 from relay_protocol.realms import parted
 from relay_protocol.text import inert
 from robot_client import config, logs
-from robot_client.enrolling import enroll as hand_in
-from robot_client.helptext import examples
-from robot_client.identity import Enrolment, StateFolder
-from robot_client.lasting import DiskLatch
-from robot_client.reactors import monotonic_reactor
+from robot_client.help_text import examples
+from robot_client.link.enrolment import enroll as hand_in
+from robot_client.link.identity import Enrolment, StateFolder
+from robot_client.link.tls import endpoint, is_loopback, split_address
+from robot_client.motion.stop_store import DiskStopStore
 from robot_client.run import Runner, agent
-from robot_client.tls import endpoint, is_loopback, split_address
+from robot_client.twisted_types import monotonic_reactor
 
 _ENROLL = (
     "switchboard-robot enroll --relay relay.example.org:9091 --tls --robot rover --code - --state ./rover",
@@ -149,7 +149,7 @@ def run(state: Path, config_path: Path | None, log_json: bool, use_sim_time: boo
     _warn_if_plain(split_address(enrolment.address)[0], enrolment.tls)
     logs.begin(log_json)
     reactor = monotonic_reactor()
-    runner = Runner(reactor, settings, enrolment, me, DiskLatch(state))
+    runner = Runner(reactor, settings, enrolment, me, DiskStopStore(state))
     runner.start()
     reactor.addSystemEventTrigger("before", "shutdown", runner.stop)
     reactor.run()

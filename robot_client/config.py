@@ -18,12 +18,12 @@ from relay_protocol.limits import (
     ROBOT_SAMPLE,
     STOP_WITHIN_MS,
 )
-from relay_protocol.link import MotionPolicy, moving
+from relay_protocol.link import MotionPolicy, motion
 from relay_protocol.wildcards import see_cheap
 from robot_client.camera.device import V4L2, read_device
-from robot_client.hardware import Switches
+from robot_client.motion.hardware import Switches
+from robot_client.motion.safety import Times
 from robot_client.platforms.definitions import normalise
-from robot_client.safety import Times
 
 ENVIRONMENT = "SWITCHBOARD_ROBOT_"
 NOT_SETTINGS = frozenset(ENVIRONMENT + name for name in ("STATE", "CONFIG", "LOG_JSON"))
@@ -87,7 +87,7 @@ class TopicTimes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         msgspec.structs.force_setattr(self, "name", _topic_name("topic", self.name))
 
 
-class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SafetySettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What moves the robot and when it is stopped.
 
     :param motion_types: message types whose topics move the robot; ``package/Name`` is taken too
@@ -203,9 +203,9 @@ class Speeds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     angular_acceleration: Most | None = None
 
     @property
-    def whole(self) -> moving.Limits:
+    def whole(self) -> motion.Limits:
         """As the relay is told."""
-        return moving.Limits(
+        return motion.Limits(
             linear=self.linear,
             angular=self.angular,
             linear_acceleration=self.linear_acceleration,
@@ -213,7 +213,7 @@ class Speeds(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
 
-class Limits(Speeds, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LimitSettings(Speeds, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How fast whom may move the robot; the stricter of what holds for all and for his level counts.
 
     :param operator: those who may operate the robot
@@ -262,7 +262,7 @@ class Monitor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     diagnostics: bool = True
 
 
-class Video(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class VideoSettingsSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How pictures are shown.
 
     :param streams: most at a time, of which a relay shows no more than 16; each takes a good part of a processor's core
@@ -274,7 +274,7 @@ class Video(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     target_ms: Annotated[float, msgspec.Meta(ge=50, le=5000)] = 300.0
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RobotSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings; each section is a table of the TOML file.
 
     :param cameras: those without ROS, by a name like a topic's: ``v4l2:/dev/video0``, which may be told its size, rate
@@ -282,11 +282,11 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         the path of a file
     """
 
-    safety: Safety = msgspec.field(default_factory=Safety)
-    limits: Limits = msgspec.field(default_factory=Limits)
+    safety: SafetySettings = msgspec.field(default_factory=SafetySettings)
+    limits: LimitSettings = msgspec.field(default_factory=LimitSettings)
     ros: Ros = msgspec.field(default_factory=Ros)
     monitor: Monitor = msgspec.field(default_factory=Monitor)
-    video: Video = msgspec.field(default_factory=Video)
+    video: VideoSettingsSection = msgspec.field(default_factory=VideoSettingsSection)
     cameras: dict[str, str] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -348,7 +348,7 @@ def _camera_source(name: str, source: str) -> str:
     return source
 
 
-def load(path: Path | None, environment: Mapping[str, str]) -> Settings:
+def load(path: Path | None, environment: Mapping[str, str]) -> RobotSettings:
     """The settings of this run.
 
     :param path: TOML file, ``None`` for none
@@ -359,7 +359,7 @@ def load(path: Path | None, environment: Mapping[str, str]) -> Settings:
         *sections, key = path_of_key
         _table(tables, sections)[key] = value
     try:
-        return msgspec.convert(tables, Settings, strict=False)
+        return msgspec.convert(tables, RobotSettings, strict=False)
     except msgspec.ValidationError as error:
         raise Invalid(f"the settings are wrong: {error}") from None
 
@@ -388,7 +388,7 @@ def _from_file(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _from_environment(environment: Mapping[str, str]) -> list[tuple[tuple[str, ...], Any]]:
-    known = {ENVIRONMENT + "_".join(path).upper(): (path, kind) for path, kind in _keys(Settings, ())}
+    known = {ENVIRONMENT + "_".join(path).upper(): (path, kind) for path, kind in _keys(RobotSettings, ())}
     found = []
     for variable, text in environment.items():
         if not variable.startswith(ENVIRONMENT) or variable in NOT_SETTINGS:

@@ -17,37 +17,36 @@ from relay_protocol.clocks import now_ns
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.limits import HEARTBEAT_SECONDS, MIB, ROBOT_FRAME
 from robot_client.alerts import CONTROL, MODULE, AlertMemory
-from robot_client.authority import Authority
-from robot_client.body import Body
-from robot_client.camera.desk import CameraDesk
-from robot_client.channel import Channel
-from robot_client.channel_end import ChannelEnd
-from robot_client.config import Settings
-from robot_client.connection import Connection, Dial
-from robot_client.driven import Driven
-from robot_client.enduring import Rounds, endure
-from robot_client.gate import Gate
-from robot_client.goal_topics import GoalTopics
-from robot_client.graph_parts import parts
-from robot_client.guard_feed import GuardFeed
-from robot_client.hardware import Hardware
-from robot_client.helm import LOOK_EVERY, Helm
-from robot_client.lasting import Latch
-from robot_client.limits import limits_told
-from robot_client.link import ChannelLink
+from robot_client.camera.service import DaemonCameras
+from robot_client.channel.channel import ChannelConnection, RobotChannel
+from robot_client.config import RobotSettings
+from robot_client.graph_chunks import parts
+from robot_client.link.connection import ControlConnection, Dial
+from robot_client.link.protocol import ChannelLink
+from robot_client.link.tls import explain
+from robot_client.link.transport import LinkLost, LinkProtocol
 from robot_client.monitor import Machine, operating_system
-from robot_client.motion import MotionDesk
+from robot_client.motion.active_goals import FAREWELL, ActiveGoals
+from robot_client.motion.authority import Authority
+from robot_client.motion.gate import MotionGate
+from robot_client.motion.goal_canceller import GoalCanceller
+from robot_client.motion.goal_topics import GoalTopics
+from robot_client.motion.guard_port import GuardPort
+from robot_client.motion.hardware import Hardware
+from robot_client.motion.limits import limits_told
+from robot_client.motion.link_loss_alert import LinkLossAlert
+from robot_client.motion.motion import MotionControl
+from robot_client.motion.orders import LOOK_EVERY, OrderHandler
+from robot_client.motion.robot_port import RobotPort
+from robot_client.motion.rules import rules_of
+from robot_client.motion.stop_store import StopStore
+from robot_client.periodic import PeriodicTasks, run_safely
 from robot_client.platforms.base import GraphView, Platform, difference, whole
-from robot_client.pursuits import FAREWELL, Pursuits
-from robot_client.rules import rules_of
-from robot_client.sweep import Sweep
-from robot_client.tls import explain
-from robot_client.transport import LinkLost, LinkProtocol
 
 MAX_CHANNELS = 64
 
 
-class Daemon(Body):
+class Daemon(RobotPort):
     """Everything between the relay and one platform.
 
     :param latch: where a stop is kept
@@ -58,12 +57,12 @@ class Daemon(Body):
 
     def __init__(
         self,
-        settings: Settings,
-        connection: Connection,
+        settings: RobotSettings,
+        connection: ControlConnection,
         platform: Platform,
-        guard: GuardFeed,
-        cameras: CameraDesk,
-        latch: Latch,
+        guard: GuardPort,
+        cameras: DaemonCameras,
+        latch: StopStore,
         hardware: Hardware,
         clock: Any,
         dial: Dial,
@@ -72,16 +71,18 @@ class Daemon(Body):
     ) -> None:
         policy = settings.safety.policy
         self.authority = Authority()
-        self.motion = MotionDesk(policy, platform, clock, now, guard, self.authority, rules_of(settings))
-        sweep = Sweep(policy, platform, clock, self.motion.commanded)
-        self.helm = Helm(self.authority, self.motion, latch, hardware, sweep, self, clock, now, time.time)
+        self.motion = MotionControl(policy, platform, clock, now, guard, self.authority, rules_of(settings))
+        sweep = GoalCanceller(policy, platform, clock, self.motion.commanded)
+        self.helm = OrderHandler(
+            self.authority, self.motion, latch, hardware, sweep, self, clock, now, time.time
+        )
         self.helm.limits = limits_told(settings)
-        self._pursuits = Pursuits(policy.actions, guard, sweep, latch, clock, now)
+        self._pursuits = ActiveGoals(policy.actions, guard, sweep, latch, clock, now)
         self.motion.proof = self._pursuits.proof = lambda: connection.answered or 0
         self.motion.on_commanded = connection.prove
         self._pursuits.on_pursuing = self._goals_pursued
         self._pursuits.on_changed = self.helm.changed
-        self._gate = Gate(policy, platform, self.authority, now, settings.safety.stop_call)
+        self._gate = MotionGate(policy, platform, self.authority, now, settings.safety.stop_call)
         self._goal_topics = GoalTopics(
             settings.safety.goal_topics, platform, self.authority, self.motion, clock, now
         )
@@ -94,7 +95,7 @@ class Daemon(Body):
         self._agent = agent
         self._now = now
         self._started = time.time()
-        self._ends: dict[str, ChannelEnd] = {}
+        self._ends: dict[str, ChannelConnection] = {}
         self._opening: dict[str, Deferred[Any]] = {}
         self._dropped = 0
         self._heartbeat = HEARTBEAT_SECONDS
@@ -102,7 +103,7 @@ class Daemon(Body):
         self._sample_limit = 0
         self._told: GraphView | None = None
         self._alerts = AlertMemory(connection, now)
-        self._driven = Driven(now)
+        self._driven = LinkLossAlert(now)
         self._machine = Machine()
         self._troubled = False
         rounds = [
@@ -111,7 +112,7 @@ class Daemon(Body):
             (self._pursuits.look, LOOK_EVERY),
             (self._tell_health, settings.monitor.health_seconds),
         ]
-        self._rounds = Rounds(rounds, clock)
+        self._rounds = PeriodicTasks(rounds, clock)
         self._log = Logger("daemon")
         connection.follower = self
 
@@ -172,15 +173,15 @@ class Daemon(Body):
         """Without a control link nobody may drive; channels are joined anew."""
         driver = self._driven.lost(proved)  # before zero is said, which changes it
         failed = "after the loss of the control link something could not be done"
-        endure(self._log, failed, self.helm.unregistered)
-        endure(self._log, failed, self.motion.stop_all, "the control link is lost", True)
+        run_safely(self._log, failed, self.helm.unregistered)
+        run_safely(self._log, failed, self.motion.stop_all, "the control link is lost", True)
         self._told = None
         self._close_channels(reason)
         if driver is not None:
             words = (
                 f"{driver or 'somebody'} lost control while the robot moved: its link to the relay was lost"
             )
-            endure(self._log, failed, self.alert, "error", words, CONTROL)
+            run_safely(self._log, failed, self.alert, "error", words, CONTROL)
         self._cameras.unregistered(reason)
 
     # --- for the helm --------------------------------------------------------------------------------------
@@ -262,9 +263,9 @@ class Daemon(Body):
     def _make_channel(self, message: link.OpenChannel) -> LinkProtocol:
         channel_link = ChannelLink(message.ticket, self._now, self._heartbeat)
 
-        def make_end(protocol: LinkProtocol) -> ChannelEnd:
-            end = ChannelEnd(message.channel, protocol, self._gone)
-            end.channel = Channel(
+        def make_end(protocol: LinkProtocol) -> ChannelConnection:
+            end = ChannelConnection(message.channel, protocol, self._gone)
+            end.channel = RobotChannel(
                 message.channel,
                 end,
                 channel_link.offset,
@@ -283,7 +284,7 @@ class Daemon(Body):
 
         return LinkProtocol(channel_link, make_end, self._clock)
 
-    def _gone(self, end: ChannelEnd, reason: str) -> None:
+    def _gone(self, end: ChannelConnection, reason: str) -> None:
         end.channel.close()
         self._dropped += end.channel.uplink.dropped
         if self._ends.get(end.name) is end:
@@ -297,13 +298,13 @@ class Daemon(Body):
         end = self._ends.pop(name, None)
         if end is not None:
             # At once, not when the connection is gone: what moves must stop, what is subscribed must end.
-            endure(self._log, "a channel could not be closed", end.channel.close)
-            endure(self._log, "goodbye could not be said on a channel", end.say, link.Bye(reason=why))
+            run_safely(self._log, "a channel could not be closed", end.channel.close)
+            run_safely(self._log, "goodbye could not be said on a channel", end.say, link.Bye(reason=why))
             end.protocol.end(LinkLost(why), gently=True)
 
     def _close_channels(self, why: str) -> None:
         for name in {*self._opening, *self._ends}:
-            endure(self._log, "a channel could not be closed", self._close, name, why)
+            run_safely(self._log, "a channel could not be closed", self._close, name, why)
 
     # --- what the relay is told ----------------------------------------------------------------------------
 

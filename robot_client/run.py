@@ -12,23 +12,23 @@ from twisted.logger import Logger
 
 from relay_protocol.clocks import now_ns
 from relay_protocol.errors import Unavailable
-from robot_client.backoff import Backoff
-from robot_client.camera.desk import CameraDesk
-from robot_client.camera.keeper import CameraKeeper
-from robot_client.camera.lines import Settings as CameraSettings
-from robot_client.config import Settings
-from robot_client.connection import Connection
+from robot_client.camera.ipc import CameraSettings
+from robot_client.camera.service import DaemonCameras
+from robot_client.camera.supervisor import CameraSupervisor
+from robot_client.config import RobotSettings
 from robot_client.daemon import Daemon
-from robot_client.guard_feed import NoGuard
-from robot_client.guarding import GuardKeeper
-from robot_client.hardware import Hardware
-from robot_client.identity import Enrolment
-from robot_client.lasting import Latch
-from robot_client.link import ControlLink, Identity
+from robot_client.link.backoff import Backoff
+from robot_client.link.connection import ControlConnection
+from robot_client.link.identity import Enrolment
+from robot_client.link.protocol import ControlLink, Identity
+from robot_client.link.tls import endpoint, split_address
+from robot_client.motion.guard_port import NoGuard
+from robot_client.motion.guard_supervisor import GuardSupervisor
+from robot_client.motion.hardware import Hardware
+from robot_client.motion.stop_store import StopStore
 from robot_client.platforms.base import Platform
-from robot_client.reactors import Endpoint
 from robot_client.systemd import Notifier
-from robot_client.tls import endpoint, split_address
+from robot_client.twisted_types import DialEndpoint
 
 LEAVE_SECONDS = 4.0
 
@@ -41,13 +41,13 @@ def agent() -> str:
         return "switchboard-robot"
 
 
-def make_ros(reactor: Any, settings: Settings, suffix: str) -> Platform:
+def make_ros(reactor: Any, settings: RobotSettings, suffix: str) -> Platform:
     """The ROS 2 platform.
 
     :raises Unavailable: there is no rclpy
     """
     try:
-        from robot_client.platforms.ros2 import Ros2Platform
+        from robot_client.platforms.ros2.platform import Ros2Platform
     except ImportError as error:
         raise Unavailable(
             f"no ROS 2 found ({error}): source /opt/ros/<distro>/setup.bash or install the extra 'ros'"
@@ -73,18 +73,18 @@ class Runner:
     def __init__(
         self,
         reactor: Any,
-        settings: Settings,
+        settings: RobotSettings,
         enrolment: Enrolment,
         me: Identity,
-        latch: Latch,
+        latch: StopStore,
         platform: Platform | None = None,
     ) -> None:
         suffix = secrets.token_hex(3)
         self.reactor = reactor
         self.platform = platform or make_ros(reactor, settings, suffix)
-        self.keeper: GuardKeeper | None = None
+        self.keeper: GuardSupervisor | None = None
         if settings.safety.guard:
-            self.keeper = GuardKeeper(
+            self.keeper = GuardSupervisor(
                 reactor,
                 f"switchboard_guard_{suffix}",
                 settings.safety.stop_within_ms,
@@ -94,7 +94,7 @@ class Runner:
                     for each in settings.safety.topic
                 },
             )
-        self.cameras = CameraKeeper(
+        self.cameras = CameraSupervisor(
             reactor,
             CameraSettings(
                 address=enrolment.address,
@@ -108,7 +108,7 @@ class Runner:
             ),
         )
         self._enrolment = enrolment
-        connection = Connection(
+        connection = ControlConnection(
             self._dial,
             lambda: ControlLink(me, agent(), now_ns),
             reactor,
@@ -121,7 +121,7 @@ class Runner:
             connection,
             self.platform,
             self.keeper or NoGuard(),
-            CameraDesk(settings.cameras, self.cameras, connection.say, reactor),
+            DaemonCameras(settings.cameras, self.cameras, connection.say, reactor),
             latch,
             Hardware(settings.safety.switches, self.platform, reactor),
             reactor,
@@ -158,7 +158,7 @@ class Runner:
         gone.addTimeout(LEAVE_SECONDS, self.reactor)
         return gone.addBoth(lambda _: self.platform.stop())
 
-    def _dial(self, address: str) -> Endpoint:
+    def _dial(self, address: str) -> DialEndpoint:
         host, port = split_address(address or self._enrolment.address)
         own = self._enrolment
         return endpoint(self.reactor, host, port, own.tls, own.ca, own.server_name)

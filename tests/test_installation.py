@@ -42,14 +42,14 @@ def run_without(absent: list[str], body: str) -> subprocess.CompletedProcess[str
     )
 
 
-@pytest.mark.parametrize("module", ["robot_client.cli", "robot_client.run", "robot_client.guard"])
+@pytest.mark.parametrize("module", ["robot_client.cli", "robot_client.run", "robot_client.motion.guard"])
 def test_the_daemon_imports_without_the_servers_dependencies(module: str) -> None:
     """A robot installs the extra 'robot' alone."""
     done = run_without(SERVER_ONLY, f"import {module}")
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("module", ["robot_client.cli", "robot_client.run", "robot_client.guard"])
+@pytest.mark.parametrize("module", ["robot_client.cli", "robot_client.run", "robot_client.motion.guard"])
 def test_the_daemon_imports_without_what_cameras_need(module: str) -> None:
     """The extra 'video' is for robots that show pictures."""
     done = run_without(VIDEO_ONLY, f"import {module}")

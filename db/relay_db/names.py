@@ -38,7 +38,7 @@ def normal_name(text: str, what: str = "name") -> str:
     return name
 
 
-def findable(text: str) -> str:
+def normalise(text: str) -> str:
     """A name to look for. One that can't be is looked for as the empty one, which nobody has.
 
     Text from anywhere must not reach the database as it is: PostgreSQL fails on NUL and on half characters.
@@ -49,13 +49,13 @@ def findable(text: str) -> str:
         return ""
 
 
-def known_as(text: str) -> str:
+def full_name_of(text: str) -> str:
     """The one name by which the whole relay knows somebody or something, however its realm is written.
 
     :param text: as ``mobile@Lab2``
     """
     name, realm = parted(text)
-    return full_name(name, findable(realm) or realm)
+    return full_name(name, normalise(realm) or realm)
 
 
 def findable_hex(text: str) -> str:
@@ -73,7 +73,7 @@ def label(text: str, what: str) -> str:
     return text
 
 
-def recorded(text: str, length: int = LABEL) -> str:
+def sanitise(text: str, length: int = LABEL) -> str:
     """Text from anyone, made fit to be kept: what can't be printed is escaped, what is too long is cut."""
     printable = "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode("ascii")

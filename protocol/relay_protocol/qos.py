@@ -24,7 +24,7 @@ _LARGEST_DEPTH = 2**31 - 1
 
 
 class QoS(link.QoS, frozen=True, kw_only=True):
-    """:class:`relay_protocol.link.QoS` that takes all the ways clients write its values in.
+    """:class:`relay_protocol.link.requests.QoS` that takes all the ways clients write its values in.
 
     :raises ValueError: a value that is none of those known; msgspec adds where it was
     """

@@ -65,7 +65,7 @@ class TypeRegistry:
         """Register a definition; the same again changes nothing, another one replaces the former.
 
         :param type_name: of a message, service or action
-        :param text: as in :class:`relay_protocol.link.TypeDefinition`
+        :param text: as in :class:`relay_protocol.link.answers.TypeDefinition`
         :raises Invalid: a bad name, or a text that is no complete definition
         """
         name = normalise(type_name)

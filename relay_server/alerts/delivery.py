@@ -7,8 +7,12 @@ what the user may know of gets to the second and third, and only of that it is c
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Awaitable, Callable, Collection, Iterator
+from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass
 from math import inf
+from typing import NamedTuple
 
 from twisted.internet.defer import CancelledError, Deferred, DeferredSemaphore
 from twisted.logger import Logger
@@ -17,13 +21,125 @@ from twisted.python.failure import Failure
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.realms import full_name
-from relay_server.alerts import kinds, rules
-from relay_server.alerts.book import Change
-from relay_server.alerts.heap import Heap, Waiting
-from relay_server.alerts.message import Message, Notice, Undelivered
-from relay_server.alerts.office import Office
-from relay_server.bucket import TokenBucket
-from relay_server.clock import Timer, cancel
+from relay_server.alerts import rules
+from relay_server.alerts import types as kinds
+from relay_server.alerts.message import AlertNotice, NotificationMessage, Undelivered
+from relay_server.alerts.store import AlertChange
+from relay_server.common.clock import Clock, Timer, cancel
+from relay_server.common.token_bucket import TokenBucket
+
+Send = Callable[[AlertRuleRecord, NotificationMessage], Awaitable[None]]
+"""Sends a message by a rule's way. Raises :class:`Undelivered`."""
+
+Room = Callable[[AlertRuleRecord, bool], AbstractAsyncContextManager[None]]
+"""What a message has to wait for, and keeps while it is sent. The last says whether the one before has failed."""
+
+Known = Callable[[AlertRuleRecord, Collection[AlertRecord]], Awaitable[set[str]]]
+"""Which of these alerts the rule's user may still know of, by their ids. Raises :class:`SwitchboardError`."""
+
+
+def at_once(rule: AlertRuleRecord, doubtful: bool) -> AbstractAsyncContextManager[None]:
+    """The room of a way on which no message waits."""
+    return nullcontext()
+
+
+@dataclass(frozen=True)
+class DeliveryContext:
+    """What all deliveries share.
+
+    :param wall: Unix time in seconds
+    :param random: 0 to 1
+    :param name: makes a fresh name for a message
+    :param lasts: whether the alert of this id is not over
+    :param realms: those that the robot of an alert is of
+    """
+
+    clock: Clock
+    wall: Callable[[], float]
+    random: Callable[[], float]
+    name: Callable[[], str]
+    send: Send
+    known: Known
+    lasts: Callable[[str], bool]
+    realms: Callable[[AlertRecord], Collection[str]]
+    room: Room = at_once
+
+
+Key = tuple[str, str]
+"""The alert's id and the event: the same news waits once."""
+
+
+class QueuedNotification(NamedTuple):
+    """A notice that waits.
+
+    :param since: when it came first, monotonic seconds
+    """
+
+    notice: AlertNotice
+    since: float
+
+
+class NotificationQueue:
+    """So many notices at most.
+
+    :param most: places
+    :param fair: one robot's many give way before another's few, whatever they tell
+    """
+
+    def __init__(self, most: int, *, fair: bool = False) -> None:
+        self._most = most
+        self._fair = fair
+        self._waiting: dict[Key, QueuedNotification] = {}
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def __iter__(self) -> Iterator[QueuedNotification]:
+        return iter(list(self._waiting.values()))
+
+    def put(self, notice: AlertNotice, since: float) -> int:
+        """Put a notice where its place in time is; how many gave way."""
+        key = _key(notice)
+        before = self._waiting.pop(key, None)
+        self._waiting[key] = QueuedNotification(notice, since if before is None else before.since)
+        if len(self._waiting) <= self._most:
+            return 0
+        del self._waiting[self._least()]
+        return 1
+
+    def drop(self, notice: AlertNotice) -> QueuedNotification | None:
+        """It waits no more; the latest of the same news, if there was any."""
+        return self._waiting.pop(_key(notice), None)
+
+    def take(self) -> list[AlertNotice]:
+        """All, in their order; none is left."""
+        taken, self._waiting = self._waiting, {}
+        return [each.notice for each in taken.values()]
+
+    def clear(self) -> None:
+        """None is left."""
+        self._waiting.clear()
+
+    def _least(self) -> Key:
+        """Which one matters least: the mildest, among those an end, among those the oldest."""
+        crowd = 0
+        robots: Counter[int] = Counter()
+        if self._fair:
+            robots.update(each.notice.alert.robot_id for each in self._waiting.values())
+            crowd = max(robots.values())
+        there = ((key, each.notice) for key, each in self._waiting.items())
+        found = ((key, it) for key, it in there if robots[it.alert.robot_id] == crowd)
+        key, _ = min(found, key=lambda each: _weight(each[1]))
+        return key
+
+
+def _key(notice: AlertNotice) -> Key:
+    return notice.alert.id, notice.event
+
+
+def _weight(notice: AlertNotice) -> tuple[int, bool]:
+    return kinds.severity(notice.alert.level), not notice.ends
+
 
 MOST = 200
 """Notices that wait for one rule, and again those that wait for the end of quiet hours."""
@@ -55,7 +171,7 @@ LONGEST_REST = 3600.0
 
 
 @dataclass
-class Status:
+class DeliveryStatus:
     """What has become of the messages of a rule.
 
     :param last: Unix time of the latest that arrived
@@ -75,14 +191,14 @@ class Delivery:
 
     log = Logger()
 
-    def __init__(self, office: Office, rule: AlertRuleRecord, places: DeferredSemaphore) -> None:
+    def __init__(self, office: DeliveryContext, rule: AlertRuleRecord, places: DeferredSemaphore) -> None:
         self.rule = rule
-        self.status = Status()
+        self.status = DeliveryStatus()
         self._office = office
         self._places = places
-        self._inbox = Heap(UNJUDGED, fair=True)
-        self._pending = Heap(MOST)
-        self._held = Heap(MOST)
+        self._inbox = NotificationQueue(UNJUDGED, fair=True)
+        self._pending = NotificationQueue(MOST)
+        self._held = NotificationQueue(MOST)
         self._told: dict[str, None] = {}
         """Alerts of which their user knows that they have begun, and not that they are over."""
         self._unheard: dict[str, None] = {}
@@ -92,7 +208,7 @@ class Delivery:
         self._worst = -1
         """How bad the worst was that the latest message told."""
         self._extra = TokenBucket(1 / URGENT_SECONDS, URGENT_BURST, office.clock.seconds)
-        self._under_way: list[Notice] = []
+        self._under_way: list[AlertNotice] = []
         """The message that is being sent, or tried again."""
         self._hushed = False
         self._failing = False
@@ -105,12 +221,12 @@ class Delivery:
         """Notices that wait."""
         return len(self._inbox) + len(self._pending) + len(self._held)
 
-    def offer(self, change: Change) -> None:
+    def offer(self, change: AlertChange) -> None:
         """There is news; if the rule wants it and its user may know of it, it goes with the next message."""
         if not rules.wants(self.rule, change.alert, change.event, self._office.realms(change.alert)):
             return
         # What gives way here is not counted: nobody knows whether its number may be told.
-        self._inbox.put(Notice(change.alert, change.event.value), self._office.clock.seconds())
+        self._inbox.put(AlertNotice(change.alert, change.event.value), self._office.clock.seconds())
         if self._judging is None and not self._hushed:
             # Judged when a coroutine can be: mostly before this returns.
             self._judging = judging = Deferred.fromCoroutine(self._judge())
@@ -211,7 +327,7 @@ class Delivery:
         end = rules.quiet_until(self.rule, wall)
         return 0.0 if end is None else end - wall
 
-    def _urgent(self, notice: Notice) -> bool:
+    def _urgent(self, notice: AlertNotice) -> bool:
         """Whether it must not wait for others: an error, and what is worse than all that was told last."""
         return notice.alarms or (not notice.ends and kinds.severity(notice.alert.level) > self._worst)
 
@@ -253,14 +369,14 @@ class Delivery:
                     self._put_aside(each)
         self._drop_ends()
 
-    def _put_aside(self, waiting: Waiting) -> None:
+    def _put_aside(self, waiting: QueuedNotification) -> None:
         alert = waiting.notice.alert
         self._pending.drop(waiting.notice)
         self._left_out += self._held.put(*waiting)
         if not waiting.notice.ends and alert.id not in self._told:
             _keep(self._unheard, alert.id)
 
-    def _still(self, notice: Notice) -> bool:
+    def _still(self, notice: AlertNotice) -> bool:
         """Whether what was held is worth telling: that something lasts which does, and is over which is."""
         return self._office.lasts(notice.alert.id) != notice.ends
 
@@ -274,7 +390,7 @@ class Delivery:
 
     # --- sending ------------------------------------------------------------------------------------------
 
-    async def _deliver(self, batch: list[Notice], left_out: int) -> None:
+    async def _deliver(self, batch: list[AlertNotice], left_out: int) -> None:
         """Try until it has arrived, or there is no hope."""
         name, pauses, due = self._office.name(), iter(RETRY_SECONDS), 0.0
         while True:
@@ -302,7 +418,7 @@ class Delivery:
         pressed = any(each.notice.alarms for each in self._pending)
         return min(due, tried + PRESSED_SECONDS) if pressed else due
 
-    async def _try(self, name: str, batch: list[Notice], left_out: int) -> bool:
+    async def _try(self, name: str, batch: list[AlertNotice], left_out: int) -> bool:
         """Send what the user may still know of; whether there was anything."""
         async with self._places, self._office.room(self.rule, self._failing):
             # Judged after every long wait: meanwhile the right may be gone.
@@ -310,11 +426,11 @@ class Delivery:
             notices = [each for each in batch if each.alert.id in known]
             if not notices:
                 return False
-            await self._office.send(self.rule, Message(name, notices, left_out))
+            await self._office.send(self.rule, NotificationMessage(name, notices, left_out))
         self._remember(notices)
         return True
 
-    def _remember(self, notices: list[Notice]) -> None:
+    def _remember(self, notices: list[AlertNotice]) -> None:
         self._worst = max(kinds.severity(each.alert.level) for each in notices)
         for each in notices:
             self._unheard.pop(each.alert.id, None)
@@ -349,7 +465,7 @@ def _keep(heap: dict[str, None], alert_id: str) -> None:
         del heap[next(iter(heap))]
 
 
-async def test(office: Office, rule: AlertRuleRecord, places: DeferredSemaphore) -> str:
+async def test(office: DeliveryContext, rule: AlertRuleRecord, places: DeferredSemaphore) -> str:
     """Send a made-up alert now; why it did not arrive, or nothing."""
     now = office.wall()
     text = "This is a test: alerts of your robots arrive like this."
@@ -358,7 +474,7 @@ async def test(office: Office, rule: AlertRuleRecord, places: DeferredSemaphore)
     )
     try:
         async with places, office.room(rule, False):
-            await office.send(rule, Message(office.name(), [Notice(alert, "test")]))
+            await office.send(rule, NotificationMessage(office.name(), [AlertNotice(alert, "test")]))
     except Undelivered as error:
         return str(error)
     return ""

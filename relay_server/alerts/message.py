@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 from relay_db.queries import AlertRecord
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.text import inert
-from relay_server.alerts import kinds
-from relay_server.alerts.kinds import Event
+from relay_server.alerts import types as kinds
+from relay_server.alerts.types import AlertEvent
 
 SHOWN = 20
 """Alerts a message for people has lines for; the rest is a number."""
 
 
-class Notice(NamedTuple):
+class AlertNotice(NamedTuple):
     """An alert as it was when there was news of it.
 
     :param event: ``begun``, ``worse``, ``over`` or ``test``
@@ -28,7 +28,7 @@ class Notice(NamedTuple):
     @property
     def ends(self) -> bool:
         """Whether it tells that the alert is over."""
-        return self.event == Event.OVER.value
+        return self.event == AlertEvent.OVER.value
 
     @property
     def alarms(self) -> bool:
@@ -37,7 +37,7 @@ class Notice(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Message:
+class NotificationMessage:
     """What goes out at once.
 
     :param delivery: names it, the same in each try
@@ -45,7 +45,7 @@ class Message:
     """
 
     delivery: str
-    notices: Sequence[Notice]
+    notices: Sequence[AlertNotice]
     left_out: int = 0
 
     @property
@@ -104,7 +104,7 @@ def view(alert: AlertRecord) -> dict[str, Any]:
     }
 
 
-def line(notice: Notice) -> str:
+def line(notice: AlertNotice) -> str:
     """What has happened in a few words."""
     alert = notice.alert
     about = f" {alert.about}" if alert.about else ""

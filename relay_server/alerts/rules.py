@@ -17,8 +17,8 @@ from relay_protocol.errors import Invalid
 from relay_protocol.rights import Operation, Rules
 from relay_protocol.text import legible
 from relay_protocol.wildcards import see_cheap
-from relay_server.alerts import kinds
-from relay_server.alerts.kinds import Event
+from relay_server.alerts import types as kinds
+from relay_server.alerts.types import AlertEvent
 
 GROUP_SECONDS = (5.0, 86400.0)
 SECRET = (16, 128)
@@ -42,7 +42,7 @@ class Quiet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"be
     least: str = "error"
 
 
-class Ask(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RuleRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A rule as a user asks for it (SPEC section 1.10)."""
 
     channel: str
@@ -59,7 +59,7 @@ class Ask(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     quiet: Quiet | None = None
 
 
-def check(ask: Ask, channels: Collection[str]) -> None:
+def check(ask: RuleRequest, channels: Collection[str]) -> None:
     """Whether a rule makes sense; its URL is looked at by who sends.
 
     :param channels: those there are here
@@ -108,7 +108,7 @@ def as_quiet(kept: dict[str, str] | None) -> Quiet | None:
     return None if kept is None else msgspec.convert(kept, Quiet)
 
 
-def wants(rule: AlertRuleRecord, alert: AlertRecord, event: Event, realms: Collection[str]) -> bool:
+def wants(rule: AlertRuleRecord, alert: AlertRecord, event: AlertEvent, realms: Collection[str]) -> bool:
     """Whether the rule tells of this, now or later.
 
     :param realms: those that the robot is of
@@ -119,7 +119,7 @@ def wants(rule: AlertRuleRecord, alert: AlertRecord, event: Event, realms: Colle
         and fnmatchcase(alert.robot, rule.robots)
         and (not rule.kinds or alert.kind in rule.kinds)
         and kinds.severity(alert.level) >= kinds.severity(rule.level)
-        and (rule.over or event is not Event.OVER)
+        and (rule.over or event is not AlertEvent.OVER)
     )
 
 

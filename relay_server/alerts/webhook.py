@@ -33,9 +33,8 @@ from relay_db.queries import AlertRuleRecord
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import KIB
-from relay_server.alerts.addresses import Fence
-from relay_server.alerts.message import Message, Undelivered
-from relay_server.alerts.names import SPECIAL, unreachable
+from relay_server.alerts.egress import SPECIAL_NAMES, EgressPolicy, unreachable
+from relay_server.alerts.message import NotificationMessage, Undelivered
 
 SECONDS = 10.0
 CONNECT_SECONDS = 4.0
@@ -55,7 +54,7 @@ Resolve = Callable[[str, int, int], Awaitable[list[str]]]
 """All addresses of a host and port, for a user. Raises :class:`Undelivered`."""
 
 
-class Place(NamedTuple):
+class WebhookTarget(NamedTuple):
     """Where a message goes."""
 
     tls: bool
@@ -70,7 +69,7 @@ class Place(NamedTuple):
         return f"{'https' if self.tls else 'http'}://{host}:{self.port}{self.target}"
 
 
-def parse(url: str) -> Place:
+def parse(url: str) -> WebhookTarget:
     """Read the address of a webhook.
 
     :raises Invalid: it is none, in words
@@ -94,7 +93,7 @@ def parse(url: str) -> Place:
             "no certificate can be for the host of this webhook's 'url'; names have letters, digits and hyphens"
         )
     query = f"?{parts.query}" if parts.query else ""
-    return Place(tls, host, port or (443 if tls else 80), (parts.path or "/") + query)
+    return WebhookTarget(tls, host, port or (443 if tls else 80), (parts.path or "/") + query)
 
 
 def _certifiable(host: str) -> bool:
@@ -125,7 +124,7 @@ class Webhooks:
         self,
         reactor: Any,
         resolve: Resolve,
-        fence: Fence,
+        fence: EgressPolicy,
         wall: Callable[[], float],
         trust: Any = None,
     ) -> None:
@@ -144,7 +143,7 @@ class Webhooks:
         """
         parse(url)
 
-    async def send(self, rule: AlertRuleRecord, message: Message) -> None:
+    async def send(self, rule: AlertRuleRecord, message: NotificationMessage) -> None:
         """Deliver one message.
 
         :raises Undelivered: it was not taken
@@ -165,7 +164,7 @@ class Webhooks:
             again = status >= 500 or status in AGAIN
             raise Undelivered(f"{place.host} answered with the status {status}", again=again)
 
-    def _headers(self, rule: AlertRuleRecord, message: Message, body: bytes) -> Headers:
+    def _headers(self, rule: AlertRuleRecord, message: NotificationMessage, body: bytes) -> Headers:
         timestamp = str(int(self._wall()))
         return Headers(
             {
@@ -177,12 +176,12 @@ class Webhooks:
             }
         )
 
-    async def _send(self, place: Place, user: int, headers: Headers, body: bytes) -> int:
+    async def _send(self, place: WebhookTarget, user: int, headers: Headers, body: bytes) -> int:
         """The status of the answer."""
         found = await self._resolve(place.host, place.port, user)
         good = self._fence.passed(found)
         if not good:
-            raise unreachable(place.host, SPECIAL)
+            raise unreachable(place.host, SPECIAL_NAMES)
         for address in good[:ADDRESSES]:
             endpoint = self._endpoint(place, address)
             agent = Agent.usingEndpointFactory(self._reactor, _Straight(endpoint))
@@ -200,7 +199,7 @@ class Webhooks:
             return int(answer.code)
         raise Undelivered(f"nobody answers at {place.host}, port {place.port}", again=True)
 
-    def _endpoint(self, place: Place, address: str) -> _Frugal:
+    def _endpoint(self, place: WebhookTarget, address: str) -> _Frugal:
         kind: Any = TCP6ClientEndpoint if ":" in address else TCP4ClientEndpoint
         endpoint = kind(self._reactor, address, place.port, timeout=CONNECT_SECONDS)
         if place.tls:
@@ -209,7 +208,7 @@ class Webhooks:
         return _Frugal(endpoint)
 
 
-def _broken(place: Place, error: Exception) -> Exception:
+def _broken(place: WebhookTarget, error: Exception) -> Exception:
     """Why there is no answer, in words; or that nobody waits for it any more."""
     causes = [error, *(reason.value for reason in getattr(error, "reasons", ()))]
     if any(isinstance(each, (CancelledError, ConnectingCancelledError)) for each in causes):

@@ -8,34 +8,36 @@ from pathlib import Path
 import click
 
 from relay_server.cli.app import App, examples
-from relay_server.cli.lazy import Entry, LazyGroup
+from relay_server.cli.lazy import CommandEntry, LazyGroup
 
 _COMMANDS = {
-    "serve": Entry("relay_server.cli.serve", "serve", "Run the relay."),
-    "demo": Entry("relay_server.cli.demo", "demo", "Run a relay with two simulated robots."),
-    "status": Entry("relay_server.cli.status", "status", "Show which robots are online, and with whom."),
-    "stop": Entry("relay_server.cli.stopping", "stop", "Stop a robot, or all of them."),
-    "resume": Entry("relay_server.cli.stopping", "resume", "Let a robot that was stopped move again."),
-    "realm": Entry("relay_server.cli.realms", "realm", "Keep users and robots apart."),
-    "user": Entry("relay_server.cli.users", "user", "Add, list, change and remove users."),
-    "group": Entry("relay_server.cli.groups", "group", "Give users rights together."),
-    "robot": Entry(
+    "serve": CommandEntry("relay_server.cli.serve", "serve", "Run the relay."),
+    "demo": CommandEntry("relay_server.cli.demo", "demo", "Run a relay with two simulated robots."),
+    "status": CommandEntry(
+        "relay_server.cli.status", "status", "Show which robots are online, and with whom."
+    ),
+    "stop": CommandEntry("relay_server.cli.stop", "stop", "Stop a robot, or all of them."),
+    "resume": CommandEntry("relay_server.cli.stop", "resume", "Let a robot that was stopped move again."),
+    "realm": CommandEntry("relay_server.cli.realms", "realm", "Keep users and robots apart."),
+    "user": CommandEntry("relay_server.cli.users", "user", "Add, list, change and remove users."),
+    "group": CommandEntry("relay_server.cli.groups", "group", "Give users rights together."),
+    "robot": CommandEntry(
         "relay_server.cli.robots", "robot", "Add, list and remove robots and their keys; orders to many."
     ),
-    "right": Entry("relay_server.cli.rights", "right", "Say who may do what on which robot."),
-    "token": Entry("relay_server.cli.tokens", "token", "Create, list and revoke access tokens."),
-    "program": Entry(
-        "relay_server.cli.programs", "program", "Add, list and revoke programs with key and secret."
+    "right": CommandEntry("relay_server.cli.rights", "right", "Say who may do what on which robot."),
+    "token": CommandEntry("relay_server.cli.tokens", "token", "Create, list and revoke access tokens."),
+    "program": CommandEntry(
+        "relay_server.cli.oauth_clients", "program", "Add, list and revoke programs with key and secret."
     ),
-    "alerts": Entry("relay_server.cli.alerts", "alerts", "Show alerts, and say who is told how."),
-    "events": Entry("relay_server.cli.events", "events", "Show what happened of late."),
-    "directory": Entry(
+    "alerts": CommandEntry("relay_server.cli.alerts", "alerts", "Show alerts, and say who is told how."),
+    "events": CommandEntry("relay_server.cli.events", "events", "Show what happened of late."),
+    "directory": CommandEntry(
         "relay_server.cli.directory",
         "directory",
         "Show which services and applications there are, and where.",
     ),
-    "audit": Entry("relay_server.cli.audit", "audit", "Read and verify the audit log."),
-    "db": Entry("relay_server.cli.database", "db", "Look after the database."),
+    "audit": CommandEntry("relay_server.cli.audit", "audit", "Read and verify the audit log."),
+    "db": CommandEntry("relay_server.cli.database", "db", "Look after the database."),
 }
 
 _DEFAULT_DATA = Path("~/.local/share/switchboard")

@@ -11,13 +11,13 @@ import click
 import msgspec
 
 from relay_db import queries
-from relay_db.names import findable
+from relay_db.names import normalise
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.realms import full_name, parted
-from relay_server.alerts import kinds
 from relay_server.alerts import rules as wording
-from relay_server.alerts.desk import keep
+from relay_server.alerts import types as kinds
 from relay_server.alerts.message import view
+from relay_server.alerts.service import keep
 from relay_server.alerts.webhook import parse
 from relay_server.cli.app import (
     App,
@@ -30,8 +30,7 @@ from relay_server.cli.app import (
     user_of,
     yes_option,
 )
-from relay_server.cli.output import show, tell
-from relay_server.cli.text import moment
+from relay_server.cli.output import moment, show, tell
 
 
 @click.group()
@@ -157,7 +156,7 @@ def rules_add(
         "quiet": _quiet(quiet),
     }
     try:
-        ask = msgspec.convert(fields, wording.Ask)
+        ask = msgspec.convert(fields, wording.RuleRequest)
     except msgspec.ValidationError as error:
         raise Invalid(f"this is no rule: {error}") from None
     wording.check(ask, kinds.CHANNELS)
@@ -210,7 +209,7 @@ def _own(robots: str, user: str) -> str:
     :raises Invalid: it is of another realm
     """
     pattern, at, _ = robots.partition("@")
-    if at and findable(parted(robots)[1]) != findable(parted(user)[1]):
+    if at and normalise(parted(robots)[1]) != normalise(parted(user)[1]):
         raise Invalid(f"'{robots}' are robots of another realm; {user} is told only of those of his own")
     return pattern
 

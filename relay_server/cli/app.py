@@ -10,17 +10,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from sqlalchemy.orm import Session
 
+from relay_db.queries import GroupRecord, RobotRecord, UserRecord
 from relay_protocol.errors import NotFound
 from relay_protocol.realms import parted
-from relay_server.cli.relaysocket import knock
+from relay_server.cli.control_socket import notify_relay
+from relay_server.realms.changes import AuditedChange
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
     from relay_db.engine import Database
     from relay_db.queries import GroupRecord, RobotRecord, UserRecord
-    from relay_server.cli.changing import LocalChange
+
+
+class LocalChange(AuditedChange):
+    """A change by who may run ``switchboard`` on the relay's machine."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(session, f"cli:{os_user()}", "local")
+
+    def user(self, name: str) -> UserRecord:
+        """:raises NotFound: no such user"""
+        return user_of(self.session, name)
+
+    def group(self, name: str) -> GroupRecord:
+        """:raises NotFound: no such group"""
+        return group_of(self.session, name)
+
+    def robot(self, name: str) -> RobotRecord:
+        """:raises NotFound: no such robot"""
+        return robot_of(self.session, name)
+
 
 _Record = TypeVar("_Record")
 
@@ -65,11 +87,10 @@ class App:
     @contextmanager
     def change(self) -> Iterator[LocalChange]:
         """One change with its audit entry; afterwards a running relay is told to look."""
-        from relay_server.cli.changing import LocalChange
 
         with self.database() as database, database.begin() as session:
             yield LocalChange(session)
-        knock(self.data)
+        notify_relay(self.data)
 
 
 def user_of(session: Session, name: str) -> UserRecord:

@@ -9,8 +9,7 @@ import click
 from relay_db import queries
 from relay_server.cli.app import App, examples, json_option, pass_app
 from relay_server.cli.failure import Failure
-from relay_server.cli.output import show, show_json, tell
-from relay_server.cli.text import moment
+from relay_server.cli.output import moment, show, show_json, tell
 
 
 @click.group()

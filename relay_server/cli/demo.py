@@ -33,8 +33,8 @@ def demo(data: Path | None, http: str, robots: str) -> None:
 
     Prints READY with the address once both robots are online.
     """
-    from relay_server.config import Endpoint
-    from relay_server.demo_run import run_demo
+    from relay_server.config import ListenAddress
+    from relay_server.demo import run_demo
 
     with ExitStack() as stack:
         if data is None:
@@ -42,5 +42,5 @@ def demo(data: Path | None, http: str, robots: str) -> None:
         else:
             folder = data.absolute()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        code = run_demo(folder, Endpoint.parse(http), Endpoint.parse(robots))
+        code = run_demo(folder, ListenAddress.parse(http), ListenAddress.parse(robots))
     sys.exit(code)

@@ -10,15 +10,14 @@ import click
 from sqlalchemy.orm import Session
 
 from relay_db import queries
-from relay_db.queries import EntryAsk, EntryRecord
+from relay_db.queries import EntryRecord, EntrySearch
 from relay_protocol.errors import NotFound
 from relay_protocol.realms import DEFAULT_REALM, full_name
 from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, sure, yes_option
-from relay_server.cli.naming import known_realm, of_one_realm, one_realm_option
-from relay_server.cli.output import show, tell
-from relay_server.cli.text import moment
-from relay_server.directory.entries import Entry, event
-from relay_server.directory.writing import audited
+from relay_server.cli.names import known_realm, of_one_realm, one_realm_option
+from relay_server.cli.output import moment, show, tell
+from relay_server.registry.audit import audited
+from relay_server.registry.entries import RegistryEntry, event
 
 PAGE = 1000
 
@@ -53,7 +52,7 @@ def directory(
     with app.reading() as session:
         where = known_realm(session, where)
         about = frozenset(robot_of(session, full_name(each, where)).id for each in names)
-        ask = EntryAsk(where, about if names else None, not names, kind)
+        ask = EntrySearch(where, about if names else None, not names, kind)
         found = list(_entries(session, ask, now))
     columns = ("id", "kind", "name", "robot", "address", "user", "expires")
     show(as_json, (_json(each, now) for each in found), columns, _cells(found))
@@ -86,13 +85,13 @@ def _see(found: EntryRecord | None, id: str) -> EntryRecord:
     return found
 
 
-def _entries(session: Session, ask: EntryAsk, now: float) -> Iterator[EntryRecord]:
+def _entries(session: Session, ask: EntrySearch, now: float) -> Iterator[EntryRecord]:
     while True:
         page = queries.list_entries(session, ask, now, PAGE)
         yield from page
         if len(page) < PAGE:
             return
-        ask = ask._replace(after=Entry.of(page[-1], now).place)
+        ask = ask._replace(after=RegistryEntry.of(page[-1], now).place)
 
 
 def _full(record: EntryRecord) -> EntryRecord:
@@ -102,7 +101,7 @@ def _full(record: EntryRecord) -> EntryRecord:
 
 
 def _json(record: EntryRecord, now: float) -> dict[str, object]:
-    return {**Entry.of(_full(record), now).told(), "data": json.loads(record.data)}
+    return {**RegistryEntry.of(_full(record), now).told(), "data": json.loads(record.data)}
 
 
 def _cells(found: Iterable[EntryRecord]) -> Iterator[tuple[str, ...]]:

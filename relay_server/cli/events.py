@@ -12,16 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 import click
 
 from relay_db import queries
-from relay_db.queries import MemoryAsk, MemoryPlace, MemoryRecord
+from relay_db.queries import EventCursor, EventSearch, StoredEventRecord
 from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name
 from relay_server.cli.app import App, examples, json_option, pass_app
-from relay_server.cli.naming import known_realm, of_one_realm, one_realm_option
-from relay_server.cli.output import say, show, show_json
-from relay_server.cli.text import moment
-from relay_server.memory import Ask, Forms, ask_of
-from relay_server.memory.asks import chosen
-from relay_server.memory.desk import Sight
+from relay_server.cli.names import known_realm, of_one_realm, one_realm_option
+from relay_server.cli.output import moment, say, show, show_json
+from relay_server.events.query import EventFormatter, EventQuery, ask_of, chosen
+from relay_server.events.service import EventVisibility
 
 FOLLOW_SECONDS = 0.5
 """How often it is looked for new ones."""
@@ -79,11 +77,11 @@ def events(
         latest = queries.latest_memory(session, realm)
         robots = queries.list_robots(session, realm)
     sight = _sight(realm, {each.id: each.name for each in robots}, ask)
-    forms = Forms({each.id: each.full for each in robots})
+    forms = EventFormatter({each.id: each.full for each in robots})
     found = _found(app, sight.ask, limit)
     if as_csv:
         table = csv.writer(sys.stdout)
-        table.writerow(Forms.COLUMNS)
+        table.writerow(EventFormatter.COLUMNS)
         table.writerows(forms.cells(each) for each in found)
         return
     rows = [each for each in found if each.number <= latest][::-1]
@@ -98,10 +96,10 @@ def events(
     show(as_json, (_json(forms, each) for each in rows), columns, (_cells(forms, each) for each in rows))
 
 
-def _sight(realm: str, names: dict[int, str], ask: Ask) -> Sight:
+def _sight(realm: str, names: dict[int, str], ask: EventQuery) -> EventVisibility:
     """Whoever may read the database may see all of it."""
-    return Sight(
-        MemoryAsk(
+    return EventVisibility(
+        EventSearch(
             realm,
             chosen(ask, names),
             ask.robot is None,
@@ -115,9 +113,9 @@ def _sight(realm: str, names: dict[int, str], ask: Ask) -> Sight:
     )
 
 
-def _found(app: App, ask: MemoryAsk, limit: int) -> Iterator[MemoryRecord]:
+def _found(app: App, ask: EventSearch, limit: int) -> Iterator[StoredEventRecord]:
     """The newest first, a page at a time."""
-    place: MemoryPlace | None = None
+    place: EventCursor | None = None
     while limit > 0:
         with app.reading() as session:
             page = queries.recall(session, ask, place, min(limit, PAGE))
@@ -127,7 +125,7 @@ def _found(app: App, ask: MemoryAsk, limit: int) -> Iterator[MemoryRecord]:
             return
 
 
-def _follow(app: App, sight: Sight, number: int, tell: Callable[[MemoryRecord], None]) -> None:
+def _follow(app: App, sight: EventVisibility, number: int, tell: Callable[[StoredEventRecord], None]) -> None:
     while True:
         with app.reading() as session:
             news = queries.memories_since(session, sight.ask.realm, number, PAGE)
@@ -140,26 +138,26 @@ def _follow(app: App, sight: Sight, number: int, tell: Callable[[MemoryRecord], 
             time.sleep(FOLLOW_SECONDS)
 
 
-def _with_realm(event: MemoryRecord) -> MemoryRecord:
+def _with_realm(event: StoredEventRecord) -> StoredEventRecord:
     """With its user's name for the whole relay. Who sits at the relay's machine is no user: he has a space in his."""
     if event.user is None or " " in event.user:
         return event
     return event._replace(user=full_name(event.user, event.realm))
 
 
-def _json(forms: Forms, event: MemoryRecord) -> dict[str, object]:
+def _json(forms: EventFormatter, event: StoredEventRecord) -> dict[str, object]:
     return {**forms.json(event), "data": json.loads(event.data)}
 
 
-def _json_line(forms: Forms, event: MemoryRecord) -> None:
+def _json_line(forms: EventFormatter, event: StoredEventRecord) -> None:
     show_json(_json(forms, event))
 
 
-def _line(forms: Forms, event: MemoryRecord) -> None:
+def _line(forms: EventFormatter, event: StoredEventRecord) -> None:
     say("  ".join(each for each in _cells(forms, event)[1:] if each))
 
 
-def _cells(forms: Forms, event: MemoryRecord) -> Sequence[str]:
+def _cells(forms: EventFormatter, event: StoredEventRecord) -> Sequence[str]:
     data = "" if event.data == "{}" else event.data
     about = forms.robot(event) or "", event.user or ""
     return str(event.number), moment(event.at), event.source, event.kind, *about, data

@@ -14,9 +14,9 @@ from relay_db import queries
 from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_protocol.realms import DEFAULT_REALM, full_name, parted
 from relay_server.cli.app import App, examples, json_option, pass_app, sure, why_option, yes_option
-from relay_server.cli.naming import listed, new_name, of_one_realm, one_realm_option, realm_option
+from relay_server.cli.control_socket import give_order
+from relay_server.cli.names import listed, new_name, of_one_realm, one_realm_option, realm_option
 from relay_server.cli.output import progress, say, show, show_json, table, tell
-from relay_server.cli.relaysocket import give_order
 
 SECONDS = 10.0
 """What each robot has where nothing else is said. A stop and a resume have their own time."""

@@ -10,9 +10,9 @@ from relay_db import queries
 from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name
 from relay_server.cli.app import App, examples, json_option, pass_app, yes_option
-from relay_server.cli.naming import listed, new_name, realm_option
+from relay_server.cli.names import listed, new_name, realm_option
 from relay_server.cli.output import show, tell
-from relay_server.cli.removing import remove_named
+from relay_server.cli.remove import remove_named
 
 
 @click.group()

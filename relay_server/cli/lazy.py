@@ -13,7 +13,7 @@ from relay_protocol.errors import SwitchboardError
 from relay_server.cli.failure import Failure
 
 
-class Entry(NamedTuple):
+class CommandEntry(NamedTuple):
     """Where a command lives, and its line in the help."""
 
     module: str
@@ -24,7 +24,7 @@ class Entry(NamedTuple):
 class LazyGroup(click.Group):
     """:param entries: commands by name, in the order of the help; modules that don't exist are left out"""
 
-    def __init__(self, *args: Any, entries: Mapping[str, Entry], **kwargs: Any) -> None:
+    def __init__(self, *args: Any, entries: Mapping[str, CommandEntry], **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._entries = {name: entry for name, entry in entries.items() if find_spec(entry.module)}
 

@@ -9,7 +9,7 @@ import click
 from relay_db import queries
 from relay_protocol.errors import Invalid
 from relay_server.cli.app import App, examples, json_option, pass_app, sure, yes_option
-from relay_server.cli.naming import known_realm
+from relay_server.cli.names import known_realm
 from relay_server.cli.output import show, tell
 
 

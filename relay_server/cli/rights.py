@@ -10,10 +10,9 @@ from relay_db import queries
 from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name
 from relay_protocol.rights import Level
-from relay_server.administration.change import GROUP_MARK, Holder, holder_text
-from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, user_of
-from relay_server.cli.changing import LocalChange
+from relay_server.cli.app import App, LocalChange, examples, json_option, pass_app, robot_of, user_of
 from relay_server.cli.output import show, tell
+from relay_server.realms.changes import GROUP_MARK, Holder, holder_text
 
 
 @click.group()

@@ -12,12 +12,11 @@ from relay_db import queries
 from relay_protocol.errors import Unavailable
 from relay_protocol.limits import ENROLMENT_SECONDS
 from relay_server.cli.app import App, examples, json_option, pass_app, robot_of, sure, yes_option
+from relay_server.cli.control_socket import ask_status
 from relay_server.cli.fleet import ORDERS
-from relay_server.cli.naming import known_realm, listed, new_name, realm_option
-from relay_server.cli.output import show, tell
-from relay_server.cli.relaysocket import ask_status
-from relay_server.cli.removing import remove_named
-from relay_server.cli.text import duration, moment
+from relay_server.cli.names import known_realm, listed, new_name, realm_option
+from relay_server.cli.output import duration, moment, show, tell
+from relay_server.cli.remove import remove_named
 
 _ROBOTS_PORT = 9091
 

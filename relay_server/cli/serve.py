@@ -215,7 +215,7 @@ def serve(
     start a one-time login link for the user 'admin' is printed.
     """
     from relay_server import logs
-    from relay_server.config import AlertSettings, Endpoint, Settings
+    from relay_server.config import AlertSettings, ListenAddress, RelaySettings
     from relay_server.run import run
 
     if data is not None:
@@ -243,11 +243,11 @@ def serve(
         raise Unavailable(
             f"the data folder {app.data} can't be made: {error.strerror}; give another --data"
         ) from None
-    settings = Settings(
+    settings = RelaySettings(
         data=app.data,
         database=app.database_url,
-        http=Endpoint.parse(http),
-        robots=Endpoint.parse(robots),
+        http=ListenAddress.parse(http),
+        robots=ListenAddress.parse(robots),
         tls_cert=tls_cert,
         tls_key=tls_key,
         origins=origins,

@@ -12,9 +12,8 @@ import click
 from relay_protocol.errors import NotFound, Unavailable
 from relay_protocol.realms import full_name, parted
 from relay_server.cli.app import App, examples, json_option, pass_app
-from relay_server.cli.output import Sheet, say, show_json, table, watch_sheets
-from relay_server.cli.relaysocket import ask_status
-from relay_server.cli.text import duration
+from relay_server.cli.control_socket import ask_status
+from relay_server.cli.output import Printable, duration, say, show_json, table, watch_sheets
 
 _ROBOTS = (
     "robot", "state", "control", "stopped", "people", "round trip", "from people", "link", "drops", "battery",
@@ -73,29 +72,29 @@ def _asked(app: App, robot: str | None) -> dict[str, Any]:
     return {**answer, "robots": mine}
 
 
-def _sheets(app: App, robot: str | None) -> Iterator[list[Sheet]]:
+def _sheets(app: App, robot: str | None) -> Iterator[list[Printable]]:
     """What is drawn, time after time; while the relay is away, what it said last, and why there is nothing new."""
-    last: list[Sheet] = []
+    last: list[Printable] = []
     while True:
         try:
             last = _drawn(_asked(app, robot), robot)
             yield last
         except (Unavailable, NotFound) as error:
-            yield [*last, Sheet(f"{error} (shown is what was)")]
+            yield [*last, Printable(f"{error} (shown is what was)")]
 
 
-def _drawn(answer: dict[str, Any], robot: str | None) -> list[Sheet]:
+def _drawn(answer: dict[str, Any], robot: str | None) -> list[Printable]:
     uptime = answer.get("uptime_s")
     since = f", up {duration(uptime)}" if isinstance(uptime, int | float) else ""
-    head = Sheet(f"Relay {answer.get('relay', '?')}{since}")
+    head = Printable(f"Relay {answer.get('relay', '?')}{since}")
     robots = _dicts(answer.get("robots"))
     if not robots:
-        return [head, Sheet(_NOBODY)]
-    sheets = [head, Sheet("", _ROBOTS, [_row(each) for each in robots])]
+        return [head, Printable(_NOBODY)]
+    sheets = [head, Printable("", _ROBOTS, [_row(each) for each in robots])]
     if robot is not None:
         now = time.time()
         there = [_person(each, now) for each in _people(robots[0])]
-        sheets.append(Sheet("", _PEOPLE, there) if there else Sheet("Nobody is there."))
+        sheets.append(Printable("", _PEOPLE, there) if there else Printable("Nobody is there."))
     return sheets
 
 

@@ -10,11 +10,9 @@ import click
 from relay_db import queries
 from relay_protocol.errors import Invalid
 from relay_protocol.scopes import Scope
-from relay_server.cli.app import App, examples, json_option, pass_app, user_of
-from relay_server.cli.changing import LocalChange
-from relay_server.cli.output import show, tell
-from relay_server.cli.removing import revoke_numbered
-from relay_server.cli.text import duration, moment, parse_duration
+from relay_server.cli.app import App, LocalChange, examples, json_option, pass_app, user_of
+from relay_server.cli.output import duration, moment, parse_duration, show, tell
+from relay_server.cli.remove import revoke_numbered
 
 
 @click.group()

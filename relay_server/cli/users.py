@@ -11,10 +11,10 @@ from relay_db.names import normal_name
 from relay_protocol.errors import Invalid
 from relay_protocol.realms import full_name, parted
 from relay_server.cli.app import App, examples, json_option, pass_app, user_of, yes_option
-from relay_server.cli.naming import known_realm, listed, new_name, realm_option
+from relay_server.cli.names import known_realm, listed, new_name, realm_option
 from relay_server.cli.output import show, tell
-from relay_server.cli.removing import remove_named
-from relay_server.cli.secrets_in import new_password_hash, stdin_option
+from relay_server.cli.password_input import new_password_hash, stdin_option
+from relay_server.cli.remove import remove_named
 
 
 @click.group()

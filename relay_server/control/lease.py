@@ -11,7 +11,7 @@ from relay_protocol.rights import Level
 from relay_server.access import Permit
 
 
-class State(enum.Enum):
+class LeaseState(enum.Enum):
     """How far control has come."""
 
     FREE = "free"
@@ -24,7 +24,7 @@ class State(enum.Enum):
     """Held, and somebody else asks for it."""
 
 
-class Event(enum.Enum):
+class LeaseEvent(enum.Enum):
     """What may happen to it."""
 
     GIVE = "give"
@@ -43,24 +43,24 @@ class Event(enum.Enum):
 
 
 NEXT = {
-    (State.FREE, Event.GIVE): State.ASKING,
-    (State.ASKING, Event.DONE): State.HELD,
-    (State.ASKING, Event.FAILED): State.FREE,
-    (State.ASKING, Event.FREE): State.RELEASING,
-    (State.HELD, Event.GIVE): State.ASKING,
-    (State.HELD, Event.FREE): State.RELEASING,
-    (State.HELD, Event.REQUEST): State.REQUESTED,
-    (State.REQUESTED, Event.REQUEST): State.REQUESTED,
-    (State.REQUESTED, Event.WITHDRAW): State.HELD,
-    (State.REQUESTED, Event.GIVE): State.ASKING,
-    (State.REQUESTED, Event.FREE): State.RELEASING,
-    (State.RELEASING, Event.DONE): State.FREE,
-    (State.RELEASING, Event.FAILED): State.FREE,
-    **{(state, Event.LOST): State.FREE for state in State},
+    (LeaseState.FREE, LeaseEvent.GIVE): LeaseState.ASKING,
+    (LeaseState.ASKING, LeaseEvent.DONE): LeaseState.HELD,
+    (LeaseState.ASKING, LeaseEvent.FAILED): LeaseState.FREE,
+    (LeaseState.ASKING, LeaseEvent.FREE): LeaseState.RELEASING,
+    (LeaseState.HELD, LeaseEvent.GIVE): LeaseState.ASKING,
+    (LeaseState.HELD, LeaseEvent.FREE): LeaseState.RELEASING,
+    (LeaseState.HELD, LeaseEvent.REQUEST): LeaseState.REQUESTED,
+    (LeaseState.REQUESTED, LeaseEvent.REQUEST): LeaseState.REQUESTED,
+    (LeaseState.REQUESTED, LeaseEvent.WITHDRAW): LeaseState.HELD,
+    (LeaseState.REQUESTED, LeaseEvent.GIVE): LeaseState.ASKING,
+    (LeaseState.REQUESTED, LeaseEvent.FREE): LeaseState.RELEASING,
+    (LeaseState.RELEASING, LeaseEvent.DONE): LeaseState.FREE,
+    (LeaseState.RELEASING, LeaseEvent.FAILED): LeaseState.FREE,
+    **{(state, LeaseEvent.LOST): LeaseState.FREE for state in LeaseState},
 }
 
 
-class Client(Hashable, Protocol):
+class LeaseClient(Hashable, Protocol):
     """One connection, as control knows it.
 
     :ivar number: the source of its commands
@@ -100,31 +100,31 @@ class Client(Hashable, Protocol):
         """Who moves the robot has changed: what waited for it goes, or never will."""
 
 
-def owns(client: Client) -> bool:
+def owns(client: LeaseClient) -> bool:
     """Whether the client is an owner of the robot, by its rights as they stand."""
     return client.permit.rules.level is Level.OWNER
 
 
-class Tenure(NamedTuple):
+class Holder(NamedTuple):
     """Somebody has control, or is to have it.
 
     :param since: Unix time, seconds
     :param implicit: whether a command took it, and nobody who can be asked has said that he wants it
     """
 
-    client: Client
+    client: LeaseClient
     since: float
     implicit: bool = False
 
 
-class Request(NamedTuple):
+class ControlRequest(NamedTuple):
     """Somebody asks for it.
 
     :param since: Unix time, seconds
     :param until: Unix time from which an owner takes over by asking again
     """
 
-    client: Client
+    client: LeaseClient
     since: float
     until: float
     why: str
@@ -139,31 +139,31 @@ class Lease:
     :param coming: who is to have it when the robot has answered
     """
 
-    state: State = State.FREE
-    holder: Tenure | None = None
-    coming: Tenure | None = None
-    request: Request | None = None
+    state: LeaseState = LeaseState.FREE
+    holder: Holder | None = None
+    coming: Holder | None = None
+    request: ControlRequest | None = None
 
     @property
     def settled(self) -> bool:
         """Whether no answer of the robot is waited for."""
-        return self.state not in (State.ASKING, State.RELEASING)
+        return self.state not in (LeaseState.ASKING, LeaseState.RELEASING)
 
-    def held_by(self, client: Client) -> bool:
+    def held_by(self, client: LeaseClient) -> bool:
         """Whether this connection moves the robot."""
         return self.holder is not None and self.holder.client is client
 
-    def requested_by(self, client: Client) -> bool:
+    def requested_by(self, client: LeaseClient) -> bool:
         """Whether this connection asks for control."""
         return self.request is not None and self.request.client is client
 
-    def coming_to(self, client: Client) -> bool:
+    def coming_to(self, client: LeaseClient) -> bool:
         """Whether this connection is to have control when the robot has answered."""
         return self.coming is not None and self.coming.client is client
 
-    def give(self, client: Client, now: float, implicit: bool = False) -> Lease:
+    def give(self, client: LeaseClient, now: float, implicit: bool = False) -> Lease:
         """The robot is being told that this client is to have it. Who asked for it asks no more."""
-        return Lease(self._after(Event.GIVE), coming=Tenure(client, now, implicit))
+        return Lease(self._after(LeaseEvent.GIVE), coming=Holder(client, now, implicit))
 
     def meant(self) -> Lease:
         """Who has control has said that he wants it."""
@@ -172,31 +172,31 @@ class Lease:
 
     def free(self) -> Lease:
         """The robot is being told that nobody has it."""
-        return Lease(self._after(Event.FREE))
+        return Lease(self._after(LeaseEvent.FREE))
 
     def done(self, now: float) -> Lease:
         """The robot obeys."""
-        state = self._after(Event.DONE)
+        state = self._after(LeaseEvent.DONE)
         coming = self.coming
         return Lease(state, holder=None if coming is None else coming._replace(since=now))
 
     def failed(self) -> Lease:
         """It has not said that it does."""
-        return Lease(self._after(Event.FAILED))
+        return Lease(self._after(LeaseEvent.FAILED))
 
-    def requested(self, request: Request) -> Lease:
+    def requested(self, request: ControlRequest) -> Lease:
         """Somebody asks for it, in the place of who asked before."""
-        return replace(self, state=self._after(Event.REQUEST), request=request)
+        return replace(self, state=self._after(LeaseEvent.REQUEST), request=request)
 
     def withdrawn(self) -> Lease:
         """Nobody asks for it any more."""
-        return replace(self, state=self._after(Event.WITHDRAW), request=None)
+        return replace(self, state=self._after(LeaseEvent.WITHDRAW), request=None)
 
     def lost(self) -> Lease:
         """The robot's link is gone."""
-        return Lease(self._after(Event.LOST))
+        return Lease(self._after(LeaseEvent.LOST))
 
-    def _after(self, event: Event) -> State:
+    def _after(self, event: LeaseEvent) -> LeaseState:
         following = NEXT.get((self.state, event))
         if following is None:
             raise ValueError(f"'{event.value}' can't happen while control is {self.state.value}")

@@ -13,12 +13,11 @@ from twisted.logger import Logger
 from relay_db.queries import StopRecord
 from relay_protocol import link
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
-from relay_server.bucket import Buckets
-from relay_server.clock import Clock, sleep
-from relay_server.control.detached import detached
-from relay_server.control.orders import NotDone, Orders
-from relay_server.control.record import WHY, Actor, Record
-from relay_server.registry import Presence
+from relay_server.common.clock import Clock, detached, sleep
+from relay_server.common.token_bucket import Buckets
+from relay_server.control.audit import WHY, Actor, AuditSink
+from relay_server.control.commands import NotDone, RobotCommands
+from relay_server.robots.registry import RobotState
 
 STOP_SECONDS = 14.0
 """A robot has so long to confirm that it stands: a switch in its hardware may take 6 s, and has to be thrown once more
@@ -48,7 +47,7 @@ AT_ONCE = 64
 """Orders to stop one robot that are under way at a time; whoever comes then is stopping it already."""
 
 
-class Again(NamedTuple):
+class RepeatedStop(NamedTuple):
     """That a stopped robot was stopped once more.
 
     :param since: Unix time, seconds
@@ -59,7 +58,7 @@ class Again(NamedTuple):
     since: float
 
 
-class Stopped(NamedTuple):
+class StopState(NamedTuple):
     """That a robot is stopped.
 
     :param since: Unix time, seconds; of what comes by two ways the later
@@ -71,10 +70,10 @@ class Stopped(NamedTuple):
     why: str
     since: float
     told: bool
-    again: Again | None = None
+    again: RepeatedStop | None = None
 
 
-class _Press(NamedTuple):
+class StopId(NamedTuple):
     """What stopped a robot that could move.
 
     :param at: the clock's seconds
@@ -91,7 +90,7 @@ class StoppedSince(Refused):
     code = "stopped_since"
 
 
-class Stopping:
+class StopController:
     """The stop of one robot.
 
     :param changed: called when it is another
@@ -104,9 +103,9 @@ class Stopping:
     def __init__(
         self,
         clock: Clock,
-        robot: Presence,
-        orders: Orders,
-        record: Record,
+        robot: RobotState,
+        orders: RobotCommands,
+        record: AuditSink,
         changed: Callable[[], None],
         wall: Callable[[], float],
         clock_ns: Callable[[], int],
@@ -121,9 +120,9 @@ class Stopping:
         self._latest = 0
         """When the robot was stopped the last time, as far as this relay knows; its monotonic nanoseconds."""
         self._repeats = Buckets(AGAIN_A_SECOND, AGAIN_AT_ONCE, AGAIN_USERS, clock.seconds)
-        self._again: Again | None = None
+        self._again: RepeatedStop | None = None
         """Who stopped it last while it was stopped."""
-        self._press: _Press | None = None
+        self._press: StopId | None = None
         self._same: float | None = None
         """When what is one press with that came last; Unix time, seconds."""
         self._pending: StopRecord | None = None
@@ -142,18 +141,18 @@ class Stopping:
         self._clearing = False
 
     @property
-    def stopped(self) -> Stopped | None:
+    def stopped(self) -> StopState | None:
         """By whom and why the robot is stopped, as it says itself, or is going to be; ``None`` when it may move."""
         told, pending, again = self._robot.safety.stopped, self._pending, self._again
         if told is not None:
             since = told.since if self._same is None else self._same
-            return Stopped(told.by, told.why, since, True, again)
+            return StopState(told.by, told.why, since, True, again)
         if pending is None:
             return None
         # What the robot was not told of gives way to the latest order, which is not told twice.
         if again is not None and again.since == pending.at:
             again = None
-        return Stopped(pending.by, pending.why, max(pending.at, self._same or 0.0), False, again)
+        return StopState(pending.by, pending.why, max(pending.at, self._same or 0.0), False, again)
 
     def stop(self, actor: Actor, why: str) -> Deferred[bool]:
         """Stop the robot, and keep it stopped. The order is on its way when this returns.
@@ -180,7 +179,7 @@ class Stopping:
         :param first: whether the robot was not stopped before
         """
         who = actor.source if actor.user is None else actor.user
-        press, before = _Press(who, order.why, self._clock.seconds()), self._press
+        press, before = StopId(who, order.why, self._clock.seconds()), self._press
         if first:
             self._unpress()
             self._press = press
@@ -188,7 +187,7 @@ class Stopping:
             # It is told by another moment: that ends a press to resume.
             self._same = order.at
         else:
-            self._again = Again(order.by, order.why, order.at)
+            self._again = RepeatedStop(order.by, order.why, order.at)
 
     async def _stop(self, order: StopRecord, actor: Actor, audit: bool) -> bool:
         # Before anything is written: nothing is as urgent.

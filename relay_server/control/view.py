@@ -9,20 +9,20 @@ import msgspec
 
 from relay_protocol.link import Inhibited, Suppressed
 from relay_protocol.rights import Level, Operation, Rules
-from relay_server.control.desk import Desk
-from relay_server.control.lease import Client, Request, State, Tenure
-from relay_server.control.terms import ROBOT, Standing
-from relay_server.registry import Presence
+from relay_server.control.controller import RobotController
+from relay_server.control.lease import ControlRequest, Holder, LeaseClient, LeaseState
+from relay_server.control.types import ROBOT, ControlSnapshot
+from relay_server.robots.registry import RobotState
 
 
-class Asker:
+class ControlReader:
     """Who is told.
 
     :param rules: its rights on the robot
     :param mine: whether a connection is its own
     """
 
-    def __init__(self, rules: Rules, mine: Callable[[Client], bool]) -> None:
+    def __init__(self, rules: Rules, mine: Callable[[LeaseClient], bool]) -> None:
         self.rules = rules
         self.mine = mine
 
@@ -34,7 +34,7 @@ class Asker:
         )
 
 
-def control(desk: Desk, asker: Asker, number: int | None) -> dict[str, Any]:
+def control(desk: RobotController, asker: ControlReader, number: int | None) -> dict[str, Any]:
     """Who moves the robot, who asks to, and why it stands.
 
     :param number: of the asker's connection, ``None`` when it has none or is told of all
@@ -59,20 +59,20 @@ def control(desk: Desk, asker: Asker, number: int | None) -> dict[str, Any]:
     }
 
 
-def state(standing: Standing) -> str:
+def state(standing: ControlSnapshot) -> str:
     """``free``, ``held`` or ``requested``; while the robot is being told of somebody nobody has it."""
     now = standing.lease.state
-    shown = now if now in (State.HELD, State.REQUESTED) else State.FREE
+    shown = now if now in (LeaseState.HELD, LeaseState.REQUESTED) else LeaseState.FREE
     return str(shown.value)
 
 
-def holder(standing: Standing) -> str | None:
+def holder(standing: ControlSnapshot) -> str | None:
     """The user who has control, if anybody has."""
     tenure = standing.lease.holder
     return None if tenure is None else tenure.client.name
 
 
-def stopped(standing: Standing) -> dict[str, Any] | None:
+def stopped(standing: ControlSnapshot) -> dict[str, Any] | None:
     """Why the robot stands, if it was stopped."""
     found = standing.stopped
     if found is None:
@@ -80,12 +80,12 @@ def stopped(standing: Standing) -> dict[str, Any] | None:
     return {**found._asdict(), "again": None if found.again is None else found.again._asdict()}
 
 
-def hands(robot: Presence, rules: Rules | None = None) -> dict[str, list[dict[str, Any]]]:
+def overrides(robot: RobotState, rules: Rules | None = None) -> dict[str, list[dict[str, Any]]]:
     """Who has a hand on topics of a robot without having control of it: who commands, and who keeps quiet.
 
     :param rules: of who is told, who learns of no topic that he may not use; ``None``: of all
     """
-    asker = None if rules is None else Asker(rules, lambda client: False)
+    asker = None if rules is None else ControlReader(rules, lambda client: False)
 
     def told(facts: Iterable[Suppressed | Inhibited]) -> list[dict[str, Any]]:
         return [
@@ -97,7 +97,7 @@ def hands(robot: Presence, rules: Rules | None = None) -> dict[str, list[dict[st
     return {"suppressed": told(robot.safety.suppressed), "inhibited": told(robot.safety.inhibited)}
 
 
-def _holder(tenure: Tenure, asker: Asker) -> dict[str, Any]:
+def _holder(tenure: Holder, asker: ControlReader) -> dict[str, Any]:
     client = tenure.client
     return {
         "user": client.name,
@@ -108,7 +108,7 @@ def _holder(tenure: Tenure, asker: Asker) -> dict[str, Any]:
     }
 
 
-def _request(request: Request, asker: Asker) -> dict[str, Any]:
+def _request(request: ControlRequest, asker: ControlReader) -> dict[str, Any]:
     client = request.client
     return {
         "user": client.name,
@@ -120,5 +120,5 @@ def _request(request: Request, asker: Asker) -> dict[str, Any]:
     }
 
 
-def _known(told: Iterable[Suppressed | Inhibited], asker: Asker) -> list[dict[str, Any]]:
+def _known(told: Iterable[Suppressed | Inhibited], asker: ControlReader) -> list[dict[str, Any]]:
     return [msgspec.structs.asdict(each) for each in told if asker.may_know(each.resource)]

@@ -13,7 +13,7 @@ VALUES_BYTES = 64 * KIB
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskOutcome:
     """How it ended.
 
     :param message: why it is not ok, or what the robot says
@@ -27,7 +27,7 @@ class Outcome:
     pending: bool = False
 
     @classmethod
-    def of_service(cls, values: Any) -> Outcome:
+    def of_service(cls, values: Any) -> TaskOutcome:
         """What a service answered; one that says itself that it failed has failed."""
         said = values if isinstance(values, dict) else {}
         message = said.get("message")
@@ -39,14 +39,14 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Result:
+class TaskResult:
     """How it ended on one robot.
 
     :param seconds: how long it took
     """
 
     robot: str
-    outcome: Outcome
+    outcome: TaskOutcome
     seconds: float
 
     def told(self) -> dict[str, Any]:

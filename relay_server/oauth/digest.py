@@ -15,7 +15,7 @@ from typing import NamedTuple
 from werkzeug.datastructures import Authorization
 
 from relay_server.access import BadCredentials
-from relay_server.passwords import REALM
+from relay_server.auth.passwords import REALM
 
 NONCE_SECONDS = 300.0
 """How long an answer may use a challenge."""

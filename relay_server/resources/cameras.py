@@ -8,10 +8,10 @@ from urllib.parse import quote
 
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
-from relay_server.channel import resolve
-from relay_server.resources.desk import Asker
-from relay_server.resources.listing import Listing
-from relay_server.video import NO_CAMERA
+from relay_server.channels.robot_link import resolve
+from relay_server.resources.page import PageQuery
+from relay_server.resources.service import RequestOrigin
+from relay_server.video.ports import NO_CAMERA
 
 Look = Callable[[Principal, str], Awaitable[list[dict[str, Any]]]]
 """Tells what a principal may know of the cameras of a robot; the front desk's."""
@@ -20,7 +20,7 @@ _ADDRESSES = {"snapshot": "snapshot", "stream": "stream", "viewer": "stream_view
 """What a camera's pictures are had as, and the end of the address of that."""
 
 
-class CameraDesk:
+class CameraService:
     """See the module's text.
 
     :param look: tells which there are
@@ -29,7 +29,7 @@ class CameraDesk:
     def __init__(self, look: Look) -> None:
         self._look = look
 
-    async def members(self, asker: Asker, listing: Listing) -> dict[str, Any]:
+    async def members(self, asker: RequestOrigin, listing: PageQuery) -> dict[str, Any]:
         """A page of the cameras that the asker may view.
 
         :raises NotFound: no such robot, or no right on it
@@ -38,7 +38,7 @@ class CameraDesk:
         page, after = listing.page(there, lambda each: [each["type"]])
         return {"cameras": [each for _, each in page], "next": after}
 
-    async def camera(self, asker: Asker, name: str) -> dict[str, Any]:
+    async def camera(self, asker: RequestOrigin, name: str) -> dict[str, Any]:
         """One of them, with the addresses of its pictures.
 
         :raises NotFound: no such robot or camera, or no right to view it: said alike

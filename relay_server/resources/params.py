@@ -8,20 +8,20 @@ import msgspec
 
 from relay_protocol import jsontext
 from relay_protocol.errors import NotFound, Refused
-from relay_server.control import NotDone
-from relay_server.inside import Guest
+from relay_server.control.commands import NotDone
+from relay_server.http_sessions.pool import PooledSession
 
 SECONDS = 10.0
 """A node has so long to answer."""
 
 
-async def names(guest: Guest) -> list[str]:
+async def names(guest: PooledSession) -> list[str]:
     """All there are, as ``<node>:<parameter>``."""
     found: list[str] = (await _ask(guest, "get_param_names"))["names"]
     return found
 
 
-async def value(guest: Guest, name: str) -> bytes:
+async def value(guest: PooledSession, name: str) -> bytes:
     """JSON of one.
 
     :raises NotFound: there is none
@@ -32,7 +32,7 @@ async def value(guest: Guest, name: str) -> bytes:
     return str(said["value"]).encode()
 
 
-async def set_value(guest: Guest, name: str, json: bytes) -> None:
+async def set_value(guest: PooledSession, name: str, json: bytes) -> None:
     """Set one.
 
     :param json: any JSON
@@ -41,7 +41,7 @@ async def set_value(guest: Guest, name: str, json: bytes) -> None:
     _see(await _ask(guest, "set_param", name=name, value=json.decode()))
 
 
-async def remove(guest: Guest, name: str) -> None:
+async def remove(guest: PooledSession, name: str) -> None:
     """Delete one.
 
     :raises NotDone: its node says why not
@@ -49,7 +49,7 @@ async def remove(guest: Guest, name: str) -> None:
     _see(await _ask(guest, "delete_param", name=name))
 
 
-async def _ask(guest: Guest, service: str, **args: Any) -> Any:
+async def _ask(guest: PooledSession, service: str, **args: Any) -> Any:
     answer = await guest.client.call(
         f"/rosapi/{service}", msgspec.Raw(jsontext.encode(args)), timeout=SECONDS
     )

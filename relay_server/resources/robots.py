@@ -8,27 +8,27 @@ from typing import Any, Protocol
 from relay_protocol import jsontext
 from relay_protocol.errors import NotFound
 from relay_server.access import NO_ROBOT, Principal
-from relay_server.resources.listing import Listing
-from relay_server.resources.states import tag_of
+from relay_server.resources.etags import tag_of
+from relay_server.resources.page import PageQuery
 
 FLEETING = frozenset({"rtt_ms", "last_seen"})
 """What is another with every ping: by that alone a robot is no other."""
 
 
-class Overview(Protocol):
+class RobotSource(Protocol):
     """Knows all robots; the front desk."""
 
     async def robots(self, principal: Principal) -> list[dict[str, Any]]:
         """What the principal may see of its robots."""
 
 
-class RobotDesk:
+class RobotService:
     """See the module's text."""
 
-    def __init__(self, overview: Overview) -> None:
+    def __init__(self, overview: RobotSource) -> None:
         self._overview = overview
 
-    async def members(self, principal: Principal, listing: Listing) -> dict[str, Any]:
+    async def members(self, principal: Principal, listing: PageQuery) -> dict[str, Any]:
         """A page of the robots on which somebody has a right."""
         there = {each["name"]: each for each in await self._overview.robots(principal)}
         page, after = listing.page(there, lambda each: ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,14 +12,69 @@ from twisted.logger import Logger
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, SwitchboardError, Unavailable
 from relay_protocol.frames import VideoFrame
-from relay_protocol.pictures import look_at
-from relay_server.clock import Clock, Timer, cancel
-from relay_server.registry import Presence
-from relay_server.video.ends import NO_CAMERA, NothingCame, NotMade, VideoLink, Viewer, Wish
-from relay_server.video.keys import Keys
-from relay_server.video.patience import UNKNOWN_SECONDS, Patience, between
-from relay_server.video.pictures import OFTEN, STALE_SECONDS, Lateness, Picture
-from relay_server.video.states import LINKED, NEXT, Event, State
+from relay_protocol.image_check import look_at
+from relay_server.common.clock import Clock, Timer, cancel
+from relay_server.robots.registry import RobotState
+from relay_server.video.first_frame_timeout import UNKNOWN_SECONDS, FirstFrameTimeout, between
+from relay_server.video.frames import OFTEN, STALE_SECONDS, DelayEstimator, VideoFrameInfo
+from relay_server.video.keyframes import Keyframes
+from relay_server.video.ports import (
+    NO_CAMERA,
+    EncoderUnavailable,
+    NoFrame,
+    StreamRequest,
+    VideoPort,
+    ViewerPort,
+)
+
+
+class StreamState(enum.Enum):
+    """Where a stream is in its life."""
+
+    NEW = "new"
+    WAITING = "waiting for the robot or its camera"
+    OPENING = "opening"
+    OPEN = "open"
+    LINGERING = "open, without viewers"
+    CLOSED = "closed"
+
+
+class StreamEvent(enum.Enum):
+    """What happens to a stream."""
+
+    WANTED = "somebody watches"
+    CAMERA_THERE = "the robot has the camera"
+    ROBOT_OFFLINE = "the robot is gone"
+    JOINED = "the robot joined"
+    LINK_LOST = "the stream's link broke"
+    LATE = "the robot did not join in time"
+    LEFT = "the last viewer left"
+    SHUT = "it is over"
+
+
+NEXT: dict[tuple[StreamState, StreamEvent], StreamState] = {
+    (StreamState.NEW, StreamEvent.WANTED): StreamState.WAITING,
+    (StreamState.WAITING, StreamEvent.CAMERA_THERE): StreamState.OPENING,
+    (StreamState.WAITING, StreamEvent.LEFT): StreamState.CLOSED,
+    (StreamState.WAITING, StreamEvent.SHUT): StreamState.CLOSED,
+    (StreamState.OPENING, StreamEvent.JOINED): StreamState.OPEN,
+    (StreamState.OPENING, StreamEvent.LATE): StreamState.OPENING,
+    (StreamState.OPENING, StreamEvent.ROBOT_OFFLINE): StreamState.WAITING,
+    (StreamState.OPENING, StreamEvent.LEFT): StreamState.CLOSED,
+    (StreamState.OPENING, StreamEvent.SHUT): StreamState.CLOSED,
+    (StreamState.OPEN, StreamEvent.LINK_LOST): StreamState.OPENING,
+    (StreamState.OPEN, StreamEvent.ROBOT_OFFLINE): StreamState.WAITING,
+    (StreamState.OPEN, StreamEvent.LEFT): StreamState.LINGERING,
+    (StreamState.OPEN, StreamEvent.SHUT): StreamState.CLOSED,
+    (StreamState.LINGERING, StreamEvent.WANTED): StreamState.OPEN,
+    (StreamState.LINGERING, StreamEvent.LINK_LOST): StreamState.CLOSED,
+    (StreamState.LINGERING, StreamEvent.ROBOT_OFFLINE): StreamState.CLOSED,
+    (StreamState.LINGERING, StreamEvent.SHUT): StreamState.CLOSED,
+}
+"""An event that is not listed for a state changes nothing."""
+
+LINKED = (StreamState.OPEN, StreamState.LINGERING)
+"""States in which pictures come."""
 
 STREAM_VIEWERS = 256
 """Most viewers of a stream."""
@@ -41,7 +97,7 @@ TELL_SECONDS = 0.1
 
 
 @dataclass(frozen=True)
-class Hooks:
+class StreamCallbacks:
     """What a stream needs of its hub.
 
     :param issue_ticket: makes the ticket the robot joins with
@@ -51,13 +107,13 @@ class Hooks:
     :param closed: called once, when it is over
     """
 
-    issue_ticket: Callable[[Stream], str]
-    busy: Callable[[Stream], None]
-    left: Callable[[Stream], None]
-    closed: Callable[[Stream], None]
+    issue_ticket: Callable[[CameraStream], str]
+    busy: Callable[[CameraStream], None]
+    left: Callable[[CameraStream], None]
+    closed: Callable[[CameraStream], None]
 
 
-class Stream:
+class CameraStream:
     """One camera in one form.
 
     :param name: what relay and robot call it
@@ -68,11 +124,11 @@ class Stream:
     def __init__(
         self,
         clock: Clock,
-        robot: Presence,
+        robot: RobotState,
         camera: str,
         settings: link.VideoSettings,
         name: str,
-        hooks: Hooks,
+        hooks: StreamCallbacks,
     ) -> None:
         self._clock = clock
         self.robot = robot
@@ -80,19 +136,19 @@ class Stream:
         self.settings = settings
         self.name = name
         self._hooks = hooks
-        self.state = State.NEW
-        self.viewers: set[Viewer] = set()
-        self.wishes: dict[Viewer, Wish] = {}
+        self.state = StreamState.NEW
+        self.viewers: set[ViewerPort] = set()
+        self.wishes: dict[ViewerPort, StreamRequest] = {}
         """What each of them came for."""
-        self.newest: Picture | None = None
+        self.newest: VideoFrameInfo | None = None
         self.told: link.Playing | None = None
         """What the robot sends at present, once it has said so."""
         self.failed: link.Playing | None = None
         """What it sent before it could not show the camera any more, and why it can't; ``None`` while all is well."""
-        self._link: VideoLink | None = None
-        self._lateness = Lateness()
-        self._patience = Patience(clock, self._due, self._in_vain)
-        self._keys = Keys(clock, self._ask_for_key, lambda: len(self.viewers) > 1)
+        self._link: VideoPort | None = None
+        self._lateness = DelayEstimator()
+        self._patience = FirstFrameTimeout(clock, self._due, self._in_vain)
+        self._keys = Keyframes(clock, self._ask_for_key, lambda: len(self.viewers) > 1)
         self._late = False
         """Whether the newest picture came too late for everybody."""
         self._viewers_told: link.Playing | None = None
@@ -103,7 +159,7 @@ class Stream:
 
     # --- viewers ------------------------------------------------------------------------------------------
 
-    def attach(self, viewer: Viewer, wish: Wish | None = None) -> None:
+    def attach(self, viewer: ViewerPort, wish: StreamRequest | None = None) -> None:
         """Somebody begins to watch; he is told nothing before this has returned.
 
         :param wish: what he came for; by default this stream, from its next picture on
@@ -112,25 +168,25 @@ class Stream:
         if len(self.viewers) >= STREAM_VIEWERS:
             raise Unavailable(f"{STREAM_VIEWERS} viewers watch this stream already")
         self.viewers.add(viewer)
-        self.wishes[viewer] = wish or Wish(self.settings)
+        self.wishes[viewer] = wish or StreamRequest(self.settings)
         self._keys.enters([viewer])
         self._patience.begins(viewer)
-        self._happen(Event.WANTED)
+        self._happen(StreamEvent.WANTED)
         self._look_for_camera()
         if self.state in LINKED:
             self._clock.callLater(0, self._greet, viewer)
             self._want_key(viewer)
 
-    def detach(self, viewer: Viewer) -> None:
+    def detach(self, viewer: ViewerPort) -> None:
         """Somebody watches no more; nothing is told to him from now on."""
         if viewer in self.viewers:
             self._drop(viewer)
             if self.viewers:
                 self._hooks.left(self)
             else:
-                self._happen(Event.LEFT)
+                self._happen(StreamEvent.LEFT)
 
-    def start_anew(self, viewer: Viewer) -> None:
+    def start_anew(self, viewer: ViewerPort) -> None:
         """A viewer has left out a picture of H.264: what follows is no use to him before one that stands alone."""
         if viewer not in self.viewers:
             return
@@ -149,11 +205,11 @@ class Stream:
         told, self.viewers = self.viewers, set()
         for viewer in told:
             self._drop(viewer)
-        self._happen(Event.SHUT)
+        self._happen(StreamEvent.SHUT)
         for viewer in told:
             viewer.ended(error)
 
-    def move(self, viewer: Viewer, stream: Stream) -> None:
+    def move(self, viewer: ViewerPort, stream: CameraStream) -> None:
         """A viewer watches another stream from now on, unless that does not take him."""
         try:
             stream.attach(viewer, self.wishes[viewer])
@@ -162,19 +218,19 @@ class Stream:
         self.detach(viewer)
         viewer.moved(stream)
 
-    def _drop(self, viewer: Viewer) -> None:
+    def _drop(self, viewer: ViewerPort) -> None:
         self.viewers.discard(viewer)
         self.wishes.pop(viewer, None)
         self._keys.leaves(viewer)
         self._patience.ends(viewer)
 
-    def _greet(self, viewer: Viewer) -> None:
+    def _greet(self, viewer: ViewerPort) -> None:
         """Who comes later is told what the others know."""
         if viewer in self.viewers and self.told is not None:
             viewer.playing(self.told)
         self._show_newest(viewer)
 
-    def _show_newest(self, viewer: Viewer) -> None:
+    def _show_newest(self, viewer: ViewerPort) -> None:
         """He sees the newest picture, if it is not old.
 
         Who wanted to is shown that of a slow camera, too, as everybody is one that its publisher keeps; its stamp tells
@@ -193,7 +249,7 @@ class Stream:
         elif kept or (self.wishes[viewer].newest and now - newest.good_until + STALE_SECONDS <= due):
             self._show(structs.replace(newest, good_until=now + STALE_SECONDS), [viewer])
 
-    def _show(self, picture: Picture, viewers: list[Viewer]) -> None:
+    def _show(self, picture: VideoFrameInfo, viewers: list[ViewerPort]) -> None:
         in_time = self._clock.seconds() <= picture.good_until
         for viewer in viewers:
             # One may leave while another is shown the picture.
@@ -210,7 +266,7 @@ class Stream:
         """Seconds from one picture to the next; 0: not known, or there is no link on which any could come."""
         return between(self.settings, self._named(), self.told) if self.state in LINKED else 0.0
 
-    def _in_vain(self, viewer: Viewer, waited: float) -> None:
+    def _in_vain(self, viewer: ViewerPort, waited: float) -> None:
         """No picture has come for him.
 
         :param waited: seconds
@@ -223,12 +279,12 @@ class Stream:
         robot = self.robot.name
         if self.robot.control is None:
             return Unavailable(f"robot {robot} is offline")
-        if self.state is State.WAITING:
+        if self.state is StreamState.WAITING:
             return NotFound(NO_CAMERA)
-        if self.state is State.OPENING:
-            return NothingCame(f"robot {robot} does not open the video of {self.camera}")
+        if self.state is StreamState.OPENING:
+            return NoFrame(f"robot {robot} does not open the video of {self.camera}")
         trouble = f": {self.told.trouble}" if self.told is not None and self.told.trouble else ""
-        return NothingCame(f"camera {self.camera} has given no picture for {waited:.0f} s{trouble}")
+        return NoFrame(f"camera {self.camera} has given no picture for {waited:.0f} s{trouble}")
 
     # --- the robot ----------------------------------------------------------------------------------------
 
@@ -237,7 +293,7 @@ class Stream:
 
     def robot_offline(self) -> None:
         """The control link is gone, and with it what the robot did for us."""
-        self._happen(Event.ROBOT_OFFLINE)
+        self._happen(StreamEvent.ROBOT_OFFLINE)
 
     def graph_changed(self) -> None:
         """Cameras are told of on their own."""
@@ -246,15 +302,15 @@ class Stream:
         """The robot told facts about itself: its cameras, perhaps."""
         self._look_for_camera()
 
-    def joined(self, video_link: VideoLink) -> None:
+    def joined(self, video_link: VideoPort) -> None:
         """The robot has come with our ticket."""
-        if self.state is not State.OPENING:
+        if self.state is not StreamState.OPENING:
             video_link.close("this stream is not being opened")
             return
         self._link = video_link
         # Its clock may have been set while it was away.
-        self._lateness = Lateness()
-        self._happen(Event.JOINED)
+        self._lateness = DelayEstimator()
+        self._happen(StreamEvent.JOINED)
 
     def part(self) -> None:
         """A part of a picture came over the link; the rest is still on its way."""
@@ -302,14 +358,14 @@ class Stream:
         """
         error = self._not_so(reason)
         stay = [each for each in self.viewers if not self._patience.waits(each)]
-        if not stay or isinstance(error, NotMade):
+        if not stay or isinstance(error, EncoderUnavailable):
             self.shut(error)
             return
         for viewer in self.viewers.difference(stay):
             self._drop(viewer)
             viewer.ended(error)
         told = self.told
-        self._happen(Event.LINK_LOST)
+        self._happen(StreamEvent.LINK_LOST)
         if told is not None:
             self.failed = structs.replace(told, trouble=reason)
             for viewer in stay:
@@ -327,14 +383,14 @@ class Stream:
 
     def _not_so(self, reason: str) -> Unavailable:
         """The robot can't show it in this form; of H.264, there is another one that it may."""
-        return NotMade(reason) if self.settings.codec == "h264" else Unavailable(reason)
+        return EncoderUnavailable(reason) if self.settings.codec == "h264" else Unavailable(reason)
 
-    def lost(self, video_link: VideoLink) -> None:
+    def lost(self, video_link: VideoPort) -> None:
         """The link has ended."""
         if self._link is video_link:
-            self._happen(Event.LINK_LOST)
+            self._happen(StreamEvent.LINK_LOST)
 
-    def _checked(self, frame: VideoFrame) -> Picture:
+    def _checked(self, frame: VideoFrame) -> VideoFrameInfo:
         seen = look_at(self.settings.codec, frame.body)
         width, height = seen.width, seen.height
         if not width:
@@ -345,7 +401,7 @@ class Stream:
         # What its publisher keeps may be old through no fault of the network's, and no other one may follow.
         kept = self.told is not None and self.told.latched and self.told.source_fps < OFTEN
         late = 0.0 if kept else self._lateness.of(stamp, now)
-        return Picture(
+        return VideoFrameInfo(
             number=frame.number,
             stamp=stamp,
             good_until=now + STALE_SECONDS - late,
@@ -359,7 +415,7 @@ class Stream:
 
     # --- key frames ---------------------------------------------------------------------------------------
 
-    def _want_key(self, viewer: Viewer) -> None:
+    def _want_key(self, viewer: ViewerPort) -> None:
         if self.settings.codec == "h264":
             self._keys.wants(viewer)
 
@@ -369,7 +425,7 @@ class Stream:
 
     # --- life ---------------------------------------------------------------------------------------------
 
-    def _happen(self, event: Event) -> None:
+    def _happen(self, event: StreamEvent) -> None:
         following = NEXT.get((self.state, event))
         if following is None:
             return
@@ -379,16 +435,16 @@ class Stream:
         self._timer = None
         if before in LINKED and following not in LINKED:
             self._leave_link(event)
-        if following is State.OPENING:
+        if following is StreamState.OPENING:
             self._open_later(event)
-        elif following is State.LINGERING:
-            self._timer = self._clock.callLater(LINGER_SECONDS, self._happen, Event.SHUT)
-        elif following is State.CLOSED:
+        elif following is StreamState.LINGERING:
+            self._timer = self._clock.callLater(LINGER_SECONDS, self._happen, StreamEvent.SHUT)
+        elif following is StreamState.CLOSED:
             self._end(before)
 
     def _look_for_camera(self) -> None:
         if self.robot.control is not None and self._named() is not None:
-            self._happen(Event.CAMERA_THERE)
+            self._happen(StreamEvent.CAMERA_THERE)
 
     def _named(self) -> link.Camera | None:
         """The camera as the robot tells of it."""
@@ -407,9 +463,9 @@ class Stream:
         names = self._names()
         return any(each.resource in names and not each.hold for each in self.robot.safety.inhibited)
 
-    def _open_later(self, event: Event) -> None:
+    def _open_later(self, event: StreamEvent) -> None:
         pause = 0.0
-        if event is Event.LINK_LOST:
+        if event is StreamEvent.LINK_LOST:
             pause, self._pause = self._pause, min(2 * self._pause, MOST_REOPEN_SECONDS)
         self._timer = self._clock.callLater(pause, self._ask_to_open)
 
@@ -423,9 +479,9 @@ class Stream:
                     settings=self.settings,
                 )
             )
-        self._timer = self._clock.callLater(JOIN_SECONDS, self._happen, Event.LATE)
+        self._timer = self._clock.callLater(JOIN_SECONDS, self._happen, StreamEvent.LATE)
 
-    def _leave_link(self, event: Event) -> None:
+    def _leave_link(self, event: StreamEvent) -> None:
         broken, self._link = self._link, None
         if broken is not None:
             broken.close(event.value)
@@ -435,8 +491,8 @@ class Stream:
         self._keys.rest()
         cancel(self._telling)
 
-    def _end(self, before: State) -> None:
-        if before is not State.WAITING and self.robot.control is not None:
+    def _end(self, before: StreamState) -> None:
+        if before is not StreamState.WAITING and self.robot.control is not None:
             self.robot.control.send(link.CloseVideo(stream=self.name))
         self.robot.watchers.remove(self)
         self._hooks.closed(self)

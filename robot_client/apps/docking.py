@@ -6,7 +6,7 @@ import json
 import math
 from typing import Any, NamedTuple
 
-from robot_client.apps.driver import STILL, Command
+from robot_client.apps.driver import STILL, VelocityCommand
 
 HALF = 0.25
 """Metres to either side of the way ahead in which something is in the way."""
@@ -27,7 +27,7 @@ UNKNOWN = 0
 """Numbers of sensor_msgs/BatteryState's ``power_supply_status``."""
 
 
-class Topics(NamedTuple):
+class DockingTopics(NamedTuple):
     """Where is heard of what.
 
     :ivar battery: BatteryState
@@ -163,12 +163,12 @@ class Approach(NamedTuple):
         """Whether it is there."""
         return seen.distance <= self.distance
 
-    def command(self, seen: Sighting) -> Command:
+    def command(self, seen: Sighting) -> VelocityCommand:
         """What brings it nearer."""
         if self.arrived(seen):
             return STILL
         turn = max(-self.turn, min(self.turn, TURNING * seen.bearing))
         if abs(seen.bearing) > ASIDE:
-            return Command(0.0, turn)
+            return VelocityCommand(0.0, turn)
         speed = max(SLOWEST, NEARER * (seen.distance - self.distance))
-        return Command(min(self.speed, speed), turn)
+        return VelocityCommand(min(self.speed, speed), turn)

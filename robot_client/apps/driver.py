@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from robot_client.apps.line import Line, Lost
+from robot_client.apps.connection import Lost, RosbridgeConnection
 
 TWIST = "geometry_msgs/msg/Twist"
 BEAT = 0.25
@@ -19,36 +19,36 @@ SILENT = 6.0
 """Seconds without an answer after which there is no connection, whatever the system says."""
 
 
-class Command(NamedTuple):
+class VelocityCommand(NamedTuple):
     """Metres per second ahead and radians per second counter-clockwise."""
 
     speed: float
     turn: float
 
 
-STILL = Command(0.0, 0.0)
+STILL = VelocityCommand(0.0, 0.0)
 
 
-class Limits(NamedTuple):
+class MaximumSpeeds(NamedTuple):
     """The fastest: metres per second and radians per second."""
 
     speed: float
     turn: float
 
-    def within(self, other: Limits) -> Limits:
+    def within(self, other: MaximumSpeeds) -> MaximumSpeeds:
         """The stricter of each."""
-        return Limits(min(self.speed, other.speed), min(self.turn, other.turn))
+        return MaximumSpeeds(min(self.speed, other.speed), min(self.turn, other.turn))
 
 
-UNLIMITED = Limits(math.inf, math.inf)
+UNLIMITED = MaximumSpeeds(math.inf, math.inf)
 
 
-def twist(command: Command) -> dict[str, Any]:
+def twist(command: VelocityCommand) -> dict[str, Any]:
     """A command as ``geometry_msgs/Twist``."""
     return {"linear": {"x": command.speed}, "angular": {"z": command.turn}}
 
 
-class Stop:
+class StopNotice:
     """The relay's stop, from when it is asked for until it is answered: it outlives the line it was asked by.
 
     :ivar asked: whether it waits for its answer
@@ -103,11 +103,11 @@ class Driver:
 
     def __init__(
         self,
-        line: Line,
+        line: RosbridgeConnection,
         topic: str,
         name: str,
         clock: Callable[[], float],
-        stop: Stop,
+        stop: StopNotice,
         heard: Callable[[str, dict[str, Any]], None] = lambda topic, message: None,
     ) -> None:
         self.in_control = False
@@ -137,11 +137,11 @@ class Driver:
         line.say(op="subscribe", topic="/relay/status")
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> MaximumSpeeds:
         """What the robot allows whoever drives here, as far as it is known."""
         told = self._limits.get(self._level) or {}
         found = (told.get(each) for each in ("linear", "angular"))
-        return Limits(*(math.inf if each is None else float(each) for each in found))
+        return MaximumSpeeds(*(math.inf if each is None else float(each) for each in found))
 
     @property
     def late(self) -> bool:
@@ -194,7 +194,7 @@ class Driver:
         self.still()
         self._say_stop()
 
-    def drive(self, command: Command) -> None:
+    def drive(self, command: VelocityCommand) -> None:
         """One command, within the robot's limits; nothing where it is not this program's to drive."""
         if not self.in_control:
             return
@@ -202,7 +202,7 @@ class Driver:
         speed = max(-top.speed, min(top.speed, command.speed))
         turn = max(-top.turn, min(top.turn, command.turn))
         self._moved = bool(speed or turn)
-        self._line.say(op="publish", topic=self._topic, msg=twist(Command(speed, turn)))
+        self._line.say(op="publish", topic=self._topic, msg=twist(VelocityCommand(speed, turn)))
 
     def still(self) -> None:
         """Zero, if the last command was none."""

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple, Protocol
 import click
 
 from robot_client.apps.clock import now as since_start
-from robot_client.apps.line import Line, Pulse, in_words, token
-from robot_client.apps.memory import Memory, Unanswered
-from robot_client.apps.status import StatusLine
-from robot_client.apps.staying import Ending, stay
+from robot_client.apps.connection import LivenessCheck, RosbridgeConnection, in_words, token
+from robot_client.apps.event_client import EventClient, Unanswered
+from robot_client.apps.reconnect import Ending, run_connected
+from robot_client.apps.status_line import StatusLine
 from robot_client.numbers import Number
 
 LOOK = 0.25
@@ -47,7 +47,7 @@ SILENT = 15.0
 """Seconds without a word of the relay after which there is no connection."""
 
 
-class Manners(NamedTuple):
+class GreetingConfig(NamedTuple):
     """How it greets.
 
     :ivar within: seconds within which nobody is greeted twice
@@ -65,7 +65,7 @@ class Manners(NamedTuple):
 
 
 class Events(Protocol):
-    """What remembers, and speaks: :class:`~robot_client.apps.memory.Memory`."""
+    """What remembers, and speaks: :class:`~robot_client.apps.event_client.EventClient`."""
 
     def events(self, kind: str, last: float, **data: str) -> list[dict[str, Any]]:
         """Events of the last so many seconds."""
@@ -130,7 +130,7 @@ class Greeting:
         faces: str,
         say: str,
         memory: Events,
-        manners: Manners,
+        manners: GreetingConfig,
         tell: Callable[[str], None],
         clock: Callable[[], float] = since_start,
     ) -> None:
@@ -141,11 +141,11 @@ class Greeting:
         self._tell = tell
         self._clock = clock
         self._attention = Attention()
-        self._pulse: Pulse
+        self._pulse: LivenessCheck
 
-    def begin(self, line: Line) -> None:
+    def begin(self, line: RosbridgeConnection) -> None:
         """There is a line."""
-        self._pulse = Pulse(line, self._clock, BEAT, SILENT)
+        self._pulse = LivenessCheck(line, self._clock, BEAT, SILENT)
         line.say(op="set_level", level="error")
         line.say(op="subscribe", topic=self._faces, type="std_msgs/msg/String", queue_length=1)
         self._tell("looking for people")
@@ -202,13 +202,13 @@ class Greeting:
 @click.option(
     "--within",
     type=Number(1, 86400),
-    default=Manners().within,
+    default=GreetingConfig().within,
     show_default=True,
     metavar="S",
     help="Nobody is greeted twice within.",
 )
 @click.option(
-    "--text", default=Manners().text, show_default=True, help="What is said; {name} is the person's."
+    "--text", default=GreetingConfig().text, show_default=True, help="What is said; {name} is the person's."
 )
 @click.option(
     "--strangers", default="", metavar="TEXT", help="What is said to who is not recognised. Default: nothing."
@@ -229,8 +229,8 @@ def main(url: str, faces: str, say: str, within: float, text: str, strangers: st
     ending = Ending()
     status = StatusLine(sys.stdout, time.monotonic)
     with in_words():
-        program = Greeting(faces, say, Memory(url), Manners(within, text, strangers), status.tell)
-        stay(url, program, ending)
+        program = Greeting(faces, say, EventClient(url), GreetingConfig(within, text, strangers), status.tell)
+        run_connected(url, program, ending)
     status.end("ended")
 
 

@@ -15,13 +15,13 @@ from collections.abc import Callable
 import click
 
 from robot_client.apps.clock import now as since_start
-from robot_client.apps.driver import Command, Driver, Limits, Stop
-from robot_client.apps.grip import CENTRE, Curve, Grip, Look, Phase, Stick
-from robot_client.apps.line import Line, in_words
+from robot_client.apps.connection import RosbridgeConnection, in_words
+from robot_client.apps.deadman import CENTRE, Curve, Deadman, DeadmanPhase, GamepadState, Stick
+from robot_client.apps.driver import Driver, MaximumSpeeds, StopNotice, VelocityCommand
+from robot_client.apps.gamepads import Gamepad, Gamepads, Layout
 from robot_client.apps.options import driving
-from robot_client.apps.pads import Layout, Pad, Pads
-from robot_client.apps.status import StatusLine
-from robot_client.apps.staying import Ending, stay
+from robot_client.apps.reconnect import Ending, run_connected
+from robot_client.apps.status_line import StatusLine
 from robot_client.numbers import Number
 
 NAME = "joystick"
@@ -45,10 +45,10 @@ class Joystick:
 
     def __init__(
         self,
-        pad: Pad,
-        grip: Grip,
+        pad: Gamepad,
+        grip: Deadman,
         topic: str,
-        wanted: Limits,
+        wanted: MaximumSpeeds,
         tell: Callable[[str, str], None],
         clock: Callable[[], float] = since_start,
     ) -> None:
@@ -59,12 +59,12 @@ class Joystick:
         self._tell = tell
         self._clock = clock
         self._driver: Driver
-        self._stop = Stop()
+        self._stop = StopNotice()
         self._sent = -math.inf
         self._last = CENTRE
         self._pressed = (False, False)
 
-    def begin(self, line: Line) -> None:
+    def begin(self, line: RosbridgeConnection) -> None:
         """There is a line: what is held counts no more until it was let go of; but the stop button, held, stops."""
         self._pressed = (False, False)
         self._grip.drop()
@@ -82,9 +82,9 @@ class Joystick:
         stick = self._grip.look(look, allowed, now)
         if stick is not None:
             self._drive(stick, now)
-        elif was is Phase.HELD:
+        elif was is DeadmanPhase.HELD:
             driver.still()
-        if was is Phase.READY and self._grip.phase is Phase.SPENT:
+        if was is DeadmanPhase.READY and self._grip.phase is DeadmanPhase.SPENT:
             driver.take()
         self._tell(*self._state(stick))
         return True
@@ -99,7 +99,7 @@ class Joystick:
         self._grip.drop()
         self._tell(f"{why}; again in {seconds:.1f} s", "")
 
-    def _press(self, look: Look | None) -> None:
+    def _press(self, look: GamepadState | None) -> None:
         """What buttons ask for that were not pressed before."""
         pressed = (False, False) if look is None else (look.stop, look.back)
         before, self._pressed = self._pressed, pressed
@@ -117,16 +117,16 @@ class Joystick:
             self._sent = now
             self._driver.drive(self._command(stick))
 
-    def _command(self, stick: Stick) -> Command:
+    def _command(self, stick: Stick) -> VelocityCommand:
         top = self._wanted.within(self._driver.limits)
-        return Command(stick.ahead * top.speed, stick.left * top.turn)
+        return VelocityCommand(stick.ahead * top.speed, stick.left * top.turn)
 
     def _state(self, stick: Stick | None) -> tuple[str, str]:
         driver, phase = self._driver, self._grip.phase
         words = phase.value
-        if phase is Phase.READY and not driver.in_control:
+        if phase is DeadmanPhase.READY and not driver.in_control:
             words = "press the button to take control"
-        elif phase is Phase.SPENT and driver.in_control:
+        elif phase is DeadmanPhase.SPENT and driver.in_control:
             words = f"you have control: {phase.value}"
         for also in (
             driver.obstacle,
@@ -204,11 +204,11 @@ def main(
       python -m robot_client.apps.joystick $ROBOT --axes 1 0 --buttons 7 2 8
     """
     ending = Ending()
-    pads = Pads(Layout(*axes, *buttons))
+    pads = Gamepads(Layout(*axes, *buttons))
     status = StatusLine(sys.stdout, time.monotonic)
-    program = Joystick(pads, Grip(Curve(dead, expo)), topic, Limits(speed, turn), status.tell)
+    program = Joystick(pads, Deadman(Curve(dead, expo)), topic, MaximumSpeeds(speed, turn), status.tell)
     with in_words():
-        stay(url, program, ending)
+        run_connected(url, program, ending)
     status.end("ended")
 
 

@@ -7,12 +7,12 @@ from typing import Any, TypeVar
 
 import click
 
-from robot_client.apps.driver import Limits
+from robot_client.apps.driver import MaximumSpeeds
 from robot_client.numbers import Number
 
 AnyCommand = TypeVar("AnyCommand", bound=Callable[..., Any])
 
-USUAL = Limits(0.3, 1.0)
+USUAL = MaximumSpeeds(0.3, 1.0)
 """What is not too fast for a room."""
 
 

@@ -18,22 +18,22 @@ from typing import Any
 import click
 
 from robot_client.apps.clock import now as since_start
+from robot_client.apps.connection import RosbridgeConnection, in_words, token
 from robot_client.apps.docking import (
     UNKNOWN,
     Approach,
     Charge,
+    DockingTopics,
     Need,
     Sighting,
-    Topics,
     charge,
     sighting,
     way_ahead,
 )
-from robot_client.apps.driver import STILL, Command, Driver, Stop
-from robot_client.apps.line import Line, in_words, token
+from robot_client.apps.driver import STILL, Driver, StopNotice, VelocityCommand
 from robot_client.apps.options import driving
-from robot_client.apps.status import StatusLine
-from robot_client.apps.staying import Ending, stay
+from robot_client.apps.reconnect import Ending, run_connected
+from robot_client.apps.status_line import StatusLine
 from robot_client.numbers import Number
 
 NAME = "recharge"
@@ -64,7 +64,7 @@ PATIENCE = 30.0
 """Seconds that it waits before something in the way."""
 
 
-class Phase(enum.Enum):
+class RechargePhase(enum.Enum):
     """What it does."""
 
     WATCHING = "watching"
@@ -89,7 +89,7 @@ class Recharge:
 
     def __init__(
         self,
-        topics: Topics,
+        topics: DockingTopics,
         command: str,
         marker: int,
         need: Need,
@@ -107,19 +107,19 @@ class Recharge:
         self._tell = tell
         self._clock = clock
         self._driver: Driver
-        self._stop = Stop()
+        self._stop = StopNotice()
         self._rest()
         self._do = {
-            Phase.WATCHING: self._watch,
-            Phase.WAITING: self._wait,
-            Phase.SEEKING: self._seek,
-            Phase.GOING: self._go,
-            Phase.STAYING: self._stay,
+            RechargePhase.WATCHING: self._watch,
+            RechargePhase.WAITING: self._wait,
+            RechargePhase.SEEKING: self._seek,
+            RechargePhase.GOING: self._go,
+            RechargePhase.STAYING: self._stay,
         }
 
     def _rest(self) -> None:
         """Nothing is known, and nothing under way."""
-        self.phase = Phase.WATCHING
+        self.phase = RechargePhase.WATCHING
         self._charge: Charge | None = None
         self._seen: Sighting | None = None
         self._seen_at = self._glimpsed_at = self._scanned_at = self._sent = -math.inf
@@ -131,7 +131,7 @@ class Recharge:
         self._failed = ""
         """Why the last attempt failed, until the next."""
 
-    def begin(self, line: Line) -> None:
+    def begin(self, line: RosbridgeConnection) -> None:
         """There is a line. What was under way before is begun anew."""
         self._rest()
         self._driver = Driver(line, self._command, NAME, self._clock, self._stop, self._heard)
@@ -143,7 +143,7 @@ class Recharge:
         """Take what comes within a moment, and act on it."""
         self._driver.hear(LOOK)
         now = self._clock()
-        if self.phase in (Phase.SEEKING, Phase.GOING):
+        if self.phase in (RechargePhase.SEEKING, RechargePhase.GOING):
             why_not = self._why_not(now) or ("" if self._driver.in_control else "control is lost")
             if why_not or not self._wanted():
                 self._let_go(now, why_not or "the battery needs no charging any more")
@@ -199,7 +199,7 @@ class Recharge:
     def _let_go(self, now: float, why: str) -> None:
         """Stand, give control back, and wait."""
         self._driver.give_back()
-        self._become(Phase.WAITING, now)
+        self._become(RechargePhase.WAITING, now)
         self._tell(f"control given back: {why}", "")
 
     def _pause(self, now: float) -> None:
@@ -213,7 +213,7 @@ class Recharge:
         self._failed, self._not_before = why, now + AGAIN
         self._let_go(now, f"{why}; again in {AGAIN:.0f} s")
 
-    def _become(self, phase: Phase, now: float) -> None:
+    def _become(self, phase: RechargePhase, now: float) -> None:
         self.phase, self._since = phase, now
 
     def _percent(self) -> str:
@@ -221,7 +221,7 @@ class Recharge:
 
     def _watch(self, now: float) -> None:
         if self._wanted():
-            self._become(Phase.WAITING, now)
+            self._become(RechargePhase.WAITING, now)
         elif self._charge is not None:
             self._tell("charging" if self._charge.fed else "watching the battery", self._percent())
         elif self._driver.said:
@@ -230,14 +230,14 @@ class Recharge:
     def _wait(self, now: float) -> None:
         driver = self._driver
         if not self._wanted():
-            self._become(Phase.WATCHING, now)
+            self._become(RechargePhase.WATCHING, now)
             return
         why_not = self._why_not(now)
         if driver.in_control and not why_not and now >= self._not_before:
             # Who drove a moment ago by a connection that is lost must let go first (SPEC section 2.5).
             driver.drive(STILL)
             self._sent = now + SILENCE
-            self._become(Phase.SEEKING, now)
+            self._become(RechargePhase.SEEKING, now)
             self._tell(f"looking for marker {self._marker}", self._percent())
             return
         if not why_not and driver.said and not driver.in_control:
@@ -256,27 +256,27 @@ class Recharge:
     def _seek(self, now: float) -> None:
         turn = min(SEEKING_TURN, self._approach.turn, self._driver.limits.turn)
         if now - self._seen_at <= FRESH:
-            self._become(Phase.GOING, now)
+            self._become(RechargePhase.GOING, now)
             self._tell(f"driving to marker {self._marker}", self._percent())
         elif now - self._since > ROUND / max(turn, SLOWEST_TURN):
             self._fail(now, f"marker {self._marker} is nowhere around")
         elif now - self._glimpsed_at <= GLIMPSE:
             self._driver.still()
         else:
-            self._drive(Command(0.0, self._side * turn), now)
+            self._drive(VelocityCommand(0.0, self._side * turn), now)
 
     def _go(self, now: float) -> None:
         assert self._seen is not None
         missing = now - self._seen_at
         if missing > LOST:
             self._side = math.copysign(1.0, self._seen.bearing)
-            self._become(Phase.SEEKING, now)
+            self._become(RechargePhase.SEEKING, now)
             self._tell(f"marker {self._marker} is lost: looking for it", self._percent())
         elif missing > FRESH:
             self._driver.still()
         elif self._approach.arrived(self._seen):
             self._driver.give_back()
-            self._become(Phase.STAYING, now)
+            self._become(RechargePhase.STAYING, now)
         elif self._ahead is not None and self._ahead < self._clear:
             self._stand_before(now)
         else:
@@ -292,7 +292,7 @@ class Recharge:
 
     def _stay(self, now: float) -> None:
         if not self._need.urgent:
-            self._become(Phase.WATCHING, now)
+            self._become(RechargePhase.WATCHING, now)
         elif self._charge is not None and self._charge.fed:
             self._since = now
             self._tell("charging", self._percent())
@@ -303,9 +303,9 @@ class Recharge:
                 f"stands at marker {self._marker}, and the battery does not charge yet", self._percent()
             )
             if now - self._since > AGAIN:
-                self._become(Phase.WAITING, now)
+                self._become(RechargePhase.WAITING, now)
 
-    def _drive(self, command: Command, now: float) -> None:
+    def _drive(self, command: VelocityCommand, now: float) -> None:
         if now - self._sent >= EVERY:
             self._sent = now
             self._driver.drive(command)
@@ -383,7 +383,7 @@ def main(
     ending = Ending()
     status = StatusLine(sys.stdout, time.monotonic)
     program = Recharge(
-        Topics(battery, markers, scan),
+        DockingTopics(battery, markers, scan),
         topic,
         marker,
         Need(low / 100, enough / 100),
@@ -392,7 +392,7 @@ def main(
         status.tell,
     )
     with in_words():
-        stay(url, program, ending)
+        run_connected(url, program, ending)
     status.end("ended")
 
 

@@ -20,15 +20,15 @@ from typing import NamedTuple, Protocol
 
 import click
 
-from robot_client.apps import sounds
+from robot_client.apps import audio
 from robot_client.apps.clock import now as since_start
-from robot_client.apps.driver import STILL, Driver, Limits, Stop
-from robot_client.apps.hearing import Recogniser
-from robot_client.apps.line import Line, in_words, token
+from robot_client.apps.command_words import MOVES, SECONDS, CommandWord, WordCommands
+from robot_client.apps.connection import RosbridgeConnection, in_words, token
+from robot_client.apps.driver import STILL, Driver, MaximumSpeeds, StopNotice
 from robot_client.apps.options import driving
-from robot_client.apps.status import StatusLine
-from robot_client.apps.staying import Ending, stay
-from robot_client.apps.words import MOVES, SECONDS, Orders, Word
+from robot_client.apps.reconnect import Ending, run_connected
+from robot_client.apps.speech_recognition import Recognizer
+from robot_client.apps.status_line import StatusLine
 from robot_client.numbers import Number
 
 NAME = "voice"
@@ -46,62 +46,62 @@ WAITING = 16
 """Words that wait to be done, at most."""
 
 
-class Heard(NamedTuple):
+class RecognisedWord(NamedTuple):
     """A word.
 
     :ivar at: seconds, suspends included, when it ended
     """
 
-    word: Word
+    word: CommandWord
     at: float
 
 
-class Ear(Protocol):
+class SpeechSource(Protocol):
     """Finds words in sound."""
 
-    def hear(self, data: bytes) -> Iterable[tuple[Word, float]]:
+    def hear(self, data: bytes) -> Iterable[tuple[CommandWord, float]]:
         """Words found with one block more, and how many seconds before its end each ended."""
 
 
-class Listening(Thread):
+class RecognitionThread(Thread):
     """Hears, in a thread of its own.
 
     :param blocks: of sound
     :ivar ended: whether there is nothing more to hear
     """
 
-    def __init__(self, blocks: Iterable[sounds.Block], ear: Ear) -> None:
+    def __init__(self, blocks: Iterable[audio.Block], ear: SpeechSource) -> None:
         super().__init__(daemon=True)
         self.ended = False
         self._blocks = blocks
         self._ear = ear
-        self._heard: deque[Heard] = deque(maxlen=WAITING)
+        self._heard: deque[RecognisedWord] = deque(maxlen=WAITING)
 
     def run(self) -> None:
         """Hear all there is."""
         try:
             for block in self._blocks:
                 for word, before in self._ear.hear(block.data):
-                    self._heard.append(Heard(word, block.at - before))
+                    self._heard.append(RecognisedWord(word, block.at - before))
         finally:
             self.ended = True
 
-    def heard(self) -> Iterator[Heard]:
+    def heard(self) -> Iterator[RecognisedWord]:
         """The words since this was asked last."""
         while self._heard:
             yield self._heard.popleft()
 
 
 class Words(Protocol):
-    """Where words come from: :class:`Listening`."""
+    """Where words come from: :class:`RecognitionThread`."""
 
     ended: bool
 
-    def heard(self) -> Iterator[Heard]:
+    def heard(self) -> Iterator[RecognisedWord]:
         """The words since this was asked last."""
 
 
-class Voice:
+class VoiceControl:
     """Does what words say.
 
     :param words: where they come from
@@ -116,9 +116,9 @@ class Voice:
     def __init__(
         self,
         words: Words,
-        orders: Orders,
+        orders: WordCommands,
         topic: str,
-        wanted: Limits,
+        wanted: MaximumSpeeds,
         latch: bool,
         tell: Callable[[str, str], None],
         clock: Callable[[], float] = since_start,
@@ -131,19 +131,19 @@ class Voice:
         self._tell = tell
         self._clock = clock
         self._driver: Driver
-        self._asked = Stop()
+        self._asked = StopNotice()
         self._told_of_stop = ""
-        self._waits: Heard | None = None
+        self._waits: RecognisedWord | None = None
         """The word that waits for control."""
         self._sent = -math.inf
         self._spoken = -math.inf
         self._moves = False
 
-    def begin(self, line: Line) -> None:
+    def begin(self, line: RosbridgeConnection) -> None:
         """There is a line. What was said before does not count by it; but *stop* does."""
         self._forget()
         self._spoken = self._clock()
-        if Word.STOP in {heard.word for heard in self._words.heard()}:
+        if CommandWord.STOP in {heard.word for heard in self._words.heard()}:
             self._asked.ask()
         self._driver = Driver(line, self._topic, NAME, self._clock, self._asked)
         self._tell("listening", "")
@@ -183,10 +183,10 @@ class Voice:
         self._waits = None
         self._moves = False
 
-    def _do(self, heard: Heard, now: float) -> None:
+    def _do(self, heard: RecognisedWord, now: float) -> None:
         word, driver = heard.word, self._driver
         self._spoken = now
-        if word is Word.STOP:
+        if word is CommandWord.STOP:
             self._stop()
         elif now - heard.at > STALE:
             self._tell(f"{word.value}: heard too late, not done", "")
@@ -213,7 +213,7 @@ class Voice:
         self._told_of_stop = self._asked.words
         self._tell(self._told_of_stop, "")
 
-    def _wait(self, heard: Heard, now: float) -> None:
+    def _wait(self, heard: RecognisedWord, now: float) -> None:
         driver = self._driver
         stale = now - heard.at > STALE
         if driver.in_control and not stale:
@@ -228,7 +228,7 @@ class Voice:
             )
             self._tell(f"{heard.word.value}: not done: {why}", "")
 
-    def _begin(self, word: Word, now: float) -> None:
+    def _begin(self, word: CommandWord, now: float) -> None:
         why = self._driver.obstacle or ("the robot does not answer" if self._driver.late else "")
         if why:
             self._tell(f"{word.value}: not done: {why}", "")
@@ -298,24 +298,26 @@ def main(
     if (wav is not None) + pcm + (microphone is not None) > 1:
         raise click.UsageError("one of --wav, --pcm and --microphone is enough")
     token()
-    tape = sounds.Tape(_source(wav, pcm, microphone))
-    listening = Listening(tape, Recogniser())
+    tape = audio.AudioBuffer(_source(wav, pcm, microphone))
+    listening = RecognitionThread(tape, Recognizer())
     ending = Ending()
     status = StatusLine(sys.stdout, time.monotonic)
-    program = Voice(listening, Orders(seconds), topic, Limits(speed, turn), latch, status.tell)
+    program = VoiceControl(
+        listening, WordCommands(seconds), topic, MaximumSpeeds(speed, turn), latch, status.tell
+    )
     tape.start()
     listening.start()
     with in_words():
-        stay(url, program, ending)
+        run_connected(url, program, ending)
     status.end(tape.broken or "ended")
 
 
 def _source(wav: Path | None, pcm: bool, microphone: str | None) -> Iterator[bytes]:
     if wav is not None:
-        return sounds.from_file(wav)
+        return audio.from_file(wav)
     if pcm:
-        return sounds.from_stream(FileIO(0, closefd=False))
-    return sounds.from_microphone(microphone)
+        return audio.from_stream(FileIO(0, closefd=False))
+    return audio.from_microphone(microphone)
 
 
 if __name__ == "__main__":

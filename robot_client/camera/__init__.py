@@ -1,7 +1,8 @@
 """Pictures of this robot's cameras: read, edited, encoded, sent at the pace of the uplink.
 
-The daemon's side is :mod:`~robot_client.camera.desk` (which cameras there are, what the relay wants) and
-:mod:`~robot_client.camera.keeper` (the process); the rest runs in the process, :mod:`~robot_client.camera.main`. What
+The daemon's side is :mod:`~robot_client.camera.service` (which cameras there are, what the relay wants) and
+:mod:`~robot_client.camera.supervisor` (the process); the rest runs in the process,
+    :mod:`~robot_client.camera.main`. What
 needs numpy and OpenCV is imported there, after :func:`check_installed`.
 """
 

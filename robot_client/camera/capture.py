@@ -13,7 +13,7 @@ from urllib.request import url2pathname
 import cv2
 import numpy as np
 
-from robot_client.camera.device import V4L2, Device, read_device
+from robot_client.camera.device import V4L2, CameraDevice, read_device
 from robot_client.camera.formats import Pixels
 
 _FILE = "file://"
@@ -38,7 +38,7 @@ _CATCH_UP = 1.0
 """Seconds for passing over what came while it was found out what comes: seconds of pictures, all at once."""
 
 Tell = Callable[[str, str], None]
-"""Told a level, as in :class:`~robot_client.camera.lines.Log`, and a sentence that goes on from the camera's name."""
+"""Told a level, as in :class:`~robot_client.camera.ipc.LogLine`, and a sentence that goes on from the camera's name."""
 
 
 class _Backlog:
@@ -79,7 +79,7 @@ class Capture:
     """
 
     latched = False
-    """See :class:`~robot_client.camera.feed.Origin`."""
+    """See :class:`~robot_client.camera.latest_frame.Origin`."""
 
     def __init__(
         self,
@@ -199,7 +199,7 @@ class Capture:
         return 1.0 / fps if 0 < fps < 1000 else 0.04
 
 
-def _set(capture: cv2.VideoCapture, device: Device) -> None:
+def _set(capture: cv2.VideoCapture, device: CameraDevice) -> None:
     """Ask a driver for what is wanted of it; one that can't do that goes on as near to it as it can."""
     # The format first: which sizes and rates there are depends on it.
     if device.format:

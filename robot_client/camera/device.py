@@ -18,7 +18,7 @@ _UNITS = {"fps": "pictures per second"}
 _EXAMPLE = "v4l2:/dev/video0?width=1280&height=720&fps=30&format=MJPG"
 
 
-class Device(NamedTuple):
+class CameraDevice(NamedTuple):
     """A device, and what is asked of its driver, which takes what comes nearest; 0 and empty ask for nothing.
 
     :param path: of the device
@@ -35,14 +35,14 @@ class Device(NamedTuple):
     format: str = ""
 
 
-def read_device(source: str) -> Device:
+def read_device(source: str) -> CameraDevice:
     """Read ``v4l2:/dev/video0?width=1280&height=720&fps=30&format=MJPG``; all behind the path may be left out.
 
     :raises Invalid: says what is wrong there, and what there may be
     """
     path, _, query = source.removeprefix(V4L2).partition("?")
     if not query:  # which not every Python takes as nothing
-        return Device(path)
+        return CameraDevice(path)
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True)
     except ValueError:
@@ -57,7 +57,7 @@ def read_device(source: str) -> Device:
         # OpenCV changes nothing before it knows both.
         raise Invalid("width and height are set together or not at all")
     width, height, fps = (_number(name, found[name]) if name in found else 0 for name in _MOST)
-    return Device(path, width, height, fps, _format(found["format"]) if "format" in found else "")
+    return CameraDevice(path, width, height, fps, _format(found["format"]) if "format" in found else "")
 
 
 def _number(name: str, text: str) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relay_protocol.errors import Invalid
-from robot_client.camera import depth, files
+from robot_client.camera import depth, image_headers
 from robot_client.camera.messages import Damaged, Image, read_compressed, read_image
 
 Pixels = npt.NDArray[np.uint8]
@@ -76,7 +76,7 @@ class Packed(NamedTuple):
     :param scale: of ``32FC1``: numerator and offset, see :func:`~robot_client.camera.depth.coloured_inverse`
     """
 
-    kind: files.Kind
+    kind: image_headers.Kind
     file: bytes
     encoding: str = ""
     scale: tuple[float, float] = (0.0, 0.0)
@@ -97,15 +97,15 @@ def _packed(cdr: bytes) -> Packed:
     if "compressedDepth" in found.format:
         return _compressed_depth(cdr, found.start, found.stop, encoding, codec)
     try:
-        kind = files.kind_of(cdr, found.start)
+        kind = image_headers.kind_of(cdr, found.start)
     except Invalid as error:
         if found.start == found.stop or any(
             name in found.format.lower() for name in ("jpeg", "jpg", "png", "webp")
         ):
             raise Damaged(str(error)) from None
         raise
-    file = cdr[found.start : files.end_of(cdr, found.start, found.stop, kind)]
-    as_raw = encoding in _SIXTEEN and kind == "png" and files.is_grey_of_sixteen_bits(file)
+    file = cdr[found.start : image_headers.end_of(cdr, found.start, found.stop, kind)]
+    as_raw = encoding in _SIXTEEN and kind == "png" and image_headers.is_grey_of_sixteen_bits(file)
     return Packed(kind, file, encoding if as_raw else "")
 
 
@@ -123,10 +123,10 @@ def _compressed_depth(cdr: bytes, start: int, stop: int, encoding: str, codec: s
     at = start + _DEPTH_HEAD.size
     if at >= stop:
         raise Damaged("this compressedDepth ends before its PNG begins")
-    if files.kind_of(cdr, at) != "png":
+    if image_headers.kind_of(cdr, at) != "png":
         raise Invalid("compressedDepth of another kind than PNG can't be shown")
-    file = cdr[at : files.end_of(cdr, at, stop, "png")]
-    if not files.is_grey_of_sixteen_bits(file):
+    file = cdr[at : image_headers.end_of(cdr, at, stop, "png")]
+    if not image_headers.is_grey_of_sixteen_bits(file):
         raise Invalid("a PNG of compressedDepth has to be grey of sixteen bits, and this one is not")
     _, *scale = _DEPTH_HEAD.unpack_from(cdr, start)
     if encoding != "32FC1":
@@ -161,13 +161,13 @@ def decoded(file: bytes) -> Raw:
 
     :raises Invalid: it is none, is broken, or has more than :data:`PIXELS`
     """
-    kind = files.kind_of(file)
+    kind = image_headers.kind_of(file)
     pixels = _decoded(kind, file, cv2.IMREAD_ANYCOLOR).astype(np.uint8, copy=False)
     return Raw(kind, pixels.shape[1], pixels.shape[0], pixels)
 
 
-def _decoded(kind: files.Kind, file: bytes, how: int) -> npt.NDArray[Any]:
-    width, height = files.size_of(file, kind)
+def _decoded(kind: image_headers.Kind, file: bytes, how: int) -> npt.NDArray[Any]:
+    width, height = image_headers.size_of(file, kind)
     if width * height > PIXELS:
         raise Invalid(f"a {kind.upper()} of {width}×{height} pixels is too large to be decoded")
     try:
@@ -190,7 +190,7 @@ def looked_at(cdr: bytes, compressed: bool) -> tuple[str, int, int]:
         found = read_image(cdr)
         return found.encoding, found.width, found.height
     packed = _packed(cdr)
-    return packed.encoding or packed.kind, *files.size_of(packed.file, packed.kind)
+    return packed.encoding or packed.kind, *image_headers.size_of(packed.file, packed.kind)
 
 
 class _Layout(NamedTuple):

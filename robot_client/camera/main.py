@@ -21,10 +21,10 @@ from twisted.logger import (
 from twisted.protocols.basic import LineReceiver
 from twisted.python.failure import Failure
 
-from robot_client.camera.lines import Alive, Answer, Log, Settings, decoder, encode
-from robot_client.camera.studio import Studio
+from robot_client.camera.ipc import Answer, CameraAlive, CameraSettings, LogLine, decoder, encode
+from robot_client.camera.stream_manager import StreamManager
 from robot_client.logs import text
-from robot_client.reactors import monotonic_reactor
+from robot_client.twisted_types import monotonic_reactor
 
 ALIVE_EVERY = 1.0
 MAX_LINE = 65536
@@ -36,7 +36,7 @@ FAREWELL = 0.3
 """Seconds for the last words on the links."""
 
 
-class Daemon(LineReceiver):
+class DaemonPipe(LineReceiver):
     """The daemon that started this process.
 
     :param reactor: its clock must be monotonic
@@ -48,8 +48,8 @@ class Daemon(LineReceiver):
 
     def __init__(self, reactor: Any) -> None:
         self._reactor = reactor
-        self._studio: Studio | None = None
-        self._alive = LoopingCall(self.tell, Alive())
+        self._studio: StreamManager | None = None
+        self._alive = LoopingCall(self.tell, CameraAlive())
 
     def connectionMade(self) -> None:
         """The pipes are open."""
@@ -58,8 +58,8 @@ class Daemon(LineReceiver):
     def lineReceived(self, data: bytes) -> None:
         """The daemon says something."""
         line = decoder.decode(data)
-        if isinstance(line, Settings):
-            self._studio = Studio(self._reactor, line, self.tell)
+        if isinstance(line, CameraSettings):
+            self._studio = StreamManager(self._reactor, line, self.tell)
         elif self._studio is not None:
             self._studio.take(line)
 
@@ -78,7 +78,7 @@ class Daemon(LineReceiver):
     def log(self, event: LogEvent) -> None:
         """Have the daemon log something; from any thread."""
         level = event.get("log_level")
-        line = Log(level=level.name if level is not None else "info", text=text(event))
+        line = LogLine(level=level.name if level is not None else "info", text=text(event))
         self._reactor.callFromThread(self.tell, line)
 
 
@@ -98,7 +98,7 @@ def main() -> None:
         signal.signal(meant_for_the_daemon, signal.SIG_IGN)
     outlet = _own_stdout()
     reactor = monotonic_reactor()
-    daemon = Daemon(reactor)
+    daemon = DaemonPipe(reactor)
     quiet: Any = LogLevelFilterPredicate(defaultLogLevel=LogLevel.info)
     for chatter in ("twisted", "stdout", "log_legacy"):
         quiet.setLogLevelForNamespace(chatter, LogLevel.warn)

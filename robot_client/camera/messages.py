@@ -54,7 +54,7 @@ def read_image(cdr: bytes) -> Image:
 
     :raises Invalid: the bytes are no such message, or the picture has no pixels or too many
     """
-    reader = _Reader(cdr)
+    reader = _CdrReader(cdr)
     reader.skip_header()
     height, width = reader.u32(), reader.u32()
     encoding = reader.text("encoding")
@@ -69,7 +69,7 @@ def read_compressed(cdr: bytes) -> Compressed:
 
     :raises Invalid: the bytes are no such message
     """
-    reader = _Reader(cdr)
+    reader = _CdrReader(cdr)
     reader.skip_header()
     return Compressed(reader.text("format"), *reader.octets())
 
@@ -87,7 +87,7 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-class _Reader:
+class _CdrReader:
     def __init__(self, cdr: bytes) -> None:
         if len(cdr) < _HEAD:
             raise Damaged(f"{len(cdr)} bytes are too short for a CDR message")

@@ -12,15 +12,15 @@ from twisted.python.failure import Failure
 
 from relay_protocol import limits, link
 from relay_protocol.errors import SwitchboardError, Unavailable
-from robot_client.camera.leaving import Leaving
-from robot_client.camera.lines import Open
+from robot_client.camera.frame import Encoded, EncodeRequest, Frame
+from robot_client.camera.ipc import OpenStream
 from robot_client.camera.messages import Damaged
-from robot_client.camera.pace import TARGET, Pace
-from robot_client.camera.shot import Made, Shot, Wish
-from robot_client.camera.trip import RoundTrip
-from robot_client.link import Ended, Event, JoinedChannel, Said
-from robot_client.reactors import Clock, Timer
-from robot_client.transport import LinkLost, LinkProtocol
+from robot_client.camera.packetizer import Packetizer
+from robot_client.camera.rate_control import TARGET, RateControl
+from robot_client.camera.rtt_probe import RttProbe
+from robot_client.link.protocol import Event, JoinedChannel, LinkEnded, MessageReceived
+from robot_client.link.transport import LinkLost, LinkProtocol
+from robot_client.twisted_types import DelayedCall, ReactorClock
 
 FAULTS = 10
 """Pictures in a row that may be damaged before a stream is given up that has shown none. One that has shown some
@@ -39,7 +39,7 @@ class Busy(Unavailable):
     """As many streams are made as this robot can."""
 
 
-class View(Protocol):
+class CameraViewPort(Protocol):
     """A camera as one stream has it."""
 
     @property
@@ -50,21 +50,21 @@ class View(Protocol):
     def latched(self) -> bool:
         """Whether its publisher keeps the latest picture for those who come later."""
 
-    def make(self, shot: Shot, wish: Wish) -> Deferred[Made]:
+    def make(self, shot: Frame, wish: EncodeRequest) -> Deferred[Encoded]:
         """Make a picture to be sent, in a thread; one at a time."""
 
-    def latest(self) -> Shot | None:
+    def latest(self) -> Frame | None:
         """The newest picture there was before, if it is still what the camera shows."""
 
     def close(self) -> None:
         """Want it no more."""
 
 
-Watch = Callable[[Open, Callable[[Shot], None]], View]
+Watch = Callable[[OpenStream, Callable[[Frame], None]], CameraViewPort]
 """Gives a camera to a stream; raises a :class:`SwitchboardError` when it can't be had."""
 
 
-class Stream:
+class EncodedStream:
     """Shows one camera on one link.
 
     :param line: what was asked for
@@ -77,23 +77,23 @@ class Stream:
 
     def __init__(
         self,
-        line: Open,
+        line: OpenStream,
         protocol: LinkProtocol,
         watch: Watch,
-        clock: Clock,
-        on_gone: Callable[[Stream, str], None],
-        way: RoundTrip,
+        clock: ReactorClock,
+        on_gone: Callable[[EncodedStream, str], None],
+        way: RttProbe,
         target: float = TARGET,
     ) -> None:
         self.line = line
-        self.pace = Pace(line.settings, way, target)
+        self.pace = RateControl(line.settings, way, target)
         self._protocol = protocol
-        self._leaving = Leaving(self.pace, protocol.write)
+        self._leaving = Packetizer(self.pace, protocol.write)
         self._watch = watch
         self._clock = clock
         self._on_gone = on_gone
-        self._view: View | None = None
-        self._newest: Shot | None = None
+        self._view: CameraViewPort | None = None
+        self._newest: Frame | None = None
         self._working = False
         self._key = True
         self._broken = False
@@ -106,8 +106,8 @@ class Stream:
         """When the first picture came that was damaged, while none was shown, and in what way."""
         self._told: link.Playing | None = None
         self._told_at = 0.0
-        self._timer: Timer | None = None
-        self._looking: Timer | None = None
+        self._timer: DelayedCall | None = None
+        self._looking: DelayedCall | None = None
         self._log = Logger("camera")
 
     # --- the link ------------------------------------------------------------------------------------------
@@ -116,13 +116,13 @@ class Stream:
         """The relay said something."""
         if isinstance(event, JoinedChannel):
             self._joined(event.channel)
-        elif isinstance(event, Said) and isinstance(event.message, link.Took):
+        elif isinstance(event, MessageReceived) and isinstance(event.message, link.Took):
             self._took(event.message)
-        elif isinstance(event, Said):
+        elif isinstance(event, MessageReceived):
             self._key = True
             self._repeat()
             self._next()
-        elif isinstance(event, Ended):
+        elif isinstance(event, LinkEnded):
             self._protocol.end(LinkLost(f"the relay closed the stream: {event.reason}"), gently=True)
 
     def on_lost(self, reason: SwitchboardError) -> None:
@@ -187,7 +187,7 @@ class Stream:
 
     # --- pictures ------------------------------------------------------------------------------------------
 
-    def _on_shot(self, shot: Shot) -> None:
+    def _on_shot(self, shot: Frame) -> None:
         self._newest = shot
         self._next()
 
@@ -203,7 +203,9 @@ class Stream:
             return
         shot, self._newest = self._newest, None
         pace = self.pace
-        wish = Wish(pace.quality, pace.scale, pace.reduced > 0, self._key, pace.fps or self._view.fps)
+        wish = EncodeRequest(
+            pace.quality, pace.scale, pace.reduced > 0, self._key, pace.fps or self._view.fps
+        )
         self._working, self._key = True, False
         self._view.make(shot, wish).addCallbacks(
             self._made, self._not_made, callbackArgs=(shot, wish), errbackArgs=(wish,)
@@ -213,7 +215,7 @@ class Stream:
         self._timer = None
         self._next()
 
-    def _made(self, made: Made, shot: Shot, wish: Wish) -> None:
+    def _made(self, made: Encoded, shot: Frame, wish: EncodeRequest) -> None:
         self._working = False
         if self._view is None:
             return
@@ -231,7 +233,7 @@ class Stream:
         self._leaving.put(self._number, shot, made.body, self._clock.seconds(), alone)
         self._next()
 
-    def _not_made(self, failure: Failure, wish: Wish) -> None:
+    def _not_made(self, failure: Failure, wish: EncodeRequest) -> None:
         self._working = False
         if self._view is None:
             return
@@ -296,7 +298,7 @@ class Stream:
             self._told = now
             self._say(now)
 
-    def _tell(self, made: Made, wish: Wish, view: View) -> None:
+    def _tell(self, made: Encoded, wish: EncodeRequest, view: CameraViewPort) -> None:
         """Say how this picture and those that follow are, if the relay does not know."""
         delay = self.pace.delay
         playing = link.Playing(

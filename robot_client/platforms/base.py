@@ -15,7 +15,7 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol import link
 from robot_client.alerts import OnAlert
-from robot_client.topics import TypedTopic
+from robot_client.motion.typed_topic import TypedTopic
 
 OnSample = Callable[[bytes], None]
 OnChange = Callable[[], None]
@@ -65,7 +65,7 @@ OnKept = Callable[[int, bytes], None]
 """Takes the stamp and the body of a sample that a publisher keeps."""
 
 
-class Source(Protocol):
+class SubscriptionHandle(Protocol):
     """A topic the daemon listens to."""
 
     type: str
@@ -98,7 +98,7 @@ class Source(Protocol):
         """Stop listening; no sample comes any more."""
 
 
-class Sink(Protocol):
+class PublisherHandle(Protocol):
     """A topic the daemon publishes."""
 
     unmatched: list[str]
@@ -111,7 +111,7 @@ class Sink(Protocol):
         """Take the publisher away."""
 
 
-class Offer(Protocol):
+class AdvertisementHandle(Protocol):
     """A service or action the daemon offers."""
 
     type: str
@@ -141,7 +141,7 @@ OnGoal = Callable[[bytes, ServedGoal], None]
 OnCancel = Callable[[ServedGoal], None]
 
 
-class Outcome(NamedTuple):
+class GoalOutcome(NamedTuple):
     """How a goal of ours ended.
 
     :param status: one of the four above
@@ -156,12 +156,12 @@ class Outcome(NamedTuple):
     certain: bool = True
 
 
-class Goal(Protocol):
+class GoalHandle(Protocol):
     """A goal that an action of the robot pursues for us."""
 
     id: bytes
     """What the action knows it by, 16 bytes."""
-    result: Deferred[Outcome]
+    result: Deferred[GoalOutcome]
     """Fires once in every case."""
 
     def cancel(self) -> None:
@@ -196,11 +196,11 @@ class Platform(Protocol):
 
     def subscribe(
         self, topic: str, type: str, qos: link.QoS | None, on_sample: OnSample, on_change: OnChange
-    ) -> Source:
+    ) -> SubscriptionHandle:
         """Listen to a topic, present or not yet.
 
         :param type: empty to take the topic's one type from the graph
-        :param on_change: called when :attr:`Source.latched`, ``publishers`` or ``unmatched`` changed
+        :param on_change: called when :attr:`SubscriptionHandle.latched`, ``publishers`` or ``unmatched`` changed
         """
 
     def after_samples(self, call: Callable[[], None]) -> None:
@@ -227,11 +227,11 @@ class Platform(Protocol):
         qos: link.QoS | None,
         queue_size: int = 0,
         on_change: OnChange = lambda: None,
-    ) -> Sink:
+    ) -> PublisherHandle:
         """Make a publisher. What ``qos`` leaves out follows what the topic's subscribers ask for.
 
         :param queue_size: messages kept for subscribers that are slow, unless ``qos`` says it; the usual below 1
-        :param on_change: called when :attr:`Sink.unmatched` changed
+        :param on_change: called when :attr:`PublisherHandle.unmatched` changed
         """
 
     def call(
@@ -246,16 +246,16 @@ class Platform(Protocol):
     def prepare_call(self, service: str, type: str) -> None:
         """Keep for good what calls a service, so that it need not be found again when it is called by this type."""
 
-    def serve(self, service: str, type: str, on_call: OnCall) -> Offer:
+    def serve(self, service: str, type: str, on_call: OnCall) -> AdvertisementHandle:
         """Offer a service; its calls come one after the other and are answered in any order."""
 
-    def act(self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel) -> Offer:
+    def act(self, action: str, type: str, on_goal: OnGoal, on_cancel: OnCancel) -> AdvertisementHandle:
         """Offer an action; every goal is accepted.
 
         :param on_cancel: told of a goal nobody wants any more
         """
 
-    def pursue(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> Goal:
+    def pursue(self, action: str, type: str, goal: bytes, on_feedback: OnSample | None) -> GoalHandle:
         """Have an action of the robot pursue a goal.
 
         :param type: empty to take the action's one type from the graph

@@ -11,11 +11,13 @@ from twisted.internet.defer import Deferred, fail
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
 from robot_client.alerts import OnAlert, nobody
+from robot_client.motion.typed_topic import TypedTopic
 from robot_client.platforms.base import (
     ABORTED,
     NEVER_BEGAN,
     Check,
     Facts,
+    GoalOutcome,
     GraphView,
     Motion,
     OnCall,
@@ -24,11 +26,9 @@ from robot_client.platforms.base import (
     OnGoal,
     OnKept,
     OnSample,
-    Outcome,
     Platform,
 )
 from robot_client.platforms.definitions import normalise
-from robot_client.topics import TypedTopic
 
 TWIST = "geometry_msgs/msg/Twist"
 _HEADER = b"\0\1\0\0"
@@ -180,7 +180,7 @@ class MemoryGoal:
 
     def __init__(self, action: str, body: bytes, on_feedback: OnSample | None) -> None:
         self.id = uuid.uuid4().bytes
-        self.result: Deferred[Outcome] = Deferred()
+        self.result: Deferred[GoalOutcome] = Deferred()
         self.action = action
         self.body = body
         self.cancels = 0
@@ -350,7 +350,7 @@ class MemoryPlatform(Platform):
         made = MemoryGoal(action, goal, on_feedback)
         self.goals.append(made)
         if action not in self.actions:
-            made.result.callback(Outcome(NEVER_BEGAN, None, f"the action {action} can't be reached"))
+            made.result.callback(GoalOutcome(NEVER_BEGAN, None, f"the action {action} can't be reached"))
         return made
 
     def interfaces(self) -> list[str]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from relay_protocol.errors import Unavailable
 from relay_protocol.text import inert
-from robot_client.services.health import Finding, Level
+from robot_client.services.health import Level, ServiceFinding
 
 SUPPLIES = Path("/sys/class/power_supply")
 
@@ -36,7 +36,7 @@ CHARGING, FULL = STATUS["Charging"], STATUS["Full"]
 _GOOD = (0, HEALTH["Good"])
 
 
-class State(NamedTuple):
+class ChargeState(NamedTuple):
     """A battery, in the units of sensor_msgs/BatteryState. What isn't known is NaN.
 
     :ivar volts: at its poles
@@ -119,7 +119,7 @@ def read(folder: Path) -> dict[str, str]:
     return facts
 
 
-def of_facts(facts: Mapping[str, str]) -> State:
+def of_facts(facts: Mapping[str, str]) -> ChargeState:
     """What the files of a power supply tell; they count in millionths, and in tenths of a degree."""
     volts = _number(facts, "voltage_now") / 1e6
     amperes = _number(facts, "current_now") / 1e6
@@ -134,7 +134,7 @@ def of_facts(facts: Mapping[str, str]) -> State:
     share = _number(facts, "capacity") / 100
     if math.isnan(share):
         share = _quotient(now, full)
-    return State(
+    return ChargeState(
         volts=volts,
         amperes=amperes,
         celsius=_number(facts, "temp") / 10,
@@ -183,7 +183,7 @@ class Gauge:
         self._volts = volts
         self._level = Level.OK
 
-    def share(self, state: State) -> float:
+    def share(self, state: ChargeState) -> float:
         """Charge from 0 to 1: as the battery says, from its capacity, or from its voltage; NaN when none is known."""
         if 0.0 <= state.share <= 1.0:
             return state.share
@@ -193,21 +193,21 @@ class Gauge:
             found = (state.volts - empty) / (full - empty)
         return found if math.isnan(found) else min(1.0, max(0.0, found))
 
-    def finding(self, state: State) -> Finding:
+    def finding(self, state: ChargeState) -> ServiceFinding:
         """What is said of it."""
         share = self.share(state)
         values = _values(state, share)
         if not state.present:
-            return Finding(Level.ERROR, "there is no battery", values)
+            return ServiceFinding(Level.ERROR, "there is no battery", values)
         if state.health not in _GOOD:
             words = next(word for word, number in HEALTH.items() if number == state.health)
-            return Finding(Level.ERROR, f"the battery tells: {words.lower()}", values)
+            return ServiceFinding(Level.ERROR, f"the battery tells: {words.lower()}", values)
         if math.isnan(share):
-            return Finding(Level.WARN, "how full the battery is nobody knows", values)
+            return ServiceFinding(Level.WARN, "how full the battery is nobody knows", values)
         percent = f"{share * 100:.0f} %"
         if state.status in (CHARGING, FULL):
             self._level = Level.OK
-            return Finding(
+            return ServiceFinding(
                 Level.OK, f"{'charging' if state.status == CHARGING else 'full'}: {percent}", values
             )
         self._level = self._judged(share)
@@ -215,7 +215,7 @@ class Gauge:
             Level.ERROR: f"nearly empty: {percent}, charge it now",
             Level.WARN: f"low: {percent}, charge it soon",
         }.get(self._level, f"charged: {percent}")
-        return Finding(self._level, words, values)
+        return ServiceFinding(self._level, words, values)
 
     def _judged(self, share: float) -> Level:
         for level in (Level.ERROR, Level.WARN):
@@ -225,7 +225,7 @@ class Gauge:
         return Level.OK
 
 
-def _values(state: State, share: float) -> dict[str, str]:
+def _values(state: ChargeState, share: float) -> dict[str, str]:
     figures = {
         "charge_percent": share * 100,
         "volts": state.volts,

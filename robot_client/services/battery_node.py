@@ -11,8 +11,8 @@ from sensor_msgs.msg import BatteryState
 
 from relay_protocol.errors import Unavailable
 from robot_client.services import battery
-from robot_client.services.battery import Gauge, State
-from robot_client.services.health import Finding, Freshness, Level
+from robot_client.services.battery import ChargeState, Gauge
+from robot_client.services.health import InputWatch, Level, ServiceFinding
 
 SILENT = 10.0
 """Seconds without a message after which it says so."""
@@ -32,16 +32,16 @@ class SysfsBattery:
         self._root = folder
         self._folder = battery.supply(folder)
         self._gauge = gauge
-        self._state = State()
+        self._state = ChargeState()
         self._trouble = ""
         self._publisher = node.create_publisher(BatteryState, "battery_state", 10)
         node.create_timer(period, self._read)
         self._read()
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """How full it is."""
         if self._trouble:
-            return Finding(Level.ERROR, self._trouble)
+            return ServiceFinding(Level.ERROR, self._trouble)
         return self._gauge.finding(self._state)
 
     def close(self) -> None:
@@ -71,11 +71,11 @@ class TopicBattery:
 
     def __init__(self, node: Any, topic: str, gauge: Gauge) -> None:
         self._gauge = gauge
-        self._state = State()
-        self._fresh = Freshness(topic, SILENT, time.monotonic)
+        self._state = ChargeState()
+        self._fresh = InputWatch(topic, SILENT, time.monotonic)
         node.create_subscription(BatteryState, topic, self._came, qos_profile_sensor_data)
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """How full it is."""
         return self._fresh.trouble() or self._gauge.finding(self._state)
 
@@ -87,9 +87,9 @@ class TopicBattery:
         self._state = _state(message)
 
 
-def _state(message: BatteryState) -> State:
+def _state(message: BatteryState) -> ChargeState:
     health = message.power_supply_health
-    return State(
+    return ChargeState(
         volts=message.voltage,
         amperes=message.current,
         celsius=message.temperature,
@@ -104,7 +104,7 @@ def _state(message: BatteryState) -> State:
     )
 
 
-def _message(state: State) -> BatteryState:
+def _message(state: ChargeState) -> BatteryState:
     message = BatteryState()
     message.voltage = state.volts
     message.current = state.amperes

@@ -20,7 +20,7 @@ from skimage.feature import Cascade, local_binary_pattern
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from robot_client.camera import formats
 from robot_client.camera.formats import Pixels
-from robot_client.services.lens import Lens
+from robot_client.services.camera_model import CameraModel
 
 FACE = 0.17
 """Metres, the side of the square that is found: from ear to ear of a grown-up."""
@@ -63,7 +63,7 @@ class Box(NamedTuple):
     side: int
 
 
-class Seen(NamedTuple):
+class SeenFace(NamedTuple):
     """A face in the frame of the camera's picture: x to the right, y down, z ahead (REP 103).
 
     :ivar box: in the picture
@@ -131,7 +131,7 @@ def _apart(boxes: list[Box]) -> list[Box]:
     return kept
 
 
-class People:
+class KnownFaces:
     """Persons, by their faces.
 
     :param alike: how alike a face must be to be one's, 0 to 1
@@ -205,13 +205,13 @@ def likeness(known: Histograms, face: Histograms) -> npt.NDArray[np.float64]:
     return found
 
 
-def read_people(folder: Path, finder: Finder, alike: float = ALIKE) -> People:
+def read_people(folder: Path, finder: Finder, alike: float = ALIKE) -> KnownFaces:
     """People of a folder: each file of a face is a person of its name, each folder one with several.
 
     :raises Unavailable: it can't be read, or there is nobody in it
     :raises Invalid: a file that is no picture, or in which no face is found
     """
-    people = People(alike)
+    people = KnownFaces(alike)
     count = 0
     for name, path in _files(folder):
         count += 1
@@ -267,17 +267,17 @@ def grey_of(pixels: Pixels) -> Grey:
     return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def look(pixels: Pixels, lens: Lens, finder: Finder, people: People) -> list[Seen]:
+def look(pixels: Pixels, lens: CameraModel, finder: Finder, people: KnownFaces) -> list[SeenFace]:
     """The faces in a picture, the largest first.
 
     :param pixels: BGR or grey
     :param lens: of this picture
     """
     grey = grey_of(pixels)
-    return [Seen(box, *people.who(grey, box), _position(box, lens)) for box in finder.find(grey)]
+    return [SeenFace(box, *people.who(grey, box), _position(box, lens)) for box in finder.find(grey)]
 
 
-def _position(box: Box, lens: Lens) -> tuple[float, float, float]:
+def _position(box: Box, lens: CameraModel) -> tuple[float, float, float]:
     """Where a face of the usual size is. Distortion is left out: it is less than faces differ."""
     ahead = lens.fx * FACE / box.side
     x = (box.left + box.side / 2 - lens.cx) / lens.fx * ahead

@@ -11,9 +11,9 @@ from builtin_interfaces.msg import Duration
 from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from robot_client.services.faces import FACE, Finder, People, Seen, look
-from robot_client.services.health import Finding, Level
-from robot_client.services.pictures import Asked, Pictures
+from robot_client.services.faces import FACE, Finder, KnownFaces, SeenFace, look
+from robot_client.services.health import Level, ServiceFinding
+from robot_client.services.pictures import ImageRequest, ImageSource
 
 STAYS = 1.0
 """Seconds a face is shown after the picture it was seen in."""
@@ -28,26 +28,28 @@ class Faces:
     :param rate: pictures per second that are looked at, at most
     """
 
-    def __init__(self, node: Any, asked: Asked, finder: Finder, people: People, rate: float) -> None:
+    def __init__(
+        self, node: Any, asked: ImageRequest, finder: Finder, people: KnownFaces, rate: float
+    ) -> None:
         cv2.setNumThreads(1)  # a robot's other cores have other work
         self._finder = finder
         self._people = people
         self._period = 1 / rate
         self._next = 0.0
         self._took = 0.0
-        self._seen: list[Seen] = []
+        self._seen: list[SeenFace] = []
         self._array = node.create_publisher(MarkerArray, "faces", 10)
         self._text = node.create_publisher(String, "faces/seen", 10)
-        self._pictures = Pictures(node, asked, self._saw)
+        self._pictures = ImageSource(node, asked, self._saw)
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """Whom it sees."""
         trouble = self._pictures.finding()
         if trouble:
             return trouble
         values = {"people": str(len(self._people.names)), "look_ms": f"{self._took * 1000:.0f}"}
         names = ", ".join(each.name or "a face" for each in self._seen)
-        return Finding(Level.OK, f"sees {names}" if names else "sees no face", values)
+        return ServiceFinding(Level.OK, f"sees {names}" if names else "sees no face", values)
 
     def close(self) -> None:
         """Nothing is left to do."""
@@ -68,7 +70,7 @@ class Faces:
         )
         self._text.publish(String(data=self._told(header)))
 
-    def _marker(self, number: int, seen: Seen, header: Header) -> Marker:
+    def _marker(self, number: int, seen: SeenFace, header: Header) -> Marker:
         marker = Marker(header=header, ns="faces", id=number, type=Marker.SPHERE)
         marker.action = Marker.ADD
         place = marker.pose.position

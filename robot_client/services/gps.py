@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pynmea2
 
-from robot_client.services.health import Finding, Level
+from robot_client.services.health import Level, ServiceFinding
 
 LONGEST = 256
 """Bytes of one line; the standard has 82, some receivers write more."""
@@ -112,7 +112,7 @@ class Nmea:
         self.last = fix or self.last
         return fix
 
-    def finding(self, too_long: int = 0) -> Finding:
+    def finding(self, too_long: int = 0) -> ServiceFinding:
         """What is said of it.
 
         :param too_long: lines that were none
@@ -123,12 +123,12 @@ class Nmea:
             "satellites": str(self.satellites),
         }
         if self.last is None:
-            return Finding(Level.WARN, "no position was heard yet", values)
+            return ServiceFinding(Level.WARN, "no position was heard yet", values)
         if self.last.status == NO_FIX:
-            return Finding(Level.WARN, "the receiver has no fix", values)
+            return ServiceFinding(Level.WARN, "the receiver has no fix", values)
         if self.last.variances:
             values["sigma_m"] = f"{math.sqrt(self.last.variances[0]):.2f}"
-        return Finding(Level.OK, f"a fix of {self.satellites} satellites", values)
+        return ServiceFinding(Level.OK, f"a fix of {self.satellites} satellites", values)
 
     def _fix(self, sentence: Any) -> Fix:
         """:raises ValueError: fields that make no sense"""

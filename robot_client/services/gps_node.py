@@ -10,8 +10,8 @@ from sensor_msgs.msg import NavSatFix
 
 from robot_client.services import gps
 from robot_client.services.gps import Fix, Lines, Nmea
-from robot_client.services.gps_source import Reader, Source
-from robot_client.services.health import Finding, Freshness
+from robot_client.services.gps_source import ByteReader, ByteSource
+from robot_client.services.health import InputWatch, ServiceFinding
 
 SILENT = 5.0
 """Seconds without a sentence after which it says so."""
@@ -25,16 +25,16 @@ class Gps:
     :param frame: coordinate frame of the antenna
     """
 
-    def __init__(self, node: Any, name: str, open_source: Callable[[], Source], frame: str) -> None:
+    def __init__(self, node: Any, name: str, open_source: Callable[[], ByteSource], frame: str) -> None:
         self._node = node
         self._frame = frame
         self._lines = Lines()
         self._nmea = Nmea()
-        self._fresh = Freshness(name, SILENT, time.monotonic)
+        self._fresh = InputWatch(name, SILENT, time.monotonic)
         self._publisher = node.create_publisher(NavSatFix, "fix", 10)
-        self._reader = Reader(name, open_source, self._came)
+        self._reader = ByteReader(name, open_source, self._came)
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """Whether there is a fix, and how good."""
         trouble = self._reader.finding() or self._fresh.trouble()
         found = self._nmea.finding(self._lines.too_long)

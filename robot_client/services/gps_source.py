@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from relay_protocol.errors import Invalid, Unavailable
-from robot_client.services.health import Finding, Level
+from robot_client.services.health import Level, ServiceFinding
 
 AGAIN = 1.0
 """Seconds until a source that was lost is opened again."""
@@ -28,7 +28,7 @@ CHUNK = 4096
 BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 
 
-class Source(Protocol):
+class ByteSource(Protocol):
     """Gives bytes."""
 
     def read(self) -> bytes:
@@ -42,7 +42,7 @@ class Source(Protocol):
         """Let go of it."""
 
 
-class Device:
+class SerialSource:
     """A serial device, or whatever else can be read like one.
 
     :param baud: bits per second
@@ -60,7 +60,7 @@ class Device:
             raise OSError(*error.args) from None
 
     def read(self) -> bytes:
-        """See :class:`Source`."""
+        """See :class:`ByteSource`."""
         if not select.select([self._file], [], [], LOOK)[0]:
             return b""
         data = os.read(self._file, CHUNK)
@@ -69,11 +69,11 @@ class Device:
         return data
 
     def close(self) -> None:
-        """See :class:`Source`."""
+        """See :class:`ByteSource`."""
         os.close(self._file)
 
 
-class Server:
+class TcpSource:
     """A TCP server that sends sentences.
 
     :raises OSError: it does not answer
@@ -85,7 +85,7 @@ class Server:
         self._socket.settimeout(LOOK)
 
     def read(self) -> bytes:
-        """See :class:`Source`."""
+        """See :class:`ByteSource`."""
         try:
             data = self._socket.recv(CHUNK)
         except TimeoutError:
@@ -95,11 +95,11 @@ class Server:
         return data
 
     def close(self) -> None:
-        """See :class:`Source`."""
+        """See :class:`ByteSource`."""
         self._socket.close()
 
 
-class Recording:
+class FileSource:
     """A file, played at the pace at which receivers speak.
 
     :param pace: seconds between two positions
@@ -112,7 +112,7 @@ class Recording:
         self._sleep = sleep
 
     def read(self) -> bytes:
-        """See :class:`Source`."""
+        """See :class:`ByteSource`."""
         line = self._file.readline(CHUNK)
         if not line:
             raise EOFError
@@ -121,11 +121,11 @@ class Recording:
         return line
 
     def close(self) -> None:
-        """See :class:`Source`."""
+        """See :class:`ByteSource`."""
         self._file.close()
 
 
-def opener(text: str, baud: int, pace: float) -> Callable[[], Source]:
+def opener(text: str, baud: int, pace: float) -> Callable[[], ByteSource]:
     """What opens the source that somebody named.
 
     :param text: ``tcp://host:port``, or the path of a device or a file
@@ -137,21 +137,21 @@ def opener(text: str, baud: int, pace: float) -> Callable[[], Source]:
         if not found or not 0 < int(found[3]) < 65536:
             raise Invalid(f"'{text}' is no address: write tcp://HOST:PORT")
         host, port = found[1] or found[2], int(found[3])
-        return lambda: Server(host, port)
+        return lambda: TcpSource(host, port)
     path = Path(text)
     try:
         regular = stat.S_ISREG(path.stat().st_mode)
     except OSError as error:
         # Devices come and go; a name that is in no folder of devices is a slip of the pen.
         if path.parent.is_relative_to("/dev"):
-            return lambda: Device(path, baud)
+            return lambda: SerialSource(path, baud)
         raise Unavailable(f"{text}: {error.strerror}") from None
     if regular:
-        return lambda: Recording(path, pace)
-    return lambda: Device(path, baud)
+        return lambda: FileSource(path, pace)
+    return lambda: SerialSource(path, baud)
 
 
-class Reader:
+class ByteReader:
     """Reads a source in a thread of its own, and opens it again when it is lost.
 
     :param name: of the source, for people
@@ -159,17 +159,17 @@ class Reader:
     """
 
     def __init__(
-        self, name: str, open_source: Callable[[], Source], on_data: Callable[[bytes], None]
+        self, name: str, open_source: Callable[[], ByteSource], on_data: Callable[[bytes], None]
     ) -> None:
         self._name = name
         self._open = open_source
         self._on_data = on_data
         self._ending = threading.Event()
-        self._trouble: Finding | None = Finding(Level.STALE, f"waiting for {name}")
+        self._trouble: ServiceFinding | None = ServiceFinding(Level.STALE, f"waiting for {name}")
         self._thread = threading.Thread(target=self._run, name="gps-source", daemon=True)
         self._thread.start()
 
-    def finding(self) -> Finding | None:
+    def finding(self) -> ServiceFinding | None:
         """What is wrong with the source, else ``None``."""
         return self._trouble
 
@@ -183,10 +183,10 @@ class Reader:
             try:
                 self._read_all()
             except EOFError:
-                self._trouble = Finding(Level.STALE, f"{self._name} has been played to its end")
+                self._trouble = ServiceFinding(Level.STALE, f"{self._name} has been played to its end")
                 return
             except OSError as error:
-                self._trouble = Finding(Level.ERROR, f"{self._name}: {error.strerror or error}")
+                self._trouble = ServiceFinding(Level.ERROR, f"{self._name}: {error.strerror or error}")
                 self._ending.wait(AGAIN)
 
     def _read_all(self) -> None:

@@ -17,7 +17,7 @@ class Level(enum.IntEnum):
     STALE = 3
 
 
-class Finding(NamedTuple):
+class ServiceFinding(NamedTuple):
     """How a service is, and the figures behind that."""
 
     level: Level
@@ -25,7 +25,7 @@ class Finding(NamedTuple):
     values: Mapping[str, str] = MappingProxyType({})
 
 
-class Freshness:
+class InputWatch:
     """Whether an input still comes.
 
     :param what: the input, as it is named to people
@@ -43,11 +43,11 @@ class Freshness:
         """It has come just now."""
         self._last = self._clock()
 
-    def trouble(self) -> Finding | None:
+    def trouble(self) -> ServiceFinding | None:
         """What to say when it does not come, else ``None``."""
         if self._last is None:
-            return Finding(Level.STALE, f"waiting for {self._what}")
+            return ServiceFinding(Level.STALE, f"waiting for {self._what}")
         silent = self._clock() - self._last
         if silent <= self._longest:
             return None
-        return Finding(Level.STALE, f"nothing from {self._what} for {silent:.0f} s")
+        return ServiceFinding(Level.STALE, f"nothing from {self._what} for {silent:.0f} s")

@@ -12,13 +12,13 @@ import click
 
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.text import inert
-from robot_client.helptext import examples
+from robot_client.help_text import examples
 from robot_client.numbers import Number
 from robot_client.services.gps_source import BAUDS, opener
 from robot_client.services.options import camera, lens
 
 if TYPE_CHECKING:
-    from robot_client.services.pictures import Asked
+    from robot_client.services.pictures import ImageRequest
 
 COMMAND = "switchboard-robot-service"
 
@@ -78,10 +78,10 @@ def _in_words(function: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _asked(topic: str, compressed: bool, info: str, view: float | None) -> Asked:
-    from robot_client.services.pictures import Asked
+def _asked(topic: str, compressed: bool, info: str, view: float | None) -> ImageRequest:
+    from robot_client.services.pictures import ImageRequest
 
-    return Asked(topic, compressed, info, view or 0.0)
+    return ImageRequest(topic, compressed, info, view or 0.0)
 
 
 @service(
@@ -152,14 +152,14 @@ def obstacles(
     Topics out: obstacles (LaserScan, a ray for each sector), obstacles/places (PoseArray, the nearest first),
     obstacles/near (Bool).
     """
+    from robot_client.services.node_runner import run
     from robot_client.services.obstacles import Band
-    from robot_client.services.obstacles_node import Obstacles, Settings
-    from robot_client.services.running import run
+    from robot_client.services.obstacles_node import Obstacles, ObstacleSettings
 
     if low >= high:
         raise click.BadParameter(f"--low ({low:g}) must be less than --high ({high:g})")
     source = _asked(depth, False, info, view) if depth else scan
-    settings = Settings(sectors, near, frame)
+    settings = ObstacleSettings(sectors, near, frame)
     band = Band(height, low, high)
     run("obstacles", namespace, lambda node: Obstacles(node, source, settings, band))
 
@@ -224,7 +224,7 @@ def battery(
     """
     from robot_client.services.battery import Gauge
     from robot_client.services.battery_node import SysfsBattery, TopicBattery
-    from robot_client.services.running import run
+    from robot_client.services.node_runner import run
 
     if critical > low:
         raise click.BadParameter(f"--critical ({critical:g}) must not be more than --low ({low:g})")
@@ -259,7 +259,7 @@ def gps(namespace: str, source: str, baud: str, frame: str, pace: float) -> None
     SOURCE is a serial device, tcp://HOST:PORT or a recorded file. Topics out: fix (NavSatFix).
     """
     from robot_client.services.gps_node import Gps
-    from robot_client.services.running import run
+    from robot_client.services.node_runner import run
 
     opened = opener(source, int(baud), pace)
     run("gps", namespace, lambda node: Gps(node, source, opened, frame))
@@ -296,7 +296,7 @@ def markers(
     """
     from robot_client.services.markers import DICTIONARIES
     from robot_client.services.markers_node import Markers
-    from robot_client.services.running import run
+    from robot_client.services.node_runner import run
 
     if dictionary not in DICTIONARIES:
         raise click.BadParameter(f"'{dictionary}' is not known; these are: {', '.join(DICTIONARIES)}")
@@ -340,12 +340,12 @@ def faces(
 
     Topics out: faces (MarkerArray), faces/seen (String: JSON with name, distance, bearing).
     """
-    from robot_client.services.faces import Finder, People, read_people
+    from robot_client.services.faces import Finder, KnownFaces, read_people
     from robot_client.services.faces_node import Faces
-    from robot_client.services.running import run
+    from robot_client.services.node_runner import run
 
     finder = Finder()
-    known = read_people(people, finder, alike) if people else People(alike)
+    known = read_people(people, finder, alike) if people else KnownFaces(alike)
     asked = _asked(image, compressed, info, view)
     run("faces", namespace, lambda node: Faces(node, asked, finder, known, rate))
 
@@ -375,7 +375,7 @@ def speech(namespace: str, voice: str, speed: int, volume: int, out: Path | None
     Service: say/hush (Trigger), which silences it.
     """
     from robot_client.services.espeak import Espeak
-    from robot_client.services.running import run
+    from robot_client.services.node_runner import run
     from robot_client.services.speech import WavFile, player
     from robot_client.services.speech_node import Speech
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot_client.camera.formats import Pixels
-from robot_client.services.lens import Lens
+from robot_client.services.camera_model import CameraModel
 
 DICTIONARIES = (
     *(f"{family}_{count}" for family in ("4X4", "5X5", "6X6", "7X7") for count in (50, 100, 250, 1000)),
@@ -19,7 +19,7 @@ DICTIONARIES = (
 """Families of markers that OpenCV knows."""
 
 
-class Seen(NamedTuple):
+class SeenMarker(NamedTuple):
     """A marker in the frame of the camera's picture: x to the right, y down, z ahead (REP 103).
 
     :ivar number: the marker's own
@@ -61,7 +61,7 @@ class Detector:
             [(-half, half, 0.0), (half, half, 0.0), (half, -half, 0.0), (-half, -half, 0.0)]
         )
 
-    def find(self, pixels: Pixels, lens: Lens) -> list[Seen]:
+    def find(self, pixels: Pixels, lens: CameraModel) -> list[SeenMarker]:
         """The markers in a picture by their numbers; of several with one number the nearest.
 
         :param pixels: BGR or grey
@@ -69,14 +69,14 @@ class Detector:
         """
         grey: Any = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
         corners, numbers, _ = self._detector.detectMarkers(np.ascontiguousarray(grey))
-        found: dict[int, Seen] = {}
+        found: dict[int, SeenMarker] = {}
         for number, corner in zip([] if numbers is None else np.ravel(numbers), corners, strict=True):
             seen = self._place(int(number), np.asarray(corner, np.float64).reshape(4, 2), lens)
             if seen and (seen.number not in found or seen.distance < found[seen.number].distance):
                 found[seen.number] = seen
         return [found[number] for number in sorted(found)]
 
-    def _place(self, number: int, corners: npt.NDArray[np.float64], lens: Lens) -> Seen | None:
+    def _place(self, number: int, corners: npt.NDArray[np.float64], lens: CameraModel) -> SeenMarker | None:
         matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
         # IPPE_SQUARE, which is made for this, gives wrong turns in OpenCV 5.0.0.
         done, turned, moved = cv2.solvePnP(
@@ -85,7 +85,7 @@ class Detector:
         x, y, z = (float(each) for each in np.ravel(moved)) if done else (0.0, 0.0, 0.0)
         if not z > 0:  # nothing behind the camera can be seen
             return None
-        return Seen(number, (x, y, z), quaternion(np.ravel(turned)))
+        return SeenMarker(number, (x, y, z), quaternion(np.ravel(turned)))
 
 
 def quaternion(turned: npt.NDArray[Any]) -> tuple[float, float, float, float]:

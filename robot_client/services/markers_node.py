@@ -10,9 +10,9 @@ from builtin_interfaces.msg import Duration
 from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from robot_client.services.health import Finding, Level
-from robot_client.services.markers import Detector, Seen
-from robot_client.services.pictures import Asked, Pictures
+from robot_client.services.health import Level, ServiceFinding
+from robot_client.services.markers import Detector, SeenMarker
+from robot_client.services.pictures import ImageRequest, ImageSource
 
 STAYS = 0.5
 """Seconds a marker is shown after the picture it was seen in."""
@@ -25,24 +25,24 @@ class Markers:
     :param size: metres, of the black square's side
     """
 
-    def __init__(self, node: Any, asked: Asked, dictionary: str, size: float) -> None:
+    def __init__(self, node: Any, asked: ImageRequest, dictionary: str, size: float) -> None:
         cv2.setNumThreads(1)  # a robot's other cores have other work
         self._dictionary = dictionary
         self._size = size
         self._detector = Detector(dictionary, size)
-        self._seen: list[Seen] = []
+        self._seen: list[SeenMarker] = []
         self._array = node.create_publisher(MarkerArray, "markers", 10)
         self._text = node.create_publisher(String, "markers/seen", 10)
-        self._pictures = Pictures(node, asked, self._saw)
+        self._pictures = ImageSource(node, asked, self._saw)
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """What it sees."""
         trouble = self._pictures.finding()
         if trouble:
             return trouble
         values = {f"marker {each.number}": f"{each.distance:.2f} m" for each in self._seen}
         numbers = ", ".join(str(each.number) for each in self._seen)
-        return Finding(Level.OK, f"sees {numbers}" if numbers else "sees no marker", values)
+        return ServiceFinding(Level.OK, f"sees {numbers}" if numbers else "sees no marker", values)
 
     def close(self) -> None:
         """Nothing is left to do."""
@@ -54,7 +54,7 @@ class Markers:
         self._array.publish(MarkerArray(markers=[self._marker(each, header) for each in self._seen]))
         self._text.publish(String(data=self._told(header)))
 
-    def _marker(self, seen: Seen, header: Header) -> Marker:
+    def _marker(self, seen: SeenMarker, header: Header) -> Marker:
         marker = Marker(header=header, ns=self._dictionary, id=seen.number, type=Marker.CUBE)
         marker.action = Marker.ADD
         place, turn = marker.pose.position, marker.pose.orientation

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from relay_protocol.errors import Invalid
 from robot_client.camera.messages import Image
-from robot_client.services.health import Finding, Level
-from robot_client.services.lens import Lens
+from robot_client.services.camera_model import CameraModel
+from robot_client.services.health import Level, ServiceFinding
 
 Floats = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
@@ -43,7 +43,7 @@ class Scan(NamedTuple):
     most: float
 
 
-class Place(NamedTuple):
+class ObstaclePosition(NamedTuple):
     """Where an obstacle is.
 
     :ivar distance: metres, along the floor
@@ -64,10 +64,10 @@ class Sectors(NamedTuple):
 
     first: float
     width: float
-    places: tuple[Place | None, ...]
+    places: tuple[ObstaclePosition | None, ...]
 
     @property
-    def nearest(self) -> Place | None:
+    def nearest(self) -> ObstaclePosition | None:
         """The nearest of all."""
         return min(filter(None, self.places), default=None)
 
@@ -121,7 +121,7 @@ def of_scan(scan: Scan, count: int) -> Sectors:
     return Sectors(first, width, _nearest(distances, bearings[met], index[met], count))
 
 
-def of_depth(depth: Depth, lens: Lens, count: int, band: Band) -> Sectors:
+def of_depth(depth: Depth, lens: CameraModel, count: int, band: Band) -> Sectors:
     """The nearest obstacle of each sector of a picture of depth; floor and ceiling are left out.
 
     What is too near to be measured (REP 117: ``-inf``) is where the camera is: at its height, and no metres away.
@@ -158,7 +158,7 @@ def of_depth(depth: Depth, lens: Lens, count: int, band: Band) -> Sectors:
     return Sectors(right + sector / 2, sector, tuple(reversed(found)))
 
 
-def _agreed(distances: Depth, bearings: Floats) -> Place | None:
+def _agreed(distances: Depth, bearings: Floats) -> ObstaclePosition | None:
     """The nearest place that enough pixels agree on.
 
     :param distances: metres by row and column, infinite where nothing is
@@ -169,7 +169,7 @@ def _agreed(distances: Depth, bearings: Floats) -> Place | None:
     which = int(np.argpartition(distances, AGREE - 1, axis=None)[AGREE - 1])
     row, column = divmod(which, distances.shape[1])
     distance = float(distances[row, column])
-    return Place(distance, float(bearings[column])) if math.isfinite(distance) else None
+    return ObstaclePosition(distance, float(bearings[column])) if math.isfinite(distance) else None
 
 
 def metres(picture: Image) -> Depth:
@@ -197,20 +197,20 @@ def metres(picture: Image) -> Depth:
 
 def _nearest(
     distances: Floats, bearings: Floats, index: npt.NDArray[np.int_], count: int
-) -> tuple[Place | None, ...]:
+) -> tuple[ObstaclePosition | None, ...]:
     """:param index: the sector of each"""
-    places: list[Place | None] = []
+    places: list[ObstaclePosition | None] = []
     for sector in range(count):
         inside = np.flatnonzero(index == sector)
         if len(inside):
             which = inside[np.argmin(distances[inside])]
-            places.append(Place(float(distances[which]), float(bearings[which])))
+            places.append(ObstaclePosition(float(distances[which]), float(bearings[which])))
         else:
             places.append(None)
     return tuple(places)
 
 
-class Nearness:
+class ProximityAlarm:
     """Whether something is too near; it does not flicker at the threshold.
 
     :param threshold: metres
@@ -220,7 +220,7 @@ class Nearness:
         self._threshold = threshold
         self.near = False
 
-    def see(self, nearest: Place | None, least: float = 0.0) -> bool:
+    def see(self, nearest: ObstaclePosition | None, least: float = 0.0) -> bool:
         """Look at what is nearest now.
 
         :param least: metres, the least that the sensor measures: what is as near as that may be nearer than any
@@ -233,13 +233,13 @@ class Nearness:
         return self.near is not before
 
 
-def finding(near: bool, nearest: Place | None) -> Finding:
+def finding(near: bool, nearest: ObstaclePosition | None) -> ServiceFinding:
     """What is said of it."""
     if nearest is None:
-        return Finding(Level.OK, "nothing in sight")
+        return ServiceFinding(Level.OK, "nothing in sight")
     side = "left" if nearest.bearing >= 0 else "right"
     where = f"{nearest.distance:.2f} m away, {abs(math.degrees(nearest.bearing)):.0f}° to the {side}"
     values = {"distance_m": f"{nearest.distance:.3f}", "bearing_deg": f"{math.degrees(nearest.bearing):.1f}"}
     if near:
-        return Finding(Level.WARN, f"an obstacle is near: {where}", values)
-    return Finding(Level.OK, f"the nearest is {where}", values)
+        return ServiceFinding(Level.WARN, f"an obstacle is near: {where}", values)
+    return ServiceFinding(Level.OK, f"the nearest is {where}", values)

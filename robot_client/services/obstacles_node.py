@@ -16,16 +16,16 @@ from std_msgs.msg import Bool, Header
 from relay_protocol.errors import Invalid
 from robot_client.camera.messages import read_image
 from robot_client.services import obstacles
-from robot_client.services.health import Finding, Freshness, Level
-from robot_client.services.obstacles import Band, Nearness, Scan, Sectors
-from robot_client.services.pictures import Asked, Pictures
-from robot_client.services.running import LATCHED
+from robot_client.services.health import InputWatch, Level, ServiceFinding
+from robot_client.services.node_runner import LATCHED
+from robot_client.services.obstacles import Band, ProximityAlarm, Scan, Sectors
+from robot_client.services.pictures import ImageRequest, ImageSource
 
 SILENT = 2.0
 """Seconds without a scan after which it says so."""
 
 
-class Settings(NamedTuple):
+class ObstacleSettings(NamedTuple):
     """What it is to do.
 
     :ivar sectors: how many directions
@@ -45,30 +45,30 @@ class Obstacles:
     :param band: heights that count, for depth
     """
 
-    def __init__(self, node: Any, source: str | Asked, settings: Settings, band: Band) -> None:
+    def __init__(self, node: Any, source: str | ImageRequest, settings: ObstacleSettings, band: Band) -> None:
         self._settings = settings
         self._band = band
-        self._nearness = Nearness(settings.near)
+        self._nearness = ProximityAlarm(settings.near)
         self._last: Sectors | None = None
         self._trouble = ""
         self._rays = node.create_publisher(LaserScan, "obstacles", 10)
         self._places = node.create_publisher(PoseArray, "obstacles/places", 10)
         self._near = node.create_publisher(Bool, "obstacles/near", LATCHED)
         self._near.publish(Bool(data=False))
-        self._pictures: Pictures | None = None
-        if isinstance(source, Asked):
-            self._pictures = Pictures(node, source, self._saw)
+        self._pictures: ImageSource | None = None
+        if isinstance(source, ImageRequest):
+            self._pictures = ImageSource(node, source, self._saw)
         else:
-            self._fresh = Freshness(source, SILENT, time.monotonic)
+            self._fresh = InputWatch(source, SILENT, time.monotonic)
             node.create_subscription(LaserScan, source, self._scanned, qos_profile_sensor_data)
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """How near the nearest is."""
         silent = self._pictures.finding() if self._pictures else self._fresh.trouble()
         if silent is not None:
             return silent
         if self._trouble:
-            return Finding(Level.ERROR, self._trouble)
+            return ServiceFinding(Level.ERROR, self._trouble)
         return obstacles.finding(self._nearness.near, self._last.nearest if self._last else None)
 
     def close(self) -> None:

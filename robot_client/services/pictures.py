@@ -13,8 +13,8 @@ from std_msgs.msg import Header
 
 from relay_protocol.errors import Invalid
 from robot_client.camera import formats
-from robot_client.services.health import Finding, Freshness, Level
-from robot_client.services.lens import Lens, calibrated, of_view
+from robot_client.services.camera_model import CameraModel, calibrated, of_view
+from robot_client.services.health import InputWatch, Level, ServiceFinding
 
 SILENT = 5.0
 """Seconds without a picture after which a service says so."""
@@ -22,7 +22,7 @@ SILENT = 5.0
 _NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-class Asked(NamedTuple):
+class ImageRequest(NamedTuple):
     """Which pictures.
 
     :ivar topic: of type sensor_msgs/Image, or CompressedImage
@@ -46,18 +46,18 @@ class Asked(NamedTuple):
         return f"{folder}{slash}camera_info"
 
 
-class Pictures:
+class ImageSource:
     """Subscribes to a camera; only the newest picture waits.
 
     :param node: to subscribe with
     :param on_picture: called with each message as it was serialised, and its header
     """
 
-    def __init__(self, node: Any, asked: Asked, on_picture: Callable[[bytes, Header], None]) -> None:
+    def __init__(self, node: Any, asked: ImageRequest, on_picture: Callable[[bytes, Header], None]) -> None:
         self._asked = asked
         self._on_picture = on_picture
         self._info: CameraInfo | None = None
-        self._fresh = Freshness(asked.topic, SILENT, time.monotonic)
+        self._fresh = InputWatch(asked.topic, SILENT, time.monotonic)
         self._trouble: str = ""
         kind = CompressedImage if asked.compressed else Image
         node.create_subscription(kind, asked.topic, self._came, _NEWEST, raw=True)
@@ -73,7 +73,7 @@ class Pictures:
             return formats.unpacked(formats.compressed(message))
         return formats.image(message)
 
-    def lens(self, width: int, height: int) -> Lens:
+    def lens(self, width: int, height: int) -> CameraModel:
         """The lens of a picture of this size.
 
         :raises Invalid: nothing is known of it yet, or it can't be used
@@ -87,17 +87,17 @@ class Pictures:
         # Drivers that were told another size sometimes keep the calibration of the first.
         return lens.scaled(width / info.width) if info.width else lens
 
-    def finding(self) -> Finding | None:
+    def finding(self) -> ServiceFinding | None:
         """What is wrong with the pictures, else ``None``."""
         silent = self._fresh.trouble()
         if silent is not None:
             return silent
         if not self._asked.view and self._info is None:
             # No error: pictures often come before it.
-            return Finding(
+            return ServiceFinding(
                 Level.STALE, f"waiting for {self._asked.info_topic}; for a camera without one give --view"
             )
-        return Finding(Level.ERROR, self._trouble) if self._trouble else None
+        return ServiceFinding(Level.ERROR, self._trouble) if self._trouble else None
 
     def _came(self, message: bytes) -> None:
         self._fresh.came()

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
 
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
-from robot_client.services.health import Finding, Level
+from robot_client.services.health import Level, ServiceFinding
 
 LONGEST_TEXT = 1000
 """Characters of one text."""
@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 _Given = TypeVar("_Given")
 
 
-class Voice(Protocol):
+class SpeechSynthesizer(Protocol):
     """Makes sound of words; :class:`~robot_client.services.espeak.Espeak` is one."""
 
     @property
@@ -156,7 +156,7 @@ def player(which: Callable[[str], str | None] = shutil.which) -> Player:
     )
 
 
-class Told(NamedTuple):
+class SpeechStatus(NamedTuple):
     """What becomes of a text.
 
     :ivar speaking: whether anything is being said now
@@ -167,7 +167,7 @@ class Told(NamedTuple):
     said: str | None = None
 
 
-class Speaker:
+class SpeechQueue:
     """Says texts in their order, in a thread of its own; never two at a time.
 
     Whatever fails is told by :meth:`finding`, and what was not foreseen is logged with its traceback; the next text
@@ -176,7 +176,9 @@ class Speaker:
     :param tell: called in that thread
     """
 
-    def __init__(self, voice: Voice, output: Output, tell: Callable[[Told], None]) -> None:
+    def __init__(
+        self, voice: SpeechSynthesizer, output: Output, tell: Callable[[SpeechStatus], None]
+    ) -> None:
         self._voice = voice
         self._output = output
         self._tell = tell
@@ -219,13 +221,13 @@ class Speaker:
             self._hush.set()
         return forgotten
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """How it is."""
         with self._changed:
             values = {"waiting": str(len(self._texts)), "refused": str(self._refused)}
             if self._trouble:
-                return Finding(Level.ERROR, self._trouble, values)
-            return Finding(Level.OK, "speaking" if self._speaking else "silent", values)
+                return ServiceFinding(Level.ERROR, self._trouble, values)
+            return ServiceFinding(Level.OK, "speaking" if self._speaking else "silent", values)
 
     def close(self) -> None:
         """Be silent for good."""
@@ -238,7 +240,7 @@ class Speaker:
 
     def _run(self) -> None:
         while (text := self._next()) is not None:
-            untold = self._told(Told(speaking=True))
+            untold = self._told(SpeechStatus(speaking=True))
             trouble = "the text was not said to its end"
             try:
                 trouble = _tried("saying a text", self._say, text)
@@ -247,7 +249,7 @@ class Speaker:
                     self._speaking = False
                     self._trouble = trouble or untold
                     said = not trouble and not self._hush.is_set()
-            untold = self._told(Told(speaking=False, said=text if said else None))
+            untold = self._told(SpeechStatus(speaking=False, said=text if said else None))
             if untold:
                 with self._changed:
                     self._trouble = self._trouble or untold
@@ -262,7 +264,7 @@ class Speaker:
             self._speaking = True
             return self._texts.popleft()
 
-    def _told(self, told: Told) -> str:
+    def _told(self, told: SpeechStatus) -> str:
         """:returns: why it could not be told"""
         return _tried("telling what is said", self._tell, told)
 

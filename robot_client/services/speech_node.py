@@ -8,24 +8,24 @@ from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
 from relay_protocol.errors import Refused
-from robot_client.services.health import Finding
-from robot_client.services.running import LATCHED
-from robot_client.services.speech import WAITING, Output, Speaker, Told, Voice
+from robot_client.services.health import ServiceFinding
+from robot_client.services.node_runner import LATCHED
+from robot_client.services.speech import WAITING, Output, SpeechQueue, SpeechStatus, SpeechSynthesizer
 
 
 class Speech:
     """Says what comes on the topic ``say``."""
 
-    def __init__(self, node: Any, voice: Voice, output: Output) -> None:
+    def __init__(self, node: Any, voice: SpeechSynthesizer, output: Output) -> None:
         self._node = node
         self._speaking = node.create_publisher(Bool, "speaking", LATCHED)
         self._said = node.create_publisher(String, "said", WAITING)
         self._speaking.publish(Bool(data=False))
-        self._speaker = Speaker(voice, output, self._tell)
+        self._speaker = SpeechQueue(voice, output, self._tell)
         node.create_subscription(String, "say", self._say, 2 * WAITING)
         node.create_service(Trigger, "say/hush", self._hush)
 
-    def finding(self) -> Finding:
+    def finding(self) -> ServiceFinding:
         """What it does."""
         return self._speaker.finding()
 
@@ -45,7 +45,7 @@ class Speech:
         response.message = f"{forgotten} texts are not said" if forgotten else "nothing was to be said"
         return response
 
-    def _tell(self, told: Told) -> None:
+    def _tell(self, told: SpeechStatus) -> None:
         """In the speaker's thread: publishers may be used in any."""
         self._speaking.publish(Bool(data=told.speaking))
         if told.said is not None:

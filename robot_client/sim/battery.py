@@ -18,7 +18,7 @@ _RESISTANCE = 0.05
 
 
 @dataclass
-class Battery:
+class SimBattery:
     """A six-cell lithium pack of 5 Ah: about four hours standing, about an hour and a half driving.
 
     An empty pack stays at zero and the robot goes on: a demo left running overnight must still drive.

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot_client.sim import paint
-from robot_client.sim.plates import Eye, Plates
+from robot_client.sim import textures
+from robot_client.sim.charger_plates import ChargerPlates, ViewColumn
 from robot_client.sim.world import Floats, Hits, Pose, World
 
 WIDTH, HEIGHT = 640, 480
@@ -35,7 +35,7 @@ _FONT_SCALE = 0.6
 Image = npt.NDArray[np.uint8]
 
 
-class Camera:
+class SimCamera:
     """Draws what a robot sees. Keeps buffers, so one object serves one caller at a time.
 
     :param width: pixels
@@ -50,22 +50,26 @@ class Camera:
         self._ray_angles = -np.arctan(offset / self._focal)
         self._straighten = np.cos(self._ray_angles)
         # OpenCV can repeat a texture by itself (BORDER_WRAP), but takes twice as long for it.
-        self._tiles = np.tile(paint.floor_tiles(), (_REPEATS, _REPEATS))
+        self._tiles = np.tile(textures.floor_tiles(), (_REPEATS, _REPEATS))
         self._far_tiles = cv2.mean(self._tiles)
-        self._textures = paint.wall_textures()
+        self._textures = textures.wall_textures()
         self._panorama_columns = round(math.tau / VIEW_ANGLE * width)
-        sky = paint.panorama(self._panorama_columns, self._horizon)
+        sky = textures.panorama(self._panorama_columns, self._horizon)
         self._panorama = np.concatenate((sky, sky[:, : width + 1]), axis=1)
         self._colours = np.array([look.colour for look in world.looks], dtype=np.float32)
         self._styles = np.array([look.texture for look in world.looks])
         rows = np.arange(height - self._horizon, dtype=np.float64) + 0.5
         clear = np.exp(-EYE_HEIGHT * self._focal / rows / (_FOG_LENGTH / 3))[:, None]
         self._floor_gain = np.repeat(clear, width, axis=1).astype(np.float32)
-        base = np.array(paint.FLOOR_TINT) * clear + np.array(paint.FOG) * (1 - clear)
+        base = np.array(textures.FLOOR_TINT) * clear + np.array(textures.FOG) * (1 - clear)
         self._floor_base = np.repeat(base[:, None, :], width, axis=1).astype(np.uint8)
         self._columns = np.tile(np.arange(width, dtype=np.float32), (height, 1))
         self._rows = np.arange(height, dtype=np.float32)[:, None] + np.float32(0.5)
-        self._plates = Plates(world, Eye(self._focal, self._horizon, EYE_HEIGHT)) if world.chargers else None
+        self._plates = (
+            ChargerPlates(world, ViewColumn(self._focal, self._horizon, EYE_HEIGHT))
+            if world.chargers
+            else None
+        )
 
     def render(self, pose: Pose, speed: float, at: float) -> Image:
         """One picture, BGR, shape (height, width, 3); the array is the caller's.
@@ -121,11 +125,11 @@ class Camera:
         top = self._horizon - (WALL_HEIGHT - EYE_HEIGHT) * self._focal / depth
         first = max(0, math.floor(top.min()))
         last = min(self._height, math.ceil(self._horizon + EYE_HEIGHT * self._focal / depth.min()))
-        texels_per_row = (paint.TEXELS * depth / (WALL_HEIGHT * self._focal)).astype(np.float32)
+        texels_per_row = (textures.TEXELS * depth / (WALL_HEIGHT * self._focal)).astype(np.float32)
         down = (self._rows[first:last] - top.astype(np.float32)) * texels_per_row - np.float32(0.5)
         # what is neither wall nor its edge must stay as it is: send it outside the table
-        outside = (down < -0.5) | (down > paint.TEXELS - 0.5) | (hits.surface < 0)
-        np.clip(down, 0, paint.TEXELS - 1, out=down)
+        outside = (down < -0.5) | (down > textures.TEXELS - 0.5) | (hits.surface < 0)
+        np.clip(down, 0, textures.TEXELS - 1, out=down)
         down[outside] = -10.0
         cv2.remap(
             self._wall_columns(hits),
@@ -138,11 +142,11 @@ class Camera:
 
     def _wall_columns(self, hits: Hits) -> Image:
         """The painted texture column of each picture column, shape (texels, width, 3)."""
-        texel = (hits.along * paint.TEXELS).astype(np.int64) % paint.TEXELS
+        texel = (hits.along * textures.TEXELS).astype(np.int64) % textures.TEXELS
         pattern = self._textures[self._styles[hits.surface], texel].T
         clear = np.exp(-hits.distance / _FOG_LENGTH)
         light = ((0.45 + 0.55 * hits.facing) * clear)[:, None]
-        haze = np.array(paint.FOG) * (1 - clear)[:, None]
+        haze = np.array(textures.FOG) * (1 - clear)[:, None]
         painted = pattern[:, :, None] * (self._colours[hits.surface] * light).astype(np.float32)
         painted += haze.astype(np.float32)
         table: Image = np.minimum(painted, 255.0, out=painted).astype(np.uint8)

@@ -23,7 +23,7 @@ _STILL = 1e-9
 _BLOCKED_SHARE = 0.3
 
 
-class Limits(NamedTuple):
+class MotorLimits(NamedTuple):
     """What the motors can do.
 
     Stops are harder than starts, as with a short-circuit brake: 0.5 m/s is gone in two steps of 20 ms.
@@ -40,7 +40,7 @@ class Limits(NamedTuple):
     turn_braking: float = 50.0
 
 
-DEFAULT_LIMITS = Limits()
+DEFAULT_LIMITS = MotorLimits()
 
 
 class Twist(NamedTuple):
@@ -54,7 +54,7 @@ STANDING = Twist(0.0, 0.0)
 
 
 @dataclass
-class Body:
+class SimBody:
     """A round robot on two wheels in a world.
 
     :ivar target: the velocity asked for, before limits
@@ -67,7 +67,7 @@ class Body:
 
     world: World
     pose: Pose
-    limits: Limits = DEFAULT_LIMITS
+    limits: MotorLimits = DEFAULT_LIMITS
     target: Twist = STANDING
     velocity: Twist = STANDING
     moving: bool = False

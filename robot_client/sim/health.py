@@ -18,7 +18,7 @@ class Severity(enum.IntEnum):
     STALE = 3
 
 
-class Finding(NamedTuple):
+class PartFinding(NamedTuple):
     """One part of the robot, how it is, and the figures behind it."""
 
     part: str
@@ -27,29 +27,29 @@ class Finding(NamedTuple):
     values: dict[str, str]
 
 
-def motors(speed: float, turn: float, blocked: bool, travelled: float) -> Finding:
+def motors(speed: float, turn: float, blocked: bool, travelled: float) -> PartFinding:
     """:param speed: m/s; :param turn: rad/s; :param travelled: metres since the last reset"""
     values = {"speed_m_s": f"{speed:.3f}", "turn_rad_s": f"{turn:.3f}", "travelled_m": f"{travelled:.2f}"}
     if blocked:
-        return Finding("motors", Severity.WARN, "stalled: an obstacle holds the robot back", values)
-    return Finding("motors", Severity.OK, "driving" if speed or turn else "standing", values)
+        return PartFinding("motors", Severity.WARN, "stalled: an obstacle holds the robot back", values)
+    return PartFinding("motors", Severity.OK, "driving" if speed or turn else "standing", values)
 
 
-def battery(charge: float, volts: float, amperes: float, charging: bool = False) -> Finding:
+def battery(charge: float, volts: float, amperes: float, charging: bool = False) -> PartFinding:
     """:param charge: share of the capacity left, 0 to 1; :param charging: whether it hangs on a charger"""
     values = {"charge_percent": f"{charge * 100:.1f}", "volts": f"{volts:.2f}", "amperes": f"{amperes:.2f}"}
     if charging:
-        return Finding("battery", Severity.OK, "charging" if charge < 1.0 else "full", values)
+        return PartFinding("battery", Severity.OK, "charging" if charge < 1.0 else "full", values)
     if charge < BATTERY_NEARLY_EMPTY:
-        return Finding("battery", Severity.ERROR, "nearly empty: charge it now", values)
+        return PartFinding("battery", Severity.ERROR, "nearly empty: charge it now", values)
     if charge < BATTERY_LOW:
-        return Finding("battery", Severity.WARN, "low: charge it soon", values)
-    return Finding("battery", Severity.OK, "charged", values)
+        return PartFinding("battery", Severity.WARN, "low: charge it soon", values)
+    return PartFinding("battery", Severity.OK, "charged", values)
 
 
-def camera(enabled: bool, viewers: int, frames: int, render_ms: float) -> Finding:
+def camera(enabled: bool, viewers: int, frames: int, render_ms: float) -> PartFinding:
     """:param viewers: subscriptions to its topics; :param frames: pictures sent so far"""
     values = {"viewers": str(viewers), "frames": str(frames), "render_ms": f"{render_ms:.2f}"}
     if not enabled:
-        return Finding("camera", Severity.STALE, "switched off", values)
-    return Finding("camera", Severity.OK, "streaming" if viewers else "waiting for viewers", values)
+        return PartFinding("camera", Severity.STALE, "switched off", values)
+    return PartFinding("camera", Severity.OK, "streaming" if viewers else "waiting for viewers", values)

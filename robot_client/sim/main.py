@@ -15,7 +15,7 @@ from typing import IO, Any
 import click
 
 from relay_protocol.errors import Invalid
-from robot_client.helptext import examples
+from robot_client.help_text import examples
 from robot_client.numbers import Number
 from robot_client.ros_log import ensure_log_folder
 
@@ -114,7 +114,7 @@ def main(
         _run(namespace, stream, seed, world, camera_size if camera else None, camera_fps, charge / 100, stop)
 
 
-class _Stop:
+class _SimStopRequested:
     requested = False
 
 
@@ -126,18 +126,18 @@ def _run(
     size: tuple[int, int] | None,
     fps: int,
     charge: float,
-    stop: _Stop,
+    stop: _SimStopRequested,
 ) -> None:
     """Imports late: `--help` and a missing ROS must not wait for, or fall over, OpenCV and rclpy."""
     import cv2
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
-    from robot_client.platforms.ros2_errors import check_namespace
-    from robot_client.sim.camera import Camera
+    from robot_client.platforms.ros2.errors import check_namespace
+    from robot_client.sim.camera import SimCamera
     from robot_client.sim.node import SimNode
-    from robot_client.sim.recorder import Recorder
-    from robot_client.sim.robot import Robot
+    from robot_client.sim.recorder import MotionRecorder
+    from robot_client.sim.robot import SimRobot
 
     try:
         check_namespace(namespace)
@@ -145,10 +145,10 @@ def _run(
         raise click.BadParameter(str(error)) from None
     cv2.setNumThreads(1)  # pictures are small: threads would cost more than they give
     place = WORLDS[world]()
-    robot = Robot(place, Recorder(stream), seed, time.monotonic, charge)
+    robot = SimRobot(place, MotionRecorder(stream), seed, time.monotonic, charge)
     ensure_log_folder()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = SimNode(robot, Camera(place, *size) if size else None, fps, namespace)
+    node = SimNode(robot, SimCamera(place, *size) if size else None, fps, namespace)
     executor = _executor()
     executor.add_node(node)
     try:
@@ -188,9 +188,9 @@ def _opened(path: Path | None) -> Iterator[IO[bytes] | None]:
 
 
 @contextlib.contextmanager
-def _stop_requested() -> Iterator[_Stop]:
+def _stop_requested() -> Iterator[_SimStopRequested]:
     """Signals only set a mark: the loop ends by itself, at a place where all is in order."""
-    stop = _Stop()
+    stop = _SimStopRequested()
 
     def note(*_: object) -> None:
         stop.requested = True

@@ -15,9 +15,9 @@ from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
 from std_msgs.msg import Header
 
 from robot_client.sim import robot as scanner
-from robot_client.sim.battery import CAPACITY_AH, Battery
+from robot_client.sim.battery import CAPACITY_AH, SimBattery
 from robot_client.sim.drive import Twist
-from robot_client.sim.health import Finding
+from robot_client.sim.health import PartFinding
 from robot_client.sim.world import Pose
 
 LASER_HEIGHT = 0.18
@@ -102,7 +102,7 @@ def compressed(stamp: Time, frames: Frames, jpeg: bytes) -> CompressedImage:
     return message
 
 
-def battery(stamp: Time, frames: Frames, pack: Battery) -> BatteryState:
+def battery(stamp: Time, frames: Frames, pack: SimBattery) -> BatteryState:
     """What isn't measured is NaN, as the message's definition wants it."""
     message = BatteryState(header=Header(stamp=stamp, frame_id=frames.base))
     message.voltage = pack.voltage
@@ -118,14 +118,14 @@ def battery(stamp: Time, frames: Frames, pack: Battery) -> BatteryState:
     return message
 
 
-def _supply_status(pack: Battery) -> int:
+def _supply_status(pack: SimBattery) -> int:
     if not pack.charging:
         return int(BatteryState.POWER_SUPPLY_STATUS_DISCHARGING)
     full = pack.charge >= 1.0
     return int(BatteryState.POWER_SUPPLY_STATUS_FULL if full else BatteryState.POWER_SUPPLY_STATUS_CHARGING)
 
 
-def diagnostics(stamp: Time, robot: str, findings: list[Finding]) -> DiagnosticArray:
+def diagnostics(stamp: Time, robot: str, findings: list[PartFinding]) -> DiagnosticArray:
     """:param robot: the name that stands before each part"""
     message = DiagnosticArray(header=Header(stamp=stamp))
     message.status = [

@@ -17,9 +17,9 @@ from sensor_msgs.msg import BatteryState, CompressedImage, Image, LaserScan
 from std_srvs.srv import Trigger
 
 from robot_client.sim import health, messages
-from robot_client.sim.camera import EYE_HEIGHT, Camera, to_jpeg, to_rgb
+from robot_client.sim.camera import EYE_HEIGHT, SimCamera, to_jpeg, to_rgb
 from robot_client.sim.drive import HIGHEST_SPEED, LONGEST_STEP
-from robot_client.sim.robot import FIRST_MAX_SPEED, Robot
+from robot_client.sim.robot import FIRST_MAX_SPEED, SimRobot
 from robot_client.sim.schedule import Schedule
 
 try:
@@ -48,8 +48,8 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
 
     def __init__(
         self,
-        robot: Robot,
-        camera: Camera | None,
+        robot: SimRobot,
+        camera: SimCamera | None,
         fps: int,
         namespace: str,
         clock: Callable[[], float] = time.monotonic,
@@ -154,7 +154,7 @@ class SimNode(Node):  # type: ignore[misc]  # rclpy is untyped
         self._battery.publish(messages.battery(stamp, self._frames, self._robot.battery))
         self._diagnostics.publish(messages.diagnostics(stamp, self._label, self._findings()))
 
-    def _findings(self) -> list[health.Finding]:
+    def _findings(self) -> list[health.PartFinding]:
         body, pack = self._robot.body, self._robot.battery
         viewers = self._raw.get_subscription_count() + self._jpeg.get_subscription_count()
         return [

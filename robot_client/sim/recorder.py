@@ -10,7 +10,7 @@ from typing import IO
 import orjson
 
 
-class Recorder:
+class MotionRecorder:
     """Writes events with a monotonic time, each flushed at once: the process may be killed at any moment.
 
     :param stream: open for writing bytes, or None to record nothing

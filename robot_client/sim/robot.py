@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from robot_client.sim.battery import Battery
-from robot_client.sim.drive import DEFAULT_LIMITS, STANDING, Body, Twist
-from robot_client.sim.recorder import Recorder
+from robot_client.sim.battery import SimBattery
+from robot_client.sim.drive import DEFAULT_LIMITS, STANDING, SimBody, Twist
+from robot_client.sim.recorder import MotionRecorder
 from robot_client.sim.world import World
 
 SCAN_RAYS = 360
@@ -27,7 +27,7 @@ SCAN_NOISE = 0.006
 FIRST_MAX_SPEED = DEFAULT_LIMITS.speed
 
 
-class Robot:
+class SimRobot:
     """Takes velocity commands, lives in steps of time.
 
     :param seed: of the scanner's noise
@@ -38,14 +38,14 @@ class Robot:
     def __init__(
         self,
         world: World,
-        recorder: Recorder,
+        recorder: MotionRecorder,
         seed: int | None,
         clock: Callable[[], float],
         charge: float = 1.0,
     ) -> None:
         self.world = world
-        self.body = Body(world, world.start)
-        self.battery = Battery(charge)
+        self.body = SimBody(world, world.start)
+        self.battery = SimBattery(charge)
         self._first_charge = charge
         self.command_timeout = 0.0
         """Seconds after which a command is void; 0 means never, as with many bases."""
@@ -85,7 +85,7 @@ class Robot:
     def reset(self) -> None:
         """Back to the start: place, velocity and charge."""
         self.body.reset(self.world.start)
-        self.battery = Battery(self._first_charge)
+        self.battery = SimBattery(self._first_charge)
         self._recorder.reset()
         self._recorder.motion(self.body.moving)
 

@@ -46,7 +46,7 @@ class Pose(NamedTuple):
     heading: float
 
 
-class Look(NamedTuple):
+class WallTexture(NamedTuple):
     """How an obstacle is painted."""
 
     colour: Colour
@@ -60,7 +60,7 @@ class Segment(NamedTuple):
     y1: float
     x2: float
     y2: float
-    look: Look
+    look: WallTexture
 
 
 class Circle(NamedTuple):
@@ -69,7 +69,7 @@ class Circle(NamedTuple):
     x: float
     y: float
     radius: float
-    look: Look
+    look: WallTexture
 
 
 class Charger(NamedTuple):
@@ -229,7 +229,7 @@ class World:
         hits.facing[rays] = np.abs(np.einsum("ij,ij->i", normal, direction[rays]))
 
 
-def box(x: float, y: float, width: float, depth: float, turn: float, look: Look) -> list[Segment]:
+def box(x: float, y: float, width: float, depth: float, turn: float, look: WallTexture) -> list[Segment]:
     """Four walls around a rectangle.
 
     :param x: centre, metres
@@ -242,7 +242,9 @@ def box(x: float, y: float, width: float, depth: float, turn: float, look: Look)
                           (-width / 2, depth / 2)], turn, look)  # fmt: skip
 
 
-def polygon(x: float, y: float, corners: list[tuple[float, float]], turn: float, look: Look) -> list[Segment]:
+def polygon(
+    x: float, y: float, corners: list[tuple[float, float]], turn: float, look: WallTexture
+) -> list[Segment]:
     """A closed ring of walls through corners given around (x, y), turned by so many radians."""
     cos, sin = float(np.cos(turn)), float(np.sin(turn))
     points = [(x + cos * cx - sin * cy, y + sin * cx + cos * cy) for cx, cy in corners]

@@ -5,17 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from robot_client.sim.world import Charger, Circle, Colour, Look, Pose, Segment, Texture, World, box, polygon
+from robot_client.sim.world import (
+    Charger,
+    Circle,
+    Colour,
+    Pose,
+    Segment,
+    Texture,
+    WallTexture,
+    World,
+    box,
+    polygon,
+)
 
-_BRICKS = Look(Colour(92, 112, 168), Texture.BRICK)
-_PLASTER = Look(Colour(176, 190, 196), Texture.PANEL)
-_RED = Look(Colour(58, 64, 214), Texture.STRIPES)
-_GREEN = Look(Colour(86, 170, 74), Texture.PANEL)
-_BLUE = Look(Colour(206, 128, 52), Texture.PANEL)
-_YELLOW = Look(Colour(60, 196, 240), Texture.CHEVRON)
-_TEAL = Look(Colour(160, 164, 40), Texture.STRIPES)
-_VIOLET = Look(Colour(190, 86, 148), Texture.STRIPES)
-_ORANGE = Look(Colour(40, 132, 240), Texture.CHEVRON)
+_BRICKS = WallTexture(Colour(92, 112, 168), Texture.BRICK)
+_PLASTER = WallTexture(Colour(176, 190, 196), Texture.PANEL)
+_RED = WallTexture(Colour(58, 64, 214), Texture.STRIPES)
+_GREEN = WallTexture(Colour(86, 170, 74), Texture.PANEL)
+_BLUE = WallTexture(Colour(206, 128, 52), Texture.PANEL)
+_YELLOW = WallTexture(Colour(60, 196, 240), Texture.CHEVRON)
+_TEAL = WallTexture(Colour(160, 164, 40), Texture.STRIPES)
+_VIOLET = WallTexture(Colour(190, 86, 148), Texture.STRIPES)
+_ORANGE = WallTexture(Colour(40, 132, 240), Texture.CHEVRON)
 
 
 def default() -> World:

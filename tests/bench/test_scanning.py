@@ -7,7 +7,7 @@ from typing import Any
 from switchboard_socket import Socket
 
 from bench.scanning import SCAN, Kept, program
-from robot_client.apps.runaway import Scan
+from robot_client.apps.collision_avoidance import ScanReading
 
 
 def scan(sec: int, nanosec: int, distance: float) -> dict[str, Any]:
@@ -24,9 +24,9 @@ def test_the_stamp_is_of_the_scan_that_was_read_last() -> None:
     link, _ = program(kept)
     assert {"op": "subscribe", "topic": SCAN}.items() <= socket.sent[-1].items()
     socket.coming += [scan(1_800_000_000, 123_456_789, 1.0), scan(1_800_000_001, 1, 2.0)]
-    assert link.scan(1.0) == Scan([1.0], 0.0, 0.1)
+    assert link.scan(1.0) == ScanReading([1.0], 0.0, 0.1)
     assert kept.stamp() == 1_800_000_000_123_456_789
-    assert link.scan(1.0) == Scan([2.0], 0.0, 0.1)
+    assert link.scan(1.0) == ScanReading([2.0], 0.0, 0.1)
     assert kept.stamp() == 1_800_000_001_000_000_001
 
 

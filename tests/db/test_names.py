@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_db.names import label, normal_name, recorded
+from relay_db.names import label, normal_name, sanitise
 from relay_protocol.errors import Invalid
 
 
@@ -67,13 +67,13 @@ def test_a_label_is_one_printable_line() -> None:
 @given(st.text(max_size=600), st.integers(min_value=8, max_value=300))
 def test_recorded_text_is_printable_and_fits(text: str, length: int) -> None:
     """Whatever comes, what is kept is printable and no longer than its column."""
-    kept = recorded(text, length)
+    kept = sanitise(text, length)
     assert kept.isprintable()
     assert len(kept) <= length
 
 
 def test_recorded_text_shows_what_was_there() -> None:
     """Plain text stays; the rest is escaped; what was cut is marked."""
-    assert recorded("ann") == "ann"
-    assert recorded("a\x00\ud800\n") == "a\\x00\\ud800\\n"
-    assert recorded("x" * 20, 10) == "x" * 9 + "…"
+    assert sanitise("ann") == "ann"
+    assert sanitise("a\x00\ud800\n") == "a\\x00\\ud800\\n"
+    assert sanitise("x" * 20, 10) == "x" * 9 + "…"

@@ -14,7 +14,7 @@ from switchboard_forks import run_command
 from switchboard_processes import BIN, ros_environment
 
 from relay_db.engine import Database
-from robot_client.identity import Enrolment, StateFolder
+from robot_client.link.identity import Enrolment, StateFolder
 
 SENTENCE = 400
 """Characters of a sentence, at most."""

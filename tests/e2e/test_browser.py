@@ -26,7 +26,7 @@ from switchboard_robot import Robot
 from switchboard_video import get
 from switchboard_waiting import wait_for
 
-from robot_client.safety import REPEATS
+from robot_client.motion.safety import REPEATS
 
 PASSWORD = "correct horse"
 WAIT_SECONDS = 60.0

@@ -13,8 +13,8 @@ from switchboard_drive import LET_GO_SECONDS
 from switchboard_http import ask
 from switchboard_waiting import wait_for
 
-from relay_server.inside import LINGER_SECONDS
-from relay_server.resources import HEADER
+from relay_server.common.freshness_tokens import HEADER
+from relay_server.http_sessions.pool import LINGER_SECONDS
 
 ROBOT = "/api/v1/robots/rover"
 STAND: Any = {"value": {}}

@@ -40,7 +40,7 @@ class Begun(NamedTuple):
 EXPECTED = {
     r"apps\.joystick ": Begun(r"no gamepad|\bbutton\b"),
     r"apps\.voice ": Begun("listening", "a microphone takes sounddevice: pip|the microphone can't be used"),
-    r"apps\.runaway ": Begun("READY"),
+    r"apps\.collision_avoidance ": Begun("READY"),
     r"apps\.recharge ": Begun("looking for marker 7"),
     r"apps\.greeting ": Begun("looking for people"),
     r"robot-service speech$": Begun("READY", "no program that plays sound is installed"),

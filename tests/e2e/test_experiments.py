@@ -43,7 +43,13 @@ class Room:
     def driven(self, speed: float, turn: float) -> Iterator[Process]:
         """Somebody takes control and drives, always the same; the program watches."""
         environment = {**os.environ, "SWITCHBOARD_TOKEN": self.guardian}
-        command = [sys.executable, "-u", "-m", "robot_client.apps.runaway", self.relay.url("rover")]
+        command = [
+            sys.executable,
+            "-u",
+            "-m",
+            "robot_client.apps.collision_avoidance",
+            self.relay.url("rover"),
+        ]
         with self.relay.connect("rover", self.driver) as client:
             wait_for("the robot is put back", lambda: client.call("/reset")["result"])
             assert client.call("/relay/take_control")["values"]["success"]

@@ -12,7 +12,8 @@ import pytest
 from switchboard_processes import ros_environment
 from switchboard_waiting import wait_for
 
-from relay_server.resources import HEADER, KEY_HEADER
+from relay_server.common.freshness_tokens import HEADER
+from relay_server.http.idempotency import KEY_HEADER
 from tests.robot_client.ros import Peer
 
 ROBOT = "/api/v1/robots/rover"

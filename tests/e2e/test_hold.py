@@ -19,7 +19,7 @@ from switchboard_robot import Robot
 from switchboard_threads import Driver
 from switchboard_waiting import PATIENCE, wait_for
 
-from relay_server.resources import HEADER
+from relay_server.common.freshness_tokens import HEADER
 
 LEVELS = {"olga": "owner", "ann": "operator", "vic": "viewer"}
 ODOM = {"topic": "/odom", "type": "nav_msgs/msg/Odometry"}

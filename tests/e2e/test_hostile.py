@@ -26,7 +26,8 @@ from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json
-from relay_server import PORTAL, passwords
+from relay_server import PORTAL
+from relay_server.auth import passwords
 
 
 @pytest.fixture(autouse=True)

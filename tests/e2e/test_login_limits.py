@@ -12,7 +12,7 @@ from typing import Any
 
 from switchboard_relay import Relay
 
-from relay_server.limiter import FAILURES_OF_ACCOUNT
+from relay_server.auth.login_limiter import FAILURES_OF_ACCOUNT
 
 NETWORKS, EACH = 15, 10
 HOME, ABROAD = "127.0.0.200", "127.0.0.201"

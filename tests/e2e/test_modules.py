@@ -14,7 +14,7 @@ from rdflib import RDF, RDFS, SSN, Graph, URIRef
 from switchboard_processes import Process, ros_environment, running
 from switchboard_waiting import wait_for
 
-from relay_server.resources.forms import FORMS
+from relay_server.http.media_types import FORMS
 
 ROBOT = "/api/v1/robots/rover"
 TALKING = Path(__file__).parent / "clients" / "talking.py"

@@ -28,8 +28,9 @@ from switchboard_relay import Relay
 from switchboard_small_robot import SmallRobot
 from switchboard_waiting import wait_for
 
-from relay_server.edges.documents import operations
-from relay_server.openapi import Credential, document
+from relay_server.http.openapi.document import document
+from relay_server.http.openapi.http import operations
+from relay_server.http.openapi.operation import Credential
 
 EXAMPLES = 12
 """Requests of each operation by who owns the robot and administers the relay."""

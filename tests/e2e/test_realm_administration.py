@@ -12,8 +12,8 @@ from switchboard_http import ask, log_in
 from switchboard_labs import REALM, TwoRealms
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from relay_server.edges.documents import operations
-from relay_server.openapi import document
+from relay_server.http.openapi.document import document
+from relay_server.http.openapi.http import operations
 
 PASSWORD = "correct horse"
 BODIES = {

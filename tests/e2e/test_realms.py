@@ -17,8 +17,8 @@ from switchboard_small_robot import SmallRobot
 from switchboard_waiting import wait_for
 from websockets.exceptions import InvalidStatus
 
-from relay_server.edges.documents import operations
-from relay_server.openapi import document
+from relay_server.http.openapi.document import document
+from relay_server.http.openapi.http import operations
 
 PASSWORD = "correct horse"
 LABS = ("lab1", "lab2")

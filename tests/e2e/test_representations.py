@@ -10,9 +10,9 @@ import pytest
 from rdflib import RDF, RDFS, SOSA, XSD, Graph, Literal, URIRef
 from switchboard_waiting import wait_for
 
-from relay_server.resources import HEADER
-from relay_server.resources.forms import FORMS
-from relay_server.resources.values import message_in
+from relay_server.common.freshness_tokens import HEADER
+from relay_server.http.media_types import FORMS
+from relay_server.http.rdf.decode import message_in
 
 ROBOT = "/api/v1/robots/rover"
 RDF_MEDIA = [each.media for each in FORMS if each.mark]

@@ -14,7 +14,7 @@ from switchboard_drive import LET_GO_SECONDS
 from switchboard_processes import ros_environment
 from switchboard_waiting import wait_for
 
-from relay_server.resources import HEADER
+from relay_server.common.freshness_tokens import HEADER
 from tests.robot_client.ros import Peer
 
 ROBOT = "/api/v1/robots/rover"

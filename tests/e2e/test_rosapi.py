@@ -17,7 +17,7 @@ from switchboard_relay import Relay
 from switchboard_robot import Robot
 from switchboard_waiting import wait_for
 
-from relay_server.local.catalogue import SERVICES
+from relay_server.relay_node.interfaces import SERVICES
 
 TESTS = Path(__file__).parents[1]
 CLIENTS = Path(__file__).parent / "clients"

@@ -16,7 +16,7 @@ from switchboard_client import Client
 from switchboard_processes import Process, ros_environment, running
 from switchboard_waiting import wait_for
 
-from relay_server.resources.forms import FORMS, JSON_LD, TURTLE
+from relay_server.http.media_types import FORMS, JSON_LD, TURTLE
 
 ROBOT = "/api/v1/robots/rover"
 MEDIA = [each.media for each in FORMS]

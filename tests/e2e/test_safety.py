@@ -229,7 +229,7 @@ def test_the_robot_stands_when_its_daemon_freezes(drive: Drive) -> None:
 def test_nobody_waits_for_a_frozen_daemons_memory(drive: Drive) -> None:
     """Daemon and guard share no memory with other nodes: one frozen with its lock in hand would hold up the base."""
     daemon = psutil.Process(drive.robot.daemon.popen.pid)
-    guards = [each for each in daemon.children() if "robot_client.guard" in each.cmdline()]
+    guards = [each for each in daemon.children() if "robot_client.motion.guard" in each.cmdline()]
     assert guards
     for process in (daemon, *guards):
         mapped = [each.path for each in process.memory_maps() if "/dev/shm/fast" in each.path]

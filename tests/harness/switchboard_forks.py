@@ -148,7 +148,7 @@ def _context() -> ForkServerContext:
             "relay_db.schema",
             "robot_client.run",
             "robot_client.sim.node",
-            "robot_client.platforms.ros2",
+            "robot_client.platforms.ros2.platform",
             *("av", "websockets.server"),  # for the portal's fake relay
         ]
     )

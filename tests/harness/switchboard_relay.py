@@ -15,7 +15,7 @@ from switchboard_processes import BIN, Process
 from switchboard_waiting import PATIENCE
 from websockets.sync.client import connect
 
-from relay_server.cli.relaysocket import ask_status
+from relay_server.cli.control_socket import ask_status
 
 
 class Relay:

@@ -19,7 +19,7 @@ from PIL import Image
 
 from relay_protocol import limits
 from relay_protocol.errors import MalformedMessage
-from relay_protocol.pictures import PARTS, Seen, look_at
+from relay_protocol.image_check import PARTS, Seen, look_at
 from tests.relay_server.video.watching import IDR, PPS, SLICE, SPS, jpeg, png, units
 
 WIDTH, HEIGHT = 61, 37

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid
 from relay_protocol.ros import fast_reader, fast_writer
+from relay_protocol.ros.codegen import MAX_STEPS, Source, TooLarge, quoted
 from relay_protocol.ros.compiled import Compiled
-from relay_protocol.ros.source import MAX_STEPS, Source, TooLarge, quoted
 from relay_protocol.ros_types import TypeRegistry
 from tests.protocol.ros_texts import LINE
 

@@ -13,19 +13,19 @@ from relay_protocol.link.control import MotionPolicy
 from relay_protocol.rights import parse_pattern
 from relay_protocol.scopes import Scope
 from relay_protocol.wildcards import MOST, see_cheap
-from relay_server.directory.entries import ask_of
-from relay_server.fleet.matching import meant
-from relay_server.resources import Listing
+from relay_server.fleet.selection import select_robots
+from relay_server.registry.entries import ask_of
+from relay_server.resources.page import PageQuery
 
 DEAR = ["[Ā-힣]", "*" * (MOST + 1), "a?" * (MOST + 1), "[a]" * (MOST + 1)]
 TAKEN_BY: list[Callable[[str], Any]] = [
     see_cheap,
     lambda pattern: parse_pattern(f"*:/{pattern}"),
     lambda pattern: Scope(f"call:/{pattern}@rover"),
-    lambda pattern: Listing.of({"name": pattern}),
+    lambda pattern: PageQuery.of({"name": pattern}),
     lambda pattern: ask_of({"name": pattern}),
     lambda pattern: ask_of({"robot": pattern}),
-    lambda pattern: meant([pattern], ["rover"], {}),
+    lambda pattern: select_robots([pattern], ["rover"], {}),
 ]
 
 

@@ -10,7 +10,7 @@ import pytest
 from twisted.internet import reactor
 
 from relay_db.engine import Database
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
 from tests.relay_server.front_desk import Desk
 from tests.relay_server.memory import Time, World
 
@@ -46,16 +46,16 @@ def database(upgraded: Path, tmp_path: Path) -> Database:
 
 
 @pytest.fixture
-def store(database: Database) -> Iterator[Store]:
+def store(database: Database) -> Iterator[AsyncDatabase]:
     """The store of a relay, running on the reactor of the tests."""
-    running = Store(reactor, database)  # type: ignore[arg-type]  # to mypy it is a module
+    running = AsyncDatabase(reactor, database)  # type: ignore[arg-type]  # to mypy it is a module
     running.start()
     yield running
     running.stop()
 
 
 @pytest.fixture
-def front(store: Store) -> Iterator[Desk]:
+def front(store: AsyncDatabase) -> Iterator[Desk]:
     """A desk with ann, who operates rover and knows nothing of hidden."""
     made = Desk(store)
     yield made

@@ -8,8 +8,8 @@ from twisted.internet.defer import Deferred
 
 from relay_db.queries import StopRecord
 from relay_protocol.errors import SwitchboardError
-from relay_server.control import Actor
-from relay_server.registry import Presence
+from relay_server.control.audit import Actor
+from relay_server.robots.registry import RobotState
 
 
 class MemoryRecord:
@@ -29,7 +29,7 @@ class MemoryRecord:
         self.held: list[Deferred[None]] = []
 
     def note(
-        self, kind: str, robot: Presence, actor: Actor, why: str = "", *, audit: bool = True, **data: Any
+        self, kind: str, robot: RobotState, actor: Actor, why: str = "", *, audit: bool = True, **data: Any
     ) -> None:
         """Keep it."""
         self.notes.append((kind, actor.name, why, data))
@@ -40,7 +40,9 @@ class MemoryRecord:
         """What has happened."""
         return [kind for kind, *_ in self.notes]
 
-    async def ordered(self, robot: Presence, order: StopRecord, actor: Actor, *, audit: bool = True) -> None:
+    async def ordered(
+        self, robot: RobotState, order: StopRecord, actor: Actor, *, audit: bool = True
+    ) -> None:
         """Keep an order to stop."""
         self._check()
         if self.hold:
@@ -50,7 +52,7 @@ class MemoryRecord:
         if audit:
             self.note("robot.stopped", robot, actor, order.why)
 
-    async def told(self, robot: Presence, at: float | None = None) -> bool:
+    async def told(self, robot: RobotState, at: float | None = None) -> bool:
         """It need not be told any more."""
         self._check()
         kept = self.stops.get(robot.robot_id)
@@ -59,7 +61,7 @@ class MemoryRecord:
         del self.stops[robot.robot_id]
         return True
 
-    async def pending(self, robot: Presence) -> StopRecord | None:
+    async def pending(self, robot: RobotState) -> StopRecord | None:
         """What is still to be told."""
         self._check()
         return self.stops.get(robot.robot_id)

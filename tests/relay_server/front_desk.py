@@ -8,14 +8,15 @@ from twisted.internet import reactor
 
 from relay_db import queries
 from relay_db.queries import UserRecord
-from relay_server import passwords
 from relay_server.access import Access, Principal
-from relay_server.auth import Authenticator
-from relay_server.frontdesk import FrontDesk
-from relay_server.journal import Journal
-from relay_server.origins import Origins
-from relay_server.session import Session, Timing
-from relay_server.store import Store
+from relay_server.auth import passwords
+from relay_server.auth.authenticator import Authenticator
+from relay_server.auth.origins import Origins
+from relay_server.common.database import AsyncDatabase
+from relay_server.events.bus import EventBus
+from relay_server.sessions.manager import SessionManager
+from relay_server.sessions.ports import Timing
+from relay_server.sessions.session import Session
 from tests.relay_server.memory import MemoryClient, World
 
 PASSWORD = "correct horse"
@@ -25,14 +26,14 @@ HERE = "192.0.2.1"
 class Desk:
     """A front desk, and what it is made of: ann operates rover, and knows nothing of hidden."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: AsyncDatabase) -> None:
         self.store = store
         self.world = World()
         self.access = Access(store, self.wall, self.world.clock.seconds)
         # To mypy the reactor is a module.
         self.auth = Authenticator(reactor, store, self.world.clock.seconds, self.wall)  # type: ignore[arg-type]
         self.auth.start()
-        self.desk = FrontDesk(
+        self.desk = SessionManager(
             self.world.clock,
             store,
             self.auth,
@@ -41,7 +42,7 @@ class Desk:
             self.world.channels,
             self.world.videos,
             self.world.desks,
-            Journal(store, self.wall),
+            EventBus(store, self.wall),
             Origins("http"),
             Timing(2.0, 0.1, 5.0),
             cookie="sb",

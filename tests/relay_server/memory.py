@@ -13,20 +13,23 @@ from twisted.internet.task import Clock
 
 from relay_protocol import link
 from relay_protocol.errors import Unavailable
-from relay_protocol.link.moving import Order
+from relay_protocol.link.motion import Order
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
-from relay_server.budget import Budgets
-from relay_server.channel import Channel, Channels
-from relay_server.control import ControlRules, Desks
-from relay_server.freshness import Freshness
-from relay_server.linkmeter import UNKNOWN, Reading
-from relay_server.local import RelayNode
-from relay_server.people import People
-from relay_server.registry import Presence, Registry
-from relay_server.rounds import Rounds
-from relay_server.session import Session, Timing
-from relay_server.video import Videos
+from relay_server.channels.channel import Channel
+from relay_server.channels.channels import Channels
+from relay_server.common.cpu_quota import UserQuotas
+from relay_server.common.timers import PeriodicTimers
+from relay_server.control.controllers import Controllers
+from relay_server.control.types import ControlRules
+from relay_server.relay_node.node import RelayNode
+from relay_server.robots.link_quality import UNKNOWN, LinkQuality
+from relay_server.robots.registry import RobotRegistry, RobotState
+from relay_server.sessions.message_age import MessageAge
+from relay_server.sessions.ports import Timing
+from relay_server.sessions.presence import PresenceService
+from relay_server.sessions.session import Session
+from relay_server.video.streams import CameraStreams
 from tests.relay_server.control_record import MemoryRecord
 
 M = TypeVar("M", bound=link.Message)
@@ -141,7 +144,7 @@ class MemoryLink:
         self.close(reason)
         self.answers = answers
 
-    def reading(self) -> Reading:
+    def reading(self) -> LinkQuality:
         """Nobody has measured it."""
         return UNKNOWN
 
@@ -224,10 +227,10 @@ class World:
     def __init__(self) -> None:
         self.clock = Clock()
         self.clock.advance(1000)
-        self.rounds = Rounds(self.clock)
+        self.rounds = PeriodicTimers(self.clock)
         self.worked = 0.0
-        self.budgets = Budgets(self.clock.seconds, lambda: self.worked)
-        self.registry = Registry(lambda: 1.7e9 + self.clock.seconds())
+        self.budgets = UserQuotas(self.clock.seconds, lambda: self.worked)
+        self.registry = RobotRegistry(lambda: 1.7e9 + self.clock.seconds())
         tickets = itertools.count(1)
         self.channels = Channels(
             self.clock,
@@ -235,10 +238,10 @@ class World:
             new_ticket=lambda: f"ticket-{next(tickets)}",
             wall_ns=lambda: self.now_ns() + 10**18,
         )
-        self.videos = Videos(self.clock, new_ticket=lambda: f"ticket-{next(tickets)}")
+        self.videos = CameraStreams(self.clock, new_ticket=lambda: f"ticket-{next(tickets)}")
         self.robot = self.registry.presence(1, "rover", "default")
         self.record = MemoryRecord()
-        self.desks = Desks(
+        self.desks = Controllers(
             self.clock,
             self.record,
             ControlRules(),
@@ -249,7 +252,7 @@ class World:
         self.control = self.control_link()
         self.link = MemoryLink()
         self.people: list[Session] = []
-        self.presence = People(lambda robot_id: self.people, lambda robot: 0, self.clock.seconds)
+        self.presence = PresenceService(lambda robot_id: self.people, lambda robot: 0, self.clock.seconds)
         self._tokens = itertools.count(1)
         self._numbers = itertools.count(1)
 
@@ -334,7 +337,7 @@ class World:
             self.channel,
             self.desks.of(self.robot),
             RelayNode(lambda robot_id: self.people, self.videos, self.presence),
-            Freshness(self.now_ns, self.now_ns(), lambda: next(self._tokens).to_bytes(8, "big")),
+            MessageAge(self.now_ns, self.now_ns(), lambda: next(self._tokens).to_bytes(8, "big")),
             Timing(client_ping=2.0, driving_ping=0.1, stall_limit=5.0),
             self.rounds,
             self.budgets.of(user),
@@ -385,5 +388,5 @@ async def hangs(*_: object, **__: object) -> None:
 
 __all__ = [
     "ADD", "FIBONACCI", "GRAPH", "MOTION", "STRING", "TEXTS", "TRIGGER", "TWIST", "MemoryClient", "MemoryLink",
-    "Person", "Presence", "Time", "Unavailable", "World", "fails", "hangs", "text", "words",
+    "Person", "RobotState", "Time", "Unavailable", "World", "fails", "hangs", "text", "words",
 ]  # fmt: skip

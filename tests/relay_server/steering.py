@@ -12,11 +12,12 @@ from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
 from relay_protocol import link
-from relay_protocol.link.moving import Order
+from relay_protocol.link.motion import Order
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
-from relay_server.control import ControlRules, Desk
-from relay_server.registry import Registry
+from relay_server.control.controller import RobotController
+from relay_server.control.types import ControlRules
+from relay_server.robots.registry import RobotRegistry
 from tests.relay_server.control_record import MemoryRecord
 
 O = TypeVar("O", bound=Order)  # noqa: E741  what else is an order called
@@ -120,11 +121,11 @@ class Place:
     def __init__(self, rules: ControlRules | None = None) -> None:
         self.clock = Clock()
         self.clock.advance(1000)
-        self.registry = Registry(self.wall)
+        self.registry = RobotRegistry(self.wall)
         self.robot = self.registry.presence(1, "rover", "main")
         self.record = MemoryRecord()
         self.changes = 0
-        self.desk = Desk(
+        self.desk = RobotController(
             self.clock,
             self.robot,
             self.record,

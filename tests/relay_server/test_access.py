@@ -14,7 +14,7 @@ from relay_db import queries
 from relay_protocol.rights import Level, Operation
 from relay_server import access as module
 from relay_server.access import Access, BadCredentials, Permit, Principal
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
 
 HASH = "ab" * 32
 
@@ -23,7 +23,7 @@ HASH = "ab" * 32
 class Hall:
     """An access with one user, one token and one robot in its database."""
 
-    store: Store
+    store: AsyncDatabase
     now: float = 1000.0
     told: list[str] = field(default_factory=list)
 
@@ -48,7 +48,7 @@ class Hall:
     def slow_down(self) -> SlowStore:
         """What the access reads from now on comes when the test lets it."""
         slow = SlowStore(self.store)
-        self.access._store = cast(Store, slow)
+        self.access._store = cast(AsyncDatabase, slow)
         return slow
 
     async def permit(self) -> Permit:
@@ -63,7 +63,7 @@ class Hall:
 class SlowStore:
     """A store in front of another: the first read waits after it has been done, until the test lets it go."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: AsyncDatabase) -> None:
         self._store = store
         self.read_done: Deferred[None] = Deferred()
         self.go: Deferred[None] = Deferred()
@@ -78,7 +78,7 @@ class SlowStore:
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_permit_judges_by_the_rights_in_the_database(store: Store) -> None:
+async def test_a_permit_judges_by_the_rights_in_the_database(store: AsyncDatabase) -> None:
     """And there is none without any right."""
     hall = await Hall(store).open()
     permit = await hall.permit()
@@ -89,7 +89,7 @@ async def test_a_permit_judges_by_the_rights_in_the_database(store: Store) -> No
 
 
 @pytest_twisted.ensureDeferred
-async def test_changed_rights_reach_what_is_open(store: Store) -> None:
+async def test_changed_rights_reach_what_is_open(store: AsyncDatabase) -> None:
     """The permit judges anew in place, and its holder is told once; nothing changed, nothing told."""
     hall = await Hall(store).open()
     permit = await hall.permit()
@@ -113,7 +113,7 @@ async def test_changed_rights_reach_what_is_open(store: Store) -> None:
 )
 @pytest_twisted.ensureDeferred
 async def test_what_is_revoked_is_told_once_and_nothing_is_allowed_after(
-    store: Store, what: str, words: str
+    store: AsyncDatabase, what: str, words: str
 ) -> None:
     """A right, a token, an account: each ends what was opened with it."""
     hall = await Hall(store).open()
@@ -131,7 +131,7 @@ async def test_what_is_revoked_is_told_once_and_nothing_is_allowed_after(
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_token_that_runs_out_ends_what_is_open(store: Store) -> None:
+async def test_a_token_that_runs_out_ends_what_is_open(store: AsyncDatabase) -> None:
     """To the second, without asking the database."""
     hall = await Hall(store).open()
     await hall.permit()
@@ -145,7 +145,7 @@ async def test_a_token_that_runs_out_ends_what_is_open(store: Store) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_released_permit_is_told_nothing(store: Store) -> None:
+async def test_a_released_permit_is_told_nothing(store: AsyncDatabase) -> None:
     """Nobody holds it, nothing keeps it."""
     hall = await Hall(store).open()
     permit = await hall.permit()
@@ -158,7 +158,7 @@ async def test_a_released_permit_is_told_nothing(store: Store) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: Store) -> None:
+async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: AsyncDatabase) -> None:
     """A refresh that goes by between the reading and its result is not missed."""
     hall = await Hall(store).open()
     slow = hall.slow_down()
@@ -172,7 +172,7 @@ async def test_no_permit_comes_of_rights_revoked_while_they_were_read(store: Sto
 
 
 @pytest_twisted.ensureDeferred
-async def test_no_list_is_kept_of_rights_revoked_while_they_were_read(store: Store) -> None:
+async def test_no_list_is_kept_of_rights_revoked_while_they_were_read(store: AsyncDatabase) -> None:
     """The next look shows the truth."""
     hall = await Hall(store).open()
     slow = hall.slow_down()
@@ -186,7 +186,7 @@ async def test_no_list_is_kept_of_rights_revoked_while_they_were_read(store: Sto
 
 
 @pytest_twisted.ensureDeferred
-async def test_no_permit_for_a_token_that_ended_since_it_was_proved(store: Store) -> None:
+async def test_no_permit_for_a_token_that_ended_since_it_was_proved(store: AsyncDatabase) -> None:
     """Between the token's proof and the permit anything may happen."""
     hall = await Hall(store).open()
     await store.write(queries.revoke_token, hall.principal.token_id)
@@ -195,7 +195,7 @@ async def test_no_permit_for_a_token_that_ended_since_it_was_proved(store: Store
 
 
 @pytest_twisted.ensureDeferred
-async def test_robots_are_listed_with_the_right_on_each(store: Store) -> None:
+async def test_robots_are_listed_with_the_right_on_each(store: AsyncDatabase) -> None:
     """Kept until something changes, then read again."""
     hall = await Hall(store).open()
     await store.write(queries.add_robot, "hidden")
@@ -211,7 +211,7 @@ async def test_robots_are_listed_with_the_right_on_each(store: Store) -> None:
 
 @pytest.mark.parametrize("ended", ["token", "user", "time", "nothing"])
 @pytest_twisted.ensureDeferred
-async def test_a_token_is_remembered_while_it_counts(store: Store, ended: str) -> None:
+async def test_a_token_is_remembered_while_it_counts(store: AsyncDatabase, ended: str) -> None:
     """Changes in the database are taken up as for what is open."""
     hall = await Hall(store).open()
     hall.access.remember(HASH, hall.principal, hall.access.refreshed)
@@ -227,7 +227,7 @@ async def test_a_token_is_remembered_while_it_counts(store: Store, ended: str) -
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_is_remembered_follows_what_its_user_may(store: Store) -> None:
+async def test_what_is_remembered_follows_what_its_user_may(store: AsyncDatabase) -> None:
     """Who was made an administrator is one at the next request, and who is none any more is not."""
     hall = await Hall(store).open()
     hall.access.remember(HASH, hall.principal, hall.access.refreshed)
@@ -238,7 +238,7 @@ async def test_what_is_remembered_follows_what_its_user_may(store: Store) -> Non
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_is_remembered_proves_nothing_without_a_look_at_the_database(store: Store) -> None:
+async def test_what_is_remembered_proves_nothing_without_a_look_at_the_database(store: AsyncDatabase) -> None:
     """Nor one that is too long ago; one that began before another and ended after it takes nothing away."""
     seconds = 50.0
     hall = await Hall(store).open()
@@ -257,7 +257,7 @@ async def test_what_is_remembered_proves_nothing_without_a_look_at_the_database(
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_token_that_was_looked_up_before_a_change_is_not_remembered(store: Store) -> None:
+async def test_a_token_that_was_looked_up_before_a_change_is_not_remembered(store: AsyncDatabase) -> None:
     """The change may have been about just that."""
     hall = await Hall(store).open()
     before = hall.access.refreshed
@@ -267,7 +267,7 @@ async def test_a_token_that_was_looked_up_before_a_change_is_not_remembered(stor
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_is_remembered_is_bounded(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_is_remembered_is_bounded(store: AsyncDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
     """The longest unused is forgotten."""
     monkeypatch.setattr(module, "PROVED", 2)
     hall = await Hall(store).open()
@@ -279,7 +279,7 @@ async def test_what_is_remembered_is_bounded(store: Store, monkeypatch: pytest.M
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_an_earlier_look_has_read_does_not_come_after_a_later_one(store: Store) -> None:
+async def test_what_an_earlier_look_has_read_does_not_come_after_a_later_one(store: AsyncDatabase) -> None:
     """A logout and somebody's change ask at once: the rights that hold are those of the last change."""
     hall = await Hall(store).open()
     permit = await hall.permit()
@@ -298,7 +298,7 @@ async def test_what_an_earlier_look_has_read_does_not_come_after_a_later_one(sto
 
 
 @pytest_twisted.ensureDeferred
-async def test_who_has_a_right_is_known_without_the_database(store: Store) -> None:
+async def test_who_has_a_right_is_known_without_the_database(store: AsyncDatabase) -> None:
     """From what is open, from what was looked up since the last change, and from nothing else."""
     hall = await Hall(store).open()
     access, robot = hall.access, hall.robot.id
@@ -331,7 +331,7 @@ async def _with_scope(hall: Hall, scope: str) -> Principal:
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_scope_narrows_what_a_token_opens(store: Store) -> None:
+async def test_a_scope_narrows_what_a_token_opens(store: AsyncDatabase) -> None:
     """The permit judges by both, and goes on to when the rights change."""
     hall = await Hall(store).open()
     await hall.grant("operator")
@@ -351,7 +351,7 @@ async def test_a_scope_narrows_what_a_token_opens(store: Store) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_robot_outside_the_scope_is_not_there(store: Store) -> None:
+async def test_a_robot_outside_the_scope_is_not_there(store: AsyncDatabase) -> None:
     """Neither in the list nor by name, however well the user's other tokens know it."""
     hall = await Hall(store).open()
     narrow = await _with_scope(hall, "owner@other")
@@ -363,7 +363,7 @@ async def test_a_robot_outside_the_scope_is_not_there(store: Store) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_an_administrators_token_administers_if_its_scope_says_so(store: Store) -> None:
+async def test_an_administrators_token_administers_if_its_scope_says_so(store: AsyncDatabase) -> None:
     """One to look at robots is no key to the house."""
     hall = await Hall(store).open()
     await store.write(queries.set_admin, hall.user.id, True)

@@ -19,8 +19,8 @@ from twisted.logger import LogLevel, capturedLogs, formatEvent
 from relay_db import queries, sqlite
 from relay_db.queries import AuditRecord
 from relay_server import audit_log as module
-from relay_server.audit_log import BATCH, FILE, KEEP_SECONDS, RETRY_SECONDS, AuditLog, Entry
-from relay_server.store import Store
+from relay_server.audit_log import BATCH, FILE, KEEP_SECONDS, RETRY_SECONDS, AuditLog, AuditLogEntry
+from relay_server.common.database import AsyncDatabase
 
 ROVER = 7
 
@@ -28,7 +28,7 @@ ROVER = 7
 class Scene:
     """An audit log on a real SQLite file; its retries wait for the test."""
 
-    def __init__(self, store: Store, folder: Path) -> None:
+    def __init__(self, store: AsyncDatabase, folder: Path) -> None:
         self.store, self.folder = store, folder
         self.clock = Clock()
         self.told: list[tuple[str, int]] = []
@@ -43,7 +43,9 @@ class Scene:
     def append(self, *numbers: int) -> None:
         """What happened at these moments."""
         for number in numbers:
-            self.audit.append(Entry(number, "user:ann", "control.taken", "rover", data={}, robots=(ROVER,)))
+            self.audit.append(
+                AuditLogEntry(number, "user:ann", "control.taken", "rover", data={}, robots=(ROVER,))
+            )
 
     async def settled(self, audit: AuditLog | None = None) -> None:
         """Until no write is under way."""
@@ -66,7 +68,7 @@ class Scene:
 
 
 @pytest.fixture
-def scene(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
+def scene(store: AsyncDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
     """Nothing written yet. A locked file is given up soon."""
     monkeypatch.setattr(sqlite, "BUSY_SECONDS", 0.05)
     return Scene(store, tmp_path)
@@ -171,7 +173,9 @@ async def test_an_entry_that_can_not_be_written_at_all_holds_up_no_other(scene: 
     """It is in the log, and its robot's owners are told."""
     with locked(scene), capturedLogs() as logs:
         scene.append(1)
-        scene.audit.append(Entry(2, "user:ann", "x", "rover", data={"bad": float("nan")}, robots=(ROVER,)))
+        scene.audit.append(
+            AuditLogEntry(2, "user:ann", "x", "rover", data={"bad": float("nan")}, robots=(ROVER,))
+        )
         scene.append(3)
         await scene.settled()
     with capturedLogs() as logs:

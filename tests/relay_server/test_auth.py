@@ -14,21 +14,21 @@ from relay_db import queries
 from relay_db.queries import UserRecord
 from relay_protocol.errors import Unavailable
 from relay_protocol.limits import TICKET_SECONDS
-from relay_server import auth as module
-from relay_server import limiter, passwords
-from relay_server.access import Principal
-from relay_server.auth import Authenticator, BadCredentials, Opening, TooManyTries
-from relay_server.store import Store
+from relay_server.access import BadCredentials, Principal
+from relay_server.auth import authenticator as module
+from relay_server.auth import login_limiter, passwords
+from relay_server.auth.authenticator import Authenticator, TicketPurpose, TooManyTries
+from relay_server.common.database import AsyncDatabase
 from tests.relay_server.memory import Time
 
 PASSWORD = "correct horse"
 HASHED = passwords.hash_password(PASSWORD)
 HERE = "192.0.2.1"
-ROVER = Opening("rover")
+ROVER = TicketPurpose("rover")
 
 
 @pytest.fixture
-def auth(store: Store, time: Time) -> Iterator[Authenticator]:
+def auth(store: AsyncDatabase, time: Time) -> Iterator[Authenticator]:
     """An authenticator on the reactor of the tests."""
     running = Authenticator(reactor, store, time, time)  # type: ignore[arg-type]
     running.start()
@@ -37,7 +37,7 @@ def auth(store: Store, time: Time) -> Iterator[Authenticator]:
 
 
 @pytest_twisted.async_yield_fixture
-async def ann(store: Store) -> AsyncIterator[UserRecord]:
+async def ann(store: AsyncDatabase) -> AsyncIterator[UserRecord]:
     """A user with a password."""
     yield await store.write(queries.add_user, "ann", HASHED)
 
@@ -49,7 +49,9 @@ async def words(work: Any) -> str:
     return str(told.value)
 
 
-async def token(store: Store, user: UserRecord, kind: Any = "access", expires: float | None = 5000.0) -> str:
+async def token(
+    store: AsyncDatabase, user: UserRecord, kind: Any = "access", expires: float | None = 5000.0
+) -> str:
     """A fresh token of a user."""
     fresh = passwords.new_token()
     await store.write(
@@ -66,7 +68,9 @@ async def test_the_right_password_names_its_user(auth: Authenticator, ann: UserR
 
 
 @pytest_twisted.ensureDeferred
-async def test_every_wrong_login_is_told_the_same(auth: Authenticator, store: Store, ann: UserRecord) -> None:
+async def test_every_wrong_login_is_told_the_same(
+    auth: Authenticator, store: AsyncDatabase, ann: UserRecord
+) -> None:
     """Unknown user, wrong password, no password, disabled account: nobody learns which."""
     await store.write(queries.add_user, "linkonly", None)
     off = await store.write(queries.add_user, "off", HASHED)
@@ -97,14 +101,14 @@ async def test_the_limit_is_judged_before_anything_is_hashed(
         return password == PASSWORD
 
     monkeypatch.setattr(passwords, "verify_password", verify)
-    for _ in range(limiter.FAILURES):
+    for _ in range(login_limiter.FAILURES):
         await words(auth.password("ann", "wrong", HERE))
     with pytest.raises(TooManyTries) as told:
         await auth.password("ann", PASSWORD, HERE)
-    assert told.value.retry_after == limiter.WINDOW
-    assert len(hashed) == limiter.FAILURES
+    assert told.value.retry_after == login_limiter.WINDOW
+    assert len(hashed) == login_limiter.FAILURES
     await auth.password("ann", PASSWORD, "198.51.100.1")
-    time.now += limiter.WINDOW
+    time.now += login_limiter.WINDOW
     await auth.password("ann", PASSWORD, HERE)
 
 
@@ -114,7 +118,9 @@ async def test_tries_at_the_same_time_count_too(
 ) -> None:
     """A burst is no way around: each counts when it begins."""
     monkeypatch.setattr(passwords, "verify_password", lambda password, stored: False)
-    burst = [Deferred.fromCoroutine(auth.password("ann", "wrong", HERE)) for _ in range(limiter.FAILURES + 5)]
+    burst = [
+        Deferred.fromCoroutine(auth.password("ann", "wrong", HERE)) for _ in range(login_limiter.FAILURES + 5)
+    ]
     refused = []
     for each in burst:
         with pytest.raises((BadCredentials, TooManyTries)) as told:
@@ -134,7 +140,7 @@ async def test_a_login_that_could_not_be_judged_counts_nothing(
 
     with monkeypatch.context() as patch:
         patch.setattr(auth._store, "read", away)
-        for _ in range(limiter.FAILURES * 2):
+        for _ in range(login_limiter.FAILURES * 2):
             with pytest.raises(Unavailable):
                 await auth.password("ann", PASSWORD, HERE)
     assert (await auth.password("ann", PASSWORD, HERE)).name == "ann"
@@ -142,7 +148,7 @@ async def test_a_login_that_could_not_be_judged_counts_nothing(
 
 @pytest_twisted.ensureDeferred
 async def test_tokens_prove_their_user_until_they_end(
-    auth: Authenticator, store: Store, ann: UserRecord, time: Time
+    auth: Authenticator, store: AsyncDatabase, ann: UserRecord, time: Time
 ) -> None:
     """Access tokens and portal sessions do; login codes, unknown, revoked and expired ones don't."""
     access, login = await token(store, ann), await token(store, ann, "login")
@@ -161,7 +167,7 @@ async def test_tokens_prove_their_user_until_they_end(
 @pytest.mark.parametrize("how", ["password", "link"])
 @pytest_twisted.ensureDeferred
 async def test_a_login_does_not_outrun_a_changed_password(
-    auth: Authenticator, store: Store, ann: UserRecord, how: str
+    auth: Authenticator, store: AsyncDatabase, ann: UserRecord, how: str
 ) -> None:
     """What was right when it was looked at opens no session once it is wrong; nothing is on record then."""
     code = await token(store, ann, "login")
@@ -175,7 +181,7 @@ async def test_a_login_does_not_outrun_a_changed_password(
 
 @pytest_twisted.ensureDeferred
 async def test_a_login_that_can_not_be_put_on_record_opens_no_session(
-    auth: Authenticator, store: Store, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
+    auth: Authenticator, store: AsyncDatabase, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both or neither: whoever is in is in the audit log."""
     login = await auth.password("ann", PASSWORD, HERE)
@@ -190,7 +196,7 @@ async def test_a_login_that_can_not_be_put_on_record_opens_no_session(
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_login_link_is_good_once(auth: Authenticator, store: Store, ann: UserRecord) -> None:
+async def test_a_login_link_is_good_once(auth: Authenticator, store: AsyncDatabase, ann: UserRecord) -> None:
     """Used, expired and unknown ones are told the same; an access token is none."""
     code = await token(store, ann, "login")
     old = await token(store, ann, "login", expires=1000.0)
@@ -202,10 +208,10 @@ async def test_a_login_link_is_good_once(auth: Authenticator, store: Store, ann:
 
 @pytest_twisted.ensureDeferred
 async def test_guessing_login_links_is_limited(
-    auth: Authenticator, store: Store, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
+    auth: Authenticator, store: AsyncDatabase, ann: UserRecord, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By network; a good one from elsewhere goes through."""
-    monkeypatch.setattr(limiter, "FAILURES_OF_NETWORK", 3)
+    monkeypatch.setattr(login_limiter, "FAILURES_OF_NETWORK", 3)
     code = await token(store, ann, "login")
     for _ in range(3):
         await words(auth.login_code("guess", HERE))
@@ -219,7 +225,7 @@ async def test_guessing_login_links_is_limited(
 
 @pytest_twisted.ensureDeferred
 async def test_a_ticket_is_good_once_for_one_robot_and_a_minute(
-    auth: Authenticator, store: Store, ann: UserRecord, time: Time
+    auth: Authenticator, store: AsyncDatabase, ann: UserRecord, time: Time
 ) -> None:
     """Every other use is told the same, and spends it; to look at it does not."""
     principal = await auth.token(await token(store, ann))
@@ -227,7 +233,7 @@ async def test_a_ticket_is_good_once_for_one_robot_and_a_minute(
     assert (await auth.ticket(good, ROVER, spend=False)) == principal
     assert (await auth.ticket(good, ROVER)) == principal
     told = {await words(auth.ticket(good, ROVER)), await words(auth.ticket("unknown", ROVER))}
-    told.add(await words(auth.ticket(other, Opening("tank"))))
+    told.add(await words(auth.ticket(other, TicketPurpose("tank"))))
     told.add(await words(auth.ticket(other, ROVER)))
     time.now += TICKET_SECONDS
     told.add(await words(auth.ticket(late, ROVER)))
@@ -237,24 +243,36 @@ async def test_a_ticket_is_good_once_for_one_robot_and_a_minute(
 @pytest.mark.parametrize(
     ("opens", "asked", "good"),
     [
-        (ROVER, Opening("rover", video=True, camera="/eye"), False),
-        (Opening("rover", video=True), ROVER, False),
-        (Opening("rover", video=True), Opening("rover", video=True), True),
-        (Opening("rover", video=True), Opening("rover", video=True, camera="/eye"), True),
-        (Opening("rover", video=True, camera="/eye"), Opening("rover", video=True, camera="/eye"), True),
-        (Opening("rover", video=True, camera="/eye"), Opening("rover", video=True, camera="/eyes"), False),
-        (Opening("rover", video=True, camera="/eye"), Opening("rover", video=True), False),
-        (Opening("rover", video=True, camera="/eye"), Opening("tank", video=True, camera="/eye"), False),
+        (ROVER, TicketPurpose("rover", video=True, camera="/eye"), False),
+        (TicketPurpose("rover", video=True), ROVER, False),
+        (TicketPurpose("rover", video=True), TicketPurpose("rover", video=True), True),
+        (TicketPurpose("rover", video=True), TicketPurpose("rover", video=True, camera="/eye"), True),
+        (
+            TicketPurpose("rover", video=True, camera="/eye"),
+            TicketPurpose("rover", video=True, camera="/eye"),
+            True,
+        ),
+        (
+            TicketPurpose("rover", video=True, camera="/eye"),
+            TicketPurpose("rover", video=True, camera="/eyes"),
+            False,
+        ),
+        (TicketPurpose("rover", video=True, camera="/eye"), TicketPurpose("rover", video=True), False),
+        (
+            TicketPurpose("rover", video=True, camera="/eye"),
+            TicketPurpose("tank", video=True, camera="/eye"),
+            False,
+        ),
     ],
 )
-def test_a_ticket_opens_what_it_is_for(opens: Opening, asked: Opening, good: bool) -> None:
+def test_a_ticket_opens_what_it_is_for(opens: TicketPurpose, asked: TicketPurpose, good: bool) -> None:
     """A picture's is no way to drive, and one camera's shows no other."""
     assert opens.covers(asked) is good
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_ticket_dies_with_the_session_that_asked_for_it(
-    auth: Authenticator, store: Store, ann: UserRecord
+    auth: Authenticator, store: AsyncDatabase, ann: UserRecord
 ) -> None:
     """Logging out in between leaves no way in."""
     principal = await auth.token(await token(store, ann))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.internet.task import Clock
 
-from relay_server.bucket import Buckets, TokenBucket
+from relay_server.common.token_bucket import Buckets, TokenBucket
 
 
 def test_what_is_taken_comes_back_with_time() -> None:

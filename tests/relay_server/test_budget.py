@@ -6,9 +6,10 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol.rights import Level
-from relay_server import budget, closing
-from relay_server.budget import Budget, Budgets
-from relay_server.session import calling, core
+from relay_server.common import close_codes, cpu_quota
+from relay_server.common.cpu_quota import Quota, UserQuotas
+from relay_server.sessions import service_calls
+from relay_server.sessions import session as core
 from tests.relay_server.memory import Person, World
 
 QUESTION = {"service": "/rosapi/topics", "id": "q"}
@@ -17,7 +18,7 @@ QUESTION = {"service": "/rosapi/topics", "id": "q"}
 def test_what_is_spent_comes_back_with_time() -> None:
     """At its share of the time, up to the reserve; what is done last may overdraw it."""
     clock = Clock()
-    mine = Budget(0.25, 1.0, clock.seconds)
+    mine = Quota(0.25, 1.0, clock.seconds)
     mine.spend(3.0)
     assert mine.left == -2.0
     clock.advance(4.0)
@@ -29,7 +30,7 @@ def test_what_is_spent_comes_back_with_time() -> None:
 def test_a_clock_that_is_set_back_gives_and_takes_nothing() -> None:
     """What was left stays."""
     now = [100.0]
-    mine = Budget(0.25, 1.0, lambda: now[0])
+    mine = Quota(0.25, 1.0, lambda: now[0])
     mine.spend(0.5)
     now[0] = 0.0
     assert mine.left == 0.5
@@ -40,16 +41,16 @@ def test_a_clock_that_is_set_back_gives_and_takes_nothing() -> None:
 def test_one_user_cannot_use_up_the_forms_of_all() -> None:
     """His own share is less; others go on until the share of all is used up."""
     worked = [0.0]
-    budgets = Budgets(lambda: 0.0, lambda: worked[0])
+    budgets = UserQuotas(lambda: 0.0, lambda: worked[0])
     one, two, three = budgets.of(1), budgets.of(2), budgets.of(3)
     assert budgets.of(1) is one
     with one.forming():
-        worked[0] += budget.FORMS_RESERVE * 0.9
+        worked[0] += cpu_quota.FORMS_RESERVE * 0.9
     assert one.may_form and two.may_form
     with two.forming():
-        worked[0] += budget.FORMS_RESERVE * 0.2
+        worked[0] += cpu_quota.FORMS_RESERVE * 0.2
     assert not three.may_form
-    assert budget.FORMS_OF_USER < budget.FORMS
+    assert cpu_quota.FORMS_OF_USER < cpu_quota.FORMS
 
 
 def busy(world: World, work: float, user: int = 7) -> None:
@@ -68,7 +69,7 @@ def test_who_has_used_up_his_share_is_refused_until_there_is_some_left(world: Wo
     """Over all connections of the user; another user's questions are answered."""
     first, second, other = world.person(), world.person(), world.person(user=8)
     assert answer(first) == ""
-    busy(world, budget.REQUESTS_RESERVE + 0.5)
+    busy(world, cpu_quota.REQUESTS_RESERVE + 0.5)
     for each in (first, second):
         assert answer(each).startswith("too much at once: your share of the relay's processor is used up")
     assert answer(other) == ""
@@ -84,7 +85,7 @@ def test_the_time_a_request_takes_is_counted(world: World, monkeypatch: pytest.M
         world.worked += 0.25
         raise ZeroDivisionError
 
-    monkeypatch.setattr(calling.Calling, "call", slow)
+    monkeypatch.setattr(service_calls.ServiceCallHandler, "call", slow)
     before = person.session.allowance.requests.left
     with pytest.raises(ZeroDivisionError):
         person.says("call_service", args="x" * 2 * core.SMALL, **QUESTION)
@@ -100,7 +101,7 @@ def test_what_is_small_to_publish_and_what_takes_back_is_always_done(world: Worl
     person.says("publish", topic="/cmd_vel", msg={})
     world.define()
     person.says("set_level", level="error")
-    busy(world, budget.REQUESTS_RESERVE + 1.0)
+    busy(world, cpu_quota.REQUESTS_RESERVE + 1.0)
     sent = len(world.link.samples)
     person.says("publish", topic="/cmd_vel", msg={})
     assert len(world.link.samples) == sent + 1
@@ -117,14 +118,14 @@ def test_what_is_small_to_publish_and_what_takes_back_is_always_done(world: Worl
 def test_who_is_far_over_his_share_is_cut(world: World) -> None:
     """It is remembered when he comes back; some seconds later he is welcome."""
     person = world.person()
-    busy(world, budget.REQUESTS_RESERVE + budget.DEBT)
+    busy(world, cpu_quota.REQUESTS_RESERVE + cpu_quota.DEBT)
     person.says("publish", topic="/nowhere", msg={})
     assert person.client.closed is not None
-    assert person.client.closed[0] == closing.TOO_MANY_ERRORS
+    assert person.client.closed[0] == close_codes.TOO_MANY_ERRORS
     again = world.person()
     assert answer(again).startswith("too much at once")
     again.session.end()
-    world.clock.advance(budget.DEBT / budget.REQUESTS + 1)
+    world.clock.advance(cpu_quota.DEBT / cpu_quota.REQUESTS + 1)
     assert answer(world.person()) == ""
 
 
@@ -140,7 +141,7 @@ def test_what_is_refused_is_counted_too(world: World, junk: dict[str, str]) -> N
 def test_long_arguments_for_the_relay_are_refused(world: World) -> None:
     """Its own services need few; to read many lists takes long."""
     person = world.person()
-    person.says("call_service", args=["x" * calling.LOCAL_BYTES], **QUESTION)
+    person.says("call_service", args=["x" * service_calls.LOCAL_BYTES], **QUESTION)
     (reply,) = person.hears("service_response")
     assert reply["result"] is False
-    assert str(calling.LOCAL_BYTES) in reply["values"]
+    assert str(service_calls.LOCAL_BYTES) in reply["values"]

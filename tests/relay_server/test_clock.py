@@ -8,7 +8,7 @@ from twisted.internet.defer import CancelledError, Deferred
 from twisted.python.failure import Failure
 
 from relay_protocol.errors import Unavailable
-from relay_server.clock import Coalesced
+from relay_server.common.clock import SingleFlight
 
 
 class Work:
@@ -16,7 +16,7 @@ class Work:
 
     def __init__(self) -> None:
         self.begun: list[Deferred[None]] = []
-        self.turns = Coalesced(self._do)
+        self.turns = SingleFlight(self._do)
 
     async def _do(self) -> None:
         self.begun.append(Deferred())

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from relay_protocol.errors import Invalid
-from relay_server.config import Endpoint, Settings
+from relay_server.config import ListenAddress, RelaySettings
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from relay_server.config import Endpoint, Settings
 )
 def test_an_address_is_read_and_written_alike(text: str, host: str, port: int) -> None:
     """Names, IPv4 and IPv6 in brackets; port 0 is any free one."""
-    endpoint = Endpoint.parse(text)
+    endpoint = ListenAddress.parse(text)
     assert (endpoint.host, endpoint.port) == (host, port)
     assert str(endpoint) == text
 
@@ -46,14 +46,14 @@ def test_an_address_is_read_and_written_alike(text: str, host: str, port: int) -
 def test_what_is_no_address_is_refused_in_words(text: str) -> None:
     """The sentence shows what was given and the form that is wanted."""
     with pytest.raises(Invalid, match="write HOST:PORT"):
-        Endpoint.parse(text)
+        ListenAddress.parse(text)
 
 
 def test_tls_decides_the_scheme() -> None:
     """With a certificate both listeners speak TLS, without one neither."""
-    here = Endpoint("localhost", 0)
-    plain = Settings(Path("data"), "sqlite://", here, here)
-    secure = Settings(Path("data"), "sqlite://", here, here, Path("cert"), Path("key"))
+    here = ListenAddress("localhost", 0)
+    plain = RelaySettings(Path("data"), "sqlite://", here, here)
+    secure = RelaySettings(Path("data"), "sqlite://", here, here, Path("cert"), Path("key"))
     assert (plain.tls, plain.scheme) == (False, "http")
     assert (secure.tls, secure.scheme) == (True, "https")
     assert plain.socket_path == Path("data/relay.sock")

@@ -11,10 +11,17 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Principal
-from relay_server.console import CONFIRM_SECONDS, NOT_ALL_KNOWN, NOT_CONFIRMED, Console, NoControl
-from relay_server.control import Answer, NotDone
-from relay_server.frontdesk import LOOKUP_SECONDS
-from relay_server.inside import Guests
+from relay_server.control.commands import NotDone
+from relay_server.control.service import (
+    CONFIRM_SECONDS,
+    NOT_ALL_KNOWN,
+    NOT_CONFIRMED,
+    ControlService,
+    NoControl,
+)
+from relay_server.control.types import ControlReply
+from relay_server.http_sessions.pool import SessionPool
+from relay_server.sessions.manager import LOOKUP_SECONDS
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import hangs
 from tests.relay_server.steering import outcome, result
@@ -30,9 +37,9 @@ class Place:
     def __init__(self, front: Desk) -> None:
         self.front = front
         self.world = front.world
-        self.guests = Guests(self.world.clock, front.desk, self.world.now_ns)
+        self.guests = SessionPool(self.world.clock, front.desk, self.world.now_ns)
         offices = front.desk, front.access, self.world.desks, self.world.registry, front.store
-        self.console = Console(self.world.clock, *offices, self.guests)
+        self.console = ControlService(self.world.clock, *offices, self.guests)
         with front.store.database.begin() as s:
             self.users = {}
             for name, level in (("olga", "owner"), ("vic", "viewer"), ("eve", "")):
@@ -152,12 +159,12 @@ async def test_an_owner_who_asks_for_control_takes_it_from_the_holder_all_the_sa
     desk = place.world.desks.of(place.world.robot)
     await desk.take(holds, "")
     assert not (await desk.take(asks, "")).success
-    assert (await console.release(olga, ROBOT, "enough", HERE)) == Answer(True, "control is given back")
+    assert (await console.release(olga, ROBOT, "enough", HERE)) == ControlReply(True, "control is given back")
     assert desk.lease.holder is None
     assert desk.lease.request is None
     await desk.take(asks, "")
     await desk.take(holds, "")
-    assert (await console.release(ann, ROBOT, "", HERE)) == Answer(True, "you ask for control no more")
+    assert (await console.release(ann, ROBOT, "", HERE)) == ControlReply(True, "you ask for control no more")
     assert desk.lease.held_by(asks)
 
 

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 
 from relay_protocol.errors import Unavailable
-from relay_server.folder import DataFolder
+from relay_server.common.data_dir import DataDir
 
 
 def test_a_second_relay_is_refused_in_words(tmp_path: Path) -> None:
     """While one relay holds the folder, another can't have it; afterwards it can."""
-    first = DataFolder(tmp_path)
+    first = DataDir(tmp_path)
     with pytest.raises(Unavailable, match="another relay runs on this data folder"):
-        DataFolder(tmp_path)
+        DataDir(tmp_path)
     first.release()
-    DataFolder(tmp_path).release()
+    DataDir(tmp_path).release()
 
 
 def test_what_a_killed_relay_left_does_not_keep_the_next_from_starting(tmp_path: Path) -> None:
@@ -24,7 +24,7 @@ def test_what_a_killed_relay_left_does_not_keep_the_next_from_starting(tmp_path:
     (tmp_path / "relay.lock").write_text("1")
     socket = tmp_path / "relay.sock"
     socket.touch()
-    folder = DataFolder(tmp_path)
+    folder = DataDir(tmp_path)
     folder.clear_socket(socket)
     assert not socket.exists()
     folder.release()
@@ -32,7 +32,7 @@ def test_what_a_killed_relay_left_does_not_keep_the_next_from_starting(tmp_path:
 
 def test_a_relay_keeps_its_name(tmp_path: Path) -> None:
     """Robots sign for the relay's name, so it outlives restarts."""
-    folder = DataFolder(tmp_path)
+    folder = DataDir(tmp_path)
     name = folder.relay_name()
     assert name.startswith("relay-")
     assert folder.relay_name() == name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from relay_server.freshness import PENDING, Freshness
+from relay_server.sessions.message_age import PENDING, MessageAge
 
 
 class Client:
@@ -13,7 +13,7 @@ class Client:
     def __init__(self) -> None:
         self.now = 1_000
         tokens = itertools.count()
-        self.fresh = Freshness(lambda: self.now, self.now, lambda: next(tokens).to_bytes(8, "big"))
+        self.fresh = MessageAge(lambda: self.now, self.now, lambda: next(tokens).to_bytes(8, "big"))
 
 
 def test_before_the_first_pong_a_message_may_be_as_old_as_the_connection() -> None:

@@ -8,11 +8,12 @@ import pytest_twisted
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
-from relay_server import closing, limiter
 from relay_server.access import IN_STEP_SECONDS, NO_ROBOT, BadCredentials
-from relay_server.auth import Opening, TooManyTries
-from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP
-from relay_server.video import Picture
+from relay_server.auth import login_limiter
+from relay_server.auth.authenticator import TicketPurpose, TooManyTries
+from relay_server.common import close_codes
+from relay_server.sessions.manager import LOOKUP_SECONDS, NOT_LOOKED_UP
+from relay_server.video.frames import VideoFrameInfo
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import hangs
 from tests.relay_server.steering import outcome, result
@@ -55,13 +56,13 @@ async def test_a_refused_login_is_of_the_realm_that_the_whole_name_gives(front: 
 @pytest_twisted.ensureDeferred
 async def test_a_flood_of_logins_does_not_reach_the_database(front: Desk) -> None:
     """What is over the limit was recorded while under it."""
-    for _ in range(limiter.FAILURES):
+    for _ in range(login_limiter.FAILURES):
         with pytest.raises(BadCredentials):
             await front.desk.password("nobody", "x", HERE)
     for _ in range(20):
         with pytest.raises(TooManyTries):
             await front.desk.password("nobody", "x", HERE)
-    assert len(await front.events("login.refused")) == limiter.FAILURES
+    assert len(await front.events("login.refused")) == login_limiter.FAILURES
 
 
 @pytest_twisted.ensureDeferred
@@ -71,7 +72,7 @@ async def test_logging_out_cuts_what_was_opened_with_that_session(front: Desk) -
     _, cut = await front.opens(first)
     _, kept = await front.opens(second)
     await front.desk.logout(first)
-    assert cut.closed == (closing.UNAUTHENTICATED, "your session was ended; log in again")
+    assert cut.closed == (close_codes.UNAUTHENTICATED, "your session was ended; log in again")
     assert kept.closed is None
     with pytest.raises(BadCredentials):
         await front.desk.token(token)
@@ -84,7 +85,7 @@ async def test_a_robot_without_rights_is_like_no_robot(front: Desk) -> None:
     for robot in ("hidden", "nothing", "", "x" * 10_000, "\x00"):
         for asking in (
             front.desk.admit(principal, robot, HERE),
-            front.desk.issue_ticket(principal, Opening(robot)),
+            front.desk.issue_ticket(principal, TicketPurpose(robot)),
         ):
             with pytest.raises(NotFound) as told:
                 await asking
@@ -127,7 +128,7 @@ async def test_open_sessions_are_counted_shown_and_recorded(front: Desk) -> None
 class Wall:
     """A screen nobody looks at."""
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: VideoFrameInfo) -> None:
         """None comes."""
 
     def playing(self, playing: link.Playing) -> None:
@@ -170,7 +171,7 @@ async def test_going_down_tells_everyone_and_lets_nobody_in(front: Desk) -> None
     ends = [await front.opens(principal) for _ in range(3)]
     front.desk.say_goodbye("the relay is going down")
     assert not front.desk.accepting
-    assert {client.closed for _, client in ends} == {(closing.GOING_AWAY, "the relay is going down")}
+    assert {client.closed for _, client in ends} == {(close_codes.GOING_AWAY, "the relay is going down")}
     assert not list(front.desk)
 
 

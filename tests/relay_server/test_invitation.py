@@ -7,14 +7,14 @@ import pytest_twisted
 
 from relay_db import queries
 from relay_protocol.errors import Invalid
-from relay_server import passwords
-from relay_server.invitation import first_login, login_link
-from relay_server.store import Store
+from relay_server.auth import passwords
+from relay_server.auth.login_links import first_login, login_link
+from relay_server.common.database import AsyncDatabase
 
 URL = "https://relay.example.org"
 
 
-async def user_of(store: Store, link: str) -> int:
+async def user_of(store: AsyncDatabase, link: str) -> int:
     """The number of the user that a link logs in."""
     found = await store.write(queries.consume_login, passwords.token_hash(link.partition("#code=")[2]), 1.0)
     assert found is not None
@@ -22,7 +22,7 @@ async def user_of(store: Store, link: str) -> int:
 
 
 @pytest_twisted.ensureDeferred
-async def test_users_of_other_realms_let_nobody_in_to_the_default_one(store: Store) -> None:
+async def test_users_of_other_realms_let_nobody_in_to_the_default_one(store: AsyncDatabase) -> None:
     """The first administrator gets his link though they are there, until there is somebody in his own."""
     await store.write(queries.add_realm, "lab")
     await store.write(queries.add_user, "admin", "hash", realm="lab")
@@ -36,7 +36,7 @@ async def test_users_of_other_realms_let_nobody_in_to_the_default_one(store: Sto
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_link_is_for_the_user_of_the_realm_that_is_named(store: Store) -> None:
+async def test_a_link_is_for_the_user_of_the_realm_that_is_named(store: AsyncDatabase) -> None:
     """And for nobody of the same name in another."""
     await store.write(queries.add_realm, "lab")
     toad = await store.write(queries.add_user, "toad", None, realm="lab")

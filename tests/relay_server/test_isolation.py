@@ -23,13 +23,13 @@ from twisted.internet.threads import deferToThread
 
 from relay_db import queries
 from relay_db.queries import NewEntry
-from relay_server import passwords
-from relay_server.alerts import kinds
-from relay_server.config import Endpoint, Settings
-from relay_server.edges.documents import operations
-from relay_server.openapi import document
-from relay_server.recording.library import FOLDER, Entry, State, text_of
-from relay_server.resources import HEADER
+from relay_server.alerts import types as kinds
+from relay_server.auth import passwords
+from relay_server.common.freshness_tokens import HEADER
+from relay_server.config import ListenAddress, RelaySettings
+from relay_server.http.openapi.document import document
+from relay_server.http.openapi.http import operations
+from relay_server.recordings.library import FOLDER, RecordingEntry, RecordingState, text_of
 from relay_server.service import Relay
 
 NOBODYS = "nobody"
@@ -60,11 +60,13 @@ class Lab:
     """
 
     def __init__(self, folder: Path) -> None:
-        nowhere = Endpoint("127.0.0.1", 0)
+        nowhere = ListenAddress("127.0.0.1", 0)
         self._folder = folder
         self.relay = Relay(
             reactor,
-            Settings(folder, f"sqlite:///{folder}/relay.db", nowhere, nowhere, refresh=3600.0, requests=0.0),
+            RelaySettings(
+                folder, f"sqlite:///{folder}/relay.db", nowhere, nowhere, refresh=3600.0, requests=0.0
+            ),
         )
         self.alerts = {NOBODYS: "0" * 16}
         self.moment = ""
@@ -114,8 +116,8 @@ class Lab:
                 robot, id = robots[name], IDS[name]
                 new = NewEntry(user.realm, "service", name, "http://a/", "", robot.id, user.id, "{}", 86400.0)
                 queries.register_entry(session, new, id, 4e9, of_user=10, of_realm=10)
-                entry = Entry(id, robot.id, name, user.id, user.name, ("/mode",), (), 1.0, 1, 1.0)
-                entry.realm, entry.state = user.realm, State.COMPLETE
+                entry = RecordingEntry(id, robot.id, name, user.id, user.name, ("/mode",), (), 1.0, 1, 1.0)
+                entry.realm, entry.state = user.realm, RecordingState.COMPLETE
                 (self._folder / FOLDER / f"{id}.json").write_bytes(text_of(entry))
                 (self._folder / FOLDER / f"{id}.mcap").write_bytes(b"")
         return robots

@@ -9,20 +9,20 @@ import pytest_twisted
 from twisted.logger import capturedLogs
 
 from relay_db import queries
-from relay_server import journal as module
-from relay_server.journal import BURST, WAITING, Journal
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
+from relay_server.events import bus as module
+from relay_server.events.bus import BURST, WAITING, EventBus
 from tests.relay_server.edges.robot_ends import until
 from tests.relay_server.memory import Time
 
 
 @pytest.fixture
-def journal(store: Store, time: Time) -> Journal:
+def journal(store: AsyncDatabase, time: Time) -> EventBus:
     """A journal on a real database."""
-    return Journal(store, time)
+    return EventBus(store, time)
 
 
-async def kept(journal: Journal, store: Store, kind: str) -> list[dict[str, Any]]:
+async def kept(journal: EventBus, store: AsyncDatabase, kind: str) -> list[dict[str, Any]]:
     """The data of all events of a kind, oldest first."""
     await until(lambda: journal._waiting == 0)
     return [dict(event.data) for event in await store.read(queries.list_events, kind=kind, limit=1000)][::-1]
@@ -30,7 +30,7 @@ async def kept(journal: Journal, store: Store, kind: str) -> list[dict[str, Any]
 
 @pytest_twisted.ensureDeferred
 async def test_a_burst_is_kept_and_what_comes_too_fast_is_counted(
-    journal: Journal, store: Store, time: Time
+    journal: EventBus, store: AsyncDatabase, time: Time
 ) -> None:
     """The count is told with the next event of that cause that is kept."""
     results = [journal.event("x", "relay", cause="192.0.2.1", n=n) for n in range(BURST + 30)]
@@ -43,7 +43,7 @@ async def test_a_burst_is_kept_and_what_comes_too_fast_is_counted(
 
 
 @pytest_twisted.ensureDeferred
-async def test_who_listens_and_fails_undoes_nothing(journal: Journal, store: Store) -> None:
+async def test_who_listens_and_fails_undoes_nothing(journal: EventBus, store: AsyncDatabase) -> None:
     """The event is kept, others hear of it, and whoever caused it goes on; the log tells."""
     heard: list[str] = []
 
@@ -61,7 +61,9 @@ async def test_who_listens_and_fails_undoes_nothing(journal: Journal, store: Sto
 
 
 @pytest_twisted.ensureDeferred
-async def test_causes_do_not_disturb_each_other_but_a_network_is_one(journal: Journal, store: Store) -> None:
+async def test_causes_do_not_disturb_each_other_but_a_network_is_one(
+    journal: EventBus, store: AsyncDatabase
+) -> None:
     """Whoever has a network of IPv6 addresses has one bucket."""
     for number in range(100):
         journal.event("x", "relay", cause=f"2001:db8::{number:x}")
@@ -72,7 +74,7 @@ async def test_causes_do_not_disturb_each_other_but_a_network_is_one(journal: Jo
 
 @pytest_twisted.ensureDeferred
 async def test_a_clock_that_is_set_back_gives_no_events_away(
-    journal: Journal, store: Store, time: Time
+    journal: EventBus, store: AsyncDatabase, time: Time
 ) -> None:
     """Nor does it lock a cause out."""
     for _ in range(BURST):
@@ -85,7 +87,9 @@ async def test_a_clock_that_is_set_back_gives_no_events_away(
 
 
 @pytest_twisted.ensureDeferred
-async def test_events_leave_room_for_logins_in_the_writers_queue(journal: Journal, store: Store) -> None:
+async def test_events_leave_room_for_logins_in_the_writers_queue(
+    journal: EventBus, store: AsyncDatabase
+) -> None:
     """Many causes at once may fill only their part of it."""
     results = [journal.event("x", "relay", cause=f"robot:{number}") for number in range(WAITING + 50)]
     assert results == [True] * WAITING + [False] * 50
@@ -96,7 +100,7 @@ async def test_events_leave_room_for_logins_in_the_writers_queue(journal: Journa
 
 
 def test_causes_are_forgotten_when_there_are_too_many(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch
+    journal: EventBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Addresses without end fill no memory."""
     monkeypatch.setattr(module, "CAUSES", 10)

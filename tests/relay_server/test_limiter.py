@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from relay_server import limiter as module
-from relay_server.limiter import (
+from relay_server.auth import login_limiter as module
+from relay_server.auth.login_limiter import (
     ACCOUNT_WINDOW,
     FAILURES,
     FAILURES_OF_NETWORK,

@@ -6,12 +6,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_server.linkmeter import LOSSES, NO_LINK, SPACING, UNKNOWN, WINDOW, LinkMeter, Reading, joined
+from relay_server.robots.link_quality import (
+    LOSSES,
+    NO_LINK,
+    SPACING,
+    UNKNOWN,
+    WINDOW,
+    LinkQuality,
+    LinkQualityMeter,
+    joined,
+)
 
 
-def measured(*trips: float, every: float = 1.0, start: float = 100.0) -> LinkMeter:
+def measured(*trips: float, every: float = 1.0, start: float = 100.0) -> LinkQualityMeter:
     """A meter that was told of these round trips, one after the other."""
-    meter = LinkMeter()
+    meter = LinkQualityMeter()
     for turn, trip in enumerate(trips):
         meter.came_back(start + turn * every, trip)
     return meter
@@ -19,7 +28,7 @@ def measured(*trips: float, every: float = 1.0, start: float = 100.0) -> LinkMet
 
 def test_nothing_is_known_before_the_first_round_trip() -> None:
     """No numbers, and no word either."""
-    assert LinkMeter().reading(100.0, [0.2]) == UNKNOWN
+    assert LinkQualityMeter().reading(100.0, [0.2]) == UNKNOWN
 
 
 def test_median_percentile_and_jitter_are_of_the_window() -> None:
@@ -81,7 +90,7 @@ def test_pings_that_were_passed_over_are_lost_only_when_they_were_late() -> None
 def test_silence_is_a_lost_link() -> None:
     """Nothing has come back for three seconds, before the first answer or after it."""
     assert measured(0.01).reading(104.0, [3.1, 2.1]).quality == "lost"
-    assert LinkMeter().reading(104.0, [3.1]).quality == "lost"
+    assert LinkQualityMeter().reading(104.0, [3.1]).quality == "lost"
 
 
 def test_of_frequent_round_trips_a_few_are_kept() -> None:
@@ -100,7 +109,7 @@ def test_two_links_one_after_the_other_take_the_time_of_both() -> None:
     whole = joined(near, far)
     assert whole.rtt == pytest.approx(0.13)
     assert (near.quality, far.quality, whole.quality) == ("good", "good", "fair")
-    assert joined(near, Reading(rtt=0.01, lately=0.01, quality="bad")).quality == "bad"
+    assert joined(near, LinkQuality(rtt=0.01, lately=0.01, quality="bad")).quality == "bad"
     assert joined(near, UNKNOWN) == UNKNOWN
     assert joined(NO_LINK, UNKNOWN) == NO_LINK == joined(near, NO_LINK)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from relay_server.resources import MomentNeeded, Moments
+from relay_server.common.freshness_tokens import FreshnessTokenRequired, FreshnessTokens
 
 
 def test_a_moment_says_when_it_was_made() -> None:
     """To the nanosecond, however often it is read."""
     now = 123_456_789_012
-    moments = Moments(lambda: now)
+    moments = FreshnessTokens(lambda: now)
     said = moments.now()
     now += 5
     assert moments.read(said) == moments.read(f" {said} ") == 123_456_789_012
@@ -23,13 +23,13 @@ def test_a_moment_says_when_it_was_made() -> None:
 )
 def test_what_is_no_moment_is_refused(text: str) -> None:
     """However long it is."""
-    with pytest.raises(MomentNeeded):
-        Moments(lambda: 1000).read(text)
+    with pytest.raises(FreshnessTokenRequired):
+        FreshnessTokens(lambda: 1000).read(text)
 
 
 def test_a_moment_is_believed_by_the_relay_that_named_it_alone() -> None:
     """Neither one of a relay that ran before, nor one that was changed, says anything."""
-    moments = Moments(lambda: 1000)
-    for each in (Moments(lambda: 1000).now(), "1" + moments.now()):
-        with pytest.raises(MomentNeeded):
+    moments = FreshnessTokens(lambda: 1000)
+    for each in (FreshnessTokens(lambda: 1000).now(), "1" + moments.now()):
+        with pytest.raises(FreshnessTokenRequired):
             moments.read(each)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol.errors import Invalid, Refused
-from relay_server.edges.caps import AddressCap
-from relay_server.origins import Origins
+from relay_server.auth.origins import Origins
+from relay_server.http.connection_limits import ConnectionLimits
 
 
 def taken(origins: Origins, origin: str | None, host: str) -> bool:
@@ -68,7 +68,7 @@ def test_null_is_never_listed_by_accident() -> None:
 
 def test_an_address_holds_so_many_connections_and_no_more() -> None:
     """Those over the cap are counted too until they leave; nothing is kept of who has left."""
-    cap = AddressCap(2)
+    cap = ConnectionLimits(2)
     assert [cap.enter("a") for _ in range(3)] == [True, True, False]
     assert cap.enter("b")
     cap.leave("a")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_server import outbox as module
-from relay_server.outbox import Outbox
+from relay_server.common import send_queue as module
+from relay_server.common.send_queue import SendQueue
 
 MIB = 1024 * 1024
 
@@ -19,7 +19,7 @@ class Receiver:
         self.got: list[bytes] = []
         self.cut = 0
         self.takes = 10**9
-        self.outbox = Outbox(self._write, lambda: self.now, self._overflow)
+        self.outbox = SendQueue(self._write, lambda: self.now, self._overflow)
 
     def _write(self, message: bytes) -> None:
         assert self.outbox.paused_since is None, "written while paused"

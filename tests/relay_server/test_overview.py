@@ -10,7 +10,7 @@ import pytest_twisted
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound
-from relay_server.linkmeter import Reading
+from relay_server.robots.link_quality import LinkQuality
 from tests.relay_server.front_desk import Desk
 from tests.relay_server.memory import MemoryLink
 
@@ -18,9 +18,9 @@ from tests.relay_server.memory import MemoryLink
 class Measured(MemoryLink):
     """A robot's link with a known round trip."""
 
-    def reading(self) -> Reading:
+    def reading(self) -> LinkQuality:
         """A fifth of a second."""
-        return Reading(rtt=0.2, p95=0.25, jitter=0.01, lately=0.2, quality="fair")
+        return LinkQuality(rtt=0.2, p95=0.25, jitter=0.01, lately=0.2, quality="fair")
 
 
 @pytest_twisted.ensureDeferred

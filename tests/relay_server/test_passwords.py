@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from relay_protocol.errors import Invalid
-from relay_server import passwords
+from relay_server.auth import passwords
 
 PASSWORD = "correct horse"
 
@@ -126,7 +126,7 @@ def test_a_code_is_taken_however_it_is_typed(typed: str) -> None:
 
 AT_ONCE = """
 import sys, threading
-from relay_server import passwords
+from relay_server.auth import passwords
 sys.setswitchinterval(1e-6)
 together = threading.Barrier(8)
 def first():

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.linkmeter import UNKNOWN, Reading
-from relay_server.people import FRESH_SECONDS, TOLD, Asker, People, clients
-from relay_server.registry import Presence
+from relay_server.robots.link_quality import UNKNOWN, LinkQuality
+from relay_server.robots.registry import RobotState
+from relay_server.sessions.presence import FRESH_SECONDS, TOLD, PresenceReader, PresenceService, client_rows
 from tests.relay_server.memory import Time
 
 
@@ -25,10 +25,10 @@ class Client:
     drops: int = 0
     asked: int = 0
 
-    def reading(self) -> Reading:
+    def reading(self) -> LinkQuality:
         """Fifty milliseconds."""
         self.asked += 1
-        return Reading(rtt=0.05, lately=0.05, quality="good")
+        return LinkQuality(rtt=0.05, lately=0.05, quality="good")
 
 
 @dataclass(frozen=True)
@@ -49,21 +49,21 @@ class Far:
     def close(self, reason: str) -> None:
         """Nobody looks."""
 
-    def reading(self) -> Reading:
+    def reading(self) -> LinkQuality:
         """A quarter of a second."""
-        return Reading(rtt=0.25, lately=0.25, quality="fair")
+        return LinkQuality(rtt=0.25, lately=0.25, quality="fair")
 
 
 class Place:
     """A robot with people at it."""
 
     def __init__(self, time: Time) -> None:
-        self.robot = Presence(1, "rover", "default", control=Far())
+        self.robot = RobotState(1, "rover", "default", control=Far())
         self.clients: list[Client] = []
         self.holder = 0
-        self.people = People(lambda robot_id: self.clients, lambda robot: self.holder, time)
+        self.people = PresenceService(lambda robot_id: self.clients, lambda robot: self.holder, time)
 
-    def told(self, asker: Asker) -> list[dict[str, Any]]:
+    def told(self, asker: PresenceReader) -> list[dict[str, Any]]:
         """The people, where none is left out."""
         people, more = self.people.told(self.robot, asker)
         assert more == 0
@@ -76,9 +76,11 @@ def place(time: Time) -> Place:
     return Place(time)
 
 
-def asker(level: Level = Level.VIEWER, *deny: str, user: str = "ann", connection: int | None = None) -> Asker:
+def asker(
+    level: Level = Level.VIEWER, *deny: str, user: str = "ann", connection: int | None = None
+) -> PresenceReader:
     """Somebody with a right on the robot."""
-    return Asker(user, Rules([Grant(level, (), deny)]), connection)
+    return PresenceReader(user, Rules([Grant(level, (), deny)]), connection)
 
 
 def test_people_come_by_user_with_their_connections(place: Place) -> None:
@@ -132,7 +134,7 @@ def test_who_watches_is_told_where_the_camera_may_be_seen(place: Place) -> None:
     assert [each["user"] for each in place.told(asker())] == ["eve", "bob"]
     assert place.people.count(place.robot, may_not.rules) == 1
     assert place.people.count(place.robot, asker().rules) == 2
-    assert [each["camera"] for each in clients(place.robot, [], may_not.rules)] == ["/camera"]
+    assert [each["camera"] for each in client_rows(place.robot, [], may_not.rules)] == ["/camera"]
 
 
 def test_a_crowd_is_told_in_part(place: Place) -> None:

@@ -6,10 +6,10 @@ import pytest
 
 from relay_protocol import limits, link
 from relay_protocol.errors import MalformedMessage
-from relay_server import graph as graph_module
-from relay_server.graph import GraphMirror
 from relay_server.metrics import RelayCollector, registry_of
-from relay_server.registry import State
+from relay_server.robots import graph as graph_module
+from relay_server.robots.graph import GraphMirror
+from relay_server.robots.registry import Availability
 from tests.relay_server.memory import STRING, MemoryLink, World
 from tests.relay_server.video import watching
 
@@ -39,13 +39,13 @@ class Watcher:
 
 def test_a_robot_is_offline_online_or_in_use(world: World) -> None:
     """In use while somebody works with it."""
-    assert world.robot.state is State.OFFLINE
+    assert world.robot.state is Availability.OFFLINE
     world.robot_comes()
-    assert world.robot.state is State.ONLINE
+    assert world.robot.state is Availability.ONLINE
     world.robot.users = 1
-    assert world.robot.state is State.IN_USE
+    assert world.robot.state is Availability.IN_USE
     world.robot_goes()
-    assert world.robot.state is State.OFFLINE
+    assert world.robot.state is Availability.OFFLINE
 
 
 def test_a_new_link_replaces_the_old_one_and_starts_afresh(world: World) -> None:
@@ -86,9 +86,9 @@ def test_the_end_of_a_replaced_link_changes_nothing(world: World) -> None:
     former = world.control
     world.robot_comes()
     world.registry.lost(world.robot, former)
-    assert world.robot.state is State.ONLINE
+    assert world.robot.state is Availability.ONLINE
     world.registry.lost(world.robot, world.control)
-    assert world.robot.state is State.OFFLINE
+    assert world.robot.state is Availability.OFFLINE
     assert not world.robot.graph.nodes
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest_twisted
 
 from relay_db import queries
-from relay_server.retiring import Realms
-from relay_server.store import Store
+from relay_server.change_watcher import RealmCaches
+from relay_server.common.database import AsyncDatabase
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_realm_that_was_made_anew_is_gone_and_there(store: Store) -> None:
+async def test_a_realm_that_was_made_anew_is_gone_and_there(store: AsyncDatabase) -> None:
     """Though one of its name was found whenever it was looked."""
     told: list[tuple[list[str], list[str]]] = []
-    realms = Realms(store, lambda gone, there: told.append((sorted(gone), sorted(there))))
+    realms = RealmCaches(store, lambda gone, there: told.append((sorted(gone), sorted(there))))
     await store.write(queries.add_realm, "lab")
     await store.write(queries.add_realm, "plant")
     await realms.look()

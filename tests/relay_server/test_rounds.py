@@ -8,17 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.internet.task import Clock
 
-from relay_server.rounds import Round, Rounds
+from relay_server.common.timers import PeriodicTimer, PeriodicTimers
 
 
 def test_each_keeps_its_own_pace() -> None:
     """From the first moment on, and however many there are, with one timer."""
     clock = Clock()
-    rounds = Rounds(clock)
+    rounds = PeriodicTimers(clock)
     calls: list[tuple[str, float]] = []
-    rounds.start(Round(lambda: calls.append(("slow", clock.seconds())), 2.0))
+    rounds.start(PeriodicTimer(lambda: calls.append(("slow", clock.seconds())), 2.0))
     clock.advance(0.05)
-    rounds.start(Round(lambda: calls.append(("fast", clock.seconds())), 0.1))
+    rounds.start(PeriodicTimer(lambda: calls.append(("fast", clock.seconds())), 0.1))
     assert len(clock.getDelayedCalls()) == 1
     clock.pump([0.01] * 400)
     fast = [at for name, at in calls if name == "fast"]
@@ -32,7 +32,7 @@ def test_each_keeps_its_own_pace() -> None:
 def test_a_round_that_is_stopped_is_not_called_again() -> None:
     """Not even by itself, and the timer ends with the last."""
     clock = Clock()
-    rounds = Rounds(clock)
+    rounds = PeriodicTimers(clock)
     calls: list[int] = []
 
     def once_more() -> None:
@@ -40,7 +40,7 @@ def test_a_round_that_is_stopped_is_not_called_again() -> None:
         if len(calls) == 3:
             begun.stop()
 
-    begun = Round(once_more, 1.0)
+    begun = PeriodicTimer(once_more, 1.0)
     rounds.start(begun)
     clock.pump([1.0] * 10)
     assert len(calls) == 3
@@ -51,8 +51,8 @@ def test_a_round_may_end_in_its_first_call() -> None:
     """It is never called again."""
     clock = Clock()
     calls: list[int] = []
-    begun = Round(lambda: (calls.append(1), begun.stop()), 1.0)
-    Rounds(clock).start(begun)
+    begun = PeriodicTimer(lambda: (calls.append(1), begun.stop()), 1.0)
+    PeriodicTimers(clock).start(begun)
     clock.pump([1.0] * 3)
     assert calls == [1]
 
@@ -61,8 +61,8 @@ def test_a_new_interval_counts_after_the_next_call() -> None:
     """As for one whose rights change."""
     clock = Clock()
     calls: list[float] = []
-    begun = Round(lambda: calls.append(clock.seconds()), 0.5)
-    Rounds(clock).start(begun)
+    begun = PeriodicTimer(lambda: calls.append(clock.seconds()), 0.5)
+    PeriodicTimers(clock).start(begun)
     begun.interval = 2.0
     clock.pump([0.25] * 20)
     assert calls == [0.0, 0.5, 2.5, 4.5]
@@ -72,7 +72,7 @@ def test_what_was_missed_is_not_made_up_for() -> None:
     """A relay that was frozen sends one ping, not a hundred."""
     clock = Clock()
     calls: list[float] = []
-    Rounds(clock).start(Round(lambda: calls.append(clock.seconds()), 0.1))
+    PeriodicTimers(clock).start(PeriodicTimer(lambda: calls.append(clock.seconds()), 0.1))
     clock.advance(10)
     assert len(calls) == 2
     clock.advance(0.1)
@@ -82,7 +82,7 @@ def test_what_was_missed_is_not_made_up_for() -> None:
 def test_a_failure_of_one_stops_no_other() -> None:
     """It is logged, and itself called again."""
     clock = Clock()
-    rounds = Rounds(clock)
+    rounds = PeriodicTimers(clock)
     failures: list[str] = []
     rounds.log = type("Log", (), {"failure": lambda self, text: failures.append(text)})()  # type: ignore[assignment]
     calls: list[int] = []
@@ -90,8 +90,8 @@ def test_a_failure_of_one_stops_no_other() -> None:
     def broken() -> None:
         raise RuntimeError("a fault")
 
-    rounds.start(Round(broken, 1.0))
-    rounds.start(Round(lambda: calls.append(1), 1.0))
+    rounds.start(PeriodicTimer(broken, 1.0))
+    rounds.start(PeriodicTimer(lambda: calls.append(1), 1.0))
     clock.pump([1.0] * 3)
     assert len(failures) == 4
     assert len(calls) == 4
@@ -102,14 +102,14 @@ def test_a_failure_of_one_stops_no_other() -> None:
 def test_everybody_is_called_as_often_as_it_should(intervals: list[float], seconds: int) -> None:
     """Whoever else is there."""
     clock = Clock()
-    rounds = Rounds(clock)
+    rounds = PeriodicTimers(clock)
     counts = [0] * len(intervals)
 
     def count(number: int) -> None:
         counts[number] += 1
 
     for number, interval in enumerate(intervals):
-        rounds.start(Round(functools.partial(count, number), interval))
+        rounds.start(PeriodicTimer(functools.partial(count, number), interval))
     clock.pump([0.05] * (20 * seconds))
     for found, interval in zip(counts, intervals, strict=True):
         assert abs(found - (1 + seconds / interval)) <= 1

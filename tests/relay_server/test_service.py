@@ -11,13 +11,14 @@ from twisted.internet import reactor
 from twisted.internet.defer import Deferred
 
 from relay_db import queries
-from relay_db.queries import NewMemory
+from relay_db.queries import NewStoredEvent
 from relay_protocol.clocks import now_ns
-from relay_server import passwords
 from relay_server.access import BadCredentials
-from relay_server.alerts import hub, kinds
-from relay_server.config import Endpoint, Settings
-from relay_server.registry import Presence
+from relay_server.alerts import alerts
+from relay_server.alerts import types as kinds
+from relay_server.auth import passwords
+from relay_server.config import ListenAddress, RelaySettings
+from relay_server.robots.registry import RobotState
 from relay_server.service import Relay
 from tests.relay_server.directory.test_entries import RECORD
 from tests.relay_server.memory import MemoryLink, hangs
@@ -27,9 +28,9 @@ GOING = "the relay is going down"
 
 def made(folder: Path) -> Relay:
     """A relay on a database of its own, which listens nowhere yet."""
-    nowhere = Endpoint("127.0.0.1", 0)
+    nowhere = ListenAddress("127.0.0.1", 0)
     database = f"sqlite:///{folder}/relay.db"
-    return Relay(reactor, Settings(data=folder, database=database, http=nowhere, robots=nowhere))
+    return Relay(reactor, RelaySettings(data=folder, database=database, http=nowhere, robots=nowhere))
 
 
 class Link(MemoryLink):
@@ -38,7 +39,7 @@ class Link(MemoryLink):
     :ivar robot: its robot
     """
 
-    def __init__(self, relay: Relay, robot: Presence) -> None:
+    def __init__(self, relay: Relay, robot: RobotState) -> None:
         super().__init__()
         self.robot = robot
         self._relay = relay
@@ -68,7 +69,7 @@ async def test_all_are_told_that_the_relay_goes_before_the_database_answers(
     robot = await with_a_robot(relay)
     relay._alerts.alerts.tell(robot.robot, kinds.STOP, "", "error", "stopped by ann")
     monkeypatch.setattr(relay._store, "write", hangs)
-    monkeypatch.setattr(hub, "KEEP_SECONDS", 0.05)
+    monkeypatch.setattr(alerts, "KEEP_SECONDS", 0.05)
     stopping = Deferred.fromCoroutine(relay.stop())
     assert robot.closed == GOING
     assert relay._desk is not None
@@ -120,7 +121,7 @@ async def test_a_realm_that_is_made_anew_is_empty_while_the_relay_runs(tmp_path:
         await relay._store.write(queries.add_realm, "lab")
         await relay.refresh()
         memory, changes = relay._memory, relay._directory._changes
-        memory.note(NewMemory("lab", 1.0, "relay", "x", None, None, "{}"))
+        memory.note(NewStoredEvent("lab", 1.0, "relay", "x", None, None, "{}"))
         await memory._writer.flush()
         changes.tell("registered", RECORD._replace(realm="lab"))
         assert memory._recent.since("lab", 0) and changes.follow("lab", None)[0].number == 1

@@ -10,11 +10,13 @@ import pytest
 from relay_protocol import link
 from relay_protocol.errors import Invalid, Refused
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server import closing
 from relay_server.access import BadCredentials
-from relay_server.channel import subscriptions
-from relay_server.session import calling, listening, normal_type, operations
-from relay_server.session import core as module
+from relay_server.channels import subscriptions
+from relay_server.common import close_codes
+from relay_server.sessions import service_calls, session
+from relay_server.sessions import session as module
+from relay_server.sessions import subscriptions as listening
+from relay_server.sessions.type_names import normal_type
 from tests.relay_server.memory import STRING, TEXTS, TWIST, Person, World, text
 
 
@@ -176,7 +178,7 @@ def test_a_hundred_messages_in_a_row_that_are_no_rosbridge_cut_the_client(world:
     assert person.client.closed is None
     person.session.message(junk)
     assert person.client.closed is not None
-    assert person.client.closed[0] == closing.TOO_MANY_ERRORS
+    assert person.client.closed[0] == close_codes.TOO_MANY_ERRORS
     assert not world.people
 
 
@@ -251,7 +253,7 @@ def test_a_client_that_takes_nothing_is_cut_after_the_stall_limit(world: World) 
         if second == 3:
             other.session.resume()
             other.session.pause()
-    assert person.client.closed == (closing.TOO_SLOW, "nothing was taken for 5 s")
+    assert person.client.closed == (close_codes.TOO_SLOW, "nothing was taken for 5 s")
     assert other.client.closed is None
 
 
@@ -262,7 +264,7 @@ def test_a_client_that_answers_no_ping_is_cut(world: World) -> None:
     assert person.client.closed is None
     world.clock.pump([0.1] * 3)
     assert person.client.closed is not None
-    assert person.client.closed[0] == closing.TOO_SLOW
+    assert person.client.closed[0] == close_codes.TOO_SLOW
 
 
 def test_a_client_whose_replies_pile_up_is_cut(world: World) -> None:
@@ -271,7 +273,7 @@ def test_a_client_whose_replies_pile_up_is_cut(world: World) -> None:
     person.session.pause()
     for number in range(1100):
         person.says("call_service", service="/relay/ping", id=number)
-    assert person.client.closed == (closing.TOO_SLOW, "replies pile up; read faster")
+    assert person.client.closed == (close_codes.TOO_SLOW, "replies pile up; read faster")
     assert world.people == [other.session]
 
 
@@ -334,8 +336,8 @@ def test_rights_taken_away_while_open_take_back_what_they_gave(world: World) -> 
 @pytest.mark.parametrize(
     ("error", "code"),
     [
-        (Refused("your right on this robot was revoked"), closing.FORBIDDEN),
-        (BadCredentials("your account was disabled"), closing.UNAUTHENTICATED),
+        (Refused("your right on this robot was revoked"), close_codes.FORBIDDEN),
+        (BadCredentials("your account was disabled"), close_codes.UNAUTHENTICATED),
     ],
 )
 def test_a_revoked_client_is_cut_with_the_reason(world: World, error: Refused, code: int) -> None:
@@ -362,9 +364,9 @@ def test_an_ended_session_does_nothing_more(world: World) -> None:
     world.channel.sample(number, text("a"))
     world.channel.sample(number, text("waits"))
     person.client.take()
-    person.session.close(closing.GOING_AWAY, "the relay is going down")
+    person.session.close(close_codes.GOING_AWAY, "the relay is going down")
     person.session.end()
-    person.session.close(closing.GOING_AWAY, "again")
+    person.session.close(close_codes.GOING_AWAY, "again")
     person.says("subscribe", topic="/secret")
     person.session.resume()
     world.channel.sample(number, text("b"))
@@ -420,7 +422,7 @@ def test_changes_faster_than_any_program_needs_are_refused(world: World) -> None
     """A loop of subscribe and unsubscribe does not reach the robot; a second later changes are followed again."""
     person = world.person()
     person.says("set_level", level="error")
-    for _ in range(int(operations.CHANGES_AT_ONCE)):
+    for _ in range(int(session.CHANGES_AT_ONCE)):
         person.says("subscribe", topic="/chatter", type=STRING)
         person.says("unsubscribe", topic="/chatter")
     assert "too many changes at once" in told(person)[0]
@@ -431,7 +433,7 @@ def test_changes_faster_than_any_program_needs_are_refused(world: World) -> None
 
 def test_arguments_of_calls_that_wait_are_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """What calls keep in memory is given back when they end."""
-    monkeypatch.setattr(calling, "CALL_BYTES", 100)
+    monkeypatch.setattr(service_calls, "CALL_BYTES", 100)
     person = world.at_work()
     for _ in range(2):
         person.says("call_service", service="/reset", args={"x": "y" * 60})

@@ -6,7 +6,7 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.sight import PICTURES, may_hear
+from relay_server.access import PICTURES, may_subscribe
 from tests.relay_server.local.asking import ask
 from tests.relay_server.memory import STRING, Person, World
 
@@ -61,16 +61,16 @@ def test_pictures_take_the_right_to_view_them(type_name: str) -> None:
         ("subscribe:/camera/x", "subscribe on"),
         ("view:/y", ""),
     ):
-        verdict = may_hear(Rules([Grant(Level.VIEWER, deny=(denied,))]).judge, world.robot, "/camera/x")
+        verdict = may_subscribe(Rules([Grant(Level.VIEWER, deny=(denied,))]).judge, world.robot, "/camera/x")
         assert (verdict.allowed, verdict.reason.startswith(reason)) == (not reason, True)
 
 
 def test_a_camera_is_one_whatever_its_topic_says(world: World) -> None:
     """The robot knows what its cameras are."""
     rules = Rules([Grant(Level.VIEWER, deny=BLIND)])
-    assert may_hear(rules.judge, world.robot, "/camera/info").allowed
+    assert may_subscribe(rules.judge, world.robot, "/camera/info").allowed
     world.registry.cameras(world.robot, link.Cameras(cameras=[link.Camera(name="/camera/info", type="x")]))
-    assert not may_hear(rules.judge, world.robot, "/camera/info").allowed
+    assert not may_subscribe(rules.judge, world.robot, "/camera/info").allowed
 
 
 def test_who_may_not_view_a_camera_does_not_hear_its_topic(world: World) -> None:

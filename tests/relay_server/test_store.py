@@ -13,27 +13,27 @@ from twisted.internet.defer import CancelledError, Deferred
 
 from relay_db import queries
 from relay_protocol.errors import Unavailable
-from relay_server.store import Store, Threads
+from relay_server.common.database import AsyncDatabase, BoundedThreadPool
 
 
 @pytest.fixture
-def threads() -> Iterator[Threads]:
+def threads() -> Iterator[BoundedThreadPool]:
     """One thread, two places."""
-    running = Threads(reactor, "test", 1, 2, "come back later")  # type: ignore[arg-type]
+    running = BoundedThreadPool(reactor, "test", 1, 2, "come back later")  # type: ignore[arg-type]
     running.start()
     yield running
     running.stop()
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_write_is_seen_by_the_next_read(store: Store) -> None:
+async def test_a_write_is_seen_by_the_next_read(store: AsyncDatabase) -> None:
     """It has been committed when it returns."""
     user = await store.write(queries.add_user, "ann", None)
     assert await store.read(queries.find_user, "ann") == user
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_failed_write_leaves_nothing(store: Store) -> None:
+async def test_a_failed_write_leaves_nothing(store: AsyncDatabase) -> None:
     """Errors come back as they were raised, and the transaction is undone."""
 
     def half(session: queries.Session) -> None:  # type: ignore[name-defined]
@@ -46,7 +46,7 @@ async def test_a_failed_write_leaves_nothing(store: Store) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_too_many_askers_are_refused_in_words(threads: Threads) -> None:
+async def test_too_many_askers_are_refused_in_words(threads: BoundedThreadPool) -> None:
     """The queue is bounded, and has room again when work is done."""
     go = threading.Event()
     waiting = [Deferred.fromCoroutine(threads.run(go.wait, 20)) for _ in range(2)]
@@ -59,7 +59,7 @@ async def test_too_many_askers_are_refused_in_words(threads: Threads) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_askers_who_leave_keep_their_place_until_the_work_is_done(threads: Threads) -> None:
+async def test_askers_who_leave_keep_their_place_until_the_work_is_done(threads: BoundedThreadPool) -> None:
     """Else coming and going would fill the queue without end while a database hangs."""
     go = threading.Event()
     waiting = [Deferred.fromCoroutine(threads.run(go.wait, 20)) for _ in range(2)]
@@ -78,7 +78,7 @@ async def test_askers_who_leave_keep_their_place_until_the_work_is_done(threads:
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_damaged_database_is_unavailable_in_words(store: Store, tmp_path: Path) -> None:
+async def test_a_damaged_database_is_unavailable_in_words(store: AsyncDatabase, tmp_path: Path) -> None:
     """Whoever asks is told so, without internals."""
     (tmp_path / "switchboard.db").write_bytes(b"junk" * 4096)
     with pytest.raises(Unavailable) as told:

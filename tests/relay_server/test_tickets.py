@@ -8,7 +8,7 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol.limits import CHANNEL_TICKET_SECONDS
-from relay_server.tickets import Tickets
+from relay_server.robots.tickets import Tickets
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 from websockets.protocol import CLIENT, OPEN, Protocol
 
-from relay_server import wsframe
+from relay_server.common import websocket_frames
 
 
 @pytest.mark.parametrize("length", [0, 1, 125, 126, 127, 65535, 65536, 70000])
@@ -18,7 +18,7 @@ def test_a_message_is_read_back_whole(length: int) -> None:
     """At and around every length at which the head changes its form (RFC 6455 section 5.2)."""
     payload = bytes(index % 128 for index in range(length))
     reader = Protocol(CLIENT, state=OPEN, max_size=None)
-    reader.receive_data(wsframe.text(payload) + wsframe.binary(payload))
+    reader.receive_data(websocket_frames.text(payload) + websocket_frames.binary(payload))
     read = [(frame.opcode, bytes(frame.data), frame.fin) for frame in reader.events_received()]
     assert read == [(Opcode.TEXT, payload, True), (Opcode.BINARY, payload, True)]
 
@@ -27,13 +27,13 @@ def test_a_message_is_read_back_whole(length: int) -> None:
 def test_pieces_make_the_same_frame_as_the_whole(length: int) -> None:
     """At and around every length at which the head changes its form."""
     body = b"x" * length
-    assert wsframe.text_of(b"a", body, b"c") == wsframe.text(b"a" + body + b"c")
+    assert websocket_frames.text_of(b"a", body, b"c") == websocket_frames.text(b"a" + body + b"c")
 
 
 def test_a_ping_is_read_back() -> None:
     """With its payload."""
     reader = Protocol(CLIENT, state=OPEN, max_size=None)
-    reader.receive_data(wsframe.ping(b"12345678"))
+    reader.receive_data(websocket_frames.ping(b"12345678"))
     read = [(frame.opcode, bytes(frame.data)) for frame in reader.events_received()]
     assert read == [(Opcode.PING, b"12345678")]
 
@@ -44,13 +44,13 @@ def test_a_ping_is_read_back() -> None:
 @settings(deadline=None, max_examples=50)
 def test_messages_in_pieces_are_the_same_messages(payloads: list[bytes], sizes: list[int]) -> None:
     """However they are cut. Between two pieces a ping may be sent (RFC 6455 section 5.4)."""
-    pieces = wsframe.Fragments(b"".join(map(wsframe.binary, payloads)))
+    pieces = websocket_frames.Fragments(b"".join(map(websocket_frames.binary, payloads)))
     reader = Protocol(CLIENT, state=OPEN, max_size=None)
     for size in itertools.cycle(sizes):
         if not pieces.left:
             break
         reader.receive_data(pieces.take(max(size, 50)))
-        reader.receive_data(wsframe.ping(b"now"))
+        reader.receive_data(websocket_frames.ping(b"now"))
     assert reader.parser_exc is None
     joined, part = [], b""
     for frame in reader.events_received():

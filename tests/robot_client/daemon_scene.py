@@ -15,17 +15,17 @@ from twisted.internet.testing import StringTransportWithDisconnection
 from twisted.python.failure import Failure
 
 from relay_protocol import frames, identity, link
-from robot_client.backoff import Backoff
-from robot_client.camera.desk import CameraDesk
-from robot_client.camera.keeper import CameraKeeper
-from robot_client.camera.lines import Settings as CameraSettings
-from robot_client.config import Settings
-from robot_client.connection import Connection
+from robot_client.camera.ipc import CameraSettings
+from robot_client.camera.service import DaemonCameras
+from robot_client.camera.supervisor import CameraSupervisor
+from robot_client.config import RobotSettings
 from robot_client.daemon import Daemon
-from robot_client.guard_feed import NoGuard
-from robot_client.hardware import Hardware, Switches
-from robot_client.lasting import MemoryLatch
-from robot_client.link import ControlLink, Identity
+from robot_client.link.backoff import Backoff
+from robot_client.link.connection import ControlConnection
+from robot_client.link.protocol import ControlLink, Identity
+from robot_client.motion.guard_port import NoGuard
+from robot_client.motion.hardware import Hardware, Switches
+from robot_client.motion.stop_store import MemoryStopStore
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
 
@@ -80,7 +80,7 @@ class Endpoint:
         return succeed(protocol)
 
 
-class Answered(Connection):
+class Answered(ControlConnection):
     """Of a relay that answers every ping at once."""
 
     now: Callable[[], int]
@@ -97,12 +97,12 @@ class Scene:
 
     def __init__(
         self,
-        latch: MemoryLatch | None = None,
+        latch: MemoryStopStore | None = None,
         switches: Switches | None = None,
-        settings: Settings | None = None,
+        settings: RobotSettings | None = None,
         answers: bool = True,
     ) -> None:
-        self.latch = latch or MemoryLatch()
+        self.latch = latch or MemoryStopStore()
         self.clock = Clock()
         self.clock.advance(1000)
         self.listening = True
@@ -111,7 +111,7 @@ class Scene:
         self.left: list[Any] = []
         """What came of the daemon's end."""
         self.platform = MemoryPlatform(GraphView(nodes=frozenset({"/talker"})))
-        self.connection = (Answered if answers else Connection)(
+        self.connection = (Answered if answers else ControlConnection)(
             self.dial,
             lambda: ControlLink(ME, "test", self.now),
             self.clock,
@@ -121,13 +121,15 @@ class Scene:
         )
         if isinstance(self.connection, Answered):
             self.connection.now = self.now
-        self.cameras = CameraKeeper(self.clock, CameraSettings(address="relay:1", node="camera", streams=8))
+        self.cameras = CameraSupervisor(
+            self.clock, CameraSettings(address="relay:1", node="camera", streams=8)
+        )
         self.daemon = Daemon(
-            settings or Settings(),
+            settings or RobotSettings(),
             self.connection,
             self.platform,
             NoGuard(),
-            CameraDesk({}, self.cameras, self.connection.say, self.clock),
+            DaemonCameras({}, self.cameras, self.connection.say, self.clock),
             self.latch,
             Hardware(switches or Switches(), self.platform, self.clock),
             self.clock,

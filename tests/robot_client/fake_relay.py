@@ -15,7 +15,7 @@ import msgspec
 
 from relay_protocol import frames, identity, link
 from relay_protocol.errors import PeerError
-from relay_protocol.link.moving import Order
+from relay_protocol.link.motion import Order
 
 T = TypeVar("T", bound=link.Message | frames.SampleFrame | frames.VideoFrame)
 PATIENCE = 60.0

@@ -52,7 +52,7 @@ class Robot:
         return self.start("run", *arguments)
 
     def guards(self, process: Forked) -> list[psutil.Process]:
-        return self.children(process, "robot_client.guard")
+        return self.children(process, "robot_client.motion.guard")
 
     def children(self, process: Forked, module: str) -> list[psutil.Process]:
         return [each for each in psutil.Process(process.pid).children() if module in each.cmdline()]

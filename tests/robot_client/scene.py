@@ -9,23 +9,23 @@ from twisted.internet.task import Clock
 from relay_protocol import link
 from relay_protocol.frames import CommandFrame, FrameDecoder, SampleFrame
 from relay_protocol.link import MotionPolicy
-from robot_client.authority import Authority
-from robot_client.channel import Channel
-from robot_client.gate import Gate
-from robot_client.guard_feed import NoGuard
-from robot_client.motion import MotionDesk
-from robot_client.offset import Offset
+from robot_client.channel.channel import RobotChannel
+from robot_client.channel.parts import ChannelWriter
+from robot_client.link.clock_offset import ClockOffset
+from robot_client.link.transport import MOST_AT_ONCE
+from robot_client.motion.authority import Authority
+from robot_client.motion.gate import MotionGate
+from robot_client.motion.guard_port import NoGuard
+from robot_client.motion.motion import MotionControl
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, MemoryPlatform
-from robot_client.transport import MOST_AT_ONCE
-from robot_client.wire import Wire
 
 STRING = "std_msgs/msg/String"
 DRIVER = 7
 """The source that holds control."""
 
 
-class Recorder(Wire):
+class Recorder(ChannelWriter):
     def __init__(self) -> None:
         self.said: list[Any] = []
         self.writes: list[list[bytes]] = []
@@ -48,15 +48,15 @@ class Scene:
         self.clock.advance(100)
         self.platform = MemoryPlatform(GraphView(topics={"/chat": link.Topic(types=[STRING])}))
         self.wire = Recorder()
-        self.offset = Offset()
+        self.offset = ClockOffset()
         self.offset.add(self.now(), self.now(), self.now())
         policy = MotionPolicy(types=[TWIST], services=["/arm/*"], actions=["/navigate_to_pose"])
         self.authority = Authority()
         self.authority.hold(DRIVER, "ann", "operator", 0)
         self.silent: dict[str, bool] = {}
-        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, NoGuard(), self.authority)
-        self.gate = Gate(policy, self.platform, self.authority, self.now)
-        self.channel = Channel(
+        self.desk = MotionControl(policy, self.platform, self.clock, self.now, NoGuard(), self.authority)
+        self.gate = MotionGate(policy, self.platform, self.authority, self.now)
+        self.channel = RobotChannel(
             "c1",
             self.wire,
             self.offset,

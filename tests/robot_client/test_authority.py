@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol import link
-from robot_client import authority as module
-from robot_client.authority import LET_GO, SETTLED, Authority, Suppression, Verdict
+from robot_client.motion import authority as module
+from robot_client.motion.authority import LET_GO, SETTLED, Authority, Suppression, Verdict
 
 MS = 1_000_000
 ANN, BEN, EVE = 1, 2, 3

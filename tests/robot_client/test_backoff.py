@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_client.backoff import CAP, FIRST, REFUSED, Backoff
+from robot_client.link.backoff import CAP, FIRST, REFUSED, Backoff
 
 
 def test_first_retry_is_quick() -> None:

@@ -10,10 +10,10 @@ from twisted.internet.defer import Deferred
 from relay_protocol import link
 from relay_protocol.frames import CommandFrame, SampleFrame
 from relay_protocol.link import MotionPolicy
-from robot_client.motion import KEPT, MOTION_QOS
-from robot_client.platforms.base import CANCELED, GraphView, Outcome
+from robot_client.motion.motion import KEPT, MOTION_QOS
+from robot_client.motion.motion_topics import MAX_TOPICS
+from robot_client.platforms.base import CANCELED, GoalOutcome, GraphView
 from robot_client.platforms.memory import TWIST, MemorySource, twist
-from robot_client.tracks import MAX_TOPICS
 from tests.robot_client.breaking import broken
 from tests.robot_client.scene import DRIVER, STRING, Scene
 
@@ -331,7 +331,7 @@ def test_goals_are_cancelled_in_order_whatever_one_does(
     monkeypatch.setattr(first, "cancel", broken)
     scene.channel.cancel_goals(only_moving=False)
     assert second.cancelled
-    second.result.callback(Outcome(CANCELED, None, "stopped"))
+    second.result.callback(GoalOutcome(CANCELED, None, "stopped"))
     assert scene.wire.said[-1] == link.ActionResult(
         id="/navigate_to_pose", status=CANCELED, result=False, reason="stopped"
     )

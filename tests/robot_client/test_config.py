@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from relay_protocol.errors import Invalid
-from robot_client.config import Settings, load
-from robot_client.rules import rules_of
-from robot_client.safety import Times
+from robot_client.config import RobotSettings, load
+from robot_client.motion.rules import rules_of
+from robot_client.motion.safety import Times
 
 POSE = "geometry_msgs/msg/PoseStamped"
 
@@ -18,7 +18,7 @@ POSE = "geometry_msgs/msg/PoseStamped"
 def test_without_anything_the_defaults_hold() -> None:
     """No file, no variables: stop within 500 ms, no ramp; velocities, joints and joysticks are motion."""
     settings = load(None, {})
-    assert settings == Settings()
+    assert settings == RobotSettings()
     assert settings.safety.policy.stop_within_ms == 500
     assert settings.safety.ramp_ms == 0
     assert settings.safety.policy.types == [

@@ -9,7 +9,7 @@ import pytest
 
 from relay_protocol import frames, link
 from robot_client.alerts import HEARING_NS
-from robot_client.lasting import MemoryLatch
+from robot_client.motion.stop_store import MemoryStopStore
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, twist
 from tests.robot_client.breaking import broken
@@ -348,7 +348,7 @@ def test_what_is_done_every_second_goes_on_after_a_failure(
     monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     """Stops are finished by it: a robot that ceased to look would have to be restarted, and nobody would know."""
-    latch = MemoryLatch()
+    latch = MemoryStopStore()
     latch.noted = ["/spin"]
     scene = Scene(latch)
     *place, name = where.split(".")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol import link
-from robot_client.driven import Driven
+from robot_client.motion.link_loss_alert import LinkLossAlert
 
 
 class Scene:
@@ -13,7 +13,7 @@ class Scene:
 
     def __init__(self) -> None:
         self.now = 1000
-        self.driven = Driven(lambda: self.now)
+        self.driven = LinkLossAlert(lambda: self.now)
 
     def says(self, moving: bool, holder: int = 7) -> None:
         """It tells, a moment later."""

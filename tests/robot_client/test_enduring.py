@@ -6,7 +6,7 @@ import pytest
 from twisted.internet.task import Clock
 from twisted.logger import Logger, capturedLogs
 
-from robot_client.enduring import LOG_EVERY, Rounds, endure
+from robot_client.periodic import LOG_EVERY, PeriodicTasks, run_safely
 
 
 class Step:
@@ -26,7 +26,7 @@ def test_a_step_that_fails_is_logged_and_ends_nothing() -> None:
     """The log says why; one that does not fail is not mentioned."""
     with capturedLogs() as logged:
         for step in (Step(1), Step(0)):
-            endure(Logger("here"), "it could not be done", step, 1)
+            run_safely(Logger("here"), "it could not be done", step, 1)
             assert step.done == 1
     assert [each["log_format"] for each in logged] == ["it could not be done"]
     assert logged[0]["log_failure"].getErrorMessage() == "this was not foreseen"
@@ -37,7 +37,7 @@ def test_rounds_go_on(failures: int) -> None:
     """At their time, however often they fail, until they are to end; one does not hang on the other."""
     clock = Clock()
     first, second = Step(failures), Step(0)
-    rounds = Rounds([(first, 1.0), (second, 0.5)], clock)
+    rounds = PeriodicTasks([(first, 1.0), (second, 0.5)], clock)
     rounds.start()
     assert (first.done, second.done) == (0, 0)
     clock.pump([0.5] * 20)
@@ -51,7 +51,7 @@ def test_rounds_go_on(failures: int) -> None:
 def test_rounds_that_fail_do_not_fill_the_disk() -> None:
     """The first failure is logged, and one a minute of those that follow."""
     clock = Clock()
-    rounds = Rounds([(Step(10**6), 0.5)], clock)
+    rounds = PeriodicTasks([(Step(10**6), 0.5)], clock)
     rounds.start()
     with capturedLogs() as logged:
         clock.pump([0.5] * round(4 * LOG_EVERY))

@@ -10,10 +10,10 @@ from twisted.internet.defer import Deferred
 from relay_protocol import link
 from relay_protocol.errors import Refused
 from relay_protocol.link import MotionPolicy
-from robot_client.authority import Suppression
-from robot_client.config import Safety, Settings
-from robot_client.gate import Gate
-from robot_client.offset import Offset
+from robot_client.config import RobotSettings, SafetySettings
+from robot_client.link.clock_offset import ClockOffset
+from robot_client.motion.authority import Suppression
+from robot_client.motion.gate import MotionGate
 from robot_client.platforms.base import GraphView
 from tests.robot_client import daemon_scene
 from tests.robot_client.scene import DRIVER, Scene
@@ -127,7 +127,7 @@ def test_who_may_not_move_the_robot_is_told_so_first(scene: Scene) -> None:
 def test_the_relays_clock_of_the_very_link_counts(scene: Scene) -> None:
     """Its stamps are far from the robot's own clock."""
     ahead = 10**15
-    other = Offset()
+    other = ClockOffset()
     other.add(scene.now(), scene.now() + ahead, scene.now())
     scene.gate.goal("/navigate_to_pose", DRIVER, scene.now() + ahead, other)
     assert goal(scene, "/navigate_to_pose", scene.now() + ahead) is not None
@@ -263,9 +263,9 @@ def test_a_call_whose_service_takes_its_time_is_made(scene: Scene) -> None:
 # --- the switch in the hardware ----------------------------------------------------------------------------
 
 
-def armed(settings: Safety) -> tuple[daemon_scene.Line, daemon_scene.Line, list[bytes]]:
+def armed(settings: SafetySettings) -> tuple[daemon_scene.Line, daemon_scene.Line, list[bytes]]:
     """A daemon with that switch, control link and channel; what its service is asked."""
-    made = daemon_scene.Scene(settings=Settings(safety=settings), switches=settings.switches)
+    made = daemon_scene.Scene(settings=RobotSettings(safety=settings), switches=settings.switches)
     asked: list[bytes] = []
 
     def thrown(request: bytes) -> bytes:
@@ -286,11 +286,14 @@ def armed(settings: Safety) -> tuple[daemon_scene.Line, daemon_scene.Line, list[
 @pytest.mark.parametrize("service", ["/estop", "estop"])
 @pytest.mark.parametrize(
     "settings",
-    [Safety(stop_call="estop"), Safety(stop_call="/estop", motion_services=["*"], motion_actions=[])],
+    [
+        SafetySettings(stop_call="estop"),
+        SafetySettings(stop_call="/estop", motion_services=["*"], motion_actions=[]),
+    ],
     ids=["plain", "motion"],
 )
 def test_no_client_calls_the_switch_in_the_hardware(
-    settings: Safety, service: str, source: int, stopped: bool
+    settings: SafetySettings, service: str, source: int, stopped: bool
 ) -> None:
     """Stopped or not, who holds control as little as others, however it is spelled and whatever else it is."""
     control, channel, asked = armed(settings)
@@ -309,14 +312,14 @@ def test_no_client_calls_the_switch_in_the_hardware(
 
 def test_the_robot_itself_throws_the_switch() -> None:
     """At a stop and at a resume."""
-    control, _, asked = armed(Safety(stop_call="/estop"))
+    control, _, asked = armed(SafetySettings(stop_call="/estop"))
     control.say(link.Stop(id=2, by="eve"), link.Resume(id=3, by="eve"))
     assert [request[4] for request in asked] == [1, 0]
 
 
 def test_no_goal_throws_the_switch(scene: Scene) -> None:
     """Not even where it bears the name of an action's own service."""
-    gate = Gate(MotionPolicy(), scene.platform, scene.authority, scene.now, "/dock/_action/send_goal")
+    gate = MotionGate(MotionPolicy(), scene.platform, scene.authority, scene.now, "/dock/_action/send_goal")
     with pytest.raises(Refused, match="no client may call"):
         gate.goal("dock", DRIVER, None, scene.offset)
     with pytest.raises(Refused, match="no client may call"):
@@ -326,7 +329,7 @@ def test_no_goal_throws_the_switch(scene: Scene) -> None:
 
 def test_no_client_stands_in_for_the_switch() -> None:
     """Whoever offered a service of its name could answer a stop that stopped nothing."""
-    _, channel, _ = armed(Safety(stop_call="/estop"))
+    _, channel, _ = armed(SafetySettings(stop_call="/estop"))
     channel.say(link.AdvertiseService(service="estop", type="std_srvs/srv/SetBool"))
     channel.say(link.AdvertiseService(service="/lamp", type="std_srvs/srv/SetBool"))
     failed, offered = channel.heard()

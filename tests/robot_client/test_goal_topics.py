@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol import frames, link
-from robot_client.motion import MOTION_QOS
+from robot_client.motion.motion import MOTION_QOS
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, twist
 from tests.robot_client.daemon_scene import DRIVER, Line, Scene

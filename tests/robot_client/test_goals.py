@@ -9,10 +9,10 @@ from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
 from relay_protocol import link
-from robot_client.goals import ASK_EVERY
-from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, Outcome
+from robot_client.channel.action_goals import ASK_EVERY
+from robot_client.channel.parts import MAX_OPEN
+from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, GoalOutcome
 from robot_client.platforms.memory import MemoryGoal
-from robot_client.wire import MAX_OPEN
 from tests.robot_client.scene import Scene
 
 BODY = b"\0\1\0\0body"
@@ -38,7 +38,7 @@ def test_goal_is_pursued_and_told(scene: Scene) -> None:
     goal = begin(scene)
     assert (goal.action, goal.body) == ("/drive", BODY)
     goal.feed(BODY)
-    goal.result.callback(Outcome(SUCCEEDED, BODY))
+    goal.result.callback(GoalOutcome(SUCCEEDED, BODY))
     goal.feed(BODY)
     assert scene.wire.said == [
         link.ActionFeedback(id="g", cdr=CDR),
@@ -55,13 +55,13 @@ def test_feedback_is_sent_only_when_asked_for(scene: Scene) -> None:
 @pytest.mark.parametrize("status", [CANCELED, ABORTED])
 def test_other_ends_have_their_result_too(scene: Scene, status: int) -> None:
     """A goal that was cancelled or aborted comes with the result the server gave."""
-    begin(scene).result.callback(Outcome(status, BODY))
+    begin(scene).result.callback(GoalOutcome(status, BODY))
     assert scene.wire.said[-1] == link.ActionResult(id="g", status=status, result=True, cdr=CDR)
 
 
 def test_goal_without_a_result_has_a_reason(scene: Scene) -> None:
     """A goal that vanished with its server ends without a result, in words."""
-    begin(scene).result.callback(Outcome(ABORTED, None, "its server vanished"))
+    begin(scene).result.callback(GoalOutcome(ABORTED, None, "its server vanished"))
     assert scene.wire.said[-1] == link.ActionResult(
         id="g", status=ABORTED, result=False, reason="its server vanished"
     )
@@ -86,7 +86,7 @@ def test_second_goal_of_an_id_does_not_end_the_first(scene: Scene) -> None:
     begin(scene)
     assert isinstance(scene.wire.said[-1], link.Failed)
     assert scene.wire.said[-1].ref == "g"
-    goal.result.callback(Outcome(SUCCEEDED, BODY))
+    goal.result.callback(GoalOutcome(SUCCEEDED, BODY))
     assert scene.wire.said[-1].status == SUCCEEDED
 
 
@@ -120,7 +120,7 @@ def test_the_relay_can_have_a_goal_cancelled_once_a_second(scene: Scene) -> None
     scene.clock.advance(ASK_EVERY)
     scene.channel.handle(link.CancelActionGoal(id="a"))
     assert goal.cancels == 3
-    goal.result.callback(Outcome(CANCELED, BODY))
+    goal.result.callback(GoalOutcome(CANCELED, BODY))
     second = begin(scene, "a")
     scene.channel.handle(link.CancelActionGoal(id="a"))
     assert second.cancels == 1
@@ -134,7 +134,7 @@ def test_full_link_keeps_the_newest_feedback(scene: Scene) -> None:
         first.feed(BODY + bytes([number]))
         second.feed(BODY + bytes([number]))
     assert scene.wire.said == []
-    second.result.callback(Outcome(SUCCEEDED, BODY))
+    second.result.callback(GoalOutcome(SUCCEEDED, BODY))
     scene.channel.resume()
     newest = link.to_base64(BODY + bytes([99]))
     assert scene.wire.said == [
@@ -148,7 +148,7 @@ def test_result_too_large_for_the_link_ends_in_words(scene: Scene) -> None:
     """A result over the relay's limit, which would cost the whole link, is told without its bytes."""
     goal = begin(scene)
     goal.feed(bytes(2**24))
-    goal.result.callback(Outcome(SUCCEEDED, bytes(2**24)))
+    goal.result.callback(GoalOutcome(SUCCEEDED, bytes(2**24)))
     assert len(scene.wire.said) == 1
     assert (scene.wire.said[0].status, scene.wire.said[0].result) == (SUCCEEDED, False)
     assert "16777216 bytes" in scene.wire.said[0].reason
@@ -168,7 +168,7 @@ def test_end_of_the_channel_cancels_all(scene: Scene) -> None:
     scene.channel.close()
     assert all(goal.cancelled for goal in goals)
     goals[0].feed(BODY)
-    goals[1].result.callback(Outcome(CANCELED, BODY))
+    goals[1].result.callback(GoalOutcome(CANCELED, BODY))
     assert scene.wire.said == []
 
 

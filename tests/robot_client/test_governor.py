@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_protocol.link.moving import Limits
-from robot_client.governor import Governor
-from robot_client.topics import TypedTopic
-from robot_client.velocity import TWIST, TWIST_STAMPED, Velocity, form
+from relay_protocol.link.motion import Limits
+from robot_client.motion.governor import Governor
+from robot_client.motion.typed_topic import TypedTopic
+from robot_client.motion.velocity import TWIST, TWIST_STAMPED, Velocity, form
 
 MS = 1_000_000
 CMD = TypedTopic("/cmd_vel", TWIST)

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol import jsontext, limits, link
-from relay_server.graph import GraphMirror
-from robot_client.graph_parts import parts
+from relay_server.robots.graph import GraphMirror
+from robot_client.graph_chunks import parts
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=30)
 ENDS = st.lists(NAMES, max_size=3)

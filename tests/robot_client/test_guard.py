@@ -7,21 +7,21 @@ import sys
 
 import pytest
 
-from robot_client.guard import Guard
-from robot_client.guard_protocol import (
+from robot_client.motion.guard import Guard
+from robot_client.motion.guard_protocol import (
     GOALS_WITHIN_MS,
-    Alive,
-    Command,
     Forget,
+    GuardAlive,
+    GuardedCommand,
+    GuardedTopic,
     Leave,
     Probe,
-    Shape,
-    Topic,
+    ZeroShape,
     cancelling,
     decoder,
     encode,
 )
-from robot_client.topics import TypedTopic
+from robot_client.motion.typed_topic import TypedTopic
 
 MS = 1_000_000
 TWIST = "geometry_msgs/msg/Twist"
@@ -58,12 +58,12 @@ class Scene:
         self.outlets = Outlets()
         self.outlets.scene = self
         self.guard = Guard(500, self.outlets, lambda: self.now)
-        self.guard.take(Topic(*CMD))
+        self.guard.take(GuardedTopic(*CMD))
         self.guard.act()
         assert self.guard.take_ready() == [CMD]
 
     def move(self, moving: bool = True) -> None:
-        self.guard.take(Command(*CMD, moving, self.now))
+        self.guard.take(GuardedCommand(*CMD, moving, self.now))
 
     def run(self, ms: int) -> None:
         """Let time pass as the loop does: sleep as long as the guard says, then act."""
@@ -152,9 +152,9 @@ def test_what_still_moves_when_the_daemon_leaves_is_stopped(scene: Scene) -> Non
 
 
 @pytest.mark.parametrize(
-    "line", [Topic("/a", "b"), Forget("/a", "b"), Command("/a", "b", True, 5), Probe(), Leave()]
+    "line", [GuardedTopic("/a", "b"), Forget("/a", "b"), GuardedCommand("/a", "b", True, 5), Probe(), Leave()]
 )
-def test_lines_come_out_as_they_went_in(line: Topic | Forget | Command | Probe | Leave) -> None:
+def test_lines_come_out_as_they_went_in(line: GuardedTopic | Forget | GuardedCommand | Probe | Leave) -> None:
     """Every line survives the pipe."""
     assert decoder.decode(encode(line)) == line
     assert encode(line).endswith(b"\n")
@@ -163,7 +163,7 @@ def test_lines_come_out_as_they_went_in(line: Topic | Forget | Command | Probe |
 def test_a_topic_is_ready_once_somebody_listens(scene: Scene) -> None:
     """The guard says which topics it could stop: those its publisher has found a listener for, each once."""
     scene.outlets.listened = False
-    scene.guard.take(Topic("/other", TWIST))
+    scene.guard.take(GuardedTopic("/other", TWIST))
     scene.run(100)
     assert scene.guard.take_ready() == []
     scene.outlets.listened = True
@@ -176,7 +176,7 @@ def test_a_topic_is_ready_once_somebody_listens(scene: Scene) -> None:
 
 def test_the_type_commanded_last_is_the_one_stopped(scene: Scene) -> None:
     """A topic commanded as Twist after it was opened as TwistStamped is stopped as Twist."""
-    scene.guard.take(Topic(*STAMPED))
+    scene.guard.take(GuardedTopic(*STAMPED))
     scene.move()
     scene.guard.orphaned()
     assert {on for _, on in scene.outlets.zeros} == {CMD}
@@ -204,15 +204,15 @@ def test_topic_that_comes_back_is_not_forgotten(scene: Scene) -> None:
     """A topic commanded again before it could be forgotten keeps its publisher."""
     scene.move()
     scene.guard.take(Forget(*CMD))
-    scene.guard.take(Topic(*CMD))
+    scene.guard.take(GuardedTopic(*CMD))
     scene.run(1000)
     assert scene.outlets.open_now == {CMD}
 
 
 def test_topic_that_can_not_be_stopped_does_not_keep_the_next_from_it(scene: Scene) -> None:
     """A publisher that fails leaves the other topics their zeros."""
-    scene.guard.take(Topic(*STAMPED))
-    scene.guard.take(Command(*STAMPED, True, scene.now))
+    scene.guard.take(GuardedTopic(*STAMPED))
+    scene.guard.take(GuardedCommand(*STAMPED, True, scene.now))
     scene.move()
     honest = scene.outlets.zero
 
@@ -229,26 +229,26 @@ def test_topic_that_can_not_be_stopped_does_not_keep_the_next_from_it(scene: Sce
 def test_answers_have_their_output_for_themselves() -> None:
     """What else is written to standard output, by ROS for one, goes to the log and not between the answers."""
     program = (
-        "import os; from robot_client import guard; from robot_client.guard_protocol import Alive\n"
+        "import os; from robot_client.motion import guard; from robot_client.motion.guard_protocol import GuardAlive\n"
         "outlet = guard._own_stdout()\n"
-        "os.write(1, b'noise'); guard._answer(outlet, Alive())"
+        "os.write(1, b'noise'); guard._answer(outlet, GuardAlive())"
     )
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
-    assert found.stdout == encode(Alive())
+    assert found.stdout == encode(GuardAlive())
     assert b"noise" in found.stderr
 
 
 def test_zero_has_the_shape_of_the_last_command(scene: Scene) -> None:
     """As the daemon told it, until the topic is forgotten."""
-    line = decoder.decode(encode(Shape(*CMD, b"\0two axes")))
+    line = decoder.decode(encode(ZeroShape(*CMD, b"\0two axes")))
     scene.guard.take(line)
     scene.move()
     scene.guard.orphaned()
     assert scene.outlets.rests == [b"\0two axes"]
     other = Scene()
-    other.guard.take(Shape(*CMD, b"shape"))
+    other.guard.take(ZeroShape(*CMD, b"shape"))
     other.guard.take(Forget(*CMD))
-    other.guard.take(Topic(*CMD))
+    other.guard.take(GuardedTopic(*CMD))
     other.move()
     other.guard.orphaned()
     assert other.outlets.rests == [b""]
@@ -257,8 +257,8 @@ def test_zero_has_the_shape_of_the_last_command(scene: Scene) -> None:
 def test_a_topic_with_a_shorter_time_is_stopped_earlier(scene: Scene) -> None:
     """The daemon says it with the topic."""
     arm = TypedTopic("/arm", TWIST)
-    scene.guard.take(Topic(*arm, 200))
-    scene.guard.take(Command(*arm, True, scene.now))
+    scene.guard.take(GuardedTopic(*arm, 200))
+    scene.guard.take(GuardedCommand(*arm, True, scene.now))
     scene.move()
     scene.run(300)
     assert scene.outlets.zeros[0] == (1180, arm)
@@ -271,9 +271,9 @@ SPIN = cancelling("/spin")
 def test_goals_of_a_dead_daemon_are_cancelled_at_once(scene: Scene) -> None:
     """Several times, as topics are stopped; not those of an action whose goals have ended."""
     for on in (SPIN, cancelling("/dock_robot")):
-        scene.guard.take(Topic(*on, GOALS_WITHIN_MS))
-        scene.guard.take(Command(*on, True, scene.now))
-    scene.guard.take(Command(*cancelling("/dock_robot"), False, scene.now))
+        scene.guard.take(GuardedTopic(*on, GOALS_WITHIN_MS))
+        scene.guard.take(GuardedCommand(*on, True, scene.now))
+    scene.guard.take(GuardedCommand(*cancelling("/dock_robot"), False, scene.now))
     scene.guard.orphaned()
     scene.run(1000)
     assert [on for _, on in scene.outlets.zeros] == [SPIN] * 5
@@ -282,8 +282,8 @@ def test_goals_of_a_dead_daemon_are_cancelled_at_once(scene: Scene) -> None:
 
 def test_goals_have_longer_than_commands(scene: Scene) -> None:
     """A daemon that stands still for a moment loses its commands, and its goals 1.8 s after its last word of them."""
-    scene.guard.take(Topic(*SPIN, GOALS_WITHIN_MS))
-    scene.guard.take(Command(*SPIN, True, scene.now))
+    scene.guard.take(GuardedTopic(*SPIN, GOALS_WITHIN_MS))
+    scene.guard.take(GuardedCommand(*SPIN, True, scene.now))
     scene.move()
     scene.run(1799)
     assert {on for _, on in scene.outlets.zeros} == {CMD}

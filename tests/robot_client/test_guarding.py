@@ -6,22 +6,22 @@ from typing import Any
 
 import pytest
 
-from robot_client.guard_protocol import (
+from robot_client.motion.guard_protocol import (
     GOALS_WITHIN_MS,
-    Alive,
-    Command,
     Forget,
+    GuardAlive,
+    GuardedCommand,
+    GuardedTopic,
     Leave,
     Probe,
-    Ready,
-    Shape,
-    Topic,
+    TopicReady,
+    ZeroShape,
     cancelling,
     decoder,
     encode,
 )
-from robot_client.guarding import DOUBTFUL, PROBE_EVERY, PROBE_MOVING, SILENT, GuardKeeper
-from robot_client.topics import TypedTopic
+from robot_client.motion.guard_supervisor import DOUBTFUL, PROBE_EVERY, PROBE_MOVING, SILENT, GuardSupervisor
+from robot_client.motion.typed_topic import TypedTopic
 from tests.robot_client.processes import Process, Reactor
 
 CMD = TypedTopic("/cmd_vel", "T")
@@ -31,7 +31,7 @@ class Scene:
     def __init__(self) -> None:
         self.reactor = Reactor(decoder.decode)
         self.alerts: list[str] = []
-        self.keeper = GuardKeeper(self.reactor, "guard", 500)
+        self.keeper = GuardSupervisor(self.reactor, "guard", 500)
         self.keeper.on_alert = self._told
         self.keeper.start()
 
@@ -53,7 +53,7 @@ def test_guard_is_told_of_topics_and_commands(scene: Scene) -> None:
     scene.keeper.topic(CMD)
     scene.keeper.topic(CMD)
     scene.keeper.command(CMD, True, 5)
-    assert scene.process.lines == [Topic(*CMD), Command(*CMD, True, 5), Probe()]
+    assert scene.process.lines == [GuardedTopic(*CMD), GuardedCommand(*CMD, True, 5), Probe()]
 
 
 def test_dead_guard_is_replaced_and_brought_up_to_date(scene: Scene) -> None:
@@ -64,20 +64,20 @@ def test_dead_guard_is_replaced_and_brought_up_to_date(scene: Scene) -> None:
     assert scene.alerts == ["module guard error"]
     scene.reactor.advance(1.0)
     assert len(scene.reactor.processes) == 2
-    assert scene.process.lines == [Topic(*CMD), Command(*CMD, True, 5)]
+    assert scene.process.lines == [GuardedTopic(*CMD), GuardedCommand(*CMD, True, 5)]
 
 
 def test_guard_is_told_what_a_zero_looks_like_and_how_long_a_topic_has(scene: Scene) -> None:
     """The next guard as well, until the topic is forgotten."""
-    keeper = GuardKeeper(scene.reactor, "guard", 500, topics={"/cmd_vel": 200})
+    keeper = GuardSupervisor(scene.reactor, "guard", 500, topics={"/cmd_vel": 200})
     keeper.start()
     keeper.topic(CMD)
     keeper.shape(CMD, b"one")
     keeper.shape(CMD, b"two")
-    assert scene.process.lines == [Topic(*CMD, 200), Shape(*CMD, b"one"), Shape(*CMD, b"two")]
+    assert scene.process.lines == [GuardedTopic(*CMD, 200), ZeroShape(*CMD, b"one"), ZeroShape(*CMD, b"two")]
     scene.process.end()
     scene.reactor.advance(1.0)
-    assert scene.process.lines == [Topic(*CMD, 200), Shape(*CMD, b"two")]
+    assert scene.process.lines == [GuardedTopic(*CMD, 200), ZeroShape(*CMD, b"two")]
     keeper.forget(CMD)
     scene.process.end()
     scene.reactor.advance(2.0)
@@ -98,7 +98,7 @@ def test_guard_that_answers_is_left_alone(scene: Scene) -> None:
     for _ in range(20):
         scene.reactor.advance(PROBE_EVERY)
         assert scene.process.lines[-1] == Probe()
-        scene.process.protocol.outReceived(encode(Alive()))
+        scene.process.protocol.outReceived(encode(GuardAlive()))
     assert scene.process.signals == []
 
 
@@ -130,14 +130,14 @@ def test_guard_that_stays_is_ended(scene: Scene) -> None:
     assert scene.process.signals == ["KILL"]
 
 
-def answer(scene: Scene, *answers: Alive | Ready) -> None:
+def answer(scene: Scene, *answers: GuardAlive | TopicReady) -> None:
     scene.process.protocol.outReceived(b"".join(map(encode, answers)))
 
 
 def test_a_topic_is_ready_when_the_guard_says_so_and_not_after_its_end(scene: Scene) -> None:
     """Only a guard that lives counts; its words may come in pieces."""
     scene.keeper.topic(CMD)
-    said = encode(Alive()) + encode(Ready(*CMD))
+    said = encode(GuardAlive()) + encode(TopicReady(*CMD))
     scene.process.protocol.outReceived(said[:12])
     assert not scene.keeper.ready(CMD)
     scene.process.protocol.outReceived(said[12:])
@@ -151,9 +151,9 @@ def test_each_type_of_a_topic_is_ready_for_itself(scene: Scene) -> None:
     """A guard that could stop a topic by one type is told of another, and can't stop it by that one yet."""
     stamped = TypedTopic("/cmd_vel", "Stamped")
     scene.keeper.topic(stamped)
-    answer(scene, Ready(*stamped))
+    answer(scene, TopicReady(*stamped))
     scene.keeper.topic(CMD)
-    assert scene.process.lines == [Topic(*stamped), Topic(*CMD)]
+    assert scene.process.lines == [GuardedTopic(*stamped), GuardedTopic(*CMD)]
     assert not scene.keeper.ready(CMD)
 
 
@@ -161,9 +161,9 @@ def test_forgotten_topic_is_told_and_not_ready(scene: Scene) -> None:
     """A topic given up is no longer ready, also when the guard's word of it comes late; a new guard hears nothing."""
     scene.keeper.topic(CMD)
     scene.keeper.command(CMD, False, 5)
-    answer(scene, Ready(*CMD))
+    answer(scene, TopicReady(*CMD))
     scene.keeper.forget(CMD)
-    answer(scene, Ready(*CMD))
+    answer(scene, TopicReady(*CMD))
     assert scene.process.lines[-1] == Forget(*CMD)
     scene.keeper.topic(CMD)
     assert not scene.keeper.ready(CMD)
@@ -180,7 +180,7 @@ def test_noise_in_front_of_an_answer_is_passed_over(scene: Scene, noise: bytes) 
     """What is no answer on the guard's output neither raises nor hides the answers behind it."""
     scene.keeper.topic(CMD)
     scene.process.protocol.outReceived(noise)
-    scene.process.protocol.outReceived(b"\n" + encode(Ready(*CMD)))
+    scene.process.protocol.outReceived(b"\n" + encode(TopicReady(*CMD)))
     assert scene.keeper.ready(CMD)
     assert scene.process.signals == []
 
@@ -188,10 +188,10 @@ def test_noise_in_front_of_an_answer_is_passed_over(scene: Scene, noise: bytes) 
 def test_frozen_guard_is_not_relied_on_while_anything_moves(scene: Scene) -> None:
     """While something moves the guard is asked every second, and two seconds without an answer take its word back."""
     scene.keeper.topic(CMD)
-    answer(scene, Ready(*CMD))
+    answer(scene, TopicReady(*CMD))
     for _ in range(5):
         scene.keeper.command(CMD, True, 5)
-        answer(scene, Alive())
+        answer(scene, GuardAlive())
         scene.reactor.advance(PROBE_MOVING)
         assert scene.process.lines[-1] == Probe()
         assert scene.keeper.ready(CMD)
@@ -199,7 +199,7 @@ def test_frozen_guard_is_not_relied_on_while_anything_moves(scene: Scene) -> Non
     assert scene.keeper.ready(CMD)
     scene.reactor.advance(0.1)
     assert not scene.keeper.ready(CMD)
-    answer(scene, Alive())
+    answer(scene, GuardAlive())
     assert scene.keeper.ready(CMD)
 
 
@@ -209,18 +209,18 @@ def test_a_guard_that_answers_again_is_told(scene: Scene) -> None:
     scene.reactor.advance(1.0)
     scene.keeper.topic(CMD)
     for _ in range(2):
-        answer(scene, Alive())
+        answer(scene, GuardAlive())
     assert scene.alerts == ["module guard error", "module guard over"]
 
 
 def test_guard_is_told_of_goals_with_a_time_of_their_own(scene: Scene) -> None:
     """Whatever the topics of the robot have; the next guard as well."""
     on = cancelling("/cmd_vel")
-    keeper = GuardKeeper(scene.reactor, "guard", 500, topics={"/cmd_vel": 200, on.topic: 200})
+    keeper = GuardSupervisor(scene.reactor, "guard", 500, topics={"/cmd_vel": 200, on.topic: 200})
     keeper.start()
     keeper.topic(on)
     keeper.command(on, True, 5)
-    told = [Topic(*on, GOALS_WITHIN_MS), Command(*on, True, 5)]
+    told = [GuardedTopic(*on, GOALS_WITHIN_MS), GuardedCommand(*on, True, 5)]
     assert scene.process.lines[:2] == told
     scene.process.end()
     scene.reactor.advance(1.0)

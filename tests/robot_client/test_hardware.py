@@ -18,8 +18,8 @@ from twisted.python.failure import Failure
 
 from relay_protocol import link
 from relay_protocol.errors import Unavailable
-from robot_client import hardware
-from robot_client.hardware import DYING, PATIENCE, Hardware, Switches, run
+from robot_client.motion import hardware
+from robot_client.motion.hardware import DYING, PATIENCE, Hardware, Switches, run
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import MemoryPlatform
 from tests.robot_client.breaking import broken

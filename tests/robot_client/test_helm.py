@@ -9,18 +9,18 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol import frames, link
 from relay_protocol.errors import Unavailable
-from robot_client.config import Limits, Safety, Settings, Speeds
-from robot_client.hardware import LOOKS, PATIENCE, RARELY, Hardware, Switches
-from robot_client.helm import KEEP_EVERY, UNFORESEEN
-from robot_client.keeping import Keeping
-from robot_client.lasting import MemoryLatch
-from robot_client.motion import MotionDesk
-from robot_client.platforms.base import CANCELED, GraphView, Outcome
+from robot_client.config import LimitSettings, RobotSettings, SafetySettings, Speeds
+from robot_client.motion.goal_canceller import HEARD_WITHIN, MAX_ACTIONS, MAX_NAMES, GoalCanceller
+from robot_client.motion.goal_status_reader import AFTER, STATUS
+from robot_client.motion.guard_protocol import CANCEL
+from robot_client.motion.hardware import LOOKS, PATIENCE, RARELY, Hardware, Switches
+from robot_client.motion.motion import MotionControl
+from robot_client.motion.orders import KEEP_EVERY, UNFORESEEN
+from robot_client.motion.state_reporter import TELL_EVERY
+from robot_client.motion.stop_store import MemoryStopStore, StopKeeper
+from robot_client.motion.zero_publisher import ZeroPublisher
+from robot_client.platforms.base import CANCELED, GoalOutcome, GraphView
 from robot_client.platforms.memory import TWIST, twist
-from robot_client.statuses import AFTER, STATUS
-from robot_client.sweep import CANCEL, HEARD_WITHIN, MAX_ACTIONS, MAX_NAMES, Sweep
-from robot_client.telling import TELL_EVERY
-from robot_client.zeros import Zeros
 from tests.robot_client.breaking import broken
 from tests.robot_client.daemon_scene import DRIVER, Line, Scene
 
@@ -99,7 +99,7 @@ def test_control_for_another_stops_what_moved_before_it_is_done(scene: Scene, co
     assert scene.platform.published[-1] == ("/cmd_vel", ZERO)
     assert [goal.cancelled for goal in scene.platform.goals] == [True, False]
     assert said(control, "done") == []
-    scene.platform.goals[0].result.callback(Outcome(CANCELED, None))
+    scene.platform.goals[0].result.callback(GoalOutcome(CANCELED, None))
     assert said(control, "done") == [{"op": "done", "id": 9}]
     scene.command(line, twist(0.7))
     assert ("/cmd_vel", twist(0.7)) not in scene.platform.published
@@ -126,7 +126,7 @@ def test_goal_that_does_not_end_holds_up_a_change_of_control_for_a_second(
     control.say(link.Control(id=11))
     line.lose()
     assert said(control, "done") == []
-    scene.platform.goals[0].result.callback(Outcome(CANCELED, None))
+    scene.platform.goals[0].result.callback(GoalOutcome(CANCELED, None))
     assert said(control, "done") == [{"op": "done", "id": 11}]
 
 
@@ -159,7 +159,7 @@ def test_goal_that_outlasts_its_drivers_control_is_told_and_cancelled_again_unti
     assert 5 <= len(acting.asked) <= 6
     assert set(acting.asked) == {b"\0\1\0\0" + former.id + bytes(8)}
     assert lasting(acting.control) == {}
-    former.result.callback(Outcome(CANCELED, None))
+    former.result.callback(GoalOutcome(CANCELED, None))
     acting.pass_seconds(3, line)
     assert lasting(acting.control) == {"goals": True}
     assert len(acting.asked) <= 6
@@ -296,7 +296,7 @@ def test_second_stop_and_needless_resume_are_done(scene: Scene, control: Line) -
     assert scene.daemon.authority.stopped.by == "eve"
 
 
-class FullDisk(MemoryLatch):
+class FullDisk(MemoryStopStore):
     """Keeps nothing, clears nothing."""
 
     def keep(self, stopped: link.Stopped) -> None:
@@ -322,7 +322,7 @@ def test_stop_that_can_not_be_kept_is_told_and_holds() -> None:
     assert scene.daemon.authority.stopped is not None
 
 
-class CountingLatch(MemoryLatch):
+class CountingLatch(MemoryStopStore):
     """Fails as often as it is told to."""
 
     def __init__(self, fails: int = 0) -> None:
@@ -337,7 +337,7 @@ class CountingLatch(MemoryLatch):
         super().keep(stopped)
 
 
-class Broken(MemoryLatch):
+class Broken(MemoryStopStore):
     """Fails as nobody foresaw."""
 
     def keep(self, stopped: link.Stopped) -> None:
@@ -359,7 +359,13 @@ def test_stop_whose_record_fails_unforeseen_is_answered_and_can_be_resumed() -> 
 
 @pytest.mark.parametrize(
     ("owner", "part"),
-    [(MotionDesk, "halt"), (Hardware, "stop"), (Sweep, "stop"), (Zeros, "say"), (Keeping, "keep")],
+    [
+        (MotionControl, "halt"),
+        (Hardware, "stop"),
+        (GoalCanceller, "stop"),
+        (ZeroPublisher, "say"),
+        (StopKeeper, "keep"),
+    ],
 )
 def test_part_of_a_stop_that_fails_unforeseen_keeps_no_other_from_being_done(
     monkeypatch: pytest.MonkeyPatch, owner: type, part: str
@@ -375,13 +381,15 @@ def test_part_of_a_stop_that_fails_unforeseen_keeps_no_other_from_being_done(
     assert (done["ok"], done["reason"]) == (False, UNFORESEEN)
     assert switched.scene.daemon.authority.stopped is not None
     assert (len(switched.asked) == 1) is (owner is not Hardware)
-    assert (switched.scene.latch.stopped is not None) is (owner is not Keeping)
+    assert (switched.scene.latch.stopped is not None) is (owner is not StopKeeper)
     switched.control.say(resume())
     switched.answer(True)
     assert switched.done() == [{"op": "done", "id": 3}]
 
 
-@pytest.mark.parametrize(("owner", "part"), [(Hardware, "resume"), (MemoryLatch, "clear"), (Sweep, "end")])
+@pytest.mark.parametrize(
+    ("owner", "part"), [(Hardware, "resume"), (MemoryStopStore, "clear"), (GoalCanceller, "end")]
+)
 def test_resume_that_fails_unforeseen_is_taken_back(
     monkeypatch: pytest.MonkeyPatch, owner: type, part: str
 ) -> None:
@@ -466,7 +474,7 @@ class Switched:
     """A daemon with a service that stops its hardware; :attr:`answers` are those of its calls that are to come."""
 
     def __init__(self, type: str = "std_srvs/srv/SetBool", stopped: link.Stopped | None = None) -> None:
-        self.scene = Scene(MemoryLatch(stopped), Switches("/estop"))
+        self.scene = Scene(MemoryStopStore(stopped), Switches("/estop"))
         self.scene.platform.view = GraphView(services={"/estop": link.Service(types=[type])})
         self.scene.platform.services["/estop"] = self._called
         self.asked: list[bytes] = []
@@ -784,7 +792,7 @@ def test_resume_ends_what_a_start_had_yet_to_stop() -> None:
 class Acting:
     """A daemon whose graph has two actions, of which one moves the robot; :attr:`asked` are the calls to cancel."""
 
-    def __init__(self, latch: MemoryLatch | None = None, switches: Switches | None = None) -> None:
+    def __init__(self, latch: MemoryStopStore | None = None, switches: Switches | None = None) -> None:
         self.scene = Scene(latch, switches)
         self.asked: list[bytes] = []
         self.answers: list[Deferred[bytes]] = []
@@ -1095,12 +1103,12 @@ def test_goal_of_a_client_that_has_not_ended_is_told(acting: Acting) -> None:
     acting.control.heard()
     acting.control.say(stop())
     acting.answer()
-    first.result.callback(Outcome(CANCELED, None))
+    first.result.callback(GoalOutcome(CANCELED, None))
     assert acting.heard("done") == []
     acting.pass_seconds(2)
     (done,) = acting.heard("done")
     assert (done["ok"], NAVIGATE in done["reason"]) == (False, True)
-    second.result.callback(Outcome(CANCELED, None))
+    second.result.callback(GoalOutcome(CANCELED, None))
     acting.pass_seconds(1)
     (alert,) = acting.heard("alert")
     assert (alert["kind"], alert["over"]) == ("stop", True)
@@ -1114,7 +1122,7 @@ def test_stop_is_confirmed_when_the_last_goal_of_a_client_has_ended(acting: Acti
     acting.control.heard()
     acting.control.say(stop())
     acting.answer()
-    acting.scene.platform.goals[0].result.callback(Outcome(CANCELED, None))
+    acting.scene.platform.goals[0].result.callback(GoalOutcome(CANCELED, None))
     assert acting.heard("done") == [{"op": "done", "id": 2}]
 
 
@@ -1176,7 +1184,7 @@ def test_many_silent_actions_are_asked_in_turn(acting: Acting, monkeypatch: pyte
 
 def test_daemon_that_starts_stopped_cancels_the_goals_of_the_one_before() -> None:
     """Until the action has answered, and not again."""
-    acting = Acting(MemoryLatch(BEFORE))
+    acting = Acting(MemoryStopStore(BEFORE))
     acting.pass_seconds(40)
     assert len(acting.asked) >= 39
     acting.answer()
@@ -1408,7 +1416,7 @@ def test_robot_moves_as_long_as_a_goal_that_moves_it_goes_on(scene: Scene, contr
     control.say(link.Control(id=9))
     scene.run(1)
     assert said(control, "safety")[-1]["moving"] is True
-    scene.platform.goals[0].result.callback(Outcome(CANCELED, None))
+    scene.platform.goals[0].result.callback(GoalOutcome(CANCELED, None))
     scene.clock.advance(TELL_EVERY)
     assert "moving" not in said(control, "safety")[-1]
 
@@ -1455,7 +1463,7 @@ def test_order_that_fails_unforeseen_is_answered(
 
 def test_limits_are_told_and_hold() -> None:
     """By level, the stricter of robot and level; what was made slower is counted."""
-    scene = Scene(settings=Settings(limits=Limits(linear=0.8, operator=Speeds(linear=0.5))))
+    scene = Scene(settings=RobotSettings(limits=LimitSettings(linear=0.8, operator=Speeds(linear=0.5))))
     control = scene.register()
     (told,) = said(control, "safety")
     assert told["limits"] == {"operator": {"linear": 0.5}, "owner": {"linear": 0.8}}
@@ -1470,7 +1478,7 @@ def test_limits_are_told_and_hold() -> None:
 
 def test_who_is_limited_hears_why_a_joystick_moves_nothing() -> None:
     """A person is told once, by an alert that lasts until control changes; where nobody may, advertising is refused."""
-    scene = Scene(settings=Settings(limits=Limits(operator=Speeds(linear=0.5))))
+    scene = Scene(settings=RobotSettings(limits=LimitSettings(operator=Speeds(linear=0.5))))
     control = scene.register()
     line = scene.channel(control)
     line.say(link.Advertise(number=5, topic="/joy", type=JOY))
@@ -1490,7 +1498,7 @@ def test_who_is_limited_hears_why_a_joystick_moves_nothing() -> None:
     assert [each["over"] for each in said(control, "alert")] == [True]
     scene.command(line, GO)
     assert scene.platform.published == [("/joy", GO)]
-    closed = Scene(settings=Settings(limits=Limits(linear=0.5)))
+    closed = Scene(settings=RobotSettings(limits=LimitSettings(linear=0.5)))
     line = closed.channel(closed.register())
     line.say(link.Advertise(number=5, topic="/joy", type=JOY))
     (failed,) = said(line, "failed")
@@ -1500,7 +1508,7 @@ def test_who_is_limited_hears_why_a_joystick_moves_nothing() -> None:
 
 def test_control_is_given_when_the_ramp_of_the_former_holder_is_over() -> None:
     """Not before; a stop does not wait for it."""
-    scene = Scene(settings=Settings(safety=Safety(ramp_ms=200)))
+    scene = Scene(settings=RobotSettings(safety=SafetySettings(ramp_ms=200)))
     control = scene.register()
     line = scene.driving(control)
     control.heard()

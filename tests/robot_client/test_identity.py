@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from robot_client.identity import KEY, Enrolment, StateError, StateFolder
+from robot_client.link.identity import KEY, Enrolment, StateError, StateFolder
 
 ENROLMENT = Enrolment(address="relay:9091", robot="r1", relay="relay-1", tls=True, ca="/etc/ca.pem")
 

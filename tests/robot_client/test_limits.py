@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from relay_protocol.link.moving import Limits
-from robot_client.config import Settings, load
-from robot_client.limits import NONE, limits_of, limits_told, stricter
+from relay_protocol.link.motion import Limits
+from robot_client.config import RobotSettings, load
+from robot_client.motion.limits import NONE, limits_of, limits_told, stricter
 
 FILE = """
 [limits]
@@ -31,7 +31,7 @@ def test_the_stricter_of_robot_and_level_is_told(tmp_path: Path) -> None:
 
 def test_without_limits_none_are_told() -> None:
     """A level without a limit is left out."""
-    assert limits_told(Settings()) == {}
+    assert limits_told(RobotSettings()) == {}
     only = load(None, {"SWITCHBOARD_ROBOT_LIMITS_OPERATOR_LINEAR": "0.3"})
     assert limits_told(only) == {"operator": Limits(linear=0.3)}
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from relay_protocol import frames, identity, link
 from relay_protocol.errors import FrameTooLarge, MalformedMessage, PeerError, SwitchboardError
 from relay_protocol.limits import COMMAND_FRAME, HANDSHAKE_FRAME
-from robot_client.link import (
+from robot_client.link.protocol import (
     ChannelLink,
     ControlLink,
     EnrolledAt,
@@ -18,11 +18,11 @@ from robot_client.link import (
     JoinedChannel,
     Link,
     LinkSilent,
+    LinkState,
+    MessageReceived,
     Registered,
     RelayRefused,
-    Said,
-    Sampled,
-    State,
+    SampleReceived,
     VideoLink,
     WrongRelay,
 )
@@ -128,7 +128,7 @@ def test_welcome_registers(ticks: Ticks) -> None:
     assert isinstance(event, Registered)
     assert end.heartbeat == 3.0
     (order,) = end.receive(link.frame(link.OpenChannel(channel="c", ticket="t")))
-    assert order == Said(link.OpenChannel(channel="c", ticket="t"))
+    assert order == MessageReceived(link.OpenChannel(channel="c", ticket="t"))
 
 
 def test_registered_link_takes_orders_for_video(ticks: Ticks) -> None:
@@ -137,7 +137,9 @@ def test_registered_link_takes_orders_for_video(ticks: Ticks) -> None:
         link.OpenVideo(stream="s", ticket="t", camera="/c", settings=link.VideoSettings(width=3)),
         link.CloseVideo(stream="s"),
     ]
-    assert registered(ticks).receive(b"".join(map(link.frame, orders))) == [Said(each) for each in orders]
+    assert registered(ticks).receive(b"".join(map(link.frame, orders))) == [
+        MessageReceived(each) for each in orders
+    ]
 
 
 def test_welcome_before_proof_is_an_error(ticks: Ticks) -> None:
@@ -213,7 +215,10 @@ def test_channel_passes_requests_and_samples(ticks: Ticks) -> None:
     """Requests and samples of an open channel come out in order."""
     end = opened(ticks)
     data = link.frame(link.Unsubscribe(number=1)) + frames.encode_sample(2, 3, b"body")
-    assert end.receive(data) == [Said(link.Unsubscribe(number=1)), Sampled(frames.SampleFrame(2, 3, b"body"))]
+    assert end.receive(data) == [
+        MessageReceived(link.Unsubscribe(number=1)),
+        SampleReceived(frames.SampleFrame(2, 3, b"body")),
+    ]
 
 
 def test_samples_before_joining_are_an_error(ticks: Ticks) -> None:
@@ -246,7 +251,7 @@ def test_hostile_bytes_end_in_words(pieces: list[bytes], framed: bool) -> None:
 def test_states_have_decoders() -> None:
     """Every state a link can be in knows what may be said in it."""
     known = {*ControlLink._decoders, *ChannelLink._decoders, *VideoLink._decoders, *EnrolmentLink._decoders}
-    assert known == set(State)
+    assert known == set(LinkState)
 
 
 def test_wrong_utf8_is_refused(ticks: Ticks) -> None:
@@ -269,7 +274,7 @@ def test_video_link_passes_on_what_the_relay_took(ticks: Ticks) -> None:
     """Answers to pictures and the wish for a key frame are for the stream."""
     end = shown(ticks)
     told = link.frame(link.Took(number=3)) + link.frame(link.KeyFrame())
-    assert end.receive(told) == [Said(link.Took(number=3)), Said(link.KeyFrame())]
+    assert end.receive(told) == [MessageReceived(link.Took(number=3)), MessageReceived(link.KeyFrame())]
 
 
 @pytest.mark.parametrize(

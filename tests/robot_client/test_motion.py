@@ -11,14 +11,14 @@ from twisted.internet.task import Clock
 
 from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.link import Limits, MotionPolicy, Stopped
-from robot_client.authority import Authority, Suppression
-from robot_client.motion import KEPT, MAX_SHAPE, MotionDesk
-from robot_client.offset import Offset
+from robot_client.link.clock_offset import ClockOffset
+from robot_client.motion.authority import Authority, Suppression
+from robot_client.motion.motion import KEPT, MAX_SHAPE, MotionControl
+from robot_client.motion.motion_topics import MAX_TOPICS
+from robot_client.motion.rules import MotionRules
+from robot_client.motion.safety import DAEMON_SHARE, REPEATS, Times
+from robot_client.motion.typed_topic import TypedTopic
 from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
-from robot_client.rules import Rules
-from robot_client.safety import DAEMON_SHARE, REPEATS, Times
-from robot_client.topics import TypedTopic
-from robot_client.tracks import MAX_TOPICS
 
 GO = twist(1.0)
 ZERO = twist()
@@ -54,7 +54,7 @@ class Feed:
 
 
 class Scene:
-    def __init__(self, rules: Rules | None = None, deadline_ms: int = 500) -> None:
+    def __init__(self, rules: MotionRules | None = None, deadline_ms: int = 500) -> None:
         self.clock = Clock()
         self.clock.advance(100)
         self.platform = MemoryPlatform()
@@ -62,8 +62,10 @@ class Scene:
         self.authority = Authority()
         self.authority.hold(DRIVER, "ann", "operator", 0)
         policy = MotionPolicy(types=[TWIST], deadline_ms=deadline_ms)
-        self.desk = MotionDesk(policy, self.platform, self.clock, self.now, self.feed, self.authority, rules)
-        self.offset = Offset()
+        self.desk = MotionControl(
+            policy, self.platform, self.clock, self.now, self.feed, self.authority, rules
+        )
+        self.offset = ClockOffset()
         self.offset.add(self.now(), self.now(), self.now())
         self.open("a")
 
@@ -482,7 +484,7 @@ def test_a_place_is_that_of_all_who_may_command_the_topic(scene: Scene) -> None:
 
 def test_commands_are_held_to_the_limits_of_who_holds_control() -> None:
     """An operator's here; whoever suppresses is of no level that is known, and has the strictest."""
-    scene = Scene(Rules(limits={"operator": Limits(linear=0.5), "owner": Limits(linear=0.8)}))
+    scene = Scene(MotionRules(limits={"operator": Limits(linear=0.5), "owner": Limits(linear=0.8)}))
     scene.command(GO)
     scene.authority.hold(DRIVER, "ann", "owner", scene.now())
     scene.command(GO)
@@ -494,7 +496,7 @@ def test_commands_are_held_to_the_limits_of_who_holds_control() -> None:
 
 def test_after_zero_speed_grows_from_there() -> None:
     """Whoever said it: the driver, or the watchdog."""
-    scene = Scene(Rules(limits={"operator": Limits(linear_acceleration=2.0)}))
+    scene = Scene(MotionRules(limits={"operator": Limits(linear_acceleration=2.0)}))
     for _ in range(10):
         scene.command(GO)
         scene.run(0.1)
@@ -511,7 +513,7 @@ def test_after_zero_speed_grows_from_there() -> None:
 
 def test_what_can_not_be_limited_is_not_followed() -> None:
     """A command whose speeds can't be found counts as no command."""
-    scene = Scene(Rules(limits={"operator": Limits(linear=0.5)}))
+    scene = Scene(MotionRules(limits={"operator": Limits(linear=0.5)}))
     assert scene.command(b"\0\7" + GO[2:]) is False
     assert scene.sent == []
     assert scene.desk.invalid_commands == 1
@@ -519,7 +521,7 @@ def test_what_can_not_be_limited_is_not_followed() -> None:
 
 def test_who_is_limited_moves_nothing_by_what_has_no_speeds_to_read() -> None:
     """He is refused, and somebody is told; his zero passes, and so does who has no limits."""
-    scene = Scene(Rules(limits={"operator": Limits(linear=0.5)}))
+    scene = Scene(MotionRules(limits={"operator": Limits(linear=0.5)}))
     told: list[tuple[str, str]] = []
     scene.desk.on_unread = lambda on, level: told.append((on.topic, level))
     scene.open("pad", "/joy", JOY)
@@ -536,7 +538,7 @@ def test_who_is_limited_moves_nothing_by_what_has_no_speeds_to_read() -> None:
 
 def test_what_is_listed_moves_the_robot_without_speeds() -> None:
     """Whoever set the limits says that it may."""
-    scene = Scene(Rules(limits={"operator": Limits(linear=0.5)}, unlimited=["/joy"]))
+    scene = Scene(MotionRules(limits={"operator": Limits(linear=0.5)}, unlimited=["/joy"]))
     scene.open("pad", "/joy", JOY)
     assert scene.command(GO, "pad")
     assert scene.sent == [GO]
@@ -544,7 +546,7 @@ def test_what_is_listed_moves_the_robot_without_speeds() -> None:
 
 def test_what_nobody_may_command_can_not_be_advertised() -> None:
     """Everybody is limited; it is said why, and what helps."""
-    scene = Scene(Rules(limits={"operator": Limits(linear=0.5), "owner": Limits(linear=0.8)}))
+    scene = Scene(MotionRules(limits={"operator": Limits(linear=0.5), "owner": Limits(linear=0.8)}))
     with pytest.raises(
         Refused, match=r"sensor_msgs/msg/Joy on /joy .* 'unlimited' of the robot's \[limits\]"
     ):
@@ -571,7 +573,7 @@ def test_a_shape_without_measure_is_no_command(scene: Scene) -> None:
 
 def test_a_topic_may_have_shorter_times() -> None:
     """Its commands grow old sooner, and it is stopped sooner; other topics have the robot's."""
-    scene = Scene(Rules(topics={"/arm": Times(200, 100)}))
+    scene = Scene(MotionRules(topics={"/arm": Times(200, 100)}))
     scene.open("arm", "/arm")
     assert scene.command(GO, "arm", age=0.15) is False
     assert scene.command(GO, "a", age=0.15)
@@ -622,7 +624,7 @@ def test_a_longer_deadline_leaves_more_time_for_the_proof() -> None:
 
 def test_a_topic_of_shorter_times_waits_no_longer_for_the_proof() -> None:
     """The greater of its own times counts, not of the robot's."""
-    scene = Scene(Rules(topics={"/arm": Times(200, 100)}))
+    scene = Scene(MotionRules(topics={"/arm": Times(200, 100)}))
     scene.open("arm", "/arm")
     proof = scene.now()
     scene.desk.proof = lambda: proof
@@ -651,7 +653,7 @@ def test_whether_somebody_may_command_is_told(scene: Scene) -> None:
 
 
 def ramping() -> Scene:
-    return Scene(Rules(ramp_ms=200))
+    return Scene(MotionRules(ramp_ms=200))
 
 
 def test_silence_ends_in_a_ramp_that_is_over_in_time() -> None:
@@ -692,7 +694,7 @@ def test_a_new_command_ends_a_ramp() -> None:
 
 def test_who_ends_a_ramp_goes_on_from_its_speed() -> None:
     """Not from the one before it: the most that his acceleration allows is counted from what was said last."""
-    scene = Scene(Rules(limits={"operator": Limits(linear_acceleration=1.0)}, ramp_ms=200))
+    scene = Scene(MotionRules(limits={"operator": Limits(linear_acceleration=1.0)}, ramp_ms=200))
     for _ in range(20):
         scene.command(GO)
         scene.run(0.1)
@@ -813,7 +815,7 @@ def test_a_ramp_ends_in_time_however_late_it_begins() -> None:
     assert scene.sent[-1] == ZERO
     scene.run(1)
     assert scene.platform.sinks == []
-    late = Scene(Rules(ramp_ms=200))
+    late = Scene(MotionRules(ramp_ms=200))
     late.command(GO)
     late.clock.pump([0.0])
     late.clock.rightNow += 0.39  # the process was held up: its watchdog has not had its turn
@@ -864,7 +866,7 @@ def test_a_suppressor_does_not_wait_for_a_ramp() -> None:
 
 def test_what_has_no_speeds_is_stopped_without_a_ramp() -> None:
     """A joystick's axes, say; when a ramp would have begun."""
-    scene = Scene(Rules(ramp_ms=200))
+    scene = Scene(MotionRules(ramp_ms=200))
     scene.open("arm", "/arm", "some/msg/Type")
     scene.command(GO, "arm")
     scene.run(0.21)

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
-from robot_client.offers import PENDING_BYTES
+from robot_client.channel.advertisements import PENDING_BYTES
+from robot_client.channel.parts import MAX_OPEN
 from robot_client.platforms.base import ABORTED, CANCELED, SUCCEEDED
 from robot_client.platforms.memory import MemoryAction, MemoryService
-from robot_client.wire import MAX_OPEN
 from tests.robot_client.scene import Scene
 
 BODY = b"\0\1\0\0body"

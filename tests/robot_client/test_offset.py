@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_client.offset import DRIFT, Offset
-from robot_client.safety import Freshness, freshness
+from robot_client.link.clock_offset import DRIFT, ClockOffset
+from robot_client.motion.safety import CommandAge, freshness
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -17,7 +17,7 @@ delays = st.one_of(st.integers(0, 5 * MS), st.integers(0, 400 * MS), st.integers
 """One way through a network: mostly quick, at times slow, at times stalled."""
 
 
-def age_at_most(offset: Offset, stamp: int, now: int) -> int:
+def age_at_most(offset: ClockOffset, stamp: int, now: int) -> int:
     """The bound, where there is one."""
     found = offset.oldest(stamp, now)
     assert found is not None
@@ -40,45 +40,45 @@ def test_no_command_older_than_the_deadline_is_ever_fresh(
     def relay(own: int) -> int:
         return own + true + (own - start) * drift // 1_000_000
 
-    offset = Offset()
+    offset = ClockOffset()
     now = start
     for there, back in exchanges:
         offset.add(now, relay(now + there), now + there + back)
         now += there + back + SECOND
     now += since
-    assert freshness(relay(now) - DEADLINE_MS * MS - over, now, offset, DEADLINE_MS) is not Freshness.FRESH
+    assert freshness(relay(now) - DEADLINE_MS * MS - over, now, offset, DEADLINE_MS) is not CommandAge.FRESH
 
 
 @given(st.integers(-(10**15), 10**15), st.integers(1, 60), st.integers(0, (DEADLINE_MS - 50) * MS))
 def test_on_an_even_link_commands_in_time_pass(true: int, count: int, age: int) -> None:
     """With 25 ms each way, whatever is younger than the deadline by a round trip is executed."""
-    offset = Offset()
+    offset = ClockOffset()
     now = 10**15
     for _ in range(count):
         offset.add(now, now + 25 * MS + true, now + 50 * MS)
         now += SECOND
-    assert freshness(now + true - age, now, offset, DEADLINE_MS) is Freshness.FRESH
+    assert freshness(now + true - age, now, offset, DEADLINE_MS) is CommandAge.FRESH
 
 
 def test_way_back_that_stalls_makes_no_old_command_young() -> None:
     """400 ms from relay to robot and none the other way: a command 690 ms old is not taken for one of 490 ms."""
-    offset = Offset()
+    offset = ClockOffset()
     for second in range(16):
         offset.add(second * SECOND, second * SECOND, second * SECOND + 400 * MS)
     now = 16 * SECOND
-    assert freshness(now - 690 * MS, now, offset, DEADLINE_MS) is Freshness.STALE
+    assert freshness(now - 690 * MS, now, offset, DEADLINE_MS) is CommandAge.STALE
 
 
 def test_stalled_join_makes_no_old_command_young() -> None:
     """An answer to the joining that lay about for a second leaves the age of what lay behind it as it is."""
-    offset = Offset()
+    offset = ClockOffset()
     offset.add(0, 0, SECOND)
-    assert freshness(10 * MS, SECOND, offset, DEADLINE_MS) is Freshness.STALE
+    assert freshness(10 * MS, SECOND, offset, DEADLINE_MS) is CommandAge.STALE
 
 
 def test_the_tightest_exchange_counts() -> None:
     """One quick way to the relay among slow ones decides."""
-    offset = Offset()
+    offset = ClockOffset()
     offset.add(0, 1090 * MS, 100 * MS)
     offset.add(200 * MS, 1201 * MS, 202 * MS)
     offset.add(300 * MS, 1385 * MS, 400 * MS)
@@ -87,7 +87,7 @@ def test_the_tightest_exchange_counts() -> None:
 
 def test_stopped_clock_is_noticed() -> None:
     """After a suspend of ten seconds, which stops one clock only, the first exchange replaces all before it."""
-    offset = Offset()
+    offset = ClockOffset()
     for second in range(16):
         offset.add(second * SECOND, second * SECOND, second * SECOND + MS)
     offset.add(20 * SECOND, 30 * SECOND, 20 * SECOND + 10 * MS)
@@ -96,7 +96,7 @@ def test_stopped_clock_is_noticed() -> None:
 
 def test_pong_from_the_future_is_passed_over() -> None:
     """A pong for a ping that was not yet sent says nothing."""
-    offset = Offset()
+    offset = ClockOffset()
     offset.add(500, 0, 400)
     assert not offset.known
     assert offset.oldest(0, 400) is None

@@ -15,7 +15,7 @@ from rclpy.serialization import serialize_message
 from switchboard_waiting import freeze
 
 from relay_protocol import link
-from robot_client.lasting import GOALS
+from robot_client.motion.stop_store import GOALS
 from robot_client.platforms.base import CANCELED
 from tests.robot_client.fake_relay import PATIENCE, FakeRelay, Peer
 from tests.robot_client.robot_process import Robot, until

@@ -12,12 +12,7 @@ from twisted.internet.task import Clock
 from relay_protocol import link
 from relay_protocol.errors import Unavailable
 from relay_protocol.link import MotionPolicy
-from robot_client.guard_feed import NoGuard
-from robot_client.guard_protocol import CANCEL, GOALS_WITHIN_MS, cancelling
-from robot_client.lasting import MemoryLatch
-from robot_client.platforms.base import ABORTED, CANCELED, GraphView, Outcome
-from robot_client.platforms.memory import MemoryGoal, MemoryPlatform
-from robot_client.pursuits import (
+from robot_client.motion.active_goals import (
     ADRIFT,
     BEAT,
     FAREWELL,
@@ -27,11 +22,16 @@ from robot_client.pursuits import (
     MAX_ADRIFT,
     MAX_ASKING,
     UNPROVEN,
-    Pursuits,
+    ActiveGoals,
 )
-from robot_client.statuses import AFTER, STATUS
-from robot_client.sweep import PATIENCE, Sweep
-from robot_client.topics import TypedTopic
+from robot_client.motion.goal_canceller import PATIENCE, GoalCanceller
+from robot_client.motion.goal_status_reader import AFTER, STATUS
+from robot_client.motion.guard_port import NoGuard
+from robot_client.motion.guard_protocol import CANCEL, GOALS_WITHIN_MS, cancelling
+from robot_client.motion.stop_store import MemoryStopStore
+from robot_client.motion.typed_topic import TypedTopic
+from robot_client.platforms.base import ABORTED, CANCELED, GoalOutcome, GraphView
+from robot_client.platforms.memory import MemoryGoal, MemoryPlatform
 from tests.robot_client.daemon_scene import DRIVER, Line
 from tests.robot_client.daemon_scene import Scene as DaemonScene
 from tests.robot_client.goal_statuses import published
@@ -62,7 +62,7 @@ class Feed(NoGuard):
         self.commands.append((on, moving, at))
 
 
-class BrokenLatch(MemoryLatch):
+class BrokenLatch(MemoryStopStore):
     def keep_goals(self, actions: list[str]) -> None:
         raise Unavailable("the disk is full")
 
@@ -72,18 +72,18 @@ class Scene:
     :param left: what lies on the disk at the start
     """
 
-    def __init__(self, left: Sequence[str] | None = (), latch: MemoryLatch | None = None) -> None:
+    def __init__(self, left: Sequence[str] | None = (), latch: MemoryStopStore | None = None) -> None:
         self.clock = Clock()
         self.feed = Feed()
-        self.latch = latch or MemoryLatch()
+        self.latch = latch or MemoryStopStore()
         self.latch.noted = None if left is None else list(left)
         self.platform = MemoryPlatform(GraphView())
         self.asked: list[str] = []
         self.wished: list[bytes] = []
         """The ids of the goals to be cancelled."""
         policy = MotionPolicy(actions=["*/spin"])
-        sweep = Sweep(policy, self.platform, self.clock, lambda topic: False)
-        self.pursuits = Pursuits(policy.actions, self.feed, sweep, self.latch, self.clock, self.now)
+        sweep = GoalCanceller(policy, self.platform, self.clock, lambda topic: False)
+        self.pursuits = ActiveGoals(policy.actions, self.feed, sweep, self.latch, self.clock, self.now)
 
     def now(self) -> int:
         return round(self.clock.seconds() * 1e9)
@@ -122,11 +122,11 @@ def scene() -> Scene:
 
 
 def end(goal: MemoryGoal) -> None:
-    goal.result.callback(Outcome(CANCELED, None, "as you wish"))
+    goal.result.callback(GoalOutcome(CANCELED, None, "as you wish"))
 
 
 def lose(goal: MemoryGoal) -> None:
-    goal.result.callback(Outcome(ABORTED, None, "its action vanished", certain=False))
+    goal.result.callback(GoalOutcome(ABORTED, None, "its action vanished", certain=False))
 
 
 def test_the_guard_hears_of_a_goal_as_long_as_it_goes_on(scene: Scene) -> None:
@@ -384,7 +384,7 @@ def test_goals_of_clients_are_followed_by_their_full_names() -> None:
 
 def test_a_daemon_that_starts_looks_for_what_was_left() -> None:
     """By itself, every second, also where nobody is registered."""
-    latch = MemoryLatch()
+    latch = MemoryStopStore()
     latch.noted = ["/spin"]
     scene = DaemonScene(latch)
     asked: list[bytes] = []

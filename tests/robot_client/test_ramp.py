@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_client.ramp import STEP, ramp
-from robot_client.velocity import STILL, Velocity
+from robot_client.motion.ramp import STEP, ramp
+from robot_client.motion.velocity import STILL, Velocity
 
 MS = 1_000_000
 AHEAD = Velocity((1.0, 0.0, 0.0), (0.0, 0.0, -2.0))

@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol.link import MotionPolicy
-from robot_client.offset import Offset
-from robot_client.safety import DAEMON_SHARE, GUARD_SHARE, Freshness, Watchdog, freshness, is_motion
-from robot_client.topics import TypedTopic
+from robot_client.link.clock_offset import ClockOffset
+from robot_client.motion.safety import DAEMON_SHARE, GUARD_SHARE, CommandAge, Watchdog, freshness, is_motion
+from robot_client.motion.typed_topic import TypedTopic
 
 MS = 1_000_000
 CMD = TypedTopic("/cmd_vel", "T")
 
 
 @pytest.fixture
-def offset() -> Offset:
-    made = Offset()
+def offset() -> ClockOffset:
+    made = ClockOffset()
     # The relay's clock is 7 s ahead, known to 5 ms, and to 1 ms more after a second.
     made.add(0, 7000 * MS + 5 * MS, 10 * MS)
     return made
@@ -24,15 +24,15 @@ def offset() -> Offset:
 @pytest.mark.parametrize(
     ("age", "verdict"),
     [
-        (0, Freshness.FRESH),
-        (493, Freshness.FRESH),
-        (496, Freshness.STALE),
-        (60_000, Freshness.STALE),
-        (-4, Freshness.FRESH),
-        (-7, Freshness.AHEAD),
+        (0, CommandAge.FRESH),
+        (493, CommandAge.FRESH),
+        (496, CommandAge.STALE),
+        (60_000, CommandAge.STALE),
+        (-4, CommandAge.FRESH),
+        (-7, CommandAge.AHEAD),
     ],
 )
-def test_age_decides(offset: Offset, age: int, verdict: Freshness) -> None:
+def test_age_decides(offset: ClockOffset, age: int, verdict: CommandAge) -> None:
     """What may be older than 500 ms is stale; what lies ahead of all the clocks can explain is refused too."""
     now = 1000 * MS
     assert freshness(now + 7000 * MS - age * MS, now, offset, 500) is verdict
@@ -40,7 +40,7 @@ def test_age_decides(offset: Offset, age: int, verdict: Freshness) -> None:
 
 def test_without_an_offset_nothing_is_fresh() -> None:
     """A link whose clock is not known yet passes no motion command."""
-    assert freshness(0, 0, Offset(), 500) is Freshness.STALE
+    assert freshness(0, 0, ClockOffset(), 500) is CommandAge.STALE
 
 
 def test_motion_is_by_type_or_by_name() -> None:

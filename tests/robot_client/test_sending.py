@@ -18,9 +18,9 @@ from twisted.internet.threads import deferToThread
 
 from relay_protocol import link
 from relay_protocol.frames import JSON, PART, SAMPLE
-from robot_client.link import ChannelLink, Event, JoinedChannel
-from robot_client.sending import Sending
-from robot_client.transport import MOST_AT_ONCE, LinkProtocol
+from robot_client.channel.uplink import WriteScheduler
+from robot_client.link.protocol import ChannelLink, Event, JoinedChannel
+from robot_client.link.transport import MOST_AT_ONCE, LinkProtocol
 from tests.robot_client.ros import until
 
 PICTURE = 6_000_000
@@ -33,7 +33,7 @@ class SlowLink:
     def __init__(self) -> None:
         self.clock = Clock()
         self.order: list[tuple[int, int]] = []
-        self.sending = Sending(self, self.clock, lambda call: call(), 2**24)
+        self.sending = WriteScheduler(self, self.clock, lambda call: call(), 2**24)
         self.sending.uplink.open(1)
         self.sending.uplink.open(2)
 
@@ -158,7 +158,7 @@ async def test_what_is_small_overtakes_a_picture_on_a_real_connection(listener: 
     relay.settimeout(20)
     try:
         wire = Wire(protocol)
-        robot.sending = Sending(wire, reactor, lambda call: call(), 2**24)
+        robot.sending = WriteScheduler(wire, reactor, lambda call: call(), 2**24)
         for number in (1, 2):
             robot.sending.uplink.open(number)
         relay.sendall(link.frame(link.Joined(channel="c", at=1)))

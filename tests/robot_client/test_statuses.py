@@ -7,8 +7,8 @@ from twisted.internet.defer import CancelledError
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import Unavailable
+from robot_client.motion.goal_status_reader import AFTER, SETTLED, STATUS, WITHIN, GoalStatusReader, going
 from robot_client.platforms.memory import MemoryPlatform
-from robot_client.statuses import AFTER, SETTLED, STATUS, WITHIN, Statuses, going
 from tests.robot_client.goal_statuses import published
 
 SPIN = "/spin"
@@ -22,7 +22,7 @@ class Scene:
     def __init__(self) -> None:
         self.clock = Clock()
         self.platform = MemoryPlatform()
-        self.statuses = Statuses(self.platform, self.clock)
+        self.statuses = GoalStatusReader(self.platform, self.clock)
         self.told: list[bool] = []
 
     def ask(self) -> None:

@@ -8,10 +8,10 @@ from twisted.internet.task import Clock
 
 from relay_protocol import link
 from relay_protocol.link import MotionPolicy
-from robot_client.guard_protocol import CANCEL
+from robot_client.motion.goal_canceller import HEARD_WITHIN, PATIENCE, GoalCanceller
+from robot_client.motion.guard_protocol import CANCEL
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import MemoryPlatform
-from robot_client.sweep import HEARD_WITHIN, PATIENCE, Sweep
 from tests.robot_client.breaking import broken
 
 SPIN, TALK = "/robot1/spin", "/robot1/talk"
@@ -28,7 +28,7 @@ class Scene:
         for action in view.actions:
             self.platform.services[action + CANCEL] = lambda _, action=action: self.ask(action)
         policy = MotionPolicy(actions=["*/spin"])
-        self.sweep = Sweep(policy, self.platform, self.clock, lambda topic: False)
+        self.sweep = GoalCanceller(policy, self.platform, self.clock, lambda topic: False)
 
     def ask(self, action: str) -> Deferred[bytes]:
         self.asked.append(action)

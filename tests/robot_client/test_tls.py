@@ -20,7 +20,7 @@ from cryptography.x509.oid import NameOID
 
 from relay_protocol.errors import Invalid
 from robot_client import cli
-from robot_client.tls import is_loopback, split_address, trust_root
+from robot_client.link.tls import is_loopback, split_address, trust_root
 from tests.robot_client.fake_relay import PATIENCE, FakeRelay
 
 ENROLL = (sys.executable, "-m", "robot_client.cli", "enroll", "--robot", "r1", "--code", "c")

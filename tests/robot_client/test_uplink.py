@@ -10,8 +10,8 @@ from twisted.internet.task import Clock
 
 from relay_protocol.frames import PART, SAMPLE, FrameDecoder, SampleFrame
 from relay_protocol.limits import ROBOT_FRAME
-from robot_client.uplink import LANE_BYTES, MAX_BYTES, SLOW_LINK, TOO_LARGE, WHOLE, Uplink
-from robot_client.uplink import PART as PART_BYTES
+from robot_client.channel.uplink import LANE_BYTES, MAX_BYTES, SLOW_LINK, TOO_LARGE, WHOLE, Uplink
+from robot_client.channel.uplink import PART as PART_BYTES
 
 
 def samples(uplink: Uplink) -> list[SampleFrame]:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_client.velocity import STILL, TWIST, TWIST_STAMPED, Velocity, form
+from robot_client.motion.velocity import STILL, TWIST, TWIST_STAMPED, Velocity, form
 
 SIX = (1.0, -2.0, 3.0, 0.1, 0.2, -0.3)
 VELOCITY = Velocity(SIX[:3], SIX[3:])

@@ -7,9 +7,9 @@ from twisted.internet.task import Clock
 
 from relay_protocol import link
 from relay_protocol.link import MotionPolicy
+from robot_client.motion.zero_publisher import EVERY, MAX_TOPICS, TIMES, ZeroPublisher
 from robot_client.platforms.base import GraphView
 from robot_client.platforms.memory import TWIST, MemoryPlatform, twist
-from robot_client.zeros import EVERY, MAX_TOPICS, TIMES, Zeros
 from tests.robot_client import daemon_scene
 
 ZERO = twist()
@@ -26,7 +26,7 @@ class Scene:
         self.clock = Clock()
         self.platform = MemoryPlatform(GraphView(topics=dict.fromkeys(topics, HEARD)))
         self.commanded: set[str] = set()
-        self.zeros = Zeros(
+        self.zeros = ZeroPublisher(
             MotionPolicy(types=[TWIST]), self.platform, self.clock, lambda topic: topic in self.commanded
         )
 

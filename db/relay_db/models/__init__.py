@@ -10,13 +10,13 @@ public half only. Rules of alerts are the exception: what signs a message, or se
 from relay_db.models.alerts import Alert, AlertRule
 from relay_db.models.columns import LABEL, NAME, SOURCE
 from relay_db.models.directory import DirectoryEntry
-from relay_db.models.history import AuditEntry, Event, Memory, MemoryCount, Revision
+from relay_db.models.history import AuditEntry, Event, Revision, StoredEvent, StoredEventCount
 from relay_db.models.people import (
     AccessToken,
     Group,
-    GuestAccount,
+    LinkedAccount,
     Membership,
-    Program,
+    OAuthClient,
     Realm,
     TokenFamily,
     User,
@@ -44,11 +44,9 @@ __all__ = [
     "EnrolmentCode",
     "Event",
     "Group",
-    "GuestAccount",
+    "LinkedAccount",
     "Membership",
-    "Memory",
-    "MemoryCount",
-    "Program",
+    "OAuthClient",
     "Realm",
     "Revision",
     "Right",
@@ -58,6 +56,8 @@ __all__ = [
     "RobotMembership",
     "RobotRealm",
     "StopOrder",
+    "StoredEvent",
+    "StoredEventCount",
     "TokenFamily",
     "User",
 ]

@@ -33,7 +33,7 @@ class Event(Base):
     data: Mapped[dict[str, Any]] = mapped_column(JsonText)
 
 
-class Memory(Base):
+class StoredEvent(Base):
     """An event of the short-term memory, numbered within its realm: nobody learns by it how much others do.
 
     ``data`` is JSON as it is told. The names of users stand as text, robots as numbers that are never given out twice:
@@ -63,7 +63,7 @@ class Memory(Base):
     used: Mapped[int]
 
 
-class MemoryCount(Base):
+class StoredEventCount(Base):
     """The number that was given last to an event of a realm's memory, so that none is given twice."""
 
     __tablename__ = "memory_count"

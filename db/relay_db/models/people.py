@@ -34,7 +34,7 @@ class User(Base):
     disabled: Mapped[bool]
 
 
-class GuestAccount(Base):
+class LinkedAccount(Base):
     """A user is the same person as one of another realm, and logs in by that one's password."""
 
     __tablename__ = "guest_account"
@@ -90,7 +90,7 @@ class AccessToken(Base):
     family_id: Mapped[int | None] = owned_by("token_family.id")
 
 
-class Program(Base):
+class OAuthClient(Base):
     """Proves itself by key and secret, and acts as a user.
 
     ``verifier`` is what RFC 7616 section 3.4.2 calls H(A1): responses of Digest can be checked by nothing less. The

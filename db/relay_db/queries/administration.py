@@ -14,7 +14,7 @@ from relay_db.models import (
     AccessToken,
     Group,
     Membership,
-    Program,
+    OAuthClient,
     Realm,
     Revision,
     Right,
@@ -25,7 +25,7 @@ from relay_db.models import (
     RobotRealm,
     User,
 )
-from relay_db.names import findable, findable_hex
+from relay_db.names import findable_hex, normalise
 from relay_db.queries.records import TokenRecord
 from relay_db.queries.rights import of_user, with_holders
 from relay_db.queries.tokens import list_tokens
@@ -48,7 +48,7 @@ class RealmSize(NamedTuple):
     robot_memberships: int
 
 
-class RightPlace(NamedTuple):
+class RightOnRobot(NamedTuple):
     """Where a right stands: exactly one of ``user`` and ``group`` is a name."""
 
     id: int
@@ -57,14 +57,14 @@ class RightPlace(NamedTuple):
     group: str | None
 
 
-def take_turn(s: Session) -> None:
+def lock_for_change(s: Session) -> None:
     """Have what others change wait until this transaction ends; on SQLite it does anyway."""
     s.execute(select(Revision.id).with_for_update())
 
 
 def realm_size(s: Session, realm: str) -> RealmSize:
     """How much is in a realm; nothing in one that there is not."""
-    of = Realm.name == findable(realm)
+    of = Realm.name == normalise(realm)
     users = select(func.count(User.id)).join(Realm, Realm.id == User.realm_id)
     groups = select(func.count(Group.id)).join(Realm, Realm.id == Group.realm_id)
     robots = select(func.count(RobotRealm.robot_id)).join(Realm, Realm.id == RobotRealm.realm_id)
@@ -75,8 +75,8 @@ def realm_size(s: Session, realm: str) -> RealmSize:
     )
     rights = with_holders(select(func.count(Right.id)))
     programs = (
-        select(func.count(Program.id))
-        .join(User, User.id == Program.user_id)
+        select(func.count(OAuthClient.id))
+        .join(User, User.id == OAuthClient.user_id)
         .join(Realm, Realm.id == User.realm_id)
     )
     robot_groups = select(func.count(RobotGroup.id)).join(Realm, Realm.id == RobotGroup.realm_id)
@@ -93,7 +93,7 @@ def count_patterns(s: Session, *, realm: str, robot_id: int | None = None) -> in
     """How many patterns the rights that are held in a realm have, or those of them on a robot."""
     none: Any = literal([], JsonText)
     query = with_holders(select(Right.allow, Right.deny)).where(
-        Realm.name == findable(realm), or_(Right.allow != none, Right.deny != none)
+        Realm.name == normalise(realm), or_(Right.allow != none, Right.deny != none)
     )
     if robot_id is not None:
         query = query.where(Right.robot_id == robot_id)
@@ -102,17 +102,17 @@ def count_patterns(s: Session, *, realm: str, robot_id: int | None = None) -> in
 
 def right_places(
     s: Session, realm: str, *, robot_id: int | None = None, user_id: int | None = None
-) -> list[RightPlace]:
+) -> list[RightOnRobot]:
     """Where the rights that are held in a realm stand, without what they say; of a user also those by its groups."""
     query = with_holders(select(Right.id, Robot.name, User.name, Group.name)).where(
-        Realm.name == findable(realm)
+        Realm.name == normalise(realm)
     )
     query = query.join(Robot, Robot.id == Right.robot_id)
     if robot_id is not None:
         query = query.where(Right.robot_id == robot_id)
     if user_id is not None:
         query = query.where(of_user(user_id))
-    return [RightPlace(*row) for row in s.execute(query)]
+    return [RightOnRobot(*row) for row in s.execute(query)]
 
 
 def groups_of(s: Session, user_ids: Collection[int]) -> dict[int, list[str]]:
@@ -140,7 +140,7 @@ def group_names(s: Session, realm: str) -> dict[str, int]:
     rows = s.execute(
         select(Group.name, Group.id)
         .join(Realm, Realm.id == Group.realm_id)
-        .where(Realm.name == findable(realm))
+        .where(Realm.name == normalise(realm))
     )
     return {row.name: row.id for row in rows}
 
@@ -175,7 +175,7 @@ def find_token(s: Session, name: str, realm: str) -> int | None:
         select(AccessToken.id)
         .join(User, User.id == AccessToken.user_id)
         .join(Realm, Realm.id == User.realm_id)
-        .where(named, Realm.name == findable(realm))
+        .where(named, Realm.name == normalise(realm))
     )
     return s.scalars(query).first()
 
@@ -187,10 +187,10 @@ def user_of_token(s: Session, token_id: int) -> str | None:
 
 def user_of_program(s: Session, program_id: int) -> str | None:
     """The full name of whom a program acts for; ``None`` if there is none of that number."""
-    return _full_name(s, Program, program_id)
+    return _full_name(s, OAuthClient, program_id)
 
 
-def _full_name(s: Session, what: type[AccessToken] | type[Program], number: int) -> str | None:
+def _full_name(s: Session, what: type[AccessToken] | type[OAuthClient], number: int) -> str | None:
     query = select(User.name, Realm.name).join(Realm, Realm.id == User.realm_id)
     row = s.execute(query.join(what, what.user_id == User.id).where(what.id == number)).one_or_none()
     return None if row is None else full_name(*row)

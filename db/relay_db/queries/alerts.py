@@ -11,7 +11,7 @@ from sqlalchemy import and_, case, delete, func, insert, literal, or_, select, t
 from sqlalchemy.orm import Session
 
 from relay_db.models import Alert, AlertRule, Realm, Robot, User
-from relay_db.names import label, recorded
+from relay_db.names import label, sanitise
 from relay_db.queries.records import AlertRecord, AlertRuleRecord
 from relay_db.queries.state import bump
 from relay_db.queries.users import live_user
@@ -71,10 +71,10 @@ def _looked_after(record: AlertRecord) -> dict[str, Any]:
 def _values(record: AlertRecord) -> dict[str, Any]:
     return {
         "robot_id": record.robot_id,
-        "kind": recorded(record.kind, 63),
-        "about": recorded(record.about),
+        "kind": sanitise(record.kind, 63),
+        "about": sanitise(record.about),
         "level": record.level,
-        "text": recorded(record.text, WORDS),
+        "text": sanitise(record.text, WORDS),
         "first_at": record.first,
         "last_at": record.last,
         "times": record.times,
@@ -111,7 +111,7 @@ def list_alerts(
     if after is not None:
         last, id = after
         # The first condition says nothing new: by it an index is read from there on, which by an 'or' it is not.
-        query = query.where(Alert.last_at <= last, or_(Alert.last_at < last, Alert.id > recorded(id, 32)))
+        query = query.where(Alert.last_at <= last, or_(Alert.last_at < last, Alert.id > sanitise(id, 32)))
     for kind, of in kinds_but.items():
         query = query.where(or_(Alert.kind != kind, Alert.robot_id.not_in(list(of))))
     if but:
@@ -136,7 +136,7 @@ def recent_alerts(s: Session, since: float) -> list[AlertRecord]:
 
 def get_alert(s: Session, alert_id: str) -> AlertRecord | None:
     """One alert."""
-    row = s.execute(_alerts().where(Alert.id == recorded(alert_id, 32))).one_or_none()
+    row = s.execute(_alerts().where(Alert.id == sanitise(alert_id, 32))).one_or_none()
     return None if row is None else AlertRecord(*row)
 
 
@@ -148,8 +148,8 @@ def acknowledge_alert(s: Session, alert_id: str, by: str, at: float) -> AlertRec
     :raises Invalid: it is over
     """
     lasts = Alert.over_at.is_(None), Alert.ack_at.is_(None)
-    known = update(Alert).where(Alert.id == recorded(alert_id, 32), *lasts)
-    values = known.values(ack_by=recorded(by), ack_at=at)
+    known = update(Alert).where(Alert.id == sanitise(alert_id, 32), *lasts)
+    values = known.values(ack_by=sanitise(by), ack_at=at)
     fresh = s.execute(values.returning(Alert.id)).first() is not None
     found = get_alert(s, alert_id)
     if found is None:

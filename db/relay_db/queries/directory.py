@@ -13,8 +13,8 @@ from sqlalchemy import ColumnElement, delete, func, insert, select, update
 from sqlalchemy.orm import Session
 
 from relay_db.models import DirectoryEntry, Realm, Robot, User
-from relay_db.names import findable, findable_hex
-from relay_db.queries.directory_records import EntryAsk, EntryPlace, EntryRecord, Leases, NewEntry
+from relay_db.names import findable_hex, normalise
+from relay_db.queries.directory_records import EntryCursor, EntryRecord, EntrySearch, LeaseTimes, NewEntry
 from relay_db.queries.realms import robot_is_of
 from relay_db.queries.state import bump
 from relay_protocol.errors import NotFound, Refused
@@ -23,13 +23,13 @@ _BATCH = 500
 """Rows looked up, or let go, in one statement."""
 
 
-class Taken(Refused):
+class AlreadyExists(Refused):
     """Somebody else has registered something by this name."""
 
     code = "taken"
 
 
-class NoRoom(Refused):
+class QuotaExceeded(Refused):
     """The user or the realm has as many entries as it may have."""
 
     code = "no_room"
@@ -49,7 +49,7 @@ def register_entry(
     :raises NotFound: no such realm
     """
     # On PostgreSQL all who register in a realm do so one after the other from here on.
-    realm = s.scalar(select(Realm.id).where(Realm.name == findable(new.realm)).with_for_update())
+    realm = s.scalar(select(Realm.id).where(Realm.name == normalise(new.realm)).with_for_update())
     if realm is None:
         raise NotFound("there is no such realm")
     if new.robot_id is not None and not robot_is_of(s, new.robot_id, realm):
@@ -71,13 +71,13 @@ def register_entry(
     }
     if before is not None:
         if before.user_id != new.user_id:
-            raise Taken(f"{before.user} has registered the {before.kind} '{before.name}' already")
+            raise AlreadyExists(f"{before.user} has registered the {before.kind} '{before.name}' already")
         s.execute(update(DirectoryEntry).where(DirectoryEntry.id == before.id).values(**values))
         return _kept(s, before.id), before
     if _count(s, *live, DirectoryEntry.user_id == new.user_id) >= of_user:
-        raise NoRoom(f"a user has {of_user} entries in the directory at most; remove one first")
+        raise QuotaExceeded(f"a user has {of_user} entries in the directory at most; remove one first")
     if _count(s, *live) >= of_realm:
-        raise NoRoom(f"the directory is full: it holds {of_realm} entries at most")
+        raise QuotaExceeded(f"the directory is full: it holds {of_realm} entries at most")
     fixed = {
         "id": entry_id,
         "realm_id": realm,
@@ -96,7 +96,7 @@ def get_entry(s: Session, realm: str, entry_id: str, now: float) -> EntryRecord 
     row = s.execute(
         _entries().where(
             DirectoryEntry.id == findable_hex(entry_id),
-            Realm.name == findable(realm),
+            Realm.name == normalise(realm),
             DirectoryEntry.expires > now,
         )
     ).one_or_none()
@@ -108,7 +108,7 @@ def all_entries(s: Session, now: float) -> list[EntryRecord]:
     return [EntryRecord(*row) for row in s.execute(_entries().where(DirectoryEntry.expires > now))]
 
 
-def list_entries(s: Session, ask: EntryAsk, now: float, limit: int) -> list[EntryRecord]:
+def list_entries(s: Session, ask: EntrySearch, now: float, limit: int) -> list[EntryRecord]:
     """Entries whose leases last, in the order of their places.
 
     :param now: Unix seconds
@@ -124,13 +124,13 @@ def list_entries(s: Session, ask: EntryAsk, now: float, limit: int) -> list[Entr
         )
         .join(Realm, Realm.id == DirectoryEntry.realm_id)
         .outerjoin(Robot, Robot.id == DirectoryEntry.robot_id)
-        .where(Realm.name == findable(ask.realm), DirectoryEntry.expires > now)
+        .where(Realm.name == normalise(ask.realm), DirectoryEntry.expires > now)
     )
     if ask.kind is not None:
         query = query.where(DirectoryEntry.kind == ask.kind)
     # Sorted here: databases order texts by rules of their own.
     places = sorted(
-        EntryPlace(row.robot or "", row.kind, row.name, row.id)
+        EntryCursor(row.robot or "", row.kind, row.name, row.id)
         for row in s.execute(query)
         if _wanted(ask, row.robot_id) and fnmatchcase(row.name, ask.name)
     )
@@ -144,7 +144,7 @@ def list_entries(s: Session, ask: EntryAsk, now: float, limit: int) -> list[Entr
     return [found[each] for each in wanted if each in found]
 
 
-def _wanted(ask: EntryAsk, robot_id: int | None) -> bool:
+def _wanted(ask: EntrySearch, robot_id: int | None) -> bool:
     if robot_id is None:
         return ask.general
     return ask.robots is None or robot_id in ask.robots
@@ -201,13 +201,13 @@ def remove_entry(s: Session, entry_id: str, now: float, *, counts: bool = False)
 # --- leases -----------------------------------------------------------------------------------------------
 
 
-def leases(s: Session, now: float) -> Leases:
+def leases(s: Session, now: float) -> LeaseTimes:
     """How the leases stand.
 
     :param now: Unix seconds
     """
     rows = s.execute(select(DirectoryEntry.id, DirectoryEntry.ttl, DirectoryEntry.expires)).all()
-    return Leases(
+    return LeaseTimes(
         frozenset(row.id for row in rows),
         min((row.expires for row in rows), default=None),
         any(row.expires > now + row.ttl for row in rows),

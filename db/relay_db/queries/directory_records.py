@@ -50,7 +50,7 @@ class EntryRecord(NamedTuple):
     expires: float
 
 
-class EntryPlace(NamedTuple):
+class EntryCursor(NamedTuple):
     """Where an entry of the directory stands among others: what is about no robot comes first."""
 
     robot: str
@@ -59,7 +59,7 @@ class EntryPlace(NamedTuple):
     id: str
 
 
-class EntryAsk(NamedTuple):
+class EntrySearch(NamedTuple):
     """What is asked of a realm's directory, and what of it may be seen.
 
     :param robots: robots about which entries are wanted and may be seen; ``None`` for all
@@ -73,10 +73,10 @@ class EntryAsk(NamedTuple):
     general: bool = True
     kind: str | None = None
     name: str = "*"
-    after: EntryPlace | None = None
+    after: EntryCursor | None = None
 
 
-class Leases(NamedTuple):
+class LeaseTimes(NamedTuple):
     """How the leases of the directory stand.
 
     :param there: what there are leases of, also those that are over

@@ -8,29 +8,29 @@ from typing import Any
 from sqlalchemy import bindparam, delete, func, insert, select, tuple_, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import Memory, MemoryCount, Realm
-from relay_db.queries.recalling import realm_number
-from relay_db.queries.records import MemoryRecord, NewMemory
+from relay_db.models import Realm, StoredEvent, StoredEventCount
+from relay_db.queries.event_search import realm_number
+from relay_db.queries.records import NewStoredEvent, StoredEventRecord
 
 SPARED = 10
 """One in so many of a source's events, the newest, is kept however little it was used."""
 
-_TABLE: Any = Memory.__table__
+_TABLE: Any = StoredEvent.__table__
 
 
-def remember(s: Session, events: Sequence[NewMemory]) -> list[MemoryRecord | None]:
+def remember(s: Session, events: Sequence[NewStoredEvent]) -> list[StoredEventRecord | None]:
     """Write events, numbered in this order within each realm; each as it is kept, ``None`` where its realm is gone."""
     realms = _lasting(s, {each.realm for each in events})
     following: dict[str, int] = {}
     for realm in sorted(realms):
         count = sum(each.realm == realm for each in events)
         following[realm] = _take_numbers(s, realms[realm], count)
-    kept: list[MemoryRecord | None] = []
+    kept: list[StoredEventRecord | None] = []
     for each in events:
         if each.realm not in realms:
             kept.append(None)
             continue
-        kept.append(MemoryRecord(following[each.realm], *each, used=0))
+        kept.append(StoredEventRecord(following[each.realm], *each, used=0))
         following[each.realm] += 1
     rows = [
         {
@@ -54,12 +54,15 @@ def remember(s: Session, events: Sequence[NewMemory]) -> list[MemoryRecord | Non
 
 def _take_numbers(s: Session, realm_id: int, count: int) -> int:
     """The first of so many numbers that nobody else gets."""
-    mine = MemoryCount.realm_id == realm_id
+    mine = StoredEventCount.realm_id == realm_id
     last = s.scalar(
-        update(MemoryCount).where(mine).values(last=MemoryCount.last + count).returning(MemoryCount.last)
+        update(StoredEventCount)
+        .where(mine)
+        .values(last=StoredEventCount.last + count)
+        .returning(StoredEventCount.last)
     )
     if last is None:
-        s.execute(insert(MemoryCount).values(realm_id=realm_id, last=count))
+        s.execute(insert(StoredEventCount).values(realm_id=realm_id, last=count))
         last = count
     return int(last) - count + 1
 
@@ -100,16 +103,16 @@ def use_memories(s: Session, uses: Mapping[tuple[str, int], int]) -> None:
 def memory_sizes(s: Session) -> dict[str, int]:
     """How many events each realm's memory holds."""
     size = func.count().label("size")
-    query = select(Realm.name, size).join(Memory, Memory.realm_id == Realm.id).group_by(Realm.name)
+    query = select(Realm.name, size).join(StoredEvent, StoredEvent.realm_id == Realm.id).group_by(Realm.name)
     return {row.name: row.size for row in s.execute(query)}
 
 
 def crowded_sources(s: Session, most: int) -> list[tuple[str, str]]:
     """Realms and sources with more than so many events."""
     query = (
-        select(Realm.name, Memory.source)
-        .join(Realm, Realm.id == Memory.realm_id)
-        .group_by(Memory.realm_id, Realm.name, Memory.source)
+        select(Realm.name, StoredEvent.source)
+        .join(Realm, Realm.id == StoredEvent.realm_id)
+        .group_by(StoredEvent.realm_id, Realm.name, StoredEvent.source)
         .having(func.count() > most)
     )
     return [(realm, source) for realm, source in s.execute(query)]
@@ -121,22 +124,22 @@ def surplus_memories(s: Session, realm: str, source: str, most: int, limit: int)
     :param most: events it may have
     :param limit: numbers at a time
     """
-    own = [Memory.realm_id == realm_number(s, realm), Memory.source == source]
+    own = [StoredEvent.realm_id == realm_number(s, realm), StoredEvent.source == source]
     count = s.scalar(select(func.count()).where(*own)) or 0
     if count <= most:
         return []
     newest = (
-        select(Memory.at, Memory.number)
+        select(StoredEvent.at, StoredEvent.number)
         .where(*own)
-        .order_by(Memory.at.desc(), Memory.number.desc())
+        .order_by(StoredEvent.at.desc(), StoredEvent.number.desc())
         .limit(1)
         .offset(most // SPARED)
     )
     at, number = s.execute(newest).one()
     query = (
-        select(Memory.number)
-        .where(*own, tuple_(Memory.at, Memory.number) <= tuple_(at, number))
-        .order_by(Memory.used, Memory.at, Memory.number)
+        select(StoredEvent.number)
+        .where(*own, tuple_(StoredEvent.at, StoredEvent.number) <= tuple_(at, number))
+        .order_by(StoredEvent.used, StoredEvent.at, StoredEvent.number)
         .limit(min(count - most, limit))
     )
     return list(s.scalars(query))
@@ -148,10 +151,10 @@ def old_memories(s: Session, realm: str, before: float | None, limit: int) -> li
     :param before: only of those that are older, Unix seconds
     :param limit: numbers at a time
     """
-    query = select(Memory.number).where(Memory.realm_id == realm_number(s, realm))
+    query = select(StoredEvent.number).where(StoredEvent.realm_id == realm_number(s, realm))
     if before is not None:
-        query = query.where(Memory.at < before)
-    return list(s.scalars(query.order_by(Memory.at, Memory.number).limit(limit)))
+        query = query.where(StoredEvent.at < before)
+    return list(s.scalars(query.order_by(StoredEvent.at, StoredEvent.number).limit(limit)))
 
 
 def forget_memories(s: Session, realm: str, numbers: Collection[int]) -> int:

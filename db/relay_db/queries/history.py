@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from relay_db.base import canonical_json
 from relay_db.models import NAME, AuditEntry, Event, Revision, Robot, User
-from relay_db.names import recorded
+from relay_db.names import sanitise
 from relay_db.queries.records import AuditRecord, EventRecord
 
 _START = hashlib.sha256(b"").hexdigest()
@@ -44,8 +44,8 @@ def record_event(
     """
     values = {
         "at": at,
-        "kind": recorded(kind, NAME),
-        "source": recorded(source),
+        "kind": sanitise(kind, NAME),
+        "source": sanitise(source),
         "robot_id": select(Robot.id).where(Robot.id == robot_id).scalar_subquery(),
         "user_id": select(User.id).where(User.id == user_id).scalar_subquery(),
         "data": dict(data),
@@ -65,7 +65,7 @@ def list_events(
     if robot_id is not None:
         query = query.where(Event.robot_id == robot_id)
     if kind is not None:
-        query = query.where(Event.kind == recorded(kind, NAME))
+        query = query.where(Event.kind == sanitise(kind, NAME))
     return [EventRecord(*row) for row in s.execute(query)]
 
 
@@ -108,10 +108,10 @@ def append_audit(
     entry = AuditRecord(
         end.audit_id + 1,
         float(at),
-        recorded(actor),
-        recorded(action, NAME),
-        recorded(target),
-        recorded(origin),
+        sanitise(actor),
+        sanitise(action, NAME),
+        sanitise(target),
+        sanitise(origin),
         dict(data or {}),
         "",
     )
@@ -129,7 +129,7 @@ _LATELY = 20_000
 
 def audit_key(at: float, actor: str, action: str, target: str) -> AuditKey:
     """What tells an entry from others: time in Unix seconds, actor, action and target as they are stored."""
-    return float(at), recorded(actor), recorded(action, NAME), recorded(target)
+    return float(at), sanitise(actor), sanitise(action, NAME), sanitise(target)
 
 
 def audited_lately(s: Session, since: float) -> frozenset[AuditKey]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from sqlalchemy import Select, delete, insert, literal, null, or_, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import AccessToken, Program, Realm, TokenFamily, User
-from relay_db.names import findable, findable_hex
+from relay_db.models import AccessToken, OAuthClient, Realm, TokenFamily, User
+from relay_db.names import findable_hex, normalise
 from relay_db.names import label as checked_label
-from relay_db.queries.records import IssuedRecord, ProgramRecord
+from relay_db.queries.records import IssuedRecord, OAuthClientRecord
 from relay_db.queries.state import bump
 from relay_db.queries.users import check_unchanged, live_user
 from relay_protocol.errors import Invalid, NotFound
@@ -43,45 +43,49 @@ def add_program(
         "label": checked_label(label, "label of a program"),
         "created": now,
     }
-    return s.scalars(insert(Program).values(**values).returning(Program.id)).one()
+    return s.scalars(insert(OAuthClient).values(**values).returning(OAuthClient.id)).one()
 
 
-def find_program(s: Session, key: str) -> ProgramRecord | None:
+def find_program(s: Session, key: str) -> OAuthClientRecord | None:
     """The program of that key, unless its user is disabled."""
-    query = _programs().where(Program.key == key, live_user())
+    query = _programs().where(OAuthClient.key == key, live_user())
     # Text from anyone: what can't be a key must not reach the database.
     row = s.execute(query).one_or_none() if key.isascii() and key.isprintable() else None
-    return None if row is None else ProgramRecord(*row)
+    return None if row is None else OAuthClientRecord(*row)
 
 
 def program_in(s: Session, key: str, realm: str) -> int | None:
     """The number of the program of that key, if its user is of the realm; also while he is disabled."""
     if not (key.isascii() and key.isprintable()):
         return None
-    query = select(Program.id).join(User, User.id == Program.user_id).join(Realm, Realm.id == User.realm_id)
-    return s.scalar(query.where(Program.key == key, Realm.name == findable(realm)))
+    query = (
+        select(OAuthClient.id)
+        .join(User, User.id == OAuthClient.user_id)
+        .join(Realm, Realm.id == User.realm_id)
+    )
+    return s.scalar(query.where(OAuthClient.key == key, Realm.name == normalise(realm)))
 
 
-def list_programs(s: Session, user_id: int | None = None) -> list[ProgramRecord]:
+def list_programs(s: Session, user_id: int | None = None) -> list[OAuthClientRecord]:
     """All programs, of one user or of all, oldest first."""
-    query = _programs().order_by(Program.id)
+    query = _programs().order_by(OAuthClient.id)
     if user_id is not None:
-        query = query.where(Program.user_id == user_id)
-    return [ProgramRecord(*row) for row in s.execute(query)]
+        query = query.where(OAuthClient.user_id == user_id)
+    return [OAuthClientRecord(*row) for row in s.execute(query)]
 
 
 def remove_program(s: Session, program_id: int) -> bool:
     """Remove a program; the tokens it was given end with it. False if there is none of that number."""
     bump(s)
-    gone = delete(Program).where(Program.id == program_id).returning(Program.id)
+    gone = delete(OAuthClient).where(OAuthClient.id == program_id).returning(OAuthClient.id)
     return s.scalar(gone) is not None
 
 
 def program_label(s: Session, token_id: int) -> str | None:
     """What the program is called that a token was given to; ``None`` for a token of no program."""
     return s.scalar(
-        select(Program.label)
-        .join(AccessToken, AccessToken.program_id == Program.id)
+        select(OAuthClient.label)
+        .join(AccessToken, AccessToken.program_id == OAuthClient.id)
         .where(AccessToken.id == token_id)
     )
 
@@ -152,14 +156,14 @@ def issued(s: Session, token_hash: str, now: float) -> IssuedRecord | None:
             User.name,
             Realm.name,
             AccessToken.scope,
-            Program.key,
+            OAuthClient.key,
             AccessToken.created,
             AccessToken.expires,
             AccessToken.family_id,
         )
         .join(User, User.id == AccessToken.user_id)
         .join(Realm, Realm.id == User.realm_id)
-        .outerjoin(Program, Program.id == AccessToken.program_id)
+        .outerjoin(OAuthClient, OAuthClient.id == AccessToken.program_id)
         .where(
             AccessToken.token_hash == found,
             AccessToken.kind == "access",
@@ -200,7 +204,7 @@ def revoke_issued(s: Session, token_hash: str, realm: str, program: str | None =
         AccessToken.kind == "access",
         or_(
             AccessToken.user_id.in_(users),
-            AccessToken.program_id.in_(select(Program.id).where(Program.key == program)),
+            AccessToken.program_id.in_(select(OAuthClient.id).where(OAuthClient.key == program)),
         ),
     )
     family = delete(TokenFamily).where(
@@ -220,16 +224,16 @@ def revoke_issued(s: Session, token_hash: str, realm: str, program: str | None =
 def _programs() -> Select[int, int, str, str, str, str, str | None, str, float]:
     return (
         select(
-            Program.id,
+            OAuthClient.id,
             User.id,
             User.name,
             Realm.name,
-            Program.key,
-            Program.verifier,
-            Program.scope,
-            Program.label,
-            Program.created,
+            OAuthClient.key,
+            OAuthClient.verifier,
+            OAuthClient.scope,
+            OAuthClient.label,
+            OAuthClient.created,
         )
-        .join(User, User.id == Program.user_id)
+        .join(User, User.id == OAuthClient.user_id)
         .join(Realm, Realm.id == User.realm_id)
     )

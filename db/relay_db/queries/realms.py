@@ -5,8 +5,17 @@ from __future__ import annotations
 from sqlalchemy import delete, exists, insert, select, update
 from sqlalchemy.orm import Session
 
-from relay_db.models import DirectoryEntry, Group, Memory, MemoryCount, Realm, RobotGroup, RobotRealm, User
-from relay_db.names import findable, normal_name
+from relay_db.models import (
+    DirectoryEntry,
+    Group,
+    Realm,
+    RobotGroup,
+    RobotRealm,
+    StoredEvent,
+    StoredEventCount,
+    User,
+)
+from relay_db.names import normal_name, normalise
 from relay_db.queries.records import RealmRecord
 from relay_db.queries.state import bump
 from relay_protocol.errors import Invalid, NotFound, Refused
@@ -34,10 +43,10 @@ def remove_realm(s: Session, name: str) -> None:
     """
     bump(s)
     # On PostgreSQL who writes to the realm's memory is done by now, or finds it gone.
-    gone = s.scalar(select(Realm.id).where(Realm.name == findable(name)).with_for_update())
+    gone = s.scalar(select(Realm.id).where(Realm.name == normalise(name)).with_for_update())
     if gone is None:
         raise NotFound("there is no such realm")
-    if findable(name) == DEFAULT_REALM:
+    if normalise(name) == DEFAULT_REALM:
         raise Refused(f"the realm '{DEFAULT_REALM}' stays: names without a realm are of it")
     left = [
         what
@@ -50,8 +59,8 @@ def remove_realm(s: Session, name: str) -> None:
         if s.scalar(select(exists().where(kind.realm_id == gone)))
     ]
     if left:
-        raise Refused(f"there are {' and '.join(left)} in the realm '{findable(name)}'; remove them first")
-    for kept in (DirectoryEntry, Memory, MemoryCount):
+        raise Refused(f"there are {' and '.join(left)} in the realm '{normalise(name)}'; remove them first")
+    for kept in (DirectoryEntry, StoredEvent, StoredEventCount):
         s.execute(delete(kept).where(kept.realm_id == gone))
     s.execute(delete(Realm).where(Realm.id == gone))
 
@@ -64,14 +73,14 @@ def list_realms(s: Session) -> list[RealmRecord]:
 
 def find_realm(s: Session, name: str) -> RealmRecord | None:
     """The realm of that name."""
-    query = select(Realm.id, Realm.name, Realm.events_days).where(Realm.name == findable(name))
+    query = select(Realm.id, Realm.name, Realm.events_days).where(Realm.name == normalise(name))
     row = s.execute(query).one_or_none()
     return None if row is None else RealmRecord(*row)
 
 
 def realm_id(s: Session, name: str) -> int:
     """:raises NotFound: no such realm"""
-    found = s.scalar(select(Realm.id).where(Realm.name == findable(name)))
+    found = s.scalar(select(Realm.id).where(Realm.name == normalise(name)))
     if found is None:
         raise NotFound("there is no such realm")
     return found

@@ -141,7 +141,7 @@ class TokenRecord(NamedTuple):
     scope: str | None = None
 
 
-class ProgramRecord(NamedTuple):
+class OAuthClientRecord(NamedTuple):
     """A program that proves itself by key and secret.
 
     :param verifier: H(A1) of RFC 7616 by SHA-256, in hex
@@ -252,7 +252,7 @@ class EventRecord(NamedTuple):
     data: dict[str, Any]
 
 
-class NewMemory(NamedTuple):
+class NewStoredEvent(NamedTuple):
     """An event for the short-term memory.
 
     :param data: a JSON object as text, in ASCII, as :func:`relay_db.base.canonical_json` writes it
@@ -267,7 +267,7 @@ class NewMemory(NamedTuple):
     data: str
 
 
-class MemoryRecord(NamedTuple):
+class StoredEventRecord(NamedTuple):
     """An event of the short-term memory.
 
     :param number: within its realm, in the order in which they were written
@@ -296,14 +296,14 @@ class NameIs(NamedTuple):
         return name.startswith(self.text) if self.prefix else name == self.text
 
 
-class MemoryPlace(NamedTuple):
+class EventCursor(NamedTuple):
     """A place among events that are told from the newest on."""
 
     at: float
     number: int
 
 
-class MemoryAsk(NamedTuple):
+class EventSearch(NamedTuple):
     """What is asked of a realm's memory, and what of it may be seen.
 
     :param robots: robots about which events are wanted and may be seen
@@ -328,16 +328,16 @@ class MemoryAsk(NamedTuple):
 class MemoryPage(NamedTuple):
     """Events that were found, and where to go on, ``None`` where there are no more."""
 
-    events: list[MemoryRecord]
-    place: MemoryPlace | None
+    events: list[StoredEventRecord]
+    place: EventCursor | None
 
 
-class MemoryTally(NamedTuple):
+class StoredEventCounts(NamedTuple):
     """How many events there are, their numbers where they are few, and where to go on as in :class:`MemoryPage`."""
 
     size: int
     numbers: list[int]
-    place: MemoryPlace | None
+    place: EventCursor | None
 
 
 class AuditRecord(NamedTuple):

@@ -9,7 +9,7 @@ from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
 from relay_db.models import Realm, Robot, RobotGroup, RobotMembership
-from relay_db.names import findable, normal_name
+from relay_db.names import normal_name, normalise
 from relay_db.queries.realms import realm_id, robot_is_of
 from relay_db.queries.records import RobotGroupRecord
 from relay_protocol.errors import Invalid, NotFound
@@ -21,7 +21,7 @@ def find_robot_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> Robot
     row = s.execute(
         select(RobotGroup.id, RobotGroup.name, Realm.name)
         .join(Realm, Realm.id == RobotGroup.realm_id)
-        .where(RobotGroup.name == findable(name), Realm.name == findable(realm))
+        .where(RobotGroup.name == normalise(name), Realm.name == normalise(realm))
     ).one_or_none()
     return (
         None
@@ -38,7 +38,7 @@ def list_robot_groups(s: Session, realm: str | None = None) -> list[RobotGroupRe
         .order_by(RobotGroup.name)
     )
     if realm is not None:
-        query = query.where(Realm.name == findable(realm))
+        query = query.where(Realm.name == normalise(realm))
     robots = robots_of_groups(s)
     return [RobotGroupRecord(id, name, where, robots[id]) for id, name, where in s.execute(query).all()]
 
@@ -48,7 +48,7 @@ def robot_group_names(s: Session, realm: str) -> dict[str, int]:
     rows = s.execute(
         select(RobotGroup.name, RobotGroup.id)
         .join(Realm, Realm.id == RobotGroup.realm_id)
-        .where(Realm.name == findable(realm))
+        .where(Realm.name == normalise(realm))
     )
     return {row.name: row.id for row in rows}
 
@@ -57,7 +57,7 @@ def add_robot_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> RobotG
     """:raises Invalid: the name can't be, or is taken
     :raises NotFound: no such realm
     """
-    name, realm = normal_name(name, "name of a group"), findable(realm)
+    name, realm = normal_name(name, "name of a group"), normalise(realm)
     if find_robot_group(s, name, realm) is not None:
         raise Invalid(f"there is a group of robots '{full_name(name, realm)}' already")
     group_id = s.scalars(

@@ -9,7 +9,7 @@ from sqlalchemy import Select, delete, insert, select, update
 from sqlalchemy.orm import Session
 
 from relay_db.models import EnrolmentCode, Realm, Robot, RobotKey, RobotRealm
-from relay_db.names import findable, findable_hex, label, recorded
+from relay_db.names import findable_hex, label, normalise, sanitise
 from relay_db.queries.realms import realm_id
 from relay_db.queries.records import KeyRecord, RobotKeyRecord, RobotRecord
 from relay_db.queries.state import bump
@@ -60,7 +60,7 @@ def add_robot(s: Session, name: str, description: str = "", realm: str = DEFAULT
     if name in _ROUTES:
         raise Invalid(f"a robot can't be called '{name}': that is an address of the relay itself")
     label(description, "description of a robot")
-    realm = findable(realm)
+    realm = normalise(realm)
     if find_robot(s, name, realm) is not None:
         raise Invalid(f"there is a robot '{full_name(name, realm)}' already")
     bump(s)
@@ -109,7 +109,7 @@ def issue_enrolment_code(s: Session, robot_id: int, code_hash: str, expires: flo
     s.execute(insert(EnrolmentCode).values(robot_id=robot_id, code_hash=code_hash, expires=expires))
 
 
-class _Enrolment(NamedTuple):
+class _EnrolmentCode(NamedTuple):
     public_key: bytes
     fingerprint: str
     agent: str
@@ -134,7 +134,7 @@ def redeem_enrolment_code(
     if len(public_key) != PUBLIC_KEY_BYTES:
         raise Invalid(f"the public key must have {PUBLIC_KEY_BYTES} bytes (Ed25519)")
     robot = find_robot(s, robot_name, realm)
-    if robot is not None and robot.realm != findable(realm):
+    if robot is not None and robot.realm != normalise(realm):
         # Keys are handed in under the name of its own realm.
         robot = None
     spent = s.scalar(
@@ -151,7 +151,7 @@ def redeem_enrolment_code(
     if robot is None or spent is None:
         raise Refused(_REFUSED)
     bump(s)
-    _make_live(s, robot, _Enrolment(public_key, fingerprint, recorded(agent)), now)
+    _make_live(s, robot, _EnrolmentCode(public_key, fingerprint, sanitise(agent)), now)
     return robot
 
 
@@ -167,7 +167,7 @@ def robot_key(
         .join(RobotKey, RobotKey.robot_id == Robot.id)
         .where(
             Robot.name == robot_name,
-            Realm.name == findable(realm),
+            Realm.name == normalise(realm),
             RobotKey.fingerprint == findable_hex(fingerprint),
             RobotKey.retired.is_(None),
         )
@@ -216,7 +216,7 @@ def revoke_key(s: Session, robot_id: int, fingerprint: str, now: float) -> None:
         raise NotFound("the robot has no such live key; see its keys for their fingerprints")
 
 
-def _make_live(s: Session, robot: RobotRecord, key: _Enrolment, now: float) -> None:
+def _make_live(s: Session, robot: RobotRecord, key: _EnrolmentCode, now: float) -> None:
     known = s.execute(
         select(RobotKey.id, RobotKey.retired, RobotKey.public_key).where(
             RobotKey.robot_id == robot.id, RobotKey.fingerprint == key.fingerprint
@@ -243,7 +243,7 @@ def _robots() -> Select[int, str, str, str]:
 
 def _robots_in(realm: str) -> Select[int, str, str, str]:
     """Those of a realm, and those that are shared with it."""
-    number = select(Realm.id).where(Realm.name == findable(realm)).scalar_subquery()
+    number = select(Realm.id).where(Realm.name == normalise(realm)).scalar_subquery()
     return _robots().join(RobotRealm, RobotRealm.robot_id == Robot.id).where(RobotRealm.realm_id == number)
 
 

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from relay_db.models import (
     DirectoryEntry,
     Group,
-    GuestAccount,
+    LinkedAccount,
     Realm,
     Right,
     Robot,
@@ -23,7 +23,7 @@ from relay_db.models import (
     RobotRealm,
     User,
 )
-from relay_db.names import findable
+from relay_db.names import normalise
 from relay_db.queries.realms import realm_id
 from relay_db.queries.records import UserRecord
 from relay_db.queries.state import bump
@@ -46,10 +46,10 @@ def share_robot(s: Session, robot_id: int, realm: str) -> None:
         select(RobotRealm.robot_id).where(RobotRealm.realm_id == number, RobotRealm.name == name)
     )
     if there == robot_id:
-        raise Invalid(f"the robot '{name}' is of the realm '{findable(realm)}' already")
+        raise Invalid(f"the robot '{name}' is of the realm '{normalise(realm)}' already")
     if there is not None:
         raise Invalid(
-            f"there is another robot '{full_name(name, findable(realm))}', and a robot has one name in all its realms"
+            f"there is another robot '{full_name(name, normalise(realm))}', and a robot has one name in all its realms"
         )
     bump(s)
     s.execute(insert(RobotRealm).values(robot_id=robot_id, realm_id=number, name=name))
@@ -66,14 +66,14 @@ def unshare_robot(s: Session, robot_id: int, realm: str) -> None:
     own = s.scalar(select(Robot.realm_id).where(Robot.id == robot_id))
     if own == number:
         raise Refused(
-            f"'{findable(realm)}' is the robot's own realm; only to remove the robot takes it out of that"
+            f"'{normalise(realm)}' is the robot's own realm; only to remove the robot takes it out of that"
         )
     bump(s)
     # Who registers something about the robot there has done so by now, or finds it gone.
     s.execute(select(Realm.id).where(Realm.id == number).with_for_update())
     shared = (RobotRealm.robot_id == robot_id) & (RobotRealm.realm_id == number)
     if s.scalar(delete(RobotRealm).where(shared).returning(RobotRealm.robot_id)) is None:
-        raise NotFound(f"the robot is not of the realm '{findable(realm)}'")
+        raise NotFound(f"the robot is not of the realm '{normalise(realm)}'")
     users = select(User.id).where(User.realm_id == number)
     groups = select(Group.id).where(Group.realm_id == number)
     s.execute(
@@ -115,8 +115,8 @@ def add_guest(s: Session, user_id: int, realm: str) -> UserRecord:
     user = get_user(s, user_id)
     if user is None:
         raise NotFound("there is no such user")
-    guest = add_user(s, user.name, None, realm=findable(realm))
-    s.execute(insert(GuestAccount).values(user_id=guest.id, home_id=home_of(s, user_id)))
+    guest = add_user(s, user.name, None, realm=normalise(realm))
+    s.execute(insert(LinkedAccount).values(user_id=guest.id, home_id=home_of(s, user_id)))
     made = get_user(s, guest.id)
     assert made is not None
     return made
@@ -128,8 +128,8 @@ def account_in(s: Session, user_id: int, realm: str) -> UserRecord | None:
     query = (
         select(User.id)
         .join(Realm, Realm.id == User.realm_id)
-        .outerjoin(GuestAccount, GuestAccount.user_id == User.id)
-        .where(Realm.name == findable(realm), or_(User.id == home, GuestAccount.home_id == home))
+        .outerjoin(LinkedAccount, LinkedAccount.user_id == User.id)
+        .where(Realm.name == normalise(realm), or_(User.id == home, LinkedAccount.home_id == home))
     )
     found = s.scalar(query)
     return None if found is None else get_user(s, found)

@@ -6,7 +6,7 @@ from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
 from relay_db.models import Robot, StopOrder
-from relay_db.names import recorded
+from relay_db.names import sanitise
 from relay_db.queries.records import StopRecord
 from relay_db.queries.state import bump
 from relay_protocol.errors import NotFound
@@ -26,7 +26,7 @@ def order_stop(s: Session, robot_id: int, by: str, why: str, at: float, *, tell:
     if s.scalar(select(Robot.id).where(Robot.id == robot_id).with_for_update()) is None:
         raise NotFound("there is no such robot")
     s.execute(delete(StopOrder).where(StopOrder.robot_id == robot_id))
-    order = StopRecord(robot_id, recorded(by), recorded(why, WORDS), float(at))
+    order = StopRecord(robot_id, sanitise(by), sanitise(why, WORDS), float(at))
     s.execute(insert(StopOrder).values(**order._asdict()))
     return order
 

@@ -18,8 +18,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Session, aliased
 
-from relay_db.models import AccessToken, Group, GuestAccount, Membership, Realm, TokenFamily, User
-from relay_db.names import findable, normal_name
+from relay_db.models import AccessToken, Group, LinkedAccount, Membership, Realm, TokenFamily, User
+from relay_db.names import normal_name, normalise
 from relay_db.queries.realms import realm_id
 from relay_db.queries.records import GroupRecord, UserRecord
 from relay_db.queries.state import bump
@@ -34,7 +34,9 @@ _HomeRealm = aliased(Realm)
 
 def find_user(s: Session, name: str, realm: str = DEFAULT_REALM) -> UserRecord | None:
     """The user of that name, in whatever case it is written; also a disabled one."""
-    row = s.execute(_users().where(User.name == findable(name), Realm.name == findable(realm))).one_or_none()
+    row = s.execute(
+        _users().where(User.name == normalise(name), Realm.name == normalise(realm))
+    ).one_or_none()
     return None if row is None else _record(row)
 
 
@@ -48,7 +50,7 @@ def list_users(s: Session, realm: str | None = None) -> list[UserRecord]:
     """All users, of one realm or of all, by name."""
     query = _users().order_by(User.name, Realm.name)
     if realm is not None:
-        query = query.where(Realm.name == findable(realm))
+        query = query.where(Realm.name == normalise(realm))
     return [_record(row) for row in s.execute(query)]
 
 
@@ -64,7 +66,7 @@ def add_user(
     :raises Invalid: the name can't be, or is taken
     :raises NotFound: no such realm
     """
-    name, realm = normal_name(name, "name of a user"), findable(realm)
+    name, realm = normal_name(name, "name of a user"), normalise(realm)
     if find_user(s, name, realm) is not None:
         raise Invalid(f"there is a user '{full_name(name, realm)}' already")
     bump(s)
@@ -139,20 +141,20 @@ def user_is_live(s: Session, user_id: int) -> bool:
 
 def home_of(s: Session, user_id: int) -> int:
     """The account whose password is good for a user: another's, or its own."""
-    return s.scalar(select(GuestAccount.home_id).where(GuestAccount.user_id == user_id)) or user_id
+    return s.scalar(select(LinkedAccount.home_id).where(LinkedAccount.user_id == user_id)) or user_id
 
 
 def _guests(s: Session, home_id: int) -> list[int]:
     """The accounts that are guests of one."""
-    return list(s.scalars(select(GuestAccount.user_id).where(GuestAccount.home_id == home_id)))
+    return list(s.scalars(select(LinkedAccount.user_id).where(LinkedAccount.home_id == home_id)))
 
 
 def live_user() -> ColumnElement[bool]:
     """Whether a user is not disabled, nor the account that it is a guest of."""
     shut_out = (
-        select(GuestAccount.user_id)
-        .join(_Home, _Home.id == GuestAccount.home_id)
-        .where(GuestAccount.user_id == User.id, _Home.disabled)
+        select(LinkedAccount.user_id)
+        .join(_Home, _Home.id == LinkedAccount.home_id)
+        .where(LinkedAccount.user_id == User.id, _Home.disabled)
     )
     return User.disabled.is_(False) & ~shut_out.exists()
 
@@ -181,7 +183,7 @@ def find_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord
     row = s.execute(
         select(Group.id, Group.name, Realm.name)
         .join(Realm, Realm.id == Group.realm_id)
-        .where(Group.name == findable(name), Realm.name == findable(realm))
+        .where(Group.name == normalise(name), Realm.name == normalise(realm))
     ).one_or_none()
     return None if row is None else _with_members(s, row)
 
@@ -192,7 +194,7 @@ def list_groups(s: Session, realm: str | None = None) -> list[GroupRecord]:
         select(Group.id, Group.name, Realm.name).join(Realm, Realm.id == Group.realm_id).order_by(Group.name)
     )
     if realm is not None:
-        query = query.where(Realm.name == findable(realm))
+        query = query.where(Realm.name == normalise(realm))
     return [_with_members(s, row) for row in s.execute(query).all()]
 
 
@@ -200,7 +202,7 @@ def add_group(s: Session, name: str, realm: str = DEFAULT_REALM) -> GroupRecord:
     """:raises Invalid: the name can't be, or is taken
     :raises NotFound: no such realm
     """
-    name, realm = normal_name(name, "name of a group"), findable(realm)
+    name, realm = normal_name(name, "name of a group"), normalise(realm)
     if find_group(s, name, realm) is not None:
         raise Invalid(f"there is a group '{full_name(name, realm)}' already")
     bump(s)
@@ -251,8 +253,8 @@ def _users() -> Select[int, str, str, bool, bool, str | None, str | None, str | 
     return (
         select(User.id, User.name, Realm.name, User.admin, disabled, password, _Home.name, _HomeRealm.name)
         .join(Realm, Realm.id == User.realm_id)
-        .outerjoin(GuestAccount, GuestAccount.user_id == User.id)
-        .outerjoin(_Home, _Home.id == GuestAccount.home_id)
+        .outerjoin(LinkedAccount, LinkedAccount.user_id == User.id)
+        .outerjoin(_Home, _Home.id == LinkedAccount.home_id)
         .outerjoin(_HomeRealm, _HomeRealm.id == _Home.realm_id)
     )
 

@@ -21,7 +21,7 @@ from relay_protocol.link.answers import (
     Subscribed,
     TypeDefinition,
 )
-from relay_protocol.link.both_ways import (
+from relay_protocol.link.common import (
     ActionFeedback,
     ActionResult,
     BothChannel,
@@ -47,24 +47,8 @@ from relay_protocol.link.control import (
     Service,
     Topic,
 )
-from relay_protocol.link.fields import (
-    from_base64,
-    to_base64,
-)
-from relay_protocol.link.moving import (
-    Control,
-    Done,
-    Inhibit,
-    Inhibited,
-    Limits,
-    Resume,
-    Safety,
-    Stop,
-    Stopped,
-    Suppress,
-    Suppressed,
-)
-from relay_protocol.link.opening import (
+from relay_protocol.link.fields import from_base64, to_base64
+from relay_protocol.link.handshake import (
     Challenge,
     Enroll,
     Enrolled,
@@ -76,6 +60,19 @@ from relay_protocol.link.opening import (
     Prove,
     Refused,
     Welcome,
+)
+from relay_protocol.link.motion import (
+    Control,
+    Done,
+    Inhibit,
+    Inhibited,
+    Limits,
+    Resume,
+    Safety,
+    Stop,
+    Stopped,
+    Suppress,
+    Suppressed,
 )
 from relay_protocol.link.requests import (
     Advertise,
@@ -118,10 +115,7 @@ from relay_protocol.link.wire import (
     robot_control_decoder,
     robot_video_decoder,
 )
-from relay_protocol.message import (
-    Message,
-    lower_tag,
-)
+from relay_protocol.message import Message, lower_tag
 
 __all__ = [
     "ActionFeedback",

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from relay_protocol import limits
-from relay_protocol.link.both_ways import BothChannel
+from relay_protocol.link.common import BothChannel
 from relay_protocol.link.fields import Few, Label, Name, cut
 from relay_protocol.message import Message
 

@@ -11,9 +11,9 @@ from msgspec import Meta
 from relay_protocol import limits
 from relay_protocol.errors import Invalid
 from relay_protocol.limits import COMMAND_DEADLINE_MS, STOP_WITHIN_MS
-from relay_protocol.link.both_ways import Bye, Ping, Pong
+from relay_protocol.link.common import Bye, Ping, Pong
 from relay_protocol.link.fields import Ends, Few, Label, Name, cut
-from relay_protocol.link.moving import Control, Done, Inhibit, Resume, Safety, Stop, Suppress
+from relay_protocol.link.motion import Control, Done, Inhibit, Resume, Safety, Stop, Suppress
 from relay_protocol.link.video import Cameras, CloseVideo, OpenVideo
 from relay_protocol.message import Message
 from relay_protocol.wildcards import see_cheap

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from relay_protocol.link.both_ways import BothChannel
+from relay_protocol.link.common import BothChannel
 from relay_protocol.message import Message
 
 

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from relay_protocol import limits
-from relay_protocol.link.both_ways import Bye, Ping, Pong
+from relay_protocol.link.common import Bye, Ping, Pong
 from relay_protocol.link.fields import Label, Name, Reasoned, cut
 from relay_protocol.message import Message
 

@@ -7,7 +7,7 @@ import msgspec
 from relay_protocol import frames, jsontext
 from relay_protocol.link.answers import RobotChannel
 from relay_protocol.link.control import RelayControl, RobotControl
-from relay_protocol.link.opening import Opening, OpeningReply
+from relay_protocol.link.handshake import Opening, OpeningReply
 from relay_protocol.link.requests import RelayChannel
 from relay_protocol.link.video import RelayVideo, RobotVideo
 from relay_protocol.message import Message

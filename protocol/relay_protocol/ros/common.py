@@ -25,4 +25,4 @@ TEXTS = {
     "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message\n",
     "std_srvs/srv/Trigger": "---\nbool success\nstring message\n",
 }
-"""Texts by full names, in the layout of :class:`relay_protocol.link.TypeDefinition`."""
+"""Texts by full names, in the layout of :class:`relay_protocol.link.answers.TypeDefinition`."""

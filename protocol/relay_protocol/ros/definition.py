@@ -211,7 +211,7 @@ def parse(type_name: str, text: str) -> dict[str, Definition]:
     """Read a definition with all it contains; the parts of ``type_name`` come first.
 
     :param type_name: a normalised name
-    :param text: see :class:`relay_protocol.link.TypeDefinition`
+    :param text: see :class:`relay_protocol.link.answers.TypeDefinition`
     :raises Invalid: the text is no definition, is not complete, or makes messages beyond the limits
     """
     if len(text) > TYPE_DEFINITION:

@@ -1,4 +1,4 @@
-"""CDR to JSON or CBOR by code generated for the type; see :mod:`relay_protocol.ros.source`.
+"""CDR to JSON or CBOR by code generated for the type; see :mod:`relay_protocol.ros.codegen`.
 
 One pass over the bytes: neighbouring numbers are unpacked at once, across nested messages, and what comes out is put
 together in one expression. For little-endian messages on little-endian machines, which is all of them.
@@ -10,11 +10,11 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
+from relay_protocol.ros.codegen import Cursor, Source, TooLarge, Unusual
 from relay_protocol.ros.definition import Definition, Field, FieldType, Primitive, Shape
-from relay_protocol.ros.forms import CborForm, HoldsArrays, JsonForm, PlainJsonForm
+from relay_protocol.ros.emit import CborForm, HoldsArrays, JsonForm, PlainJsonForm
+from relay_protocol.ros.layout import Block, Shapes
 from relay_protocol.ros.reader import HEAD, MAX_ELEMENTS
-from relay_protocol.ros.shapes import Block, Shapes
-from relay_protocol.ros.source import Cursor, Source, TooLarge, Unusual
 from relay_protocol.ros.structs import Structs
 
 Read = Callable[[bytes], bytes]

@@ -1,4 +1,4 @@
-"""JSON to CDR by code generated for the type; see :mod:`relay_protocol.ros.source`.
+"""JSON to CDR by code generated for the type; see :mod:`relay_protocol.ros.codegen`.
 
 msgspec decodes the text into structs of the type, which checks it too; neighbouring numbers are packed at once,
 across nested messages. What does not fit, and the spellings that are only tolerated, go to the closures.
@@ -16,10 +16,10 @@ import pybase64
 from msgspec import UNSET
 
 from relay_protocol.limits import ROBOT_MESSAGE
+from relay_protocol.ros.codegen import Cursor, Source, TooLarge, Unusual
 from relay_protocol.ros.definition import BYTES, Definition, Field, FieldType, Shape
+from relay_protocol.ros.layout import Shapes
 from relay_protocol.ros.reader import HEAD
-from relay_protocol.ros.shapes import Shapes
-from relay_protocol.ros.source import Cursor, Source, TooLarge, Unusual
 from relay_protocol.ros.structs import Structs, is_stamp, is_time
 
 Write = Callable[[Any, int], bytes]

@@ -12,8 +12,8 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from relay_protocol.limits import MIB
+from relay_protocol.ros.codegen import MAX_STEPS, TooLarge
 from relay_protocol.ros.definition import BYTES, HEADER, Definition, Field, FieldType, Shape
-from relay_protocol.ros.source import MAX_STEPS, TooLarge
 
 _DEFAULTS = 20_000
 """Most elements in the default arrays of all structs of one type."""

@@ -6,7 +6,7 @@ import pytest
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_db.queries import RightPlace
+from relay_db.queries import RightOnRobot
 from relay_protocol.errors import Invalid, NotFound
 
 
@@ -40,8 +40,8 @@ def test_places_of_rights_are_those_of_the_realm(database: Database) -> None:
         queries.grant_right(s, rover.id, "viewer", group_id=crew.id)
         queries.grant_right(s, rover.id, "operator", user_id=bob.id)
         group, own = sorted(queries.right_places(s, "lab"))
-        assert group == RightPlace(group.id, "rover", None, "crew")
-        assert own == RightPlace(own.id, "rover", "bob", None)
+        assert group == RightOnRobot(group.id, "rover", None, "crew")
+        assert own == RightOnRobot(own.id, "rover", "bob", None)
         assert queries.right_places(s, "lab", user_id=ann.id) == [group]
         assert queries.right_places(s, "lab", robot_id=other[1].id) == []
         held = queries.right_held(s, rover.id, user_id=bob.id)

@@ -8,7 +8,7 @@ import pytest
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_db.queries import EntryAsk, EntryPlace, EntryRecord, NewEntry, NoRoom, Taken
+from relay_db.queries import AlreadyExists, EntryCursor, EntryRecord, EntrySearch, NewEntry, QuotaExceeded
 
 ROOM = {"of_user": 3, "of_realm": 4}
 
@@ -43,7 +43,7 @@ class Filled(NamedTuple):
     def found(self, now: float = 100.0, limit: int = 100, **ask: Any) -> list[str]:
         """Ids of what is found."""
         with self.database.reading() as s:
-            rows = queries.list_entries(s, EntryAsk(**{"realm": "default", **ask}), now, limit)
+            rows = queries.list_entries(s, EntrySearch(**{"realm": "default", **ask}), now, limit)
         return [each.id for each in rows]
 
 
@@ -82,7 +82,7 @@ def test_who_enters_it_again_has_the_same_entry(filled: Filled) -> None:
     again, before = filled.enter("a2", now=110.0, address="http://b/")
     assert before == first
     assert again == first._replace(address="http://b/", expires=170.0)
-    with pytest.raises(Taken, match="ann has registered the service 'map' already"):
+    with pytest.raises(AlreadyExists, match="ann has registered the service 'map' already"):
         filled.enter("b1", user_id=filled.bob)
     assert filled.enter("b2", user_id=filled.bob, robot_id=filled.arm)[0].robot == "arm"
     assert filled.enter("c1", realm="lab", user_id=filled.cleo)[0].realm == "lab"
@@ -94,10 +94,10 @@ def test_a_user_and_a_realm_have_so_many_entries_at_most(filled: Filled) -> None
     """Those that are over count no more, and what is renewed is none more."""
     for number in range(3):
         filled.enter(f"a{number}", name=f"n{number}")
-    with pytest.raises(NoRoom, match="a user has 3"):
+    with pytest.raises(QuotaExceeded, match="a user has 3"):
         filled.enter("a3", name="n3")
     filled.enter("b0", name="n3", user_id=filled.bob)
-    with pytest.raises(NoRoom, match="holds 4 entries"):
+    with pytest.raises(QuotaExceeded, match="holds 4 entries"):
         filled.enter("b1", name="n4", user_id=filled.bob)
     assert filled.enter("b2", name="n3", user_id=filled.bob)[0].id == "b0"
     filled.enter("c0", realm="lab", user_id=filled.cleo)
@@ -118,8 +118,8 @@ def test_entries_are_found_in_the_order_of_their_places(filled: Filled) -> None:
     assert filled.found(robots=frozenset()) == ["b1", "a1"]
     assert filled.found(realm="lab") == filled.found(realm="none") == filled.found(now=160.0) == []
     assert filled.found(limit=2) == ["b1", "a1"]
-    assert filled.found(after=EntryPlace("", "service", "Zoo", "a1")) == ["a3", "a2"]
-    assert filled.found(after=EntryPlace("", "service", "Zoo", "")) == ["a1", "a3", "a2"]
+    assert filled.found(after=EntryCursor("", "service", "Zoo", "a1")) == ["a3", "a2"]
+    assert filled.found(after=EntryCursor("", "service", "Zoo", "")) == ["a1", "a3", "a2"]
 
 
 def test_a_lease_is_renewed_while_it_lasts(filled: Filled) -> None:

@@ -11,20 +11,28 @@ from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_db.queries import MemoryAsk, MemoryPlace, MemoryRecord, NameIs, NewMemory, events, recalling
+from relay_db.queries import (
+    EventCursor,
+    EventSearch,
+    NameIs,
+    NewStoredEvent,
+    StoredEventRecord,
+    event_search,
+    events,
+)
 from relay_protocol.errors import Unavailable
 
-ALL = MemoryAsk("default", frozenset({1, 2}), True, insider=True)
+ALL = EventSearch("default", frozenset({1, 2}), True, insider=True)
 
 
-def new(at: float, source: str = "app", kind: str = "x", **fields: Any) -> NewMemory:
+def new(at: float, source: str = "app", kind: str = "x", **fields: Any) -> NewStoredEvent:
     """An event; what is no column is its data."""
     realm, robot, user = (fields.pop(name, None) for name in ("realm", "robot_id", "user"))
     data = json.dumps(fields, sort_keys=True, separators=(",", ":"))
-    return NewMemory(realm or "default", at, source, kind, robot, user, data)
+    return NewStoredEvent(realm or "default", at, source, kind, robot, user, data)
 
 
-def remembered(database: Database, *new_ones: NewMemory) -> list[MemoryRecord]:
+def remembered(database: Database, *new_ones: NewStoredEvent) -> list[StoredEventRecord]:
     """Write them in one transaction."""
     with database.begin() as s:
         return queries.remember(s, new_ones)
@@ -32,7 +40,7 @@ def remembered(database: Database, *new_ones: NewMemory) -> list[MemoryRecord]:
 
 def found(database: Database, **ask: Any) -> list[int]:
     """Numbers of what is asked for, all of them."""
-    place: MemoryPlace | None = None
+    place: EventCursor | None = None
     numbers: list[int] = []
     with database.reading() as s:
         while True:
@@ -180,8 +188,8 @@ def test_a_page_goes_on_where_the_last_one_ended(database: Database) -> None:
 
 def test_one_look_is_at_a_bounded_number_of_rows(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
     """It says where to go on, and in the end nothing was passed over."""
-    monkeypatch.setattr(recalling, "LOOKED_AT", 50)
-    monkeypatch.setattr(recalling, "_SLICES", (5, 10, 50))
+    monkeypatch.setattr(event_search, "LOOKED_AT", 50)
+    monkeypatch.setattr(event_search, "_SLICES", (5, 10, 50))
     remembered(database, *(new(float(each), n=each % 7) for each in range(200)))
     with database.reading() as s:
         page = queries.recall(s, ALL._replace(data=(("n", "6"),)), None, 1000)
@@ -196,21 +204,21 @@ def test_rows_that_lie_apart_are_looked_at_by_fewer(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each of them takes longer. Where a part ends with the last of them there is nothing more."""
-    monkeypatch.setattr(recalling, "LOOKED_AT", 8)
-    monkeypatch.setattr(recalling, "SCATTERED", 4)
-    monkeypatch.setattr(recalling, "_SLICES", (1, 2, 8))
+    monkeypatch.setattr(event_search, "LOOKED_AT", 8)
+    monkeypatch.setattr(event_search, "SCATTERED", 4)
+    monkeypatch.setattr(event_search, "_SLICES", (1, 2, 8))
     rows = [new(float(n), f"s{n % 2}", f"k{n % 2}", user=f"u{n % 2}", robot_id=1 + n % 2) for n in range(16)]
     remembered(database, *rows)
     with database.reading() as s:
         one_robot = {"robots": frozenset({1}), "general": False}
         for ask in ({"source": NameIs("s0")}, {"kind": NameIs("k0")}, {"user": "u0"}, one_robot):
             first = queries.count_memories(s, ALL._replace(**ask), None, 4)
-            assert first == (4, [15, 13, 11, 9], MemoryPlace(8.0, 9)), ask
+            assert first == (4, [15, 13, 11, 9], EventCursor(8.0, 9)), ask
             assert queries.recall(s, ALL._replace(**ask), None, 10).place == first.place, ask
             assert queries.count_memories(s, ALL._replace(**ask), first.place, 3) == (4, [], None), ask
         for whole in ({}, {"kind": NameIs("k", prefix=True)}, {"source": NameIs("s", prefix=True)}):
             first = queries.count_memories(s, ALL._replace(**whole), None, 0)
-            assert first == (8, [], MemoryPlace(8.0, 9)), whole
+            assert first == (8, [], EventCursor(8.0, 9)), whole
             assert queries.recall(s, ALL._replace(**whole), first.place, 100).place is None, whole
 
 
@@ -260,10 +268,10 @@ def test_each_kind_of_query_goes_by_its_index(database: Database) -> None:
     with database.reading() as s:
         explain = "EXPLAIN QUERY PLAN" if s.get_bind().dialect.name == "sqlite" else "EXPLAIN"
         for index, ask in PLANS.items():
-            for place in (None, MemoryPlace(4000.0, 4000)):
+            for place in (None, EventCursor(4000.0, 4000)):
                 asks = ALL._replace(**ask)
-                part = recalling._part(recalling._shape(s, asks, place)).element
-                values = {**recalling._values(s, asks), **recalling._place_values(place), "size": 100}
+                part = event_search._part(event_search._shape(s, asks, place)).element
+                values = {**event_search._values(s, asks), **event_search._place_values(place), "size": 100}
                 names = part.compile(s.get_bind()).params
                 bound = part.params({name: values[name] for name in names if name in values})
                 query = bound.compile(s.get_bind(), compile_kwargs={"literal_binds": True})

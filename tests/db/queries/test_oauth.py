@@ -32,7 +32,7 @@ def test_a_program_is_found_by_its_key(database: Database, ann: UserRecord) -> N
     """With all that is known of it, unless its user is shut out."""
     with database.begin() as s:
         number = queries.add_program(s, ann.id, "key", VERIFIER, scope="viewer", label="report", now=5.0)
-        record = queries.ProgramRecord(
+        record = queries.OAuthClientRecord(
             number, ann.id, "ann", "default", "key", VERIFIER, "viewer", "report", 5.0
         )
         assert queries.find_program(s, "key") == record

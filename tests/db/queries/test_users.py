@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_db.queries import NewMemory
+from relay_db.queries import NewStoredEvent
 from relay_protocol.errors import Invalid, NotFound, Refused
 from relay_protocol.rights import Level
 
@@ -62,7 +62,7 @@ def test_a_realm_is_removed_when_nobody_is_left(database: Database) -> None:
         rover = queries.add_robot(s, "rover", realm="lab")
         crew = queries.add_group(s, "crew", realm="lab")
         fleet = queries.add_robot_group(s, "fleet", realm="lab")
-        queries.remember(s, [NewMemory("lab", 1.0, "app", "x", None, None, "{}")])
+        queries.remember(s, [NewStoredEvent("lab", 1.0, "app", "x", None, None, "{}")])
         for left, remove, id in (
             ("users and groups and robots and groups of robots", queries.remove_user, ann.id),
             ("groups and robots and groups of robots", queries.remove_group, crew.id),

@@ -15,7 +15,7 @@ from switchboard_threads import Driver
 from switchboard_waiting import wait_for
 
 from relay_protocol import link
-from relay_server.alerts.hub import AGAIN_SECONDS
+from relay_server.alerts.alerts import AGAIN_SECONDS
 from tests.e2e.alerts.house import House
 
 

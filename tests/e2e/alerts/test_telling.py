@@ -18,7 +18,7 @@ from switchboard_threads import Driver
 from switchboard_waiting import wait_for
 
 from relay_protocol import link
-from relay_server.alerts.flow import REGULAR_SECONDS
+from relay_server.alerts.monitors import REGULAR_SECONDS
 from tests.e2e.alerts.house import House
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
 from tests.relay_server.administration.office import Office
 
 
 @pytest.fixture
-def office(store: Store) -> Office:
+def office(store: AsyncDatabase) -> Office:
     """Everybody."""
     return Office(store)

@@ -11,14 +11,14 @@ from twisted.internet.defer import Deferred
 from relay_db import queries
 from relay_db.queries import PrincipalRecord
 from relay_protocol.errors import Unavailable
-from relay_server import passwords
 from relay_server.access import Principal
-from relay_server.administration.desk import RealmDesk
-from relay_server.resources import Listing
-from relay_server.store import Store
+from relay_server.auth import passwords
+from relay_server.common.database import AsyncDatabase
+from relay_server.realms.service import RealmService
+from relay_server.resources.page import PageQuery
 
 HERE = "192.0.2.1"
-ALL = Listing()
+ALL = PageQuery()
 
 
 class Office:
@@ -26,7 +26,7 @@ class Office:
     and administrators: ``root`` and ``boss`` of lab1, ``root`` of lab2.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: AsyncDatabase) -> None:
         self.store = store
         self.taken_up = 0
         self.down = False
@@ -35,7 +35,7 @@ class Office:
         self.seconds = 0.0
         self.people: dict[str, Principal] = {}
         library = SimpleNamespace(of=lambda number: [None] * self.recorded)
-        self.desk = RealmDesk(
+        self.desk = RealmService(
             store,
             self,
             cast(Any, SimpleNamespace(library=library)),

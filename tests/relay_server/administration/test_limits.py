@@ -9,21 +9,21 @@ import pytest_twisted
 from twisted.internet.defer import CancelledError, Deferred
 
 from relay_db import queries
-from relay_db.queries import NoRoom, Taken
+from relay_db.queries import AlreadyExists, QuotaExceeded
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
-from relay_server import passwords
-from relay_server.administration import limits, machines, own, people
-from relay_server.administration.desk import TooManyChanges
+from relay_server.auth import passwords
+from relay_server.realms import limits, realm_change, robots, users
+from relay_server.realms.service import TooManyChanges
 from tests.relay_server.administration.office import ALL, Office
 
 
 @pytest.mark.parametrize(
     ("work", "name", "more"),
     [
-        (people.add_user, "toad", (None, False)),
-        (people.add_group, "crew", ()),
-        (machines.add_robot, "mobile", ("",)),
-        (machines.add_group, "cleaners", ()),
+        (users.add_user, "toad", (None, False)),
+        (users.add_group, "crew", ()),
+        (robots.add_robot, "mobile", ("",)),
+        (robots.add_group, "cleaners", ()),
     ],
 )
 @pytest_twisted.ensureDeferred
@@ -31,14 +31,14 @@ async def test_what_new_things_may_be_called(
     office: Office, monkeypatch: pytest.MonkeyPatch, work: Any, name: str, more: Any
 ) -> None:
     """Nothing that there is, that can't be a name, or that can't stand in an address; and there are not too many."""
-    with pytest.raises(Taken, match=f"'{name}' already"):
+    with pytest.raises(AlreadyExists, match=f"'{name}' already"):
         await office.do(work, name, *more)
     for impossible in ("", "a b", "a@lab1", "a/b", "..", "\0", "x" * 64):
         with pytest.raises(Invalid):
             await office.do(work, impossible, *more)
     for what in limits.MOST:
         monkeypatch.setitem(limits.MOST, what, 1)
-    with pytest.raises(NoRoom, match=r"1 .* at most"):
+    with pytest.raises(QuotaExceeded, match=r"1 .* at most"):
         await office.do(work, "other", *more)
     assert office.record() == []
 
@@ -47,16 +47,16 @@ async def test_what_new_things_may_be_called(
 async def test_a_right_that_can_not_be_is_refused(office: Office) -> None:
     """As on the command line; one in the place of another is told from a new one."""
     with pytest.raises(Invalid):
-        await office.do(machines.grant, "mobile", "toad", "viewer", ["fly:/x"], [])
-    _, fresh = await office.do(machines.grant, "mobile", "toad", "viewer", [], [])
-    right, again = await office.do(machines.grant, "mobile", "Toad", "operator", ["call:/reset"], [])
+        await office.do(robots.grant, "mobile", "toad", "viewer", ["fly:/x"], [])
+    _, fresh = await office.do(robots.grant, "mobile", "toad", "viewer", [], [])
+    right, again = await office.do(robots.grant, "mobile", "Toad", "operator", ["call:/reset"], [])
     assert (fresh, again) == (True, False)
     assert (right["holder"], right["level"], right["allow"]) == ("toad", "operator", ["call:/reset"])
-    await office.do(machines.revoke, "mobile", "toad")
+    await office.do(robots.revoke, "mobile", "toad")
     with pytest.raises(NotFound, match="no such right"):
-        await office.do(machines.revoke, "mobile", "toad")
+        await office.do(robots.revoke, "mobile", "toad")
     with pytest.raises(NotFound, match="not in this group"):
-        await office.do(people.leave, "crew", "toad")
+        await office.do(users.leave, "crew", "toad")
 
 
 def test_changes_are_counted(office: Office) -> None:
@@ -100,28 +100,28 @@ def test_many_patterns_count_as_many_changes(office: Office) -> None:
 @pytest_twisted.ensureDeferred
 async def test_rights_have_not_too_many_patterns(office: Office, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither those on a robot nor those of the realm; what takes the place of as many is taken."""
-    monkeypatch.setattr(own, "MOST_PATTERNS", 5)
-    monkeypatch.setattr(own, "MOST_PATTERNS_OF_A_ROBOT", 3)
-    await office.do(machines.add_robot, "arm", "")
-    await office.do(machines.grant, "mobile", "toad", "viewer", ["call:/a"], ["call:/b"])
-    with pytest.raises(NoRoom, match="use wildcards"):
-        await office.do(machines.grant, "mobile", "@crew", "viewer", ["call:/a", "call:/b"], [])
-    await office.do(machines.grant, "mobile", "toad", "viewer", ["call:/c"], ["call:/b", "call:/d"])
-    await office.do(machines.grant, "arm", "toad", "viewer", ["call:/a", "call:/b"], [])
-    with pytest.raises(NoRoom):
-        await office.do(machines.grant, "arm", "@crew", "viewer", ["call:/a"], [])
-    await office.do(machines.grant, "arm", "@crew", "viewer", [], [])
-    await office.do(machines.grant, "mobile", "toad", "viewer", ["call:/e"], ["call:/b", "call:/d"])
+    monkeypatch.setattr(realm_change, "MOST_PATTERNS", 5)
+    monkeypatch.setattr(realm_change, "MOST_PATTERNS_OF_A_ROBOT", 3)
+    await office.do(robots.add_robot, "arm", "")
+    await office.do(robots.grant, "mobile", "toad", "viewer", ["call:/a"], ["call:/b"])
+    with pytest.raises(QuotaExceeded, match="use wildcards"):
+        await office.do(robots.grant, "mobile", "@crew", "viewer", ["call:/a", "call:/b"], [])
+    await office.do(robots.grant, "mobile", "toad", "viewer", ["call:/c"], ["call:/b", "call:/d"])
+    await office.do(robots.grant, "arm", "toad", "viewer", ["call:/a", "call:/b"], [])
+    with pytest.raises(QuotaExceeded):
+        await office.do(robots.grant, "arm", "@crew", "viewer", ["call:/a"], [])
+    await office.do(robots.grant, "arm", "@crew", "viewer", [], [])
+    await office.do(robots.grant, "mobile", "toad", "viewer", ["call:/e"], ["call:/b", "call:/d"])
 
 
 @pytest_twisted.ensureDeferred
 async def test_the_same_right_again_changes_nothing(office: Office) -> None:
     """Nor is it on record: the relay has nothing to take up."""
     given = ("mobile", "@crew", "operator", ["call:/reset"], ["publish:/x"])
-    told, fresh = await office.do(machines.grant, *given)
+    told, fresh = await office.do(robots.grant, *given)
     with office.store.database.reading() as s:
         revision = queries.revision(s)
-    assert fresh and await office.do(machines.grant, *given) == (told, False)
+    assert fresh and await office.do(robots.grant, *given) == (told, False)
     with office.store.database.reading() as s:
         assert queries.revision(s) == revision
     assert len(office.record()) == 1
@@ -130,20 +130,20 @@ async def test_the_same_right_again_changes_nothing(office: Office) -> None:
 @pytest.mark.parametrize(
     ("work", "args"),
     [
-        (people.add_user, ("luigi", None, False)),
-        (people.change_user, ("toad", "hash", None, None)),
-        (people.change_user, ("toad", None, True, True)),
-        (people.change_user, ("toad", None, False, None)),
-        (people.change_user, ("toad", None, None, True)),
-        (people.change_user, ("toad", None, None, None)),
-        (people.remove_user, ("toad",)),
-        (people.add_group, ("band",)),
-        (people.remove_group, ("crew",)),
-        (people.join, ("crew", "toad")),
-        (people.leave, ("crew", "toad")),
-        (machines.grant, ("mobile", "toad", "viewer", [], [])),
-        (machines.revoke, ("mobile", "toad")),
-        (people.add_program, ("toad", "", None)),
+        (users.add_user, ("luigi", None, False)),
+        (users.change_user, ("toad", "hash", None, None)),
+        (users.change_user, ("toad", None, True, True)),
+        (users.change_user, ("toad", None, False, None)),
+        (users.change_user, ("toad", None, None, True)),
+        (users.change_user, ("toad", None, None, None)),
+        (users.remove_user, ("toad",)),
+        (users.add_group, ("band",)),
+        (users.remove_group, ("crew",)),
+        (users.join, ("crew", "toad")),
+        (users.leave, ("crew", "toad")),
+        (robots.grant, ("mobile", "toad", "viewer", [], [])),
+        (robots.revoke, ("mobile", "toad")),
+        (users.add_program, ("toad", "", None)),
     ],
 )
 @pytest_twisted.ensureDeferred
@@ -163,14 +163,14 @@ async def test_a_token_for_administration_shuts_out_and_sees_to_robots(office: O
     office.people["narrow"] = narrow = office.by_token("root", "lab1", "admin")
     with pytest.raises(Refused, match="a token without a scope"):
         await office.desk.new_hash(narrow, "correct horse")
-    await office.do(people.change_user, "toad", None, True, None, who="narrow")
-    await office.do(machines.add_robot, "arm", "", who="narrow")
-    await office.do(machines.new_code, "arm", who="narrow")
-    await office.do(machines.change_robot, "arm", "on the bench", who="narrow")
-    await office.do(machines.join, "cleaners", "arm", who="narrow")
-    await office.do(machines.remove_robot, "arm", 0, who="narrow")
-    (token,) = (await office.see(people.tokens, "toad", ALL, who="narrow"))["tokens"]
-    await office.do(people.revoke_token, token["id"], who="narrow")
+    await office.do(users.change_user, "toad", None, True, None, who="narrow")
+    await office.do(robots.add_robot, "arm", "", who="narrow")
+    await office.do(robots.new_code, "arm", who="narrow")
+    await office.do(robots.change_robot, "arm", "on the bench", who="narrow")
+    await office.do(robots.join, "cleaners", "arm", who="narrow")
+    await office.do(robots.remove_robot, "arm", 0, who="narrow")
+    (token,) = (await office.see(users.tokens, "toad", ALL, who="narrow"))["tokens"]
+    await office.do(users.revoke_token, token["id"], who="narrow")
     assert [each[2] for each in office.record()] == [
         "user.disable",
         "robot.add",

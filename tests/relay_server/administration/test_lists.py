@@ -10,43 +10,43 @@ import pytest_twisted
 
 from relay_db import queries
 from relay_protocol.errors import NotFound
-from relay_server.administration import machines, people
-from relay_server.resources import Listing
+from relay_server.realms import robots, users
+from relay_server.resources.page import PageQuery
 from tests.relay_server.administration.office import ALL, Office
 
 LOOKS: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
-    (people.user, ("{}",)),
-    (people.tokens, ("{}", ALL)),
-    (people.programs, ("{}", ALL)),
-    (people.group, ("{}",)),
-    (machines.group, ("{}",)),
-    (machines.robot, ("{}",)),
-    (machines.keys, ("{}", ALL)),
-    (machines.rights, (ALL, "{}", None)),
-    (machines.rights, (ALL, None, "{}")),
+    (users.user, ("{}",)),
+    (users.tokens, ("{}", ALL)),
+    (users.programs, ("{}", ALL)),
+    (users.group, ("{}",)),
+    (robots.group, ("{}",)),
+    (robots.robot, ("{}",)),
+    (robots.keys, ("{}", ALL)),
+    (robots.rights, (ALL, "{}", None)),
+    (robots.rights, (ALL, None, "{}")),
 ]
 CHANGES: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
-    (people.change_user, ("{}", None, True, None)),
-    (people.remove_user, ("{}",)),
-    (people.remove_group, ("{}",)),
-    (people.join, ("{}", "toad")),
-    (people.join, ("crew", "{}")),
-    (people.leave, ("crew", "{}")),
-    (people.add_program, ("{}", "", None)),
-    (people.revoke_program, ("{}",)),
-    (machines.change_robot, ("{}", "x")),
-    (machines.remove_group, ("{}",)),
-    (machines.join, ("{}", "mobile")),
-    (machines.join, ("cleaners", "{}")),
-    (machines.leave, ("{}", "mobile")),
-    (machines.leave, ("cleaners", "{}")),
-    (machines.new_code, ("{}",)),
-    (machines.remove_robot, ("{}", 0)),
-    (machines.revoke_key, ("{}", "0" * 16)),
-    (machines.grant, ("{}", "toad", "viewer", [], [])),
-    (machines.grant, ("mobile", "{}", "viewer", [], [])),
-    (machines.grant, ("mobile", "@{}", "viewer", [], [])),
-    (machines.revoke, ("{}", "toad")),
+    (users.change_user, ("{}", None, True, None)),
+    (users.remove_user, ("{}",)),
+    (users.remove_group, ("{}",)),
+    (users.join, ("{}", "toad")),
+    (users.join, ("crew", "{}")),
+    (users.leave, ("crew", "{}")),
+    (users.add_program, ("{}", "", None)),
+    (users.revoke_program, ("{}",)),
+    (robots.change_robot, ("{}", "x")),
+    (robots.remove_group, ("{}",)),
+    (robots.join, ("{}", "mobile")),
+    (robots.join, ("cleaners", "{}")),
+    (robots.leave, ("{}", "mobile")),
+    (robots.leave, ("cleaners", "{}")),
+    (robots.new_code, ("{}",)),
+    (robots.remove_robot, ("{}", 0)),
+    (robots.revoke_key, ("{}", "0" * 16)),
+    (robots.grant, ("{}", "toad", "viewer", [], [])),
+    (robots.grant, ("mobile", "{}", "viewer", [], [])),
+    (robots.grant, ("mobile", "@{}", "viewer", [], [])),
+    (robots.revoke, ("{}", "toad")),
 ]
 
 
@@ -85,7 +85,7 @@ async def test_lists_are_of_the_own_realm(office: Office) -> None:
             queries.redeem_enrolment_code(
                 s, "mobile", key.hex() * 32, key * 32, key.hex() * 8, "x", 1.0, realm="lab1"
             )
-    assert await office.see(people.about) == {
+    assert await office.see(users.about) == {
         "realm": "lab1",
         "users": 3,
         "groups": 1,
@@ -94,35 +94,35 @@ async def test_lists_are_of_the_own_realm(office: Office) -> None:
         "robot_groups": 1,
         "events_days": None,
     }
-    told = await office.see(people.users, ALL)
+    told = await office.see(users.users, ALL)
     assert [(each["user"], each["groups"]) for each in told["users"]] == [
         ("boss", []),
         ("root", []),
         ("toad", ["crew"]),
     ]
-    first = await office.see(people.users, Listing(limit=2))
+    first = await office.see(users.users, PageQuery(limit=2))
     assert (first["users"], first["next"]) == (told["users"][:2], "root")
-    assert await office.see(people.users, Listing(after="root")) == {"users": told["users"][2:], "next": ""}
-    assert (await office.see(people.groups, ALL))["groups"] == [{"group": "crew", "members": ["toad"]}]
-    assert (await office.see(machines.robots, ALL))["robots"] == [
+    assert await office.see(users.users, PageQuery(after="root")) == {"users": told["users"][2:], "next": ""}
+    assert (await office.see(users.groups, ALL))["groups"] == [{"group": "crew", "members": ["toad"]}]
+    assert (await office.see(robots.robots, ALL))["robots"] == [
         {"robot": "mobile", "description": "", "keys": 2, "guest": False}
     ]
-    rights = (await office.see(machines.rights, ALL, None, None))["rights"]
+    rights = (await office.see(robots.rights, ALL, None, None))["rights"]
     assert [(each["holder"], each["level"]) for each in rights] == [("@crew", "viewer"), ("toad", "viewer")]
-    assert (await office.see(machines.rights, ALL, None, "boss"))["rights"] == []
-    assert len((await office.see(machines.rights, ALL, "mobile", "toad"))["rights"]) == 2
-    await office.do(machines.revoke_key, "mobile", "61" * 8)
-    keys = (await office.see(machines.keys, "mobile", ALL))["keys"]
+    assert (await office.see(robots.rights, ALL, None, "boss"))["rights"] == []
+    assert len((await office.see(robots.rights, ALL, "mobile", "toad"))["rights"]) == 2
+    await office.do(robots.revoke_key, "mobile", "61" * 8)
+    keys = (await office.see(robots.keys, "mobile", ALL))["keys"]
     assert [each["retired"] for each in keys] == [1000.0, None]
 
 
 @pytest_twisted.ensureDeferred
 async def test_a_token_of_another_realm_is_none(office: Office) -> None:
     """Its name says nothing of how many tokens there are, and revokes it in its own realm alone."""
-    (token,) = (await office.see(people.tokens, "toad", ALL, who="root@lab2"))["tokens"]
+    (token,) = (await office.see(users.tokens, "toad", ALL, who="root@lab2"))["tokens"]
     assert len(token["id"]) == 16 and token["kind"] == "access"
     for id in (token["id"], token["id"][:15], "%" * 16, "_" * 16, "1"):
         with pytest.raises(NotFound, match="nobody in your realm has such a token"):
-            await office.do(people.revoke_token, id)
-    await office.do(people.revoke_token, token["id"], who="root@lab2")
-    assert (await office.see(people.tokens, "toad", ALL, who="root@lab2"))["tokens"] == []
+            await office.do(users.revoke_token, id)
+    await office.do(users.revoke_token, token["id"], who="root@lab2")
+    assert (await office.see(users.tokens, "toad", ALL, who="root@lab2"))["tokens"] == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from relay_db.queries import AlertRecord, AlertRuleRecord
-from relay_server.alerts.message import Message, Notice
+from relay_server.alerts.message import AlertNotice, NotificationMessage
 
 SECRET = "0123456789abcdef"
 
@@ -27,6 +27,6 @@ def rule(**other: Any) -> AlertRuleRecord:
     return made._replace(**other)
 
 
-def message(*notices: Notice, left_out: int = 0) -> Message:
+def message(*notices: AlertNotice, left_out: int = 0) -> NotificationMessage:
     """With one notice, if none is given."""
-    return Message("d1", notices or (Notice(alert(), "begun"),), left_out)
+    return NotificationMessage("d1", notices or (AlertNotice(alert(), "begun"),), left_out)

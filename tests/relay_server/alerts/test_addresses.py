@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_protocol.errors import Invalid
-from relay_server.alerts.addresses import Fence, allowed, networks
+from relay_server.alerts.egress import EgressPolicy, allowed, parse_networks
 
 
 @pytest.mark.parametrize("address", ["8.8.8.8", "93.184.215.14", "2606:2800:21f:cb07::1", "64:ff9b::808:808"])
@@ -37,7 +37,7 @@ def test_special_addresses_are_not(address: str) -> None:
 
 def test_an_administrator_can_allow_networks() -> None:
     """These, and no others."""
-    also = networks(["192.168.7.0/24", "fd00:7::/64"])
+    also = parse_networks(["192.168.7.0/24", "fd00:7::/64"])
     assert allowed("192.168.7.9", also)
     assert allowed("::ffff:192.168.7.9", also)
     assert allowed("fd00:7::9", also)
@@ -45,7 +45,7 @@ def test_an_administrator_can_allow_networks() -> None:
     assert not allowed("fd00:8::9", also)
 
 
-HOME = networks(["2606:2800:21f:cb07::/64", "93.184.215.0/24"])
+HOME = parse_networks(["2606:2800:21f:cb07::/64", "93.184.215.0/24"])
 
 
 @pytest.mark.parametrize(
@@ -62,8 +62,8 @@ def test_networks_the_machine_is_in_are_refused_though_all_the_world_may_send_th
 
 def test_what_is_denied_is_so_within_what_is_allowed() -> None:
     """An administrator names one machine of a network, or a network of public addresses behind a router."""
-    never = networks(["10.0.0.7/32", "93.184.215.0/24", "2606:2800:21f::/48"])
-    also = networks(["10.0.0.0/8", "93.184.215.0/28"])
+    never = parse_networks(["10.0.0.7/32", "93.184.215.0/24", "2606:2800:21f::/48"])
+    also = parse_networks(["10.0.0.0/8", "93.184.215.0/28"])
     for address in ("10.0.0.7", "93.184.215.14", "2606:2800:21f:1::9"):
         assert not allowed(address, also, never)
     assert allowed("10.0.0.8", also, never)
@@ -73,7 +73,7 @@ def test_what_is_denied_is_so_within_what_is_allowed() -> None:
 def test_where_the_machine_is_counts_as_it_is_when_something_is_judged() -> None:
     """Interfaces come and go while the relay runs."""
     now = list(HOME)
-    fence = Fence(lambda: now, never=networks(["8.8.8.8/32"]))
+    fence = EgressPolicy(lambda: now, never=parse_networks(["8.8.8.8/32"]))
     asked = ["8.8.8.8", "93.184.215.14", "8.8.4.4"]
     assert fence.passed(asked) == ["8.8.4.4"]
     now.clear()
@@ -84,7 +84,7 @@ def test_where_the_machine_is_counts_as_it_is_when_something_is_judged() -> None
 def test_a_network_that_is_none_is_told_in_words(text: str) -> None:
     """An administrator who mistypes must not open something else."""
     with pytest.raises(Invalid, match="is no network"):
-        networks([text])
+        parse_networks([text])
 
 
 @given(st.ip_addresses())

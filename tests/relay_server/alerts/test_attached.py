@@ -11,10 +11,10 @@ import psutil
 import pytest
 import pytest_twisted
 
-from relay_server.alerts import attached
-from relay_server.alerts.attached import around
+from relay_server.alerts import egress
+from relay_server.alerts.egress import around
 from relay_server.alerts.message import Undelivered
-from relay_server.alerts.ways import Ways
+from relay_server.alerts.transports import Transports
 from tests.relay_server.alerts.made_up import message, rule
 from tests.relay_server.alerts.receiver import REACTOR, Hook, serve
 
@@ -70,13 +70,13 @@ def test_an_address_stands_for_the_network_of_its_interface(
 
 def test_this_machine_says_what_it_is_in() -> None:
     """Itself, at least."""
-    assert ip_network("127.0.0.0/8") in attached.networks()
+    assert ip_network("127.0.0.0/8") in egress.local_networks()
 
 
 @pytest_twisted.ensureDeferred
 async def test_the_machines_own_addresses_are_reached_by_no_message(interfaces: Interfaces) -> None:
     """However public they are: by them a user would pass its firewall; nor is what stands beside it."""
-    ways = Ways(REACTOR, lambda: 0.0, (), ())
+    ways = Transports(REACTOR, lambda: 0.0, (), ())
     interfaces(
         Address(socket.AF_INET, OURS, "255.255.255.240"),
         Address(socket.AF_INET6, "2606:2800:21f:cb07::5", "ffff:ffff:ffff:ffff::"),
@@ -94,9 +94,9 @@ async def test_an_administrator_allows_and_denies(interfaces: Interfaces) -> Non
     url = f"http://127.0.0.1:{port.getHost().port}/"
     interfaces(Address(socket.AF_INET, "127.0.0.1", "255.0.0.0"))
     try:
-        await Ways(REACTOR, lambda: 0.0, ["127.0.0.0/8"], ()).send(rule(url=url), message())
+        await Transports(REACTOR, lambda: 0.0, ["127.0.0.0/8"], ()).send(rule(url=url), message())
         assert len(hook.got) == 1
-        denies = Ways(REACTOR, lambda: 0.0, ["127.0.0.0/8"], (), ["127.0.0.1/32"])
+        denies = Transports(REACTOR, lambda: 0.0, ["127.0.0.0/8"], (), ["127.0.0.1/32"])
         with pytest.raises(Undelivered, match="does not send to"):
             await denies.send(rule(url=url), message())
         assert len(hook.got) == 1
@@ -113,5 +113,5 @@ async def test_a_system_that_hides_its_networks_sends_nothing(monkeypatch: pytes
 
     monkeypatch.setattr(psutil, "net_if_addrs", fails)
     with pytest.raises(Undelivered, match=r"which networks its machine is in.*not supported") as error:
-        await Ways(REACTOR, lambda: 0.0, (), ()).send(rule(url="http://8.8.8.8/"), message())
+        await Transports(REACTOR, lambda: 0.0, (), ()).send(rule(url="http://8.8.8.8/"), message())
     assert error.value.again

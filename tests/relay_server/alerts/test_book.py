@@ -7,9 +7,9 @@ import itertools
 import pytest
 
 from relay_db.queries import AlertRecord
-from relay_server.alerts import kinds
-from relay_server.alerts.book import Book, Change, Moment
-from relay_server.alerts.kinds import Event
+from relay_server.alerts import types as kinds
+from relay_server.alerts.store import AlertChange, AlertStore, Moment
+from relay_server.alerts.types import AlertEvent
 
 ROBOT = 1
 
@@ -19,7 +19,7 @@ class Scene:
 
     def __init__(self) -> None:
         numbers = itertools.count(1)
-        self.book = Book(lambda: f"a{next(numbers)}")
+        self.book = AlertStore(lambda: f"a{next(numbers)}")
         self.now = 1000.0
         """By the wall clock, and by the monotonic one but for what the first was set."""
         self.set = 0.0
@@ -50,7 +50,7 @@ class Scene:
         return alert
 
 
-def events(changes: list[Change]) -> list[str]:
+def events(changes: list[AlertChange]) -> list[str]:
     """Kinds and events."""
     return [f"{each.alert.kind} {each.event.value}" for each in changes]
 
@@ -388,4 +388,4 @@ def test_an_unknown_level_is_a_warning() -> None:
     """No word of a robot makes an alert disappear."""
     assert kinds.known_level("disaster") == "warning"
     assert kinds.known_level("error") == "error"
-    assert Event.WORSE.value == "worse"
+    assert AlertEvent.WORSE.value == "worse"

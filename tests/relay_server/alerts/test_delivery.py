@@ -15,7 +15,6 @@ from twisted.logger import capturedLogs, formatEvent
 from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import Unavailable
 from relay_server.alerts import delivery as module
-from relay_server.alerts.book import Change
 from relay_server.alerts.delivery import (
     MOST,
     PRESSED_SECONDS,
@@ -23,10 +22,11 @@ from relay_server.alerts.delivery import (
     TOLD,
     UNJUDGED,
     Delivery,
+    DeliveryContext,
 )
-from relay_server.alerts.kinds import Event
-from relay_server.alerts.message import Message, Undelivered
-from relay_server.alerts.office import Office
+from relay_server.alerts.message import NotificationMessage, Undelivered
+from relay_server.alerts.store import AlertChange
+from relay_server.alerts.types import AlertEvent
 from tests.relay_server.alerts.made_up import alert, rule
 
 NIGHT = {"from": "22:00", "to": "07:00", "zone": "UTC", "least": "error"}
@@ -43,7 +43,7 @@ class Scene:
     def __init__(self, wall: str = "2026-11-22 12:00:00") -> None:
         self.clock = Clock()
         self._wall = datetime.fromisoformat(wall).replace(tzinfo=UTC).timestamp()
-        self.got: list[Message] = []
+        self.got: list[NotificationMessage] = []
         self.doubtful: list[bool] = []
         self.errors: list[Exception] = []
         self.hanging: list[Deferred[None]] = []
@@ -53,7 +53,7 @@ class Scene:
         self.over: set[str] = set()
         self.asks = 0
         self._names = 0
-        self.office = Office(
+        self.office = DeliveryContext(
             self.clock,
             self.wall,
             lambda: 0.0,
@@ -95,7 +95,7 @@ class Scene:
             self.doubtful.append(doubtful)
             yield
 
-    async def _send(self, rule: AlertRuleRecord, message: Message) -> None:
+    async def _send(self, rule: AlertRuleRecord, message: NotificationMessage) -> None:
         if self.hangs:
             self.hanging.append(Deferred())
             await self.hanging[-1]
@@ -113,14 +113,14 @@ class Scene:
         return alert_id not in self.over
 
 
-def begun(id: str = "a1", **other: Any) -> Change:
+def begun(id: str = "a1", **other: Any) -> AlertChange:
     """News of an alert."""
-    return Change(alert(id, **other), Event.BEGUN)
+    return AlertChange(alert(id, **other), AlertEvent.BEGUN)
 
 
-def ended(id: str = "a1", **other: Any) -> Change:
+def ended(id: str = "a1", **other: Any) -> AlertChange:
     """Its end."""
-    return Change(alert(id, over=11.0, **other), Event.OVER)
+    return AlertChange(alert(id, over=11.0, **other), AlertEvent.OVER)
 
 
 def again() -> Undelivered:
@@ -218,7 +218,7 @@ def test_a_database_that_does_not_answer_is_asked_again(
             raise answers.pop()
         return {each.id for each in alerts}
 
-    office = Office(
+    office = DeliveryContext(
         scene.clock, scene.wall, lambda: 0.0, lambda: "d1", scene._send, known, scene._lasts, its_own
     )
     way = Delivery(office, rule(), scene.places)

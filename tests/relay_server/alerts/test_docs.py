@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from relay_server.alerts.services import PARAMETERS
+from relay_server.alerts.email import PARAMETERS
 from relay_server.alerts.webhook import signature
 from tests.relay_server.alerts.made_up import SECRET
 

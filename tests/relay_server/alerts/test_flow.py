@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from relay_server.alerts.flow import Flow
+from relay_server.alerts.monitors import TopicWatch
 
 
 class Scene:
@@ -15,7 +15,7 @@ class Scene:
     def __init__(self) -> None:
         self.now = 1000.0
         self.count = 0
-        self.flow = Flow(self.now, 0)
+        self.flow = TopicWatch(self.now, 0)
 
     def goes(self, hertz: float, seconds: float) -> bool:
         """It comes at this rate; whether it was stale at any look."""
@@ -82,7 +82,7 @@ def test_what_comes_in_bursts_is_never_stale(scene: Scene) -> None:
 
 def test_what_came_since_the_beginning_is_known(scene: Scene) -> None:
     """Not what came before."""
-    flow = Flow(0.0, 7)
+    flow = TopicWatch(0.0, 7)
     assert not flow.came
     flow.look(1.0, 8)
     assert flow.came

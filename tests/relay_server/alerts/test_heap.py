@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from relay_server.alerts.heap import Heap
-from relay_server.alerts.message import Notice
+from relay_server.alerts.delivery import NotificationQueue
+from relay_server.alerts.message import AlertNotice
 from tests.relay_server.alerts.made_up import alert
 
 
-def notice(id: str, level: str = "warning", event: str = "begun", robot: int = 1) -> Notice:
+def notice(id: str, level: str = "warning", event: str = "begun", robot: int = 1) -> AlertNotice:
     """News of an alert."""
-    return Notice(alert(id, level=level, robot_id=robot), event)
+    return AlertNotice(alert(id, level=level, robot_id=robot), event)
 
 
-def ids(heap: Heap) -> list[str]:
+def ids(heap: NotificationQueue) -> list[str]:
     """What waits, in its order."""
     return [f"{each.notice.alert.id} {each.notice.event}" for each in heap]
 
 
 def test_the_same_news_waits_once_since_it_came_first() -> None:
     """Its latest words count, and its place is that of the latest."""
-    heap = Heap(5)
+    heap = NotificationQueue(5)
     heap.put(notice("a"), 1.0)
     heap.put(notice("b"), 2.0)
     heap.put(notice("a", "error"), 3.0)
@@ -31,7 +31,7 @@ def test_the_same_news_waits_once_since_it_came_first() -> None:
 
 def test_the_mildest_gives_way_then_an_end_then_the_oldest() -> None:
     """Also when it is the latest; one each time there are too many."""
-    heap = Heap(3)
+    heap = NotificationQueue(3)
     for each in (notice("old"), notice("bad", "error"), notice("well", event="over")):
         assert heap.put(each, 0.0) == 0
     assert heap.put(notice("new"), 0.0) == 1
@@ -44,7 +44,7 @@ def test_the_mildest_gives_way_then_an_end_then_the_oldest() -> None:
 
 def test_where_it_is_fair_who_has_most_gives_way() -> None:
     """Whatever it tells; of his own the mildest."""
-    heap = Heap(3, fair=True)
+    heap = NotificationQueue(3, fair=True)
     heap.put(notice("mine", "info"), 0.0)
     for number, level in enumerate(("error", "warning", "error")):
         heap.put(notice(f"x{number}", level, robot=2), 0.0)
@@ -53,7 +53,7 @@ def test_where_it_is_fair_who_has_most_gives_way() -> None:
 
 def test_what_is_dropped_is_given_back_as_it_was_last() -> None:
     """And nothing, when it is not there."""
-    heap = Heap(3)
+    heap = NotificationQueue(3)
     heap.put(notice("a"), 1.0)
     heap.put(notice("a", "error"), 2.0)
     dropped = heap.drop(notice("a"))

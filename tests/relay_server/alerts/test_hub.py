@@ -13,17 +13,16 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Refused, Unavailable
 from relay_server.access import Access, Principal
-from relay_server.alerts import kinds
-from relay_server.alerts.desk import PAGE, REFUSED, AlertDesk, TooOften
-from relay_server.alerts.hub import ABSENT_SECONDS, AGAIN_SECONDS, KEEP_SECONDS, TIDY_EVERY, Alerts
-from relay_server.alerts.message import Message
-from relay_server.alerts.position import Position
-from relay_server.alerts.rules import Ask
-from relay_server.alerts.senses import Thresholds
-from relay_server.alerts.ways import Ways
-from relay_server.journal import Journal
-from relay_server.registry import Presence
-from relay_server.store import Store
+from relay_server.alerts import types as kinds
+from relay_server.alerts.alerts import ABSENT_SECONDS, AGAIN_SECONDS, KEEP_SECONDS, TIDY_EVERY, AlertHub
+from relay_server.alerts.message import NotificationMessage
+from relay_server.alerts.monitors import Thresholds
+from relay_server.alerts.rules import RuleRequest
+from relay_server.alerts.service import PAGE, REFUSED, AlertCursor, AlertService, TooManyRuleChanges
+from relay_server.alerts.transports import Transports
+from relay_server.common.database import AsyncDatabase
+from relay_server.events.bus import EventBus
+from relay_server.robots.registry import RobotState
 from tests.relay_server.alerts.made_up import alert
 from tests.relay_server.alerts.receiver import REACTOR
 from tests.relay_server.edges.robot_ends import until
@@ -33,13 +32,13 @@ from tests.relay_server.memory import World, hangs
 class Scene:
     """A relay's alerts on a real database; the robot rover, ann who operates it, vic who watches, eve who may not."""
 
-    def __init__(self, world: World, store: Store) -> None:
+    def __init__(self, world: World, store: AsyncDatabase) -> None:
         self.world = world
         self.store = store
-        self.sent: list[Message] = []
+        self.sent: list[NotificationMessage] = []
         self.step = 0.0
         self.access = Access(store, self.wall)
-        self.journal = Journal(store, self.wall)
+        self.journal = EventBus(store, self.wall)
         with store.database.begin() as s:
             self.number = queries.add_robot(s, "rover").id
             self.people = {
@@ -50,11 +49,11 @@ class Scene:
             queries.grant_right(
                 s, self.number, "viewer", user_id=self.people["vic"].user_id, deny=["subscribe:/diagnostics"]
             )
-        self.robot: Presence = world.registry.presence(self.number, "rover", "default")
+        self.robot: RobotState = world.registry.presence(self.number, "rover", "default")
         world.robot = self.robot
         self.alerts = self.begin()
-        ways = Ways(REACTOR, self.wall, (), ())
-        self.desk = AlertDesk(
+        ways = Transports(REACTOR, self.wall, (), ())
+        self.desk = AlertService(
             self.alerts, ways, store, self.access, self.journal, world.clock.seconds, self.wall
         )
 
@@ -62,16 +61,16 @@ class Scene:
         """Unix time."""
         return 1.7e9 + self.world.clock.seconds() + self.step
 
-    def begin(self) -> Alerts:
+    def begin(self) -> AlertHub:
         """A relay's alerts."""
         world = self.world
         thresholds = Thresholds(6.0, 0.2, 0.1)
-        return Alerts(
+        return AlertHub(
             world.clock, self.wall, self.store, self.access, world.registry, world.channels, world.desks,
             self.journal, thresholds, self._send,
         )  # fmt: skip
 
-    async def _send(self, rule: Any, message: Message) -> None:
+    async def _send(self, rule: Any, message: NotificationMessage) -> None:
         self.sent.append(message)
 
     def says(self, kind: str, **data: Any) -> None:
@@ -86,7 +85,7 @@ class Scene:
 
 
 @pytest.fixture
-def scene(world: World, store: Store) -> Scene:
+def scene(world: World, store: AsyncDatabase) -> Scene:
     """Nothing has happened yet."""
     return Scene(world, store)
 
@@ -169,14 +168,14 @@ async def test_a_list_goes_on_with_what_is_older(scene: Scene) -> None:
         queries.save_alerts(s, rows)
     ann, vic = scene.people["ann"], scene.people["vic"]
     listed: list[str] = []
-    before: Position | None = None
+    before: AlertCursor | None = None
     while page := await scene.desk.all(ann, limit=100, before=before):
         listed += [each["id"] for each in page]
-        before = Position(page[-1]["last"], page[-1]["id"])
+        before = AlertCursor(page[-1]["last"], page[-1]["id"])
         with scene.store.database.begin() as s:
             queries.save_alerts(s, [alert(page[-1]["id"], robot_id=scene.number, last=3e9)])
     assert listed == [each.id for each in rows]
-    (oldest,) = await scene.desk.all(vic, limit=100, before=Position(2e9 - len(rows) // 2 + 2, "z"))
+    (oldest,) = await scene.desk.all(vic, limit=100, before=AlertCursor(2e9 - len(rows) // 2 + 2, "z"))
     assert oldest["kind"] == "module"
 
 
@@ -192,7 +191,7 @@ async def test_a_rule_that_was_written_is_made_though_it_counts_later(
     with monkeypatch.context() as patch:
         patch.setattr(scene.alerts, "refresh", fails)
         made = await scene.desk.add_rule(
-            scene.people["ann"], Ask("webhook", url="https://example.org/x"), "192.0.2.9"
+            scene.people["ann"], RuleRequest("webhook", url="https://example.org/x"), "192.0.2.9"
         )
         assert len(made["secret"]) >= 32
         (listed,) = (await scene.desk.rules(scene.people["ann"]))["rules"]
@@ -254,7 +253,7 @@ async def test_a_page_is_told_what_is_over_however_much_lasts(scene: Scene) -> N
 @pytest_twisted.ensureDeferred
 async def test_a_rule_tells_its_user_what_he_may_know(scene: Scene) -> None:
     """Rules of both; only who may hear diagnostics is told of them. Secrets are shown once."""
-    ask = Ask("webhook", url="https://example.org/hook")
+    ask = RuleRequest("webhook", url="https://example.org/hook")
     made = await scene.desk.add_rule(scene.people["ann"], ask, "192.0.2.9")
     assert len(made["secret"]) >= 32
     await scene.desk.add_rule(scene.people["vic"], ask, "192.0.2.9")
@@ -278,7 +277,7 @@ async def test_a_rule_tells_its_user_what_he_may_know(scene: Scene) -> None:
 async def test_a_rule_tells_nothing_of_a_robot_its_user_has_lost(scene: Scene) -> None:
     """As soon as rights are taken up; of what is his again he is told."""
     await scene.desk.add_rule(
-        scene.people["ann"], Ask("webhook", url="https://example.org/hook"), "192.0.2.9"
+        scene.people["ann"], RuleRequest("webhook", url="https://example.org/hook"), "192.0.2.9"
     )
     scene.alerts.tell(scene.robot, "module", "one", "error", "x")
     scene.world.clock.advance(1)
@@ -317,17 +316,19 @@ async def test_what_is_told_of_a_robot_is_its_realms(scene: Scene) -> None:
 async def test_a_rule_of_robots_of_a_realm_is_refused(scene: Scene) -> None:
     """Names are those of one's own; nothing is kept."""
     with pytest.raises(Invalid, match="own realm"):
-        await scene.desk.add_rule(scene.people["ann"], Ask("portal", robots="rover@default"), "192.0.2.9")
+        await scene.desk.add_rule(
+            scene.people["ann"], RuleRequest("portal", robots="rover@default"), "192.0.2.9"
+        )
     assert (await scene.desk.rules(scene.people["ann"]))["rules"] == []
 
 
 @pytest_twisted.ensureDeferred
 async def test_rules_are_not_tested_without_end(scene: Scene) -> None:
     """Five at once, then one each twelve seconds."""
-    made = await scene.desk.add_rule(scene.people["ann"], Ask("portal"), "192.0.2.9")
+    made = await scene.desk.add_rule(scene.people["ann"], RuleRequest("portal"), "192.0.2.9")
     for _ in range(5):
         assert (await scene.desk.test_rule(scene.people["ann"], made["id"]))["ok"]
-    with pytest.raises(TooOften):
+    with pytest.raises(TooManyRuleChanges):
         await scene.desk.test_rule(scene.people["ann"], made["id"])
     scene.world.clock.advance(13)
     assert (await scene.desk.test_rule(scene.people["ann"], made["id"]))["ok"]
@@ -542,7 +543,7 @@ async def test_a_robot_that_is_removed_before_it_is_missed_does_not_come_back(sc
 async def test_control_lost_as_a_relay_ends_is_told_by_the_next_once(scene: Scene, by_robot: bool) -> None:
     """By the robot's word, or when it has lasted for a moment."""
     await scene.desk.add_rule(
-        scene.people["ann"], Ask("webhook", url="https://example.org/hook"), "192.0.2.9"
+        scene.people["ann"], RuleRequest("webhook", url="https://example.org/hook"), "192.0.2.9"
     )
     scene.says("control.taken")
     scene.alerts.hush()
@@ -573,7 +574,7 @@ async def test_what_waited_when_a_relay_ended_is_told_by_the_next_if_it_lasts(
 ) -> None:
     """Once, and not what had arrived."""
     await scene.desk.add_rule(
-        scene.people["ann"], Ask("webhook", url="https://example.org/hook"), "192.0.2.9"
+        scene.people["ann"], RuleRequest("webhook", url="https://example.org/hook"), "192.0.2.9"
     )
     scene.alerts.tell(scene.robot, "module", "arm", "warning", "x")
     scene.alerts.tell(scene.robot, "module", "leg", "warning", "x")

@@ -12,11 +12,10 @@ from switchboard_hook import MailServer
 from twisted.internet.defer import CancelledError, Deferred
 
 from relay_protocol.errors import Invalid
-from relay_server.alerts.addresses import Fence, networks
-from relay_server.alerts.mailing import DOUBTFUL, THREADS, Mailing
-from relay_server.alerts.message import Message, Notice, Undelivered
-from relay_server.alerts.names import Names
-from relay_server.alerts.ways import Ways, check_schemes
+from relay_server.alerts.egress import EgressPolicy, NameResolver, parse_networks
+from relay_server.alerts.email import DOUBTFUL, THREADS, Mailing
+from relay_server.alerts.message import AlertNotice, NotificationMessage, Undelivered
+from relay_server.alerts.transports import Transports, check_schemes
 from tests.relay_server.alerts.made_up import alert, message, rule
 from tests.relay_server.alerts.receiver import REACTOR
 
@@ -32,8 +31,10 @@ def server() -> Iterator[MailServer]:
 @pytest_twisted.async_yield_fixture
 async def mailing() -> AsyncIterator[Mailing]:
     """Sends by mail alone, also to this machine."""
-    names = Names(REACTOR)
-    made = Mailing(REACTOR, names.addresses, ["mailto"], Fence(frozenset, networks(["127.0.0.0/8"])))
+    names = NameResolver(REACTOR)
+    made = Mailing(
+        REACTOR, names.addresses, ["mailto"], EgressPolicy(frozenset, parse_networks(["127.0.0.0/8"]))
+    )
     names.start()
     made.start()
     yield made
@@ -56,7 +57,7 @@ def by(url: str) -> Any:
 async def test_a_message_arrives_by_mail(mailing: Mailing, server: MailServer) -> None:
     """With a subject of one line, whatever a robot says."""
     evil = alert(kind="module", about="arm\r\nBcc: eve@x.example", text="gone\r\nX-Evil: yes")
-    await mailing.send(by(url(server)), message(Notice(evil, "begun")))
+    await mailing.send(by(url(server)), message(AlertNotice(evil, "begun")))
     (mail,) = server.mails
     assert "Subject: rover: error: module arm" in mail
     assert "\nBcc:" not in mail
@@ -67,8 +68,8 @@ async def test_a_message_arrives_by_mail(mailing: Mailing, server: MailServer) -
 @pytest_twisted.ensureDeferred
 async def test_a_server_in_a_network_that_is_not_allowed_is_not_reached(server: MailServer) -> None:
     """By address or by name."""
-    names = Names(REACTOR)
-    mailing = Mailing(REACTOR, names.addresses, ["mailto"], Fence(frozenset))
+    names = NameResolver(REACTOR)
+    mailing = Mailing(REACTOR, names.addresses, ["mailto"], EgressPolicy(frozenset))
     names.start()
     mailing.start()
     try:
@@ -133,7 +134,7 @@ async def test_a_message_waits_for_a_thread_before_it_is_judged(mailing: Mailing
 
 def test_a_long_message_says_how_many_more_there_are() -> None:
     """People get lines, and a number."""
-    many = Message("d1", [Notice(alert(f"a{number}"), "begun") for number in range(50)], 7)
+    many = NotificationMessage("d1", [AlertNotice(alert(f"a{number}"), "begun") for number in range(50)], 7)
     assert many.title == "57 alerts"
     assert many.text.splitlines()[-1] == "and 37 more"
     assert len(many.text.splitlines()) == 21
@@ -148,6 +149,6 @@ def test_what_works_on_the_relays_own_machine_can_not_be_allowed(scheme: str) ->
 
 def test_without_schemes_there_is_no_apprise() -> None:
     """The channel is not offered."""
-    ways = Ways(REACTOR, lambda: 0.0, (), ())
+    ways = Transports(REACTOR, lambda: 0.0, (), ())
     assert (ways.channels, ways.schemes) == (("portal", "webhook"), [])
-    assert Ways(REACTOR, lambda: 0.0, (), ("mailtos",)).channels[-1] == "apprise"
+    assert Transports(REACTOR, lambda: 0.0, (), ("mailtos",)).channels[-1] == "apprise"

@@ -11,9 +11,9 @@ import pytest
 import pytest_twisted
 from twisted.internet.defer import Deferred
 
-from relay_server.alerts import names as module
+from relay_server.alerts import egress as module
+from relay_server.alerts.egress import LOOKUPS, SPECIAL_NAMES, THREADS, NameResolver, unreachable
 from relay_server.alerts.message import Undelivered
-from relay_server.alerts.names import LOOKUPS, SPECIAL, THREADS, Names, unreachable
 from tests.relay_server.alerts.receiver import REACTOR
 from tests.relay_server.edges.robot_ends import until
 
@@ -24,7 +24,7 @@ class Scene:
     """Names, of which those below ``slow.test`` hang until the test lets them go."""
 
     def __init__(self) -> None:
-        self.names = Names(REACTOR)
+        self.names = NameResolver(REACTOR)
         self.go = threading.Event()
         self.asked: list[str] = []
 
@@ -105,7 +105,7 @@ async def test_of_an_address_nobody_is_asked(scene: Scene, host: str, address: s
 async def test_people_do_not_hear_whether_a_name_is_known(scene: Scene) -> None:
     """Of the relay's own networks; an address they know as well as we."""
     unknown = await gives_up(scene.asks("x.slow.test", ANN))
-    internal = unreachable("x.slow.test", SPECIAL)
+    internal = unreachable("x.slow.test", SPECIAL_NAMES)
     assert (unknown, internal.again) == (str(internal), True)
-    plain = unreachable("10.0.0.7", SPECIAL)
-    assert (str(plain).startswith(f"10.0.0.7: {SPECIAL}"), plain.again) == (True, False)
+    plain = unreachable("10.0.0.7", SPECIAL_NAMES)
+    assert (str(plain).startswith(f"10.0.0.7: {SPECIAL_NAMES}"), plain.again) == (True, False)

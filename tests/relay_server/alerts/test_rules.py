@@ -12,8 +12,8 @@ from relay_db.queries import AlertRecord, AlertRuleRecord
 from relay_protocol.errors import Invalid
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.alerts import rules
-from relay_server.alerts.kinds import Event
-from relay_server.alerts.rules import Ask, Quiet
+from relay_server.alerts.rules import Quiet, RuleRequest
+from relay_server.alerts.types import AlertEvent
 
 ALERT = AlertRecord(
     "a1", 1, "cleaner-7", "default", "battery", "", "warning", "low", 1.0, 1.0, 1, 1, None, None, None
@@ -34,20 +34,20 @@ def at(text: str, zone: str = "Europe/Rome") -> float:
 @pytest.mark.parametrize(
     ("change", "event", "wanted"),
     [
-        ({}, Event.BEGUN, True),
-        ({"robots": "cleaner-*"}, Event.BEGUN, True),
-        ({"robots": "Cleaner-*"}, Event.BEGUN, False),
-        ({"robots": "cleaner"}, Event.BEGUN, False),
-        ({"kinds": ("offline", "battery")}, Event.BEGUN, True),
-        ({"kinds": ("offline",)}, Event.BEGUN, False),
-        ({"level": "error"}, Event.BEGUN, False),
-        ({"level": "info"}, Event.BEGUN, True),
-        ({"over": False}, Event.OVER, False),
-        ({"over": False}, Event.WORSE, True),
-        ({"over": True}, Event.OVER, True),
+        ({}, AlertEvent.BEGUN, True),
+        ({"robots": "cleaner-*"}, AlertEvent.BEGUN, True),
+        ({"robots": "Cleaner-*"}, AlertEvent.BEGUN, False),
+        ({"robots": "cleaner"}, AlertEvent.BEGUN, False),
+        ({"kinds": ("offline", "battery")}, AlertEvent.BEGUN, True),
+        ({"kinds": ("offline",)}, AlertEvent.BEGUN, False),
+        ({"level": "error"}, AlertEvent.BEGUN, False),
+        ({"level": "info"}, AlertEvent.BEGUN, True),
+        ({"over": False}, AlertEvent.OVER, False),
+        ({"over": False}, AlertEvent.WORSE, True),
+        ({"over": True}, AlertEvent.OVER, True),
     ],
 )
-def test_a_rule_tells_what_it_is_for(change: dict[str, object], event: Event, wanted: bool) -> None:
+def test_a_rule_tells_what_it_is_for(change: dict[str, object], event: AlertEvent, wanted: bool) -> None:
     """By robot, kind, level, and whether it is over."""
     assert rules.wants(RULE._replace(**change), ALERT, event, {ALERT.realm}) is wanted  # type: ignore[arg-type]  # its fields
 
@@ -55,8 +55,8 @@ def test_a_rule_tells_what_it_is_for(change: dict[str, object], event: Event, wa
 def test_a_rule_tells_nothing_of_another_realms_robots() -> None:
     """Their names may be the same; one that is shared with its realm is one of it."""
     theirs = RULE._replace(realm="lab1", robots="cleaner-7")
-    assert not rules.wants(theirs, ALERT, Event.BEGUN, {ALERT.realm})
-    assert rules.wants(theirs, ALERT, Event.BEGUN, {ALERT.realm, "lab1"})
+    assert not rules.wants(theirs, ALERT, AlertEvent.BEGUN, {ALERT.realm})
+    assert rules.wants(theirs, ALERT, AlertEvent.BEGUN, {ALERT.realm, "lab1"})
 
 
 @pytest.mark.parametrize(
@@ -117,14 +117,14 @@ def test_the_worst_is_told_in_quiet_hours_too(least: str, level: str, told: bool
 @pytest.mark.parametrize(
     "ask",
     [
-        Ask("portal"),
-        Ask("webhook", url="https://example.org"),
-        Ask("webhook", url="https://example.org", secret="0123456789abcdef"),
-        Ask("apprise", url="mailtos://example.org", quiet=Quiet("22:00", "07:00", "Europe/Rome")),
-        Ask("portal", quiet=Quiet("00:00", "23:59")),
+        RuleRequest("portal"),
+        RuleRequest("webhook", url="https://example.org"),
+        RuleRequest("webhook", url="https://example.org", secret="0123456789abcdef"),
+        RuleRequest("apprise", url="mailtos://example.org", quiet=Quiet("22:00", "07:00", "Europe/Rome")),
+        RuleRequest("portal", quiet=Quiet("00:00", "23:59")),
     ],
 )
-def test_rules_that_make_sense_are_taken(ask: Ask) -> None:
+def test_rules_that_make_sense_are_taken(ask: RuleRequest) -> None:
     """Each channel has what it needs."""
     rules.check(ask, CHANNELS)
 
@@ -132,24 +132,24 @@ def test_rules_that_make_sense_are_taken(ask: Ask) -> None:
 @pytest.mark.parametrize(
     ("ask", "words"),
     [
-        (Ask("pager"), "'channel' is one of"),
-        (Ask("portal", level="fatal"), "'level' is one of"),
-        (Ask("portal", url="https://example.org"), "leave it out with the channel 'portal'"),
-        (Ask("webhook"), "'url' says where"),
-        (Ask("apprise", url="mailtos://x", secret="0123456789abcdef"), "'secret' goes with"),
-        (Ask("webhook", url="https://x", secret="short"), "16 to 128"),
-        (Ask("webhook", url="https://x", secret="0123456789abcdef\n"), "printable"),
-        (Ask("portal", label="a\nb"), "printable lines"),
-        (Ask("portal", robots="a\x00b"), "printable lines"),
-        (Ask("portal", robots="r*@lab1"), "'r.@lab1' must be written without '@'"),
-        (Ask("portal", quiet=Quiet("08:00", "08:00")), "are the same"),
-        (Ask("portal", quiet=Quiet("08:00", "09:00", least="all")), "'least'"),
-        (Ask("portal", quiet=Quiet("08:00", "09:00", "Mars/Olympus")), "no time zone"),
-        (Ask("portal", quiet=Quiet("08:00", "09:00", "../../etc/passwd")), "no time zone"),
-        (Ask("portal", quiet=Quiet("08:00", "09:00", "Europe")), "no time zone"),
+        (RuleRequest("pager"), "'channel' is one of"),
+        (RuleRequest("portal", level="fatal"), "'level' is one of"),
+        (RuleRequest("portal", url="https://example.org"), "leave it out with the channel 'portal'"),
+        (RuleRequest("webhook"), "'url' says where"),
+        (RuleRequest("apprise", url="mailtos://x", secret="0123456789abcdef"), "'secret' goes with"),
+        (RuleRequest("webhook", url="https://x", secret="short"), "16 to 128"),
+        (RuleRequest("webhook", url="https://x", secret="0123456789abcdef\n"), "printable"),
+        (RuleRequest("portal", label="a\nb"), "printable lines"),
+        (RuleRequest("portal", robots="a\x00b"), "printable lines"),
+        (RuleRequest("portal", robots="r*@lab1"), "'r.@lab1' must be written without '@'"),
+        (RuleRequest("portal", quiet=Quiet("08:00", "08:00")), "are the same"),
+        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", least="all")), "'least'"),
+        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", "Mars/Olympus")), "no time zone"),
+        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", "../../etc/passwd")), "no time zone"),
+        (RuleRequest("portal", quiet=Quiet("08:00", "09:00", "Europe")), "no time zone"),
     ],
 )
-def test_rules_that_make_none_are_refused_in_words(ask: Ask, words: str) -> None:
+def test_rules_that_make_none_are_refused_in_words(ask: RuleRequest, words: str) -> None:
     """Each says what is wrong."""
     with pytest.raises(Invalid, match=words):
         rules.check(ask, CHANNELS)
@@ -158,7 +158,7 @@ def test_rules_that_make_none_are_refused_in_words(ask: Ask, words: str) -> None
 def test_a_channel_that_is_switched_off_is_refused() -> None:
     """Whoever asks is told who can switch it on."""
     with pytest.raises(Invalid, match="administrator"):
-        rules.check(Ask("apprise", url="mailtos://x"), ("portal", "webhook"))
+        rules.check(RuleRequest("apprise", url="mailtos://x"), ("portal", "webhook"))
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_a_channel_that_is_switched_off_is_refused() -> None:
 def test_bodies_of_another_form_are_refused(body: bytes) -> None:
     """Ranges, clocks and unknown fields are judged as they are read."""
     with pytest.raises(msgspec.ValidationError):
-        msgspec.json.decode(body, type=Ask)
+        msgspec.json.decode(body, type=RuleRequest)
 
 
 @pytest.mark.parametrize(

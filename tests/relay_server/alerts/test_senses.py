@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol import link
-from relay_server.alerts import kinds
-from relay_server.alerts.senses import Senses, Thresholds
-from relay_server.control import Actor
-from relay_server.registry import Presence
+from relay_server.alerts import types as kinds
+from relay_server.alerts.monitors import Monitors, Thresholds
+from relay_server.control.audit import Actor
+from relay_server.robots.registry import RobotState
 from tests.relay_server.memory import STRING, TWIST, Person, World, text
 
 THRESHOLDS = Thresholds(silent=6.0, battery_low=0.2, battery_critical=0.1)
@@ -21,21 +21,21 @@ class Ear:
         self.told: list[str] = []
         self.now: dict[tuple[str, str], str] = {}
 
-    def tell(self, robot: Presence, kind: str, about: str, level: str, text: str) -> None:
+    def tell(self, robot: RobotState, kind: str, about: str, level: str, text: str) -> None:
         """Something is wrong."""
         self.now[kind, about] = level
         self.told.append(f"{kind} {about} {level}".replace("  ", " "))
 
-    def over(self, robot: Presence, kind: str, about: str = "") -> None:
+    def over(self, robot: RobotState, kind: str, about: str = "") -> None:
         """It is well again."""
         if self.now.pop((kind, about), None) is not None:
             self.told.append(f"{kind} {about} over".replace("  ", " "))
 
-    def lasts(self, robot: Presence, kind: str, about: str = "") -> str | None:
+    def lasts(self, robot: RobotState, kind: str, about: str = "") -> str | None:
         """Its level."""
         return self.now.get((kind, about))
 
-    def lasting(self, robot: Presence, kind: str) -> list[str]:
+    def lasting(self, robot: RobotState, kind: str) -> list[str]:
         """What those of a kind are about."""
         return [about for each, about in self.now if each == kind]
 
@@ -46,7 +46,7 @@ class Scene:
     def __init__(self, world: World) -> None:
         self.world = world
         self.ear = Ear()
-        self.senses = Senses(world.registry, world.channels, world.desks, THRESHOLDS, self.ear)
+        self.senses = Monitors(world.registry, world.channels, world.desks, THRESHOLDS, self.ear)
         self.number = 0
         self.mute = False
         self.wall_step = 0.0
@@ -171,7 +171,7 @@ def test_a_battery_is_low_critical_and_well_again_with_room_between(scene: Scene
 
 def test_batteries_are_not_looked_at_where_that_is_switched_off(scene: Scene) -> None:
     """Not even an empty one is told."""
-    scene.senses = Senses(
+    scene.senses = Monitors(
         scene.world.registry, scene.world.channels, scene.world.desks, Thresholds(6.0, 0.0, 0.0), scene.ear
     )
     scene.world.robot_comes()

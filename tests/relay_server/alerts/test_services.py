@@ -13,11 +13,9 @@ import pytest_twisted
 from twisted.protocols.portforward import ProxyFactory, ProxyServer
 
 from relay_protocol.errors import Invalid
-from relay_server.alerts.addresses import Fence, networks
-from relay_server.alerts.mailing import Mailing
+from relay_server.alerts.egress import EgressPolicy, NameResolver, parse_networks
+from relay_server.alerts.email import CLOUDS, PARAMETERS, SERVERS, Mailing
 from relay_server.alerts.message import Undelivered
-from relay_server.alerts.names import Names
-from relay_server.alerts.services import CLOUDS, PARAMETERS, SERVERS
 from tests.relay_server.alerts.made_up import message, rule
 from tests.relay_server.alerts.receiver import REACTOR, Hook, certificate, serve
 
@@ -34,8 +32,8 @@ class Scene:
     def __init__(self, allowed: str = "") -> None:
         self.hook = Hook()
         self.port = serve(self.hook)
-        self.names = Names(REACTOR)
-        fence = Fence(frozenset, networks([allowed] if allowed else []))
+        self.names = NameResolver(REACTOR)
+        fence = EgressPolicy(frozenset, parse_networks([allowed] if allowed else []))
         self.mailing = Mailing(REACTOR, self.names.addresses, list(PARAMETERS), fence)
         self.names.start()
         self.mailing.start()
@@ -162,7 +160,7 @@ async def test_urls_as_people_write_them_are_taken(scene: Scene, url: str) -> No
 def test_a_service_that_was_not_looked_at_can_not_be_allowed(scheme: str) -> None:
     """Push services read key files, others ask addresses of the user's choice; the words name what there is."""
     with pytest.raises(Invalid, match=f"'{scheme}' is no service that a relay can allow.*mailtos.*slack"):
-        Mailing(REACTOR, Names(REACTOR).addresses, ["mailtos", scheme], Fence(frozenset))
+        Mailing(REACTOR, NameResolver(REACTOR).addresses, ["mailtos", scheme], EgressPolicy(frozenset))
 
 
 def test_the_lists_have_nothing_that_names_a_file_or_an_address() -> None:

@@ -15,14 +15,13 @@ from twisted.internet.task import deferLater
 
 from relay_protocol.errors import Invalid
 from relay_server.alerts import webhook as module
-from relay_server.alerts.addresses import Fence, networks
+from relay_server.alerts.egress import EgressPolicy, NameResolver, parse_networks
 from relay_server.alerts.message import Undelivered
-from relay_server.alerts.names import Names
 from relay_server.alerts.webhook import ANSWER_BYTES, Webhooks, parse, signature
 from tests.relay_server.alerts.made_up import SECRET, message, rule
 from tests.relay_server.alerts.receiver import REACTOR, Hook, certificate, raw, serve
 
-LOOPBACK = networks(["127.0.0.0/8", "::1/128"])
+LOOPBACK = parse_networks(["127.0.0.0/8", "::1/128"])
 
 
 class Resolver:
@@ -56,7 +55,7 @@ class Scene:
 
 def sender(resolver: Any = None, allowed: Any = LOOPBACK, trust: Any = None) -> Webhooks:
     """Sends to this machine alone, unless told otherwise."""
-    fence = Fence(frozenset, allowed)
+    fence = EgressPolicy(frozenset, allowed)
     made = Webhooks(REACTOR, resolver or Resolver(["127.0.0.1"]), fence, lambda: 1700000000.9, trust)
     made.relay = "relay-1"
     return made
@@ -128,7 +127,7 @@ async def test_the_connection_goes_to_the_address_that_was_judged(scene: Scene) 
 @pytest_twisted.ensureDeferred
 async def test_a_name_within_is_told_like_one_that_nobody_knows() -> None:
     """In the same words, and it is tried as often: else users could ask for the names of the relay's networks."""
-    names = Names(REACTOR)
+    names = NameResolver(REACTOR)
     names.start()
     try:
         unknown = await refused(sender(names.addresses, ()), "http://no-such-host.invalid/")
@@ -146,7 +145,9 @@ async def test_of_several_addresses_only_the_allowed_are_tried(scene: Scene) -> 
     hook = Hook()
     port = scene.open(serve(hook, "127.0.0.2"))
     resolver = Resolver(["127.0.0.1", "10.0.0.7", "127.0.0.2"])
-    await sender(resolver, networks(["127.0.0.2/32"])).send(rule(url=f"http://x.example:{port}/"), message())
+    await sender(resolver, parse_networks(["127.0.0.2/32"])).send(
+        rule(url=f"http://x.example:{port}/"), message()
+    )
     assert len(hook.got) == 1
 
 
@@ -179,7 +180,7 @@ async def test_this_machine_is_not_reached_under_any_of_its_names(scene: Scene, 
     """The system resolves them all, and what comes of it is judged."""
     hook = Hook()
     port = scene.open(serve(hook))
-    names = Names(REACTOR)
+    names = NameResolver(REACTOR)
     names.start()
     try:
         error = await refused(sender(names.addresses, ()), f"http://{host}:{port}/")
@@ -282,7 +283,7 @@ async def test_tls_is_checked_by_name_and_signer(scene: Scene, tmp_path: Path) -
 @pytest_twisted.ensureDeferred
 async def test_a_name_that_nobody_knows_is_told_in_words() -> None:
     """No name server can make the relay fail."""
-    names = Names(REACTOR)
+    names = NameResolver(REACTOR)
     names.start()
     try:
         for host in ("no-such-host.invalid", "a" * 64 + ".example", ".".join(["abc"] * 60)):

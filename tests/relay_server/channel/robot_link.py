@@ -6,9 +6,9 @@ from typing import Any
 
 from relay_protocol import link
 from relay_protocol.frames import encode_sample
-from relay_server.edges.caps import AddressCap
-from relay_server.edges.robot_roles import Opening, RobotHall
-from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
+from relay_server.http.connection_limits import ConnectionLimits
+from relay_server.robots.connection import LinkTiming, RobotConnection, RobotFactory
+from relay_server.robots.link_roles import HandshakeRole, RobotLinkContext
 from tests.relay_server.edges.robot_ends import RELAY, Robot
 from tests.relay_server.memory import STRING, TEXTS, World
 
@@ -18,7 +18,7 @@ class _Relay:
 
     def __init__(self, world: World) -> None:
         unused: Any = None
-        hall = RobotHall(
+        hall = RobotLinkContext(
             RELAY,
             unused,
             world.registry,
@@ -29,10 +29,10 @@ class _Relay:
             world.clock.seconds,
             world.clock.seconds,
         )
-        cap = AddressCap(3)
+        cap = ConnectionLimits(3)
         self.factory = RobotFactory(
             lambda: RobotConnection(
-                world.clock, world.now_ns, LinkTiming(2.0), lambda each: Opening(hall, each), cap
+                world.clock, world.now_ns, LinkTiming(2.0), lambda each: HandshakeRole(hall, each), cap
             )
         )
 

@@ -6,18 +6,18 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol import link
-from relay_server.channel.wire import ASK_SECONDS, ASKS, Ask, Asks
+from relay_server.channels.robot_link import ASK_SECONDS, ASKS, Request, RequestQueue
 
 
 class Scene:
     def __init__(self) -> None:
         self.clock = Clock()
         self.sent: list[link.Message] = []
-        self.asks = Asks(self.clock, self.sent.append)
+        self.asks = RequestQueue(self.clock, self.sent.append)
 
     def ask(self, number: int, throttle_ms: int = 0) -> None:
         message = link.Subscribe(number=number, topic="/t", throttle_ms=throttle_ms)
-        self.asks.ask(Ask(("subscribe", number), message, lambda: None))
+        self.asks.ask(Request(("subscribe", number), message, lambda: None))
 
     @property
     def numbers(self) -> list[int]:

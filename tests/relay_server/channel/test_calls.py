@@ -9,9 +9,9 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.channel import bodies
-from relay_server.channel import calls as module
-from relay_server.session import calling as session_module
+from relay_server.channels import payloads
+from relay_server.channels import service_calls as module
+from relay_server.sessions import service_calls as session_module
 from tests.relay_server.memory import TRIGGER, Person, World
 
 YES = b"\x00\x01\x00\x00\x01\x00\x00\x00\x03\x00\x00\x00ok\x00"
@@ -198,7 +198,7 @@ def test_too_many_calls_on_one_robot_are_refused(world: World, monkeypatch: pyte
 def test_a_request_too_large_for_a_robot_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """The robot would have to cut the link of everybody."""
     person = at_work(world)
-    monkeypatch.setattr(bodies, "LARGEST", 3)
+    monkeypatch.setattr(payloads, "LARGEST", 3)
     person.says("call_service", service="/reset")
     assert "a robot takes at most 3" in person.hears("service_response")[0]["values"]
 

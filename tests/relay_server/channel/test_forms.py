@@ -14,9 +14,9 @@ from PIL import Image
 from twisted.logger import LogLevel, globalLogPublisher
 
 from relay_protocol import link
-from relay_server import budget
-from relay_server.channel import sample as module
-from relay_server.forms import cbor, png
+from relay_server.channels import encodings
+from relay_server.channels import samples as module
+from relay_server.common import cpu_quota
 from tests.relay_server.channel.watching import counting, heard, watching
 from tests.relay_server.memory import STRING, Person, World, text
 
@@ -198,10 +198,10 @@ def test_a_png_that_would_take_long_comes_plain(world: World) -> None:
     number, (person,) = watching(world, {"compression": "png"})
     person.says("set_level", level="warning")
     for _ in range(2):
-        world.channel.sample(number, text("x" * png.MOST))
+        world.channel.sample(number, text("x" * encodings.MOST_PNG))
     told, first, second = map(json.loads, person.client.sent)
     assert (told["op"], told["level"]) == ("status", "warning")
-    assert str(png.MOST) in told["msg"]
+    assert str(encodings.MOST_PNG) in told["msg"]
     assert first["op"] == second["op"] == "publish"
 
 
@@ -214,8 +214,8 @@ def test_fifty_clients_cost_one_conversion_a_form(world: World, monkeypatch: pyt
     ] * 2
     number, people = watching(world, *asks)
     pictures: list[bytes] = []
-    encode = png.encode
-    monkeypatch.setattr(png, "encode", lambda message: pictures.append(message) or encode(message))
+    encode = encodings.encode
+    monkeypatch.setattr(encodings, "encode", lambda message: pictures.append(message) or encode(message))
     converted = counting(world, number)
     world.channel.sample(number, text("x" * 500))
     assert sorted(converted) == ["cbor", "json"]
@@ -260,7 +260,7 @@ def test_who_has_used_up_his_share_gets_plain_json(world: World, ask: dict[str, 
 def spend_forms(world: World, person: Person) -> None:
     """The user has used up his share; something is left of that of all."""
     with person.session.allowance.forming():
-        world.worked += budget.FORMS_RESERVE + 0.05
+        world.worked += cpu_quota.FORMS_RESERVE + 0.05
     world.clock.advance(0.3)
     assert not person.session.allowance.may_form
     assert world.budgets.of(99).may_form
@@ -297,7 +297,7 @@ def test_json_that_is_too_long_for_cbor_comes_plain(world: World) -> None:
     person.says("set_level", level="warning")
     world.subscribed(number, encoding="json")
     for _ in range(2):
-        world.channel.sample(number, b'{"data":"' + b"x" * cbor.MOST + b'"}')
+        world.channel.sample(number, b'{"data":"' + b"x" * encodings.MOST_CBOR + b'"}')
     assert [op(each) for each in person.client.sent] == ["status", "publish", "publish"]
 
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from relay_protocol import link
-from relay_server.channel import goals as module
+from relay_server.channels import goals as module
 from tests.relay_server.channel.goal_ends import FEEDBACK, GOAL, RESULT, finish, send, with_action
 from tests.relay_server.memory import FIBONACCI, World
 

@@ -8,9 +8,9 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.channel import errands
-from relay_server.channel import goals as module
-from relay_server.channel.bodies import Bodies
+from relay_server.channels import goals as module
+from relay_server.channels import service_calls
+from relay_server.channels.payloads import PayloadCodec
 from tests.relay_server.channel.goal_ends import FEEDBACK, RESULT, graph_sends, offering, results
 from tests.relay_server.memory import FIBONACCI, Person, World
 
@@ -188,7 +188,7 @@ def test_a_goal_nobody_wants_any_more_keeps_its_place_for_a_while(world: World) 
     graph_sends(world)
     world.robot_goes()
     assert world.channel.goals._errands._of
-    world.wait(errands.PLACE_SECONDS + 1, person)
+    world.wait(service_calls.PLACE_SECONDS + 1, person)
     assert not world.channel.goals._errands._of
 
 
@@ -206,8 +206,8 @@ def test_a_client_that_reads_slowly_is_not_cut_for_what_others_ask(world: World)
     assert person.client.closed is None
     person.session.resume()
     told = person.client.take()
-    assert sum(each["op"] == "send_action_goal" for each in told) == errands.WAITING
-    assert sum(each["op"] == "cancel_action_goal" for each in told) == errands.WAITING
+    assert sum(each["op"] == "send_action_goal" for each in told) == service_calls.WAITING
+    assert sum(each["op"] == "cancel_action_goal" for each in told) == service_calls.WAITING
 
 
 def test_goals_that_can_not_be_served_are_ended(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,7 +218,7 @@ def test_goals_that_can_not_be_served_are_ended(world: World, monkeypatch: pytes
     graph_sends(world, "c")
     graph_sends(world, "c")
     assert [(end.id, end.status) for end in results(world)] == [("a", 0), ("b", 0), ("c", 0)]
-    monkeypatch.setattr(errands, "WAITING", 1)
+    monkeypatch.setattr(service_calls, "WAITING", 1)
     graph_sends(world, "d")
     assert results(world)[0].reason == "1 calls and goals wait for the client that offers /fib"
     monkeypatch.setattr(module, "ROBOT_GOALS", 1)
@@ -230,8 +230,8 @@ def test_goals_that_can_not_be_served_are_ended(world: World, monkeypatch: pytes
     def broken(*_: object) -> bytes:
         raise RuntimeError("defect")
 
-    monkeypatch.setattr(Bodies, "from_robot", broken)
-    monkeypatch.setattr(module.Goals.log, "failure", lambda *_, **__: None)
+    monkeypatch.setattr(PayloadCodec, "from_robot", broken)
+    monkeypatch.setattr(module.ActionGoals.log, "failure", lambda *_, **__: None)
     graph_sends(world, "f")
     assert results(world)[0].reason == "the relay failed on this goal of /fib; its log tells more"
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
-from relay_server.channel.latched import HOLD_SECONDS, KEPT_BYTES, MOST
+from relay_server.channels.latched import HOLD_SECONDS, KEPT_BYTES, MOST
 from tests.relay_server.channel.robot_link import RobotLink
 from tests.relay_server.channel.test_subscriptions import heard
 from tests.relay_server.memory import Person, World, text

@@ -10,10 +10,9 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol import link
 from relay_protocol.errors import Refused
-from relay_server.channel import State
-from relay_server.channel.lifecycle import JOIN_SECONDS, REOPEN_SECONDS
-from relay_server.channel.states import NEXT, Event
-from relay_server.channel.wire import Sent
+from relay_server.channels.channel import JOIN_SECONDS, REOPEN_SECONDS
+from relay_server.channels.robot_link import RequestContext
+from relay_server.channels.states import NEXT, ChannelEvent, ChannelState
 from tests.relay_server.memory import MemoryLink, World, fails, text
 
 
@@ -27,31 +26,33 @@ class Member:
         """May hear everything."""
 
 
-def brought_to(world: World, state: State) -> None:
+def brought_to(world: World, state: ChannelState) -> None:
     """A channel in this state, by what really happens."""
     channel = world.channel
-    if state is State.NEW:
+    if state is ChannelState.NEW:
         return
     channel.attach(Member())
-    if state in (State.OPENING, State.OPEN):
+    if state in (ChannelState.OPENING, ChannelState.OPEN):
         world.robot_comes()
-    if state is State.OPEN:
+    if state is ChannelState.OPEN:
         world.robot_joins()
-    if state is State.CLOSED:
+    if state is ChannelState.CLOSED:
         channel.shut()
 
 
-@pytest.mark.parametrize("event", Event)
-@pytest.mark.parametrize("state", State)
-def test_every_event_in_every_state(world: World, state: State, event: Event) -> None:
+@pytest.mark.parametrize("event", ChannelEvent)
+@pytest.mark.parametrize("state", ChannelState)
+def test_every_event_in_every_state(world: World, state: ChannelState, event: ChannelEvent) -> None:
     """The table says what follows; what it does not list changes nothing."""
     channel = world.channel
     brought_to(world, state)
     assert channel.state is state
     channel._happen(event)
     assert channel.state is NEXT.get((state, event), state)
-    assert (channel.wire.link is not None) == (state is State.OPEN and channel.state is State.OPEN)
-    assert (channel in world.robot.watchers) == (channel.state is not State.CLOSED)
+    assert (channel.wire.link is not None) == (
+        state is ChannelState.OPEN and channel.state is ChannelState.OPEN
+    )
+    assert (channel in world.robot.watchers) == (channel.state is not ChannelState.CLOSED)
 
 
 def test_a_channels_name_says_nothing_of_how_many_there_were(world: World) -> None:
@@ -64,11 +65,11 @@ def test_a_channels_name_says_nothing_of_how_many_there_were(world: World) -> No
 def test_nobody_opens_a_channel_to_a_robot_that_is_away(world: World) -> None:
     """It waits, and opens when the robot registers."""
     world.channel.attach(Member())
-    assert world.channel.state is State.WAITING
+    assert world.channel.state is ChannelState.WAITING
     world.robot_comes()
-    assert world.channel.state is State.OPENING
+    assert world.channel.state is ChannelState.OPENING
     world.robot_joins()
-    assert world.channel.state is State.OPEN
+    assert world.channel.state is ChannelState.OPEN
 
 
 def test_a_channel_lingers_after_its_last_member(world: World) -> None:
@@ -81,10 +82,10 @@ def test_a_channel_lingers_after_its_last_member(world: World) -> None:
     world.clock.advance(4.9)
     channel.attach(member)
     world.clock.advance(60)
-    assert channel.state is State.OPEN
+    assert channel.state is ChannelState.OPEN
     channel.detach(member)
     world.clock.advance(5.1)
-    assert channel.state is State.CLOSED
+    assert channel.state is ChannelState.CLOSED
     assert world.link.closed
     assert len(world.control.all(link.CloseChannel)) == 1
     assert world.channel is not channel
@@ -140,7 +141,7 @@ def test_a_second_link_to_an_open_channel_is_turned_away(world: World) -> None:
     assert second.closed
     assert first.closed is None
     world.channel.link_lost(second)
-    assert world.channel.state is State.OPEN
+    assert world.channel.state is ChannelState.OPEN
 
 
 def test_a_broken_link_is_asked_for_anew_after_a_pause(world: World) -> None:
@@ -149,7 +150,7 @@ def test_a_broken_link_is_asked_for_anew_after_a_pause(world: World) -> None:
     world.channel.attach(Member())
     broken = world.robot_joins()
     world.channel.link_lost(broken)
-    assert world.channel.state is State.OPENING
+    assert world.channel.state is ChannelState.OPENING
     world.clock.advance(REOPEN_SECONDS / 2)
     assert not world.control.all(link.OpenChannel)
     world.clock.advance(REOPEN_SECONDS / 2)
@@ -206,7 +207,7 @@ def test_a_robot_that_never_joins_keeps_nobody_waiting_for_ever(world: World) ->
     for work in (
         world.channel.asking.round_trip(),
         world.channel.asking.definition("std_msgs/msg/String"),
-        world.channel.asking.call("/reset", "", b"", 2.0, Sent(1)),
+        world.channel.asking.call("/reset", "", b"", 2.0, RequestContext(1)),
     ):
         Deferred.fromCoroutine(work).addErrback(lambda failure: told.append(str(failure.value)))
     world.clock.pump([1.0] * 4)

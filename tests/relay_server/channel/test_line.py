@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from relay_server.channel.line import Line
+from relay_server.common.fair_queue import FairQueue
 
 
 class Turns:
@@ -33,7 +33,7 @@ class Turns:
 def test_each_has_a_turn_of_his_own() -> None:
     """In order; the first does not wait, and who has left takes a turn and holds up nobody."""
     turns = Turns()
-    line = Line(turns)
+    line = FairQueue(turns)
     had: list[int] = []
 
     def ask(number: int) -> Any:

@@ -8,11 +8,11 @@ from twisted.internet.task import Clock
 
 from relay_protocol import rosbridge
 from relay_protocol.ros_types import TypeRegistry
-from relay_server.budget import Budgets
-from relay_server.channel import listener as module
-from relay_server.channel.listener import Listener
-from relay_server.channel.sample import Converter, Sample
-from relay_server.forms import Form
+from relay_server.channels import client_subscription as module
+from relay_server.channels.client_subscription import ClientSubscription
+from relay_server.channels.encodings import MessageEncoding
+from relay_server.channels.samples import Converter, Sample
+from relay_server.common.cpu_quota import UserQuotas
 
 
 class Desk:
@@ -23,13 +23,13 @@ class Desk:
         self.plain_instead = 0
         self.queued_bytes = 0
         self.drops = 0
-        self.allowance = Budgets(lambda: 0.0, lambda: 0.0).of(1)
+        self.allowance = UserQuotas(lambda: 0.0, lambda: 0.0).of(1)
 
-    def deliver(self, listener: Listener, parcel: Sample) -> None:
+    def deliver(self, listener: ClientSubscription, parcel: Sample) -> None:
         """Keep it."""
         self.got.append(parcel)
 
-    def dropped(self, listener: Listener) -> None:
+    def dropped(self, listener: ClientSubscription) -> None:
         """Count it."""
         self.drops += 1
 
@@ -37,16 +37,16 @@ class Desk:
         """Nobody listens."""
 
 
-def listening(*asks: dict[str, Any]) -> tuple[Clock, Desk, Listener]:
+def listening(*asks: dict[str, Any]) -> tuple[Clock, Desk, ClientSubscription]:
     """A listener with these subscriptions; the clock and the receiver."""
     clock, desk = Clock(), Desk()
-    listener = Listener(clock, desk, "/scan")
+    listener = ClientSubscription(clock, desk, "/scan")
     for number, fields in enumerate(asks):
         add(listener, id=number, **fields)
     return clock, desk, listener
 
 
-def add(listener: Listener, form: Form = Form(), **fields: Any) -> None:  # noqa: B008
+def add(listener: ClientSubscription, form: MessageEncoding = MessageEncoding(), **fields: Any) -> None:  # noqa: B008
     """One more subscription."""
     listener.add(rosbridge.Subscribe(**{"topic": "/scan", **fields}), form)
 
@@ -56,7 +56,7 @@ def sample(body: bytes = b"{}") -> Sample:
     return Sample(body, 0, Converter(TypeRegistry(), "", "json", print))
 
 
-def burst(listener: Listener, *bodies: bytes) -> None:
+def burst(listener: ClientSubscription, *bodies: bytes) -> None:
     """Samples that come at once."""
     for body in bodies:
         listener.offer(sample(body))
@@ -70,25 +70,25 @@ def bodies(desk: Desk) -> list[bytes]:
 def test_the_least_and_the_latest_count() -> None:
     """Least throttle, least size of fragments of those given, latest compression."""
     _, _, listener = listening(
-        {"throttle_rate": 100, "form": Form("png", 500)},
-        {"throttle_rate": 50, "form": Form("cbor", 0)},
-        {"throttle_rate": 200, "form": Form("none", 300)},
+        {"throttle_rate": 100, "form": MessageEncoding("png", 500)},
+        {"throttle_rate": 50, "form": MessageEncoding("cbor", 0)},
+        {"throttle_rate": 200, "form": MessageEncoding("none", 300)},
     )
     assert listener.throttle == 0.05
-    assert listener.wish.form == Form("none", 300)
+    assert listener.wish.form == MessageEncoding("none", 300)
     listener.remove("/scan", 2)
-    assert listener.wish.form == Form("cbor", 500)
+    assert listener.wish.form == MessageEncoding("cbor", 500)
     listener.remove("/scan", 0)
-    assert listener.wish.form == Form("cbor", 0)
+    assert listener.wish.form == MessageEncoding("cbor", 0)
 
 
 def test_asking_again_is_the_latest() -> None:
     """The same id anew replaces the former, and counts as the latest."""
-    _, _, listener = listening({"form": Form("png")}, {"form": Form("cbor")})
-    add(listener, Form("cbor-raw"), id=0)
-    assert listener.wish.form == Form("cbor-raw")
+    _, _, listener = listening({"form": MessageEncoding("png")}, {"form": MessageEncoding("cbor")})
+    add(listener, MessageEncoding("cbor-raw"), id=0)
+    assert listener.wish.form == MessageEncoding("cbor-raw")
     listener.remove("/scan", 0)
-    assert listener.wish.form == Form("cbor")
+    assert listener.wish.form == MessageEncoding("cbor")
 
 
 def test_every_spelling_counts() -> None:
@@ -196,7 +196,7 @@ def test_a_queue_comes_whole_when_the_throttle_is_lifted() -> None:
 def test_a_queue_is_bounded_in_bytes() -> None:
     """For one topic and for one client; the newest of each topic stays."""
     _, desk, listener = listening({"throttle_rate": 1250, "queue_length": 100})
-    other = Listener(listener._clock, desk, "/other")
+    other = ClientSubscription(listener._clock, desk, "/other")
     add(other, throttle_rate=1000, queue_length=10)
     half = b"x" * (module.QUEUE_BYTES // 2)
     burst(listener, b"first", half, half, half)

@@ -8,8 +8,8 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.channel import offers as module
-from relay_server.channel import wire
+from relay_server.channels import advertisements as module
+from relay_server.channels import robot_link
 from tests.relay_server.memory import ADD, FIBONACCI, GRAPH, Person, World
 
 KINDS = ["service", "action"]
@@ -258,7 +258,7 @@ def test_offers_of_one_client_and_of_one_user_are_bounded(
     for number in range(2):
         offer(again, kind, f"/b{number}")
     assert again.told() == [f"you offer 3 {kind}s on this robot, the most one user may"]
-    monkeypatch.setattr(wire, "NAMES", 4)
+    monkeypatch.setattr(robot_link, "NAMES", 4)
     for number in range(2):
         offer(stranger, kind, f"/c{number}")
     assert stranger.told() == ["more than 4 names are in use on this robot"]
@@ -269,7 +269,7 @@ def test_no_client_floods_the_robot_with_offers(
     world: World, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A bounded number of requests goes out at a time; the next when one is answered."""
-    monkeypatch.setattr(wire, "ASKS", 4)
+    monkeypatch.setattr(robot_link, "ASKS", 4)
     person = world.at_work()
     for number in range(20):
         offer(person, kind, f"/a{number}")

@@ -8,7 +8,7 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.qos import QoS
-from relay_server.channel import publications as module
+from relay_server.channels import publications as module
 from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World, words
 
 

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from relay_protocol import link
-from relay_server.channel.robot_clock import THROTTLE_MS, TYPE, nanoseconds
+from relay_server.channels.robot_clock import THROTTLE_MS, TYPE, nanoseconds
 from tests.relay_server.memory import GRAPH, MOTION, STRING, Person, World, text
 
 STAMPED = "a_msgs/msg/Stamped"

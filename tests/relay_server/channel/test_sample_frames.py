@@ -5,8 +5,8 @@ from __future__ import annotations
 import cbor2
 import msgspec
 
-from relay_server.channel.robot_clock import TYPE
-from relay_server.recording.recorder import HELD
+from relay_server.channels.robot_clock import TYPE
+from relay_server.recordings.recorder import HELD
 from tests.relay_server.channel.robot_link import RobotLink
 from tests.relay_server.channel.test_robot_clock import tick
 from tests.relay_server.memory import MOTION, TEXTS, World, text

@@ -10,8 +10,8 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.channel import errands, serving
-from relay_server.channel.bodies import Bodies
+from relay_server.channels import service_calls
+from relay_server.channels.payloads import PayloadCodec
 from tests.relay_server.memory import ADD, Person, World
 
 REQUEST, RESPONSE = f"{ADD}_Request", f"{ADD}_Response"
@@ -173,15 +173,15 @@ def test_a_call_is_given_up_after_its_time(world: World, timeout: float, seconds
 def test_a_call_keeps_its_place_until_the_client_can_have_read_it(world: World) -> None:
     """Callers that give up fast are no way around the bound; nor is there a leak."""
     person = offering(world)
-    for number in range(errands.WAITING):
+    for number in range(service_calls.WAITING):
         graph_calls(world, str(number), timeout=0.1)
     world.wait(1, person)
-    assert len(responses(world)) == errands.WAITING
+    assert len(responses(world)) == service_calls.WAITING
     graph_calls(world, "more")
     (response,) = responses(world)
     assert response.reason == "256 calls and goals wait for the client that offers /add"
-    assert len(person.hears("call_service")) == errands.WAITING
-    world.wait(errands.PLACE_SECONDS, person)
+    assert len(person.hears("call_service")) == service_calls.WAITING
+    world.wait(service_calls.PLACE_SECONDS, person)
     graph_calls(world, "later")
     assert len(person.hears("call_service")) == 1
 
@@ -189,7 +189,7 @@ def test_a_call_keeps_its_place_until_the_client_can_have_read_it(world: World) 
 def test_what_waits_for_one_client_is_bounded_in_bytes(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """Others' calls must not cut a client that reads slowly."""
     person = offering(world)
-    monkeypatch.setattr(errands, "WAITING_BYTES", 30)
+    monkeypatch.setattr(service_calls, "WAITING_BYTES", 30)
     graph_calls(world, "a")
     graph_calls(world, "b")
     graph_calls(world, "c")
@@ -206,7 +206,7 @@ def test_calls_that_wait_for_the_type_are_bounded_and_kept_in_order(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot that calls before it has told the type."""
-    monkeypatch.setattr(serving, "GRAPH_CALLS", 3)
+    monkeypatch.setattr(service_calls, "GRAPH_CALLS", 3)
     world.robot_comes()
     person = world.person()
     world.robot_joins()
@@ -377,7 +377,7 @@ def test_a_caller_that_leaves_frees_what_it_may(world: World) -> None:
             caller.says("call_service", service="/add", id=number, timeout=3600)
         caller.session.end()
     calls = person.hears("call_service")
-    assert len(calls) == errands.WAITING
+    assert len(calls) == service_calls.WAITING
     for call in calls:
         person.says("service_response", service="add", id=call["id"], values={})
     assert not person.hears("status")
@@ -402,7 +402,7 @@ def test_answers_too_large_for_a_robot_are_refused(world: World, monkeypatch: py
     """The robot would have to cut the link of everybody."""
     person = offering(world)
     graph_calls(world)
-    monkeypatch.setattr("relay_server.channel.bodies.LARGEST", 3)
+    monkeypatch.setattr("relay_server.channels.payloads.LARGEST", 3)
     (call,) = person.hears("call_service")
     person.says("service_response", service="add", id=call["id"], values={"sum": 5})
     assert "a robot takes at most 3" in responses(world)[0].reason
@@ -415,7 +415,7 @@ def test_a_fault_of_the_relay_is_answered_too(world: World, monkeypatch: pytest.
     def broken(*_: object) -> bytes:
         raise RuntimeError("defect")
 
-    monkeypatch.setattr(Bodies, "from_robot", broken)
-    monkeypatch.setattr(serving.ServedCalls.log, "failure", lambda *_, **__: None)
+    monkeypatch.setattr(PayloadCodec, "from_robot", broken)
+    monkeypatch.setattr(service_calls.ClientServiceCalls.log, "failure", lambda *_, **__: None)
     graph_calls(world)
     assert responses(world)[0].reason == "the relay failed on this call; its log tells more"

@@ -6,9 +6,9 @@ import cbor2
 
 from relay_protocol import link
 from relay_protocol.rights import Level
-from relay_server.channel import listener as listener_module
-from relay_server.channel import topics as module
-from relay_server.channel.subscriptions import LOOK_SECONDS
+from relay_server.channels import client_subscription as listener_module
+from relay_server.channels import topics as module
+from relay_server.channels.subscriptions import LOOK_SECONDS
 from tests.relay_server.channel.watching import counting, heard, watching
 from tests.relay_server.memory import GRAPH, STRING, World, text
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from relay_protocol import link
-from relay_server.channel import subscriptions as module
+from relay_server.channels import subscriptions as module
 from tests.relay_server.channel.watching import heard, watching
 from tests.relay_server.memory import STRING, TWIST, Person, World, text
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from relay_protocol import link
-from relay_server.channel.sample import Converter
+from relay_server.channels.samples import Converter
 from tests.relay_server.memory import Person, World
 
 

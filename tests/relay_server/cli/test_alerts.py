@@ -10,7 +10,7 @@ from relay_db import queries
 from relay_db.engine import Database
 from relay_server import logs
 from relay_server import run as running
-from relay_server.config import Settings
+from relay_server.config import RelaySettings
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_alerts_of_batteries_are_switched_off_by_a_low_charge_of_nothing(
     cli: Any, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], low: float, critical: float
 ) -> None:
     """Whatever is critical otherwise."""
-    began: list[Settings] = []
+    began: list[RelaySettings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: began.append(settings))
     monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
     cli.ok("serve", *options)
@@ -76,7 +76,7 @@ def test_alerts_of_batteries_are_switched_off_by_a_low_charge_of_nothing(
 
 def test_networks_are_allowed_and_denied_by_name(cli: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A list of each."""
-    began: list[Settings] = []
+    began: list[RelaySettings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: began.append(settings))
     monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
     cli.ok("serve", "--webhook-networks", "10.0.0.0/8", "--webhook-deny", "10.0.0.7/32, 2606:2800:21f::/48")

@@ -14,12 +14,14 @@ from relay_db.engine import Database
 from relay_server.cli import events as module
 
 
-def new(at: float, source: str, kind: str, robot: int | None = None, data: str = "{}") -> queries.NewMemory:
+def new(
+    at: float, source: str, kind: str, robot: int | None = None, data: str = "{}"
+) -> queries.NewStoredEvent:
     """An event by ann."""
-    return queries.NewMemory("default", at, source, kind, robot, "ann", data)
+    return queries.NewStoredEvent("default", at, source, kind, robot, "ann", data)
 
 
-def write(cli: Any, *new_ones: queries.NewMemory) -> None:
+def write(cli: Any, *new_ones: queries.NewStoredEvent) -> None:
     """As a relay does."""
     database = Database(f"sqlite:///{cli.data / 'switchboard.db'}")
     with database.begin() as s:

@@ -17,7 +17,7 @@ from sqlalchemy import create_engine, text
 
 from relay_db.schema import HEAD
 from relay_server.cli import main
-from relay_server.cli.relaysocket import SOCKET_NAME
+from relay_server.cli.control_socket import SOCKET_NAME
 
 CHANGES = [
     ("realm.add", ("realm", "add", "lab1")),
@@ -181,10 +181,10 @@ def test_a_relay_that_hangs_does_not_hold_a_change_up(
     """The knock is given up; the change is made."""
     import socket
 
-    from relay_server.cli import relaysocket
+    from relay_server.cli import control_socket
 
-    monkeypatch.setattr(relaysocket, "_KNOCK_SECONDS", 0.05)
-    monkeypatch.setattr(relaysocket, "_ASK_SECONDS", 0.05)
+    monkeypatch.setattr(control_socket, "_KNOCK_SECONDS", 0.05)
+    monkeypatch.setattr(control_socket, "_ASK_SECONDS", 0.05)
     with socket.socket(socket.AF_UNIX) as silent:
         silent.bind(str(short_folder / SOCKET_NAME))
         silent.listen()

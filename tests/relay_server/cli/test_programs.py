@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_server.passwords import token_hash, verifier
+from relay_server.auth.passwords import token_hash, verifier
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.errors import Invalid
-from relay_server.cli.naming import of_one_realm
+from relay_server.cli.names import of_one_realm
 
 
 @pytest.fixture
@@ -273,9 +273,9 @@ def test_events_are_those_of_one_realm(labs: Any) -> None:
         lambda s: queries.remember(
             s,
             [
-                queries.NewMemory("default", 10.0, "relay:rover", "here", 1, "ann", "{}"),
-                queries.NewMemory("lab1", 20.0, "relay:rover", "there", 2, "ann", "{}"),
-                queries.NewMemory("lab1", 30.0, "relay:rover", "local", 2, "admin (local)", "{}"),
+                queries.NewStoredEvent("default", 10.0, "relay:rover", "here", 1, "ann", "{}"),
+                queries.NewStoredEvent("lab1", 20.0, "relay:rover", "there", 2, "ann", "{}"),
+                queries.NewStoredEvent("lab1", 30.0, "relay:rover", "local", 2, "admin (local)", "{}"),
             ],
         ),
     )

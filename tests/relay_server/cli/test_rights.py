@@ -9,7 +9,7 @@ import pytest
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_server.passwords import token_hash
+from relay_server.auth.passwords import token_hash
 
 
 @pytest.fixture

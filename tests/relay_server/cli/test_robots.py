@@ -13,8 +13,8 @@ from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol import identity
 from relay_protocol.errors import Refused
-from relay_server.passwords import code_hash
-from relay_server.recording.library import FOLDER, Entry, State, text_of
+from relay_server.auth.passwords import code_hash
+from relay_server.recordings.library import FOLDER, RecordingEntry, RecordingState, text_of
 
 
 def _enrol(cli: Any, robot: str, code: str, agent: str = "robot 1") -> str:
@@ -126,7 +126,9 @@ def test_what_is_recorded_of_a_robot_is_told_before_it_is_removed(cli: Any) -> N
     folder = cli.data / FOLDER
     folder.mkdir()
     for id, size in (("a", 1_200_000), ("b", 50_000)):
-        entry = Entry(id, 1, "rover", 1, "ann", ("/odom",), (), 1.0, 10**7, 60.0, state=State.COMPLETE)
+        entry = RecordingEntry(
+            id, 1, "rover", 1, "ann", ("/odom",), (), 1.0, 10**7, 60.0, state=RecordingState.COMPLETE
+        )
         (folder / f"{id}.json").write_bytes(text_of(entry))
         (folder / f"{id}.mcap").write_bytes(bytes(size))
     asked = cli("robot", "remove", "rover", stdin="n\n")

@@ -8,19 +8,19 @@ import pytest
 
 from relay_server import logs
 from relay_server import run as running
-from relay_server.config import Settings
+from relay_server.config import RelaySettings
 
 
 @pytest.fixture
-def began(monkeypatch: pytest.MonkeyPatch) -> list[Settings]:
+def began(monkeypatch: pytest.MonkeyPatch) -> list[RelaySettings]:
     """The settings of the relays that were begun."""
-    found: list[Settings] = []
+    found: list[RelaySettings] = []
     monkeypatch.setattr(running, "run", lambda settings, ready: found.append(settings))
     monkeypatch.setattr(logs, "begin", lambda *how, **later: None)
     return found
 
 
-def test_a_request_for_control_lapses_after_the_grace_time(cli: Any, began: list[Settings]) -> None:
+def test_a_request_for_control_lapses_after_the_grace_time(cli: Any, began: list[RelaySettings]) -> None:
     """Or no owner could ever take over."""
     cli.ok("serve")
     cli.ok("serve", "--control-grace", "5", "--control-request", "10")
@@ -30,7 +30,7 @@ def test_a_request_for_control_lapses_after_the_grace_time(cli: Any, began: list
     assert len(began) == 2
 
 
-def test_the_room_of_recordings_is_not_less_than_nothing(cli: Any, began: list[Settings]) -> None:
+def test_the_room_of_recordings_is_not_less_than_nothing(cli: Any, began: list[RelaySettings]) -> None:
     """Neither what they may take nor what they leave free of the disk."""
     cli.ok("serve")
     cli.ok("serve", "--recordings-gb", "0.5", "--recordings-reserve-gb", "2.5")
@@ -41,7 +41,7 @@ def test_the_room_of_recordings_is_not_less_than_nothing(cli: Any, began: list[S
     assert len(began) == 2
 
 
-def test_requests_are_limited_unless_they_are_not(cli: Any, began: list[Settings]) -> None:
+def test_requests_are_limited_unless_they_are_not(cli: Any, began: list[RelaySettings]) -> None:
     """By so many a second; 0 is for no limit, less is none."""
     cli.ok("serve")
     cli.ok("serve", "--requests-per-second", "0")

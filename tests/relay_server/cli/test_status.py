@@ -23,8 +23,8 @@ from switchboard_waiting import wait_for
 
 from relay_protocol.errors import Unavailable
 from relay_protocol.text import inert
-from relay_server.cli import relaysocket
-from relay_server.cli.text import duration, moment
+from relay_server.cli import control_socket
+from relay_server.cli.output import duration, moment
 
 
 def _answer(**robot: Any) -> dict[str, Any]:
@@ -225,16 +225,16 @@ def test_no_relay_is_exit_code_3(cli: Any, short_folder: Path) -> None:
 @pytest.mark.parametrize(
     ("waits", "ask"),
     [
-        ("_ASK_SECONDS", lambda folder: relaysocket.ask_status(folder)),
-        ("_MOTION_SECONDS", lambda folder: relaysocket.order_motion(folder, "stop", {})),
-        ("_LINE_SECONDS", lambda folder: list(relaysocket.give_order(folder, {}, "default"))),
+        ("_ASK_SECONDS", lambda folder: control_socket.ask_status(folder)),
+        ("_MOTION_SECONDS", lambda folder: control_socket.order_motion(folder, "stop", {})),
+        ("_LINE_SECONDS", lambda folder: list(control_socket.give_order(folder, {}, "default"))),
     ],
 )
 def test_a_relay_that_does_not_answer_is_told_with_the_time_that_was_waited(
     short_folder: Path, monkeypatch: pytest.MonkeyPatch, waits: str, ask: Callable[[Path], Any]
 ) -> None:
     """Each question has a time of its own."""
-    monkeypatch.setattr(relaysocket, waits, 0.125)
+    monkeypatch.setattr(control_socket, waits, 0.125)
     with socket.socket(socket.AF_UNIX) as mute:
         mute.bind(str(short_folder / "relay.sock"))
         mute.listen()

@@ -10,7 +10,7 @@ import pytest
 from relay_db import queries
 from relay_db.engine import Database
 from relay_protocol.clocks import now_ns
-from relay_server.cli import relaysocket, stopping
+from relay_server.cli import control_socket, stop
 from relay_server.cli.app import os_user
 
 
@@ -125,8 +125,8 @@ def test_a_stop_that_a_relay_does_not_confirm_is_kept(
     live: Any, relay: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And that is told, on each robot: nobody knows whether it stands."""
-    monkeypatch.setattr(relaysocket, "_SURE_SECONDS", 0.05)
-    monkeypatch.setattr(relaysocket, "_MOTION_SECONDS", 0.3)
+    monkeypatch.setattr(control_socket, "_SURE_SECONDS", 0.05)
+    monkeypatch.setattr(control_socket, "_MOTION_SECONDS", 0.3)
     live.ok("robot", "add", "rover")
     relay.may_answer.clear()
     result = live("stop", "--all", "--why", "smoke")
@@ -140,7 +140,7 @@ def test_an_answer_that_comes_late_is_told_all_the_same(
     live: Any, relay: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The order was kept meanwhile; the relay knows what to do with it."""
-    monkeypatch.setattr(relaysocket, "_SURE_SECONDS", 0.05)
+    monkeypatch.setattr(control_socket, "_SURE_SECONDS", 0.05)
     live.ok("robot", "add", "rover")
     relay.motion = (200, b'{"robots": [{"robot": "rover", "done": true}]}')
     relay.may_answer.clear()
@@ -150,7 +150,7 @@ def test_an_answer_that_comes_late_is_told_all_the_same(
         said.append(sentence)
         relay.may_answer.set()
 
-    monkeypatch.setattr(stopping, "say_aside", tell)
+    monkeypatch.setattr(stop, "say_aside", tell)
     assert live.ok("stop", "rover") == "Robot rover is stopped.\n"
     assert "The order is kept" in said[0]
     assert [robot for robot, *_ in pending(live)] == [1]

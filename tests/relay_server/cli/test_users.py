@@ -8,7 +8,7 @@ import pytest
 
 from relay_db import queries
 from relay_db.engine import Database
-from relay_server.passwords import verify_password
+from relay_server.auth.passwords import verify_password
 
 PASSWORD = "correct horse"
 

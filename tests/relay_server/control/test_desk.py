@@ -10,11 +10,12 @@ import pytest
 from relay_protocol import link
 from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.control import ControlRules, State, comeback
-from relay_server.control import desk as module
-from relay_server.control.orders import WAITING
-from relay_server.control.record import Actor
-from relay_server.control.terms import REST_SECONDS
+from relay_server.control import controller as module
+from relay_server.control import rearm
+from relay_server.control.audit import Actor
+from relay_server.control.commands import WAITING
+from relay_server.control.lease import LeaseState
+from relay_server.control.types import REST_SECONDS, ControlRules
 from tests.relay_server.steering import Connection, Place, outcome, result
 
 
@@ -59,7 +60,7 @@ def test_a_robot_that_does_not_answer_is_free_again_and_its_asker_is_told(place:
     asked = outcome(place.desk.take(ann, ""))
     place.clock.advance(3.1)
     assert isinstance(asked[0], Unavailable)
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
     assert place.link.holders == [ann.number, 0]
     assert ann.told == ["you did not get control of rover: robot rover did not answer within 3 s"]
     place.link.answers(place.link.orders(link.Control)[0])
@@ -85,7 +86,7 @@ def test_a_robot_that_refuses_is_free(place: Place) -> None:
     place.link.unable = "the key switch is off"
     (error,) = outcome(place.desk.take(place.connection(), ""))
     assert "the key switch is off" in str(error)
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
 
 
 def test_a_robot_that_is_offline_can_not_be_taken() -> None:
@@ -426,7 +427,7 @@ def test_a_robot_that_does_not_confirm_the_end_is_free_all_the_same(place: Place
     place.link.silent = True
     place.desk.release(ann, "")
     place.clock.advance(3.1)
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
 
 
 def test_who_has_none_gives_none_back(place: Place) -> None:
@@ -441,7 +442,7 @@ def test_it_ends_with_the_connection(place: Place) -> None:
     ann = place.holding()
     place.desk.told(link.Safety(holder=ann.number, moving=True))
     place.desk.left(ann)
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
     assert place.record.notes[-1] == ("control.lost", "ann", "the connection has ended", {"moving": True})
     place.link.silent = True
     bob = place.connection("bob")
@@ -450,7 +451,7 @@ def test_it_ends_with_the_connection(place: Place) -> None:
     place.link.silent = False
     for order in place.link.orders(link.Control)[-2:]:
         place.link.answers(order)
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
     assert place.link.holders[-2:] == [bob.number, 0]
 
 
@@ -499,7 +500,7 @@ def test_it_ends_with_the_robots_link_and_is_taken_anew(place: Place) -> None:
     """A robot that is back obeys nobody."""
     ann = place.holding()
     place.offline()
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
     assert ann.told == ["you have lost control of rover: the robot's link was lost"]
     assert place.record.kinds == ["control.taken", "control.lost"]
     place.online()
@@ -514,7 +515,7 @@ def test_a_link_that_is_lost_while_the_robot_is_asked_ends_it(place: Place) -> N
     asked = outcome(place.desk.take(place.connection(), ""))
     place.offline()
     assert "offline" in str(asked[0])
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
 
 
 def test_it_ends_when_nobody_commands_any_more(place: Place) -> None:
@@ -528,7 +529,7 @@ def test_it_ends_when_nobody_commands_any_more(place: Place) -> None:
     assert place.desk.passes(ann, "/cmd_vel")
     place.desk.told(link.Safety(holder=ann.number))
     place.clock.advance(601)
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
     assert ann.told == ["you have lost control of rover: no command for 600 s"]
 
 
@@ -558,7 +559,7 @@ def test_whoever_is_told_may_leave_by_that(place: Place) -> None:
     for each in (ann, bob, olga):
         each.when_told = lambda each=each: place.desk.left(each)
     result(place.desk.take(bob, ""))
-    assert place.desk.lease.state is State.FREE, "she was told of the request, and left"
+    assert place.desk.lease.state is LeaseState.FREE, "she was told of the request, and left"
     ann, bob = place.holding("ann"), place.connection("bob")
     bob.when_told = lambda: place.desk.left(bob)
     result(place.desk.take(bob, ""))
@@ -572,12 +573,12 @@ def test_whoever_is_told_may_leave_by_that(place: Place) -> None:
     result(place.desk.take(bob, ""))
     ann.when_told = lambda: place.desk.left(ann)
     place.desk.left(ann)
-    assert place.desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
     ann = place.holding("ann")
     ann.when_told = lambda: place.desk.left(ann)
     place.offline()
-    assert place.desk.lease.state is State.FREE
-    assert place.online().desk.lease.state is State.FREE
+    assert place.desk.lease.state is LeaseState.FREE
+    assert place.online().desk.lease.state is LeaseState.FREE
     ann = place.holding("ann", Level.OWNER)
     ann.when_told = lambda: place.desk.left(ann)
     second = place.connection("ann")
@@ -784,7 +785,7 @@ def test_who_comes_back_before_his_connection_is_known_to_be_lost_lets_go_first(
 
 def test_users_who_are_remembered_are_bounded(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest are forgotten first."""
-    monkeypatch.setattr(comeback, "USERS", 2)
+    monkeypatch.setattr(rearm, "USERS", 2)
     gone = [place.connection(name) for name in ("ann", "bob", "eve")]
     for each in gone:
         place.desk.unheard(each)
@@ -846,11 +847,11 @@ def test_a_call_that_moves_waits_for_control(place: Place) -> None:
 
 def test_changes_are_told_together_ten_times_a_second(place: Place) -> None:
     """At once when it was quiet, and what is between the robot's being asked and its answer is not told."""
-    told: list[State] = []
+    told: list[LeaseState] = []
     place.desk.pushing.follow("me", lambda: told.append(place.desk.lease.state))
     ann = place.holding()
     place.clock.advance(0)
-    assert told == [State.HELD]
+    assert told == [LeaseState.HELD]
     for moving in (True, False) * 5:
         place.desk.told(link.Safety(holder=ann.number, moving=moving))
     place.clock.advance(0.05)

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from relay_server.control.lease import FREE, NEXT, Event, Lease, Request, State
+from relay_server.control.lease import FREE, NEXT, ControlRequest, Lease, LeaseEvent, LeaseState
 from tests.relay_server.steering import Place
 
 PLACE = Place()
@@ -20,13 +20,13 @@ def held() -> Lease:
 
 def requested() -> Lease:
     """Bob asks for it."""
-    return held().requested(Request(BOB, 3.0, 33.0, "my turn"))
+    return held().requested(ControlRequest(BOB, 3.0, 33.0, "my turn"))
 
 
 def test_nobody_has_control_before_the_robot_has_agreed() -> None:
     """Who is coming is not yet there."""
     asked = FREE.give(ANN, 1.0)
-    assert (asked.state, asked.holder) == (State.ASKING, None)
+    assert (asked.state, asked.holder) == (LeaseState.ASKING, None)
     assert asked.coming_to(ANN)
     assert not asked.held_by(ANN)
     assert held().held_by(ANN)
@@ -56,7 +56,7 @@ def test_a_lost_link_frees_it_from_every_state() -> None:
 
 def test_a_request_is_taken_back() -> None:
     """The holder holds on."""
-    assert requested().state is State.REQUESTED
+    assert requested().state is LeaseState.REQUESTED
     assert requested().requested_by(BOB)
     assert requested().withdrawn() == held()
 
@@ -64,29 +64,29 @@ def test_a_request_is_taken_back() -> None:
 def test_there_are_never_two() -> None:
     """Whatever happens in whatever order, there is at most one of holder and coming, and a request only to a holder."""
     events = {
-        Event.GIVE: lambda lease: lease.give(BOB, 1.0),
-        Event.FREE: lambda lease: lease.free(),
-        Event.DONE: lambda lease: lease.done(1.0),
-        Event.FAILED: lambda lease: lease.failed(),
-        Event.REQUEST: lambda lease: lease.requested(Request(BOB, 1.0, 2.0, "")),
-        Event.WITHDRAW: lambda lease: lease.withdrawn(),
-        Event.LOST: lambda lease: lease.lost(),
+        LeaseEvent.GIVE: lambda lease: lease.give(BOB, 1.0),
+        LeaseEvent.FREE: lambda lease: lease.free(),
+        LeaseEvent.DONE: lambda lease: lease.done(1.0),
+        LeaseEvent.FAILED: lambda lease: lease.failed(),
+        LeaseEvent.REQUEST: lambda lease: lease.requested(ControlRequest(BOB, 1.0, 2.0, "")),
+        LeaseEvent.WITHDRAW: lambda lease: lease.withdrawn(),
+        LeaseEvent.LOST: lambda lease: lease.lost(),
     }
     reached = set()
-    for path in itertools.product(Event, repeat=4):
+    for path in itertools.product(LeaseEvent, repeat=4):
         lease = FREE
         for event in path:
             if (lease.state, event) in NEXT:
                 lease = events[event](lease)
                 reached.add(lease.state)
         assert lease.holder is None or lease.coming is None
-        assert (lease.holder is not None) == (lease.state in (State.HELD, State.REQUESTED))
-        assert (lease.coming is not None) == (lease.state is State.ASKING)
-        assert (lease.request is not None) == (lease.state is State.REQUESTED)
-    assert reached == set(State)
+        assert (lease.holder is not None) == (lease.state in (LeaseState.HELD, LeaseState.REQUESTED))
+        assert (lease.coming is not None) == (lease.state is LeaseState.ASKING)
+        assert (lease.request is not None) == (lease.state is LeaseState.REQUESTED)
+    assert reached == set(LeaseState)
 
 
 def test_what_can_not_follow_is_an_error_of_ours() -> None:
     """Nobody asks for what is free."""
     with pytest.raises(ValueError, match="'request' can't happen while control is free"):
-        FREE.requested(Request(BOB, 1.0, 2.0, ""))
+        FREE.requested(ControlRequest(BOB, 1.0, 2.0, ""))

@@ -6,8 +6,8 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.errors import Unavailable
-from relay_server.control import NotDone
-from relay_server.control import orders as module
+from relay_server.control import commands as module
+from relay_server.control.commands import NotDone
 from tests.relay_server.steering import Place, outcome, result
 
 

@@ -11,25 +11,25 @@ from twisted.internet.task import Clock
 from relay_db import queries
 from relay_db.queries import StopRecord
 from relay_server.audit_log import AuditLog
-from relay_server.control import Actor, DatabaseRecord
-from relay_server.journal import BURST, Journal
-from relay_server.registry import Presence
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
+from relay_server.control.audit import Actor, DatabaseAuditSink
+from relay_server.events.bus import BURST, EventBus
+from relay_server.robots.registry import RobotState
 from tests.relay_server.memory import Time
 
 ANN = Actor("ann", "user:ann", None, "192.0.2.7", 3)
 
 
-async def made(store: Store, time: Time) -> tuple[DatabaseRecord, Presence]:
+async def made(store: AsyncDatabase, time: Time) -> tuple[DatabaseAuditSink, RobotState]:
     """A record, and a robot the database knows."""
     robot = await store.write(queries.add_robot, "rover")
-    journal = Journal(store, time)
+    journal = EventBus(store, time)
     folder = Path(store.database.url.removeprefix("sqlite:///")).parent
     audit = AuditLog(Clock(), store, folder, journal.tell)
-    return DatabaseRecord(store, journal, audit, time), Presence(robot.id, robot.name, robot.realm)
+    return DatabaseAuditSink(store, journal, audit, time), RobotState(robot.id, robot.name, robot.realm)
 
 
-async def written(store: Store) -> tuple[list[Any], list[Any]]:
+async def written(store: AsyncDatabase) -> tuple[list[Any], list[Any]]:
     """Events and audit entries, oldest first, once all is written that waits now."""
     for _ in range(5):
         await store.write(queries.revision)
@@ -37,7 +37,7 @@ async def written(store: Store) -> tuple[list[Any], list[Any]]:
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_change_is_an_event_and_an_audit_entry(store: Store, time: Time) -> None:
+async def test_a_change_is_an_event_and_an_audit_entry(store: AsyncDatabase, time: Time) -> None:
     """Both say who, which robot, why, and by which connection."""
     record, robot = await made(store, time)
     record.note("control.lost", robot, ANN, "the connection has ended", moving=True)
@@ -63,7 +63,7 @@ async def test_a_change_is_an_event_and_an_audit_entry(store: Store, time: Time)
 
 
 @pytest_twisted.ensureDeferred
-async def test_who_causes_much_is_on_record_with_all_of_it(store: Store, time: Time) -> None:
+async def test_who_causes_much_is_on_record_with_all_of_it(store: AsyncDatabase, time: Time) -> None:
     """Suppressing needs no audit entry; a flood of changes leaves few events, and an entry for each change."""
     record, robot = await made(store, time)
     record.note("robot.suppressed", robot, ANN, audit=False, resource="/cmd_vel")
@@ -75,7 +75,7 @@ async def test_who_causes_much_is_on_record_with_all_of_it(store: Store, time: T
 
 
 @pytest_twisted.ensureDeferred
-async def test_an_order_to_stop_is_kept_with_its_entry(store: Store, time: Time) -> None:
+async def test_an_order_to_stop_is_kept_with_its_entry(store: AsyncDatabase, time: Time) -> None:
     """Until it is told, and however many there are."""
     record, robot = await made(store, time)
     order = StopRecord(robot.robot_id, "ann", "smoke", 1000.5)

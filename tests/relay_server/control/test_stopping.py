@@ -7,14 +7,15 @@ import pytest
 from relay_db.queries import StopRecord
 from relay_protocol import link
 from relay_protocol.errors import Unavailable
-from relay_server.cli import relaysocket
-from relay_server.console import CONFIRM_SECONDS
-from relay_server.control import Actor, NotDone, StoppedSince
+from relay_server.cli import control_socket
 from relay_server.control import stopping as module
-from relay_server.control.stopping import SAME_SECONDS, STOP_SECONDS
-from relay_server.fleet import desk
-from relay_server.frontdesk import LOOKUP_SECONDS
-from robot_client.hardware import DYING, PATIENCE
+from relay_server.control.audit import Actor
+from relay_server.control.commands import NotDone
+from relay_server.control.service import CONFIRM_SECONDS
+from relay_server.control.stopping import SAME_SECONDS, STOP_SECONDS, StoppedSince
+from relay_server.fleet import service as desk
+from relay_server.sessions.manager import LOOKUP_SECONDS
+from robot_client.motion.hardware import DYING, PATIENCE
 from tests.relay_server.memory import World
 from tests.relay_server.steering import Place, outcome, result
 
@@ -204,7 +205,7 @@ def test_a_stop_is_waited_for_as_long_as_it_may_take_a_robot() -> None:
     assert 2 * (PATIENCE + DYING) + 1 <= STOP_SECONDS
     assert STOP_SECONDS < CONFIRM_SECONDS
     assert STOP_SECONDS + LOOKUP_SECONDS < desk.STOP_SECONDS
-    assert CONFIRM_SECONDS + LOOKUP_SECONDS < relaysocket._MOTION_SECONDS
+    assert CONFIRM_SECONDS + LOOKUP_SECONDS < control_socket._MOTION_SECONDS
 
 
 def test_what_of_it_could_not_be_done_is_told_and_the_robot_is_stopped_all_the_same() -> None:

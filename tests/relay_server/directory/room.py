@@ -7,13 +7,13 @@ from typing import Any
 import msgspec
 
 from relay_db import queries
-from relay_db.queries import NewMemory
+from relay_db.queries import NewStoredEvent
 from relay_protocol.scopes import Scope
 from relay_server.access import Access, Principal
-from relay_server.directory.desk import Kept
-from relay_server.directory.entries import Ask, Registration, ask_of, place_text
-from relay_server.directory.house import DirectoryHouse
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
+from relay_server.registry.build import RegistryParts
+from relay_server.registry.entries import EntryQuery, Registration, ask_of, place_text
+from relay_server.registry.service import Kept
 from tests.relay_server.memory import Time, World
 
 HERE = "192.0.2.7"
@@ -26,11 +26,11 @@ class Room:
     :ivar noted: what the memory was told
     """
 
-    def __init__(self, store: Store, time: Time) -> None:
+    def __init__(self, store: AsyncDatabase, time: Time) -> None:
         self.store, self.time = store, time
         self.world = World()
         self.access = Access(store, time)
-        self.noted: list[NewMemory] = []
+        self.noted: list[NewStoredEvent] = []
         self.people: dict[str, Principal] = {}
         self.robots: dict[tuple[str, str], int] = {}
         with store.database.begin() as s:
@@ -51,11 +51,11 @@ class Room:
         self.house = self.again()
         self.desk = self.house.desk
 
-    def again(self) -> DirectoryHouse:
+    def again(self) -> RegistryParts:
         """The directory of a relay that begins now."""
         world = self.world
         known = self.store, self.access, world.registry, world.channels
-        return DirectoryHouse(world.clock, *known, self.noted.append, self.time)
+        return RegistryParts(world.clock, *known, self.noted.append, self.time)
 
     def by_token(self, who: str, scope: str) -> Principal:
         """Somebody with a token for less."""
@@ -85,7 +85,7 @@ class Room:
     async def all(self, who: str | Principal = "ann", **query: str) -> list[dict[str, Any]]:
         """What somebody finds, page by page."""
         found: list[dict[str, Any]] = []
-        ask: Ask | None = ask_of(query)
+        ask: EntryQuery | None = ask_of(query)
         while ask is not None:
             page, behind = await self.desk.page(self.who(who), ask)
             assert len(page) <= ask.limit

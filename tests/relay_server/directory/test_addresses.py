@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol.errors import Invalid
-from relay_server.directory.addresses import check_address
-from relay_server.directory.limits import ADDRESS
+from relay_server.registry.entries import check_address
+from relay_server.registry.limits import ADDRESS
 
 GOOD = [
     "http://10.0.0.7:8000/",

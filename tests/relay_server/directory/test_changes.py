@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from relay_server.directory.changes import AT_ONCE, Changes
+from relay_server.registry.changes import AT_ONCE, Changes
 from tests.relay_server.directory.test_entries import RECORD
 
 ELSEWHERE = RECORD._replace(realm="lab")

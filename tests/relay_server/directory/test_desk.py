@@ -8,13 +8,13 @@ import pytest
 import pytest_twisted
 
 from relay_db import queries
-from relay_db.queries import NoRoom, Taken
+from relay_db.queries import AlreadyExists, QuotaExceeded
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError
-from relay_server.directory import desk as module
-from relay_server.directory.desk import MatchNeeded, TooManyChanges
-from relay_server.directory.entries import TooLarge
-from relay_server.directory.limits import CHANGES_AT_ONCE
-from relay_server.resources import NotAsBefore
+from relay_server.registry import service as module
+from relay_server.registry.entries import TooLarge
+from relay_server.registry.limits import CHANGES_AT_ONCE
+from relay_server.registry.service import MatchNeeded, TooManyRegistryChanges
+from relay_server.resources.etags import PreconditionFailed
 from tests.relay_server.directory.room import HERE, Room
 
 
@@ -129,7 +129,7 @@ async def test_who_begins_anew_gets_his_entry_back(room: Room) -> None:
     room.time.now += 10
     again = await room.register(description="again")
     assert (again["id"], again["fresh"], again["expires"]) == (first["id"], False, 1070.0)
-    with pytest.raises(Taken, match="ann has registered"):
+    with pytest.raises(AlreadyExists, match="ann has registered"):
         await room.register("root")
     await room.register("bob", robot="hidden")
     assert [each[0] for each in room.memory()] == ["registered", "registered"]
@@ -164,12 +164,12 @@ async def test_an_entry_is_changed_only_as_it_was_read(room: Room) -> None:
     read = await room.register()
     with pytest.raises(MatchNeeded):
         await room.put("ann", read["id"], description="b")
-    with pytest.raises(NotAsBefore):
+    with pytest.raises(PreconditionFailed):
         await room.put("ann", read["id"], '"other"', description="b")
     changed = await room.put("ann", read["id"], read["etag"], description="b", ttl=5)
     assert (changed["description"], changed["expires"]) == ("b", 1005.0)
     for match in (read["etag"], f"W/{changed['etag']}"):
-        with pytest.raises(NotAsBefore):
+        with pytest.raises(PreconditionFailed):
             await room.put("ann", read["id"], match)
     assert (await room.put("ann", read["id"], "*", description="c"))["description"] == "c"
     for fields in ({"name": "other"}, {"kind": "application"}, {"robot": "rover"}):
@@ -185,7 +185,7 @@ async def test_an_entry_is_removed_by_its_user_or_an_administrator(room: Room) -
         await room.remove("bob", mine)
     with pytest.raises(NotFound):
         await room.remove("cleo", mine)
-    with pytest.raises(NotAsBefore):
+    with pytest.raises(PreconditionFailed):
         await room.remove("ann", mine, '"x"')
     await room.remove("ann", mine)
     with pytest.raises(NotFound):
@@ -213,10 +213,10 @@ async def test_there_is_room_for_so_many(room: Room, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(module, "OF_REALM", 3)
     for name in ("a", "b"):
         await room.register(name=name)
-    with pytest.raises(NoRoom, match="a user has 2"):
+    with pytest.raises(QuotaExceeded, match="a user has 2"):
         await room.register(name="c")
     await room.register("root", name="c")
-    with pytest.raises(NoRoom, match="holds 3"):
+    with pytest.raises(QuotaExceeded, match="holds 3"):
         await room.register("root", name="d")
     await room.register("cleo")
 
@@ -228,7 +228,7 @@ async def test_who_changes_too_much_has_to_wait(room: Room) -> None:
         with pytest.raises(NotFound):
             await room.register(robot="nowhere")
     for work in (room.register(), room.put("ann", "x"), room.remove("ann", "x")):
-        with pytest.raises(TooManyChanges):
+        with pytest.raises(TooManyRegistryChanges):
             await work
     await room.register("root")
     room.world.clock.advance(1)

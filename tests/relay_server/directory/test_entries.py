@@ -7,19 +7,19 @@ from typing import Any
 import msgspec
 import pytest
 
-from relay_db.queries import EntryPlace, EntryRecord
+from relay_db.queries import EntryCursor, EntryRecord
 from relay_protocol.errors import Invalid
-from relay_server.directory.entries import (
-    Ask,
-    Entry,
+from relay_server.registry.entries import (
+    EntryQuery,
     Registration,
+    RegistryEntry,
     TooLarge,
     ask_of,
     check_words,
     data_text,
     place_text,
 )
-from relay_server.directory.limits import DATA
+from relay_server.registry.limits import DATA
 
 RECORD = EntryRecord(
     "a1", "default", "service", "map", "http://a/", "", 1, "rover", 2, "ann", '{"a":1}', 60.0, 10.12345, 70.0
@@ -72,7 +72,7 @@ def test_data_is_a_small_object() -> None:
 
 def test_an_entry_is_told_with_its_lease() -> None:
     """Which no clock that was set back prolongs."""
-    told = msgspec.json.decode(msgspec.json.encode(Entry.of(RECORD, 20.0).told()))
+    told = msgspec.json.decode(msgspec.json.encode(RegistryEntry.of(RECORD, 20.0).told()))
     assert told == {
         "id": "a1",
         "kind": "service",
@@ -86,17 +86,17 @@ def test_an_entry_is_told_with_its_lease() -> None:
         "registered": 10.123,
         "expires": 70.0,
     }
-    assert Entry.of(RECORD, 5.0).told()["expires"] == 65.0
+    assert RegistryEntry.of(RECORD, 5.0).told()["expires"] == 65.0
 
 
 def test_a_query_becomes_what_is_asked() -> None:
     """Names, patterns, how many, and from where on."""
-    place = EntryPlace("rover", "service", "Karte für alle", "a1")
+    place = EntryCursor("rover", "service", "Karte für alle", "a1")
     query = {"kind": "service", "robot": "r*", "name": "K*", "realm": "lab", "limit": "1000"}
     asked = ask_of({**query, "after": place_text(place)})
-    assert asked == Ask("service", "r*", "K*", "lab", 1000, place)
-    assert ask_of({}) == Ask()
-    longest = EntryPlace("r" * 63, "service", "/" + "x" * 254, f"service:{'r' * 63}:/{'x' * 254}")
+    assert asked == EntryQuery("service", "r*", "K*", "lab", 1000, place)
+    assert ask_of({}) == EntryQuery()
+    longest = EntryCursor("r" * 63, "service", "/" + "x" * 254, f"service:{'r' * 63}:/{'x' * 254}")
     assert ask_of({"after": place_text(longest)}).after == longest
 
 

@@ -11,8 +11,8 @@ from twisted.internet.task import deferLater
 
 from relay_db import queries
 from relay_server.access import Principal
-from relay_server.directory.entries import Ask
-from relay_server.directory.limits import LOOK_SECONDS, SURE_SECONDS
+from relay_server.registry.entries import EntryQuery
+from relay_server.registry.limits import LOOK_SECONDS, SURE_SECONDS
 from tests.harness.switchboard_waiting import PATIENCE
 from tests.relay_server.directory.room import Room
 
@@ -29,7 +29,7 @@ async def until(room: Room, condition: Callable[[], Any]) -> None:
 
 async def heard(room: Room, who: Principal, follower: Any) -> list[tuple[str, str]]:
     """What a follower is told, and of which name."""
-    told, _, _ = await room.desk.news(who, Ask(), follower)
+    told, _, _ = await room.desk.news(who, EntryQuery(), follower)
     return [(what, entry["name"]) for _, what, entry in told]
 
 
@@ -139,7 +139,7 @@ async def test_who_follows_hears_of_what_he_may_see(room: Room) -> None:
         await room.remove("ann", id)
         mine = [("registered", "map"), ("changed", "map"), ("changed", "map"), ("removed", "map")]
         assert await heard(room, ann, of_ann) == mine
-        told, missed, more = await room.desk.news(bob, Ask(robot="h*"), of_bob)
+        told, missed, more = await room.desk.news(bob, EntryQuery(robot="h*"), of_bob)
         assert [(what, entry["name"]) for _, what, entry in told] == [("registered", "secret")]
         assert not missed and not more
         assert await heard(room, cleo, of_cleo) == []

@@ -11,9 +11,9 @@ import pytest_twisted
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused
-from relay_server.directory import own
-from relay_server.local.view import seen, view
-from relay_server.registry import Presence
+from relay_server.registry import robot_entries
+from relay_server.relay_node.view import seen, view
+from relay_server.robots.registry import RobotState
 from tests.relay_server.directory.room import Room, read
 from tests.relay_server.memory import STRING, TRIGGER
 
@@ -100,9 +100,9 @@ async def test_nobody_sees_more_than_by_his_rights(there: Room) -> None:
 @pytest_twisted.ensureDeferred
 async def test_a_robot_that_is_away_has_what_the_relay_offers(room: Room) -> None:
     """As in the lists of resources."""
-    away = Presence(9, "away", "default")
+    away = RobotState(9, "away", "default")
     ((_, rules),) = await room.access.robots(room.people["ann"])
-    names = list(seen(away, own.Ends(), rules).services)
+    names = list(seen(away, robot_entries.OwnEndpoints(), rules).services)
     assert [each["name"] for each in await of_rover(room, kind="service")] == names
     assert all(each.startswith(("/relay/", "/rosapi/")) for each in names)
 
@@ -146,7 +146,7 @@ async def test_pages_join_all_in_one_order(there: Room, monkeypatch: pytest.Monk
     assert len([each for each in whole if each["user"]]) == 7 and len(whole) > 90
     for limit in ("1", "7", "100"):
         assert await there.all("bob", limit=limit) == whole
-    monkeypatch.setattr(own, "LOOKED_AT", 45)
+    monkeypatch.setattr(robot_entries, "LOOKED_AT", 45)
     for limit in ("2", "1000"):
         assert await there.all("bob", limit=limit) == whole
     wanted = [each for each in whole if each["name"].startswith("/")]
@@ -158,7 +158,7 @@ async def test_an_entry_that_fits_far_behind_is_found_all_the_same(
     there: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pages on the way there are empty, and say where to go on."""
-    monkeypatch.setattr(own, "LOOKED_AT", 25)
+    monkeypatch.setattr(robot_entries, "LOOKED_AT", 25)
     await there.register(kind="zoo", name="needle", robot="rover")
     assert [each["kind"] for each in await there.all("bob", name="needle")] == ["zoo"]
     assert await there.all("bob", name="/cha*r") == [

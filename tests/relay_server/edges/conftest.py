@@ -6,13 +6,13 @@ import pytest
 
 from relay_db import queries
 from relay_protocol import identity
-from relay_server import passwords
-from relay_server.store import Store
+from relay_server.auth import passwords
+from relay_server.common.database import AsyncDatabase
 from tests.relay_server.edges.robot_ends import FINGERPRINT, KEY, Hall
 
 
 @pytest.fixture
-def hall(store: Store) -> Hall:
+def hall(store: AsyncDatabase) -> Hall:
     """A relay's end for robots; its database knows the key of r2-d2."""
     with store.database.begin() as session:
         robot = queries.add_robot(session, "r2-d2")

@@ -16,20 +16,20 @@ from twisted.internet.testing import StringTransportWithDisconnection
 
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import BadCredentials, Principal
-from relay_server.auth import Opening, TooManyTries
-from relay_server.edges.api import Api
-from relay_server.edges.caps import AddressCap
-from relay_server.edges.documents import Documents
-from relay_server.edges.handshake import Handshake
-from relay_server.edges.limiting import RequestLimits
-from relay_server.edges.pages import PageFactory, PageGate
-from relay_server.edges.robot_pages import RobotPages
-from relay_server.edges.site import Missing, RelaySite, Robots, Root
-from relay_server.edges.sources import Sources
-from relay_server.edges.static_files import Portal
-from relay_server.edges.websocket import ClientFactory
-from relay_server.origins import Origins
-from relay_server.session import Timing
+from relay_server.auth.authenticator import TicketPurpose, TooManyTries
+from relay_server.auth.origins import Origins
+from relay_server.http.api import Api
+from relay_server.http.connection_limits import ConnectionLimits
+from relay_server.http.openapi.http import ApiDocuments
+from relay_server.http.rate_limits import RequestLimits
+from relay_server.http.site import Missing, RelaySite, RobotAddress, Root
+from relay_server.http.static_files import Portal
+from relay_server.http.update_sources import Sources
+from relay_server.resources.robots_http import RobotResource
+from relay_server.sessions.ports import Timing
+from relay_server.ws.client import ClientFactory
+from relay_server.ws.updates import UpdatesFactory, UpdatesGate
+from relay_server.ws.upgrade import WebSocketUpgrade
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 ROOT = Principal(2, "root", "default", True, 2, None)
@@ -46,7 +46,7 @@ class MemoryDesk:
         self.tokens = {"ann": ANN, "root": ROOT}
         self.up = True
         self.listeners: list[Callable[[], None]] = []
-        self.tickets: list[Opening] = []
+        self.tickets: list[TicketPurpose] = []
 
     async def password(self, user: str, password: str, address: str) -> tuple[Principal, str]:
         """One password is right, one too many."""
@@ -86,7 +86,7 @@ class MemoryDesk:
         """One robot."""
         return [{"name": "rover", "seen by": principal.name}]
 
-    async def issue_ticket(self, principal: Principal, opens: Opening) -> str:
+    async def issue_ticket(self, principal: Principal, opens: TicketPurpose) -> str:
         """A ticket for the one robot."""
         if opens.robot != "rover":
             raise NotFound("there is no such robot, or you have no right on it")
@@ -171,7 +171,7 @@ def api_of(
         CollectorRegistry(),
         {} if below is None else below,
         {} if beside is None else beside,
-        RobotPages(desk, cast(Any, AtOnce())),
+        RobotResource(desk, cast(Any, AtOnce())),
         sources or Sources(clock, {}, lambda listener: lambda: None),
         cookie="sb",
         secure=tls,
@@ -200,7 +200,7 @@ class World:
     ) -> None:
         self.clock: Any = clock or Clock()
         self.desk = MemoryDesk()
-        self.cap = AddressCap(4)
+        self.cap = ConnectionLimits(4)
         origins = Origins("https" if tls else "http")
         self.below: dict[str, Any] = {}
         self.beside: dict[str, Any] = {}
@@ -210,11 +210,11 @@ class World:
         sources = Sources(self.clock, told, self.desk.on_change)
         parts = self.below, self.beside, sources
         api = api_of(self.clock, self.desk, origins, *parts, tls=tls, limits=limits)
-        websocket = Handshake(ClientFactory(self.clock, lambda: 0, self.desk, self.cap, limits))  # type: ignore[arg-type]
-        self.pages = PageGate(self.clock, self.desk, origins, "sb", sources)
-        pages = Handshake(PageFactory(self.clock, lambda: 0, self.pages, self.cap, limits))
-        robots = Robots(websocket, Missing(), "1.2.3")
-        documents = Documents(limits, "1.2.3", "sb").app.resource() if documented else None
+        websocket = WebSocketUpgrade(ClientFactory(self.clock, lambda: 0, self.desk, self.cap, limits))  # type: ignore[arg-type]
+        self.pages = UpdatesGate(self.clock, self.desk, origins, "sb", sources)
+        pages = WebSocketUpgrade(UpdatesFactory(self.clock, lambda: 0, self.pages, self.cap, limits))
+        robots = RobotAddress(websocket, Missing(), "1.2.3")
+        documents = ApiDocuments(limits, "1.2.3", "sb").app.resource() if documented else None
         root = Root(robots, api.app.resource(), Missing(), Portal(folder), pages, documents)
         self.site = RelaySite(root, self.clock, self.cap, tls, limits)
 

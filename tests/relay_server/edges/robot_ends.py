@@ -15,12 +15,12 @@ from twisted.python.failure import Failure
 
 from relay_protocol import PROTOCOL_VERSION, identity, jsontext, limits, link
 from relay_protocol.frames import FrameDecoder, JsonFrame, encode_json
-from relay_server.edges.caps import AddressCap
-from relay_server.edges.robot_roles import Opening, RobotHall
-from relay_server.edges.robots import LinkTiming, RobotConnection, RobotFactory
-from relay_server.journal import Journal
-from relay_server.registry import Presence, Registry
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
+from relay_server.events.bus import EventBus
+from relay_server.http.connection_limits import ConnectionLimits
+from relay_server.robots.connection import LinkTiming, RobotConnection, RobotFactory
+from relay_server.robots.link_roles import HandshakeRole, RobotLinkContext
+from relay_server.robots.registry import RobotRegistry, RobotState
 from tests.relay_server.memory import World
 
 RELAY = "lab relay"
@@ -57,17 +57,17 @@ class Transport(StringTransportWithDisconnection):
 class Hall:
     """A relay's end for robots, with one enrolled robot."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: AsyncDatabase) -> None:
         self.world = World()
         self.store = store
-        self.registry = Registry(lambda: 1000.0)
-        self.cap = AddressCap(3)
+        self.registry = RobotRegistry(lambda: 1000.0)
+        self.cap = ConnectionLimits(3)
         clock = self.world.clock
-        self.journal = Journal(store, clock.seconds)
+        self.journal = EventBus(store, clock.seconds)
         self.told: list[tuple[str, dict[str, Any]]] = []
         """Kinds and data of events."""
         self.journal.listen(lambda kind, _, data: self.told.append((kind, data)))
-        self.hall = RobotHall(
+        self.hall = RobotLinkContext(
             RELAY,
             store,
             self.registry,
@@ -81,7 +81,7 @@ class Hall:
         timing = LinkTiming(2.0)
         self.factory = RobotFactory(
             lambda: RobotConnection(
-                clock, self.world.now_ns, timing, lambda each: Opening(self.hall, each), self.cap
+                clock, self.world.now_ns, timing, lambda each: HandshakeRole(self.hall, each), self.cap
             )
         )
 
@@ -96,7 +96,7 @@ class Hall:
         return robot
 
     @property
-    def presence(self) -> Presence | None:
+    def presence(self) -> RobotState | None:
         """The robot as the registry sees it."""
         return next((robot for robot in self.registry if robot.name == "r2-d2"), None)
 

@@ -10,9 +10,9 @@ from twisted.internet.task import Clock
 from twisted.web.server import Site
 
 from relay_protocol.errors import Unavailable
-from relay_server.console import Halted
-from relay_server.edges.admin import AdminSocket
-from relay_server.edges.fleet import SENT_HEADER
+from relay_server.control.service import StopAllResult
+from relay_server.fleet.http import SENT_HEADER
+from relay_server.http.admin_socket import AdminSocket
 from tests.relay_server.edges.http_client import Answer, Transport, parse
 
 
@@ -24,9 +24,9 @@ class Stopping:
 
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
-        self.halted: Halted | Unavailable = Halted([{"robot": "rover", "done": True}])
+        self.halted: StopAllResult | Unavailable = StopAllResult([{"robot": "rover", "done": True}])
 
-    async def stop_here(self, robot: str | None, why: str, by: str) -> Halted:
+    async def stop_here(self, robot: str | None, why: str, by: str) -> StopAllResult:
         """Keep it."""
         self.asked.append((robot, why, by))
         if isinstance(self.halted, Unavailable):
@@ -74,7 +74,7 @@ def test_no_stop_is_refused_for_its_reason(stopping: Stopping, why: bytes, kept:
 
 def test_what_could_not_be_looked_up_is_told(stopping: Stopping) -> None:
     """With what was stopped all the same; where that is nothing, the order has failed."""
-    stopping.halted = Halted([{"robot": "rover", "done": True}], "the database does not answer")
+    stopping.halted = StopAllResult([{"robot": "rover", "done": True}], "the database does not answer")
     order = json.dumps({"by": "root"}).encode()
     assert post(stopping, "/stop", order).json["missed"] == "the database does not answer"
     stopping.halted = Unavailable("the database does not answer")

@@ -10,9 +10,9 @@ import pytest
 
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
-from relay_server.alerts import Ask, Position
-from relay_server.alerts.desk import TooOften
-from relay_server.edges import alerts as module
+from relay_server.alerts import http as module
+from relay_server.alerts.rules import RuleRequest
+from relay_server.alerts.service import AlertCursor, TooManyRuleChanges
 from tests.relay_server.edges.http_client import World
 
 HERE = "/api/v1/alerts"
@@ -26,7 +26,7 @@ class Desk:
         self.asked: list[tuple[object, ...]] = []
 
     async def all(
-        self, principal: Principal, robot: str, open: bool | None, limit: int, before: Position | None
+        self, principal: Principal, robot: str, open: bool | None, limit: int, before: AlertCursor | None
     ) -> list[dict[str, Any]]:
         """Three, or as many as are asked for."""
         self.asked.append((principal.name, robot, open, limit, before))
@@ -42,7 +42,7 @@ class Desk:
         """None."""
         return {"rules": []}
 
-    async def add_rule(self, principal: Principal, ask: Ask, address: str) -> dict[str, Any]:
+    async def add_rule(self, principal: Principal, ask: RuleRequest, address: str) -> dict[str, Any]:
         """Any."""
         self.asked.append((principal.name, ask, address))
         return {"id": 7}
@@ -54,7 +54,7 @@ class Desk:
     async def test_rule(self, principal: Principal, number: int) -> dict[str, Any]:
         """Not twice."""
         if number == 8:
-            raise TooOften("you test rules", 11.5)
+            raise TooManyRuleChanges("you test rules", 11.5)
         return {"ok": True, "reason": ""}
 
 
@@ -87,7 +87,7 @@ def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     assert world.ask("GET", f"{HERE}/rules", **ANN).json == {"rules": []}
     answer = world.ask("POST", f"{HERE}/rules", {"channel": "portal", "group_s": 30}, **ANN)
     assert (answer.status, answer.json) == (201, {"id": 7})
-    assert desk.asked[-1] == ("ann", Ask("portal", group_s=30.0), "192.0.2.9")
+    assert desk.asked[-1] == ("ann", RuleRequest("portal", group_s=30.0), "192.0.2.9")
     assert world.ask("DELETE", f"{HERE}/rules/7", **ANN).status == 204
     assert desk.asked[-1] == ("ann", 7, "192.0.2.9")
     assert world.ask("DELETE", f"{HERE}/rules/{2**31 - 1}", **ANN).status == 204
@@ -100,7 +100,7 @@ def test_a_list_goes_on_where_it_ended(world: World, desk: Desk) -> None:
     page = world.ask("GET", f"{HERE}?limit=2", **ANN).json
     assert [each["id"] for each in page["alerts"]] == ["a0", "a1"]
     world.ask("GET", f"{HERE}?limit=2&before={page['next']}", **ANN)
-    assert desk.asked[-1] == ("ann", "", None, 3, Position(1e9 - 1 / 3, "a1"))
+    assert desk.asked[-1] == ("ann", "", None, 3, AlertCursor(1e9 - 1 / 3, "a1"))
     assert world.ask("GET", f"{HERE}?limit=3", **ANN).json["next"] is None
 
 

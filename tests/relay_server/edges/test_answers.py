@@ -9,9 +9,9 @@ import pytest
 from twisted.internet.abstract import FileDescriptor
 from twisted.internet.address import IPv4Address
 
-from relay_server.edges import caps
-from relay_server.edges import site as module
-from relay_server.edges.caps import Unsent
+from relay_server.http import connection_limits
+from relay_server.http import site as module
+from relay_server.http.connection_limits import Unsent
 from tests.relay_server.edges.http_client import World, parse
 
 ASSET = 300_000
@@ -202,7 +202,7 @@ def test_a_pipelined_request_that_lasts_is_not_cut_as_idle(world: World) -> None
 def test_what_one_network_does_not_take_is_bounded(tmp_path: Path) -> None:
     """The connection that has waited longest is cut; those of other networks are left alone."""
     world = World(tmp_path)
-    world.cap = world.site.cap = caps.AddressCap(100)
+    world.cap = world.site.cap = connection_limits.ConnectionLimits(100)
     world.site.unsent = Unsent(most=1_000_000)
     body = b"x" * 400_000
     transports = [Socket(world, address) for address in ("192.0.2.9",) * 4 + ("203.0.113.5",)]

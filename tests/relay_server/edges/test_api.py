@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from relay_server.auth import Opening
+from relay_server.auth.authenticator import TicketPurpose
 from tests.relay_server.edges.http_client import ORIGIN, World
 
 SESSION = "/api/v1/session"
@@ -145,17 +145,17 @@ def test_robots_are_told_in_pages_and_once(world: World) -> None:
 @pytest.mark.parametrize(
     ("fields", "opens"),
     [
-        ({}, Opening("rover")),
-        ({"for": "robot"}, Opening("rover")),
-        ({"for": "video"}, Opening("rover", video=True)),
-        ({"for": "video", "camera": "/eye"}, Opening("rover", video=True, camera="/eye")),
+        ({}, TicketPurpose("rover")),
+        ({"for": "robot"}, TicketPurpose("rover")),
+        ({"for": "video"}, TicketPurpose("rover", video=True)),
+        ({"for": "video", "camera": "/eye"}, TicketPurpose("rover", video=True, camera="/eye")),
         ({"camera": "/eye"}, None),
         ({"for": "everything"}, None),
         ({"for": "video", "camera": "x" * 1000}, None),
     ],
 )
 def test_a_ticket_is_for_the_websocket_or_for_cameras(
-    world: World, fields: dict[str, str], opens: Opening | None
+    world: World, fields: dict[str, str], opens: TicketPurpose | None
 ) -> None:
     """What makes no sense is told."""
     answer = world.ask("POST", "/api/v1/tickets", {"robot": "rover", **fields}, Authorization="Bearer ann")

@@ -11,9 +11,11 @@ import pytest
 
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
-from relay_server.edges import cameras as module
-from relay_server.resources import HEADER, Asker, CameraDesk, Moments
-from relay_server.resources.forms import FORMS
+from relay_server.common.freshness_tokens import HEADER, FreshnessTokens
+from relay_server.http.media_types import FORMS
+from relay_server.resources import cameras_http as module
+from relay_server.resources.cameras import CameraService
+from relay_server.resources.service import RequestOrigin
 from tests.relay_server.edges.http_client import World
 
 HERE = "/api/v1/robots/rover/cameras"
@@ -39,7 +41,7 @@ async def look(principal: Principal, robot: str) -> list[dict[str, Any]]:
 class Desk:
     """Makes what takes long."""
 
-    async def made(self, asker: Asker, work: Callable[[], Any]) -> Any:
+    async def made(self, asker: RequestOrigin, work: Callable[[], Any]) -> Any:
         """Here and now."""
         return work()
 
@@ -49,7 +51,7 @@ def world(tmp_path: Path) -> World:
     """A site with the cameras of one robot."""
     made = World(tmp_path)
     desk: Any = Desk()
-    made.below["cameras"] = partial(module.below, CameraDesk(look), Moments(lambda: 1), desk)
+    made.below["cameras"] = partial(module.below, CameraService(look), FreshnessTokens(lambda: 1), desk)
     return made
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from relay_server.edges.caps import AddressCap
+from relay_server.http.connection_limits import ConnectionLimits
 
 
 def test_a_network_of_addresses_counts_as_one() -> None:
     """Whoever has a /64 of IPv6 has no more places than others; an IPv4 address is one however it is written."""
-    cap = AddressCap(2)
+    cap = ConnectionLimits(2)
     assert cap.enter("2001:db8::1")
     assert cap.enter("2001:db8::2")
     assert not cap.enter("2001:db8::3")
@@ -22,7 +22,7 @@ def test_a_network_of_addresses_counts_as_one() -> None:
 
 def test_a_place_is_given_back_once() -> None:
     """Known first and gone later is one place, not two."""
-    cap = AddressCap(2, strangers=1)
+    cap = ConnectionLimits(2, strangers=1)
     place = cap.stranger()
     assert place is not None
     assert cap.stranger() is None
@@ -34,7 +34,7 @@ def test_a_place_is_given_back_once() -> None:
 
 def test_nothing_is_kept_of_who_has_left() -> None:
     """Addresses without end fill no memory."""
-    cap = AddressCap(2)
+    cap = ConnectionLimits(2)
     for number in range(100):
         cap.enter(f"192.0.2.{number}")
         cap.leave(f"192.0.2.{number}")

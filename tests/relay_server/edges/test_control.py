@@ -10,11 +10,13 @@ import pytest
 
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import Principal
-from relay_server.console import Outcome, Taken
-from relay_server.control import Answer, NotDone, StoppedSince
-from relay_server.edges import control as module
-from relay_server.inside import LINGER_SECONDS
-from relay_server.moments import HEADER, Moments
+from relay_server.common.freshness_tokens import HEADER, FreshnessTokens
+from relay_server.control import http as module
+from relay_server.control.commands import NotDone
+from relay_server.control.service import StopResult, TakeResult
+from relay_server.control.stopping import StoppedSince
+from relay_server.control.types import ControlReply
+from relay_server.http_sessions.pool import LINGER_SECONDS
 from tests.relay_server.edges.http_client import ORIGIN, World
 
 HERE = "/api/v1/robots/rover"
@@ -45,36 +47,42 @@ class Console:
             raise NotFound("there is no such robot, or you have no right on it")
         return {"robot": robot, "stopped": STOPPED}
 
-    async def take(self, principal: Principal, robot: str, why: str, address: str, seconds: float) -> Taken:
+    async def take(
+        self, principal: Principal, robot: str, why: str, address: str, seconds: float
+    ) -> TakeResult:
         """Keep it."""
         self._keep("take", principal, robot, why, address, seconds)
-        return Taken(Answer(self.done, "you have control"), {"robot": robot})
+        return TakeResult(ControlReply(self.done, "you have control"), {"robot": robot})
 
     async def let_go(self, principal: Principal, robot: str, address: str) -> None:
         """Keep it."""
         self._keep("let go", principal, robot, address)
 
-    async def release(self, principal: Principal, robot: str, why: str, address: str) -> Answer:
+    async def release(self, principal: Principal, robot: str, why: str, address: str) -> ControlReply:
         """Keep it."""
         self._keep("release", principal, robot, why, address)
-        return Answer(True, "control is given back")
+        return ControlReply(True, "control is given back")
 
-    async def grant(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
+    async def grant(
+        self, principal: Principal, robot: str, why: str, address: str, client: int
+    ) -> ControlReply:
         """Keep it."""
         self._keep("grant", principal, robot, why, address, client)
         raise NotDone("nobody asks for control")
 
-    async def refuse(self, principal: Principal, robot: str, why: str, address: str, client: int) -> Answer:
+    async def refuse(
+        self, principal: Principal, robot: str, why: str, address: str, client: int
+    ) -> ControlReply:
         """Keep it."""
         self._keep("refuse", principal, robot, why, address, client)
-        return Answer(True, "you keep control")
+        return ControlReply(True, "you keep control")
 
-    async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
+    async def stop(self, principal: Principal, robot: str, why: str, address: str) -> StopResult:
         """Keep it."""
         if isinstance(self.fails, NotDone):
-            return Outcome(False, STOPPED, str(self.fails))
+            return StopResult(False, STOPPED, str(self.fails))
         self._keep("stop", principal, robot, why, address)
-        return Outcome(self.done, {**STOPPED, "told": self.done})
+        return StopResult(self.done, {**STOPPED, "told": self.done})
 
     async def resume(self, principal: Principal, robot: str, why: str, address: str, sent: int) -> None:
         """Keep it."""
@@ -98,7 +106,7 @@ class Site(World):
         super().__init__(folder, rate=rate)
         self.console = Console()
         self.now = 1000
-        self.moments = Moments(lambda: self.now)
+        self.moments = FreshnessTokens(lambda: self.now)
         self.below.update(
             {part: partial(module.below, self.console, self.moments, part) for part in module.PARTS}
         )

@@ -16,14 +16,14 @@ from twisted.internet import reactor
 from twisted.internet.defer import Deferred
 from twisted.internet.threads import deferToThread
 
-from relay_db.queries import EntryPlace, NoRoom, Taken
+from relay_db.queries import AlreadyExists, EntryCursor, QuotaExceeded
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_server.access import BadCredentials, Principal
-from relay_server.directory.desk import Kept, MatchNeeded, TooManyChanges
-from relay_server.directory.entries import Ask, Registration, TooLarge
-from relay_server.edges import directory as module
-from relay_server.memory import Following
-from relay_server.resources import NotAsBefore
+from relay_server.events.service import EventFollower
+from relay_server.registry import http as module
+from relay_server.registry.entries import EntryQuery, Registration, TooLarge
+from relay_server.registry.service import Kept, MatchNeeded, TooManyRegistryChanges
+from relay_server.resources.etags import PreconditionFailed
 from tests.harness.switchboard_waiting import PATIENCE
 from tests.relay_server.edges.http_client import Transport, World
 
@@ -41,7 +41,7 @@ class Desk:
         self.fresh = True
         self.news_to_tell: list[tuple[str, str, dict[str, Any]]] = []
         self.missed = False
-        self.followers: list[Following] = []
+        self.followers: list[EventFollower] = []
 
     def _see(self, *asked: Any) -> Kept:
         if self.error is not None:
@@ -49,10 +49,12 @@ class Desk:
         self.asked.append(asked)
         return Kept(b'{"id":"a1"}', '"tag"', "a1", self.fresh)
 
-    async def page(self, principal: Principal, ask: Ask) -> tuple[list[dict[str, Any]], EntryPlace | None]:
+    async def page(
+        self, principal: Principal, ask: EntryQuery
+    ) -> tuple[list[dict[str, Any]], EntryCursor | None]:
         """One, with more behind it but for the last."""
         self._see(ask)
-        behind = EntryPlace("", "service", "map", "a1") if ask.after is None else None
+        behind = EntryCursor("", "service", "map", "a1") if ask.after is None else None
         return [{"id": "a1"}], behind
 
     async def one(self, principal: Principal, entry_id: str) -> Kept:
@@ -74,21 +76,21 @@ class Desk:
         self._see("remove", entry_id, match, address)
 
     @contextmanager
-    def following(self, principal: Principal, last: str | None) -> Iterator[tuple[Following, bool]]:
+    def following(self, principal: Principal, last: str | None) -> Iterator[tuple[EventFollower, bool]]:
         """Keep it."""
         self.asked.append(last)
-        follower = Following(7)
+        follower = EventFollower(7)
         self.followers.append(follower)
         try:
             yield follower, last == "old-1"
         finally:
             self.followers.remove(follower)
 
-    def mark(self, follower: Following) -> str:
+    def mark(self, follower: EventFollower) -> str:
         """Of this run."""
         return f"run-{follower.number}"
 
-    async def news(self, principal: Principal, ask: Ask, follower: Following) -> Any:
+    async def news(self, principal: Principal, ask: EntryQuery, follower: EventFollower) -> Any:
         """What the test has made."""
         follower.fresh = False
         if self.error is not None:
@@ -168,12 +170,12 @@ def test_an_entry_is_renewed_changed_and_removed(world: World, desk: Desk) -> No
         (NotFound("x"), 404),
         (Refused("x"), 403),
         (Invalid("x"), 400),
-        (Taken("x"), 409),
-        (NoRoom("x"), 409),
+        (AlreadyExists("x"), 409),
+        (QuotaExceeded("x"), 409),
         (TooLarge("x"), 413),
         (MatchNeeded("x"), 428),
-        (NotAsBefore("x"), 412),
-        (TooManyChanges("x"), 429),
+        (PreconditionFailed("x"), 412),
+        (TooManyRegistryChanges("x"), 429),
         (Unavailable("x"), 503),
     ],
     ids=lambda each: type(each).__name__,

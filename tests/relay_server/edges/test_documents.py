@@ -18,13 +18,13 @@ from klein import Klein
 from openapi_spec_validator import OpenAPIV31SpecValidator
 from twisted.internet.task import Clock
 
-from relay_server import edges
-from relay_server.edges.admin import AdminSocket
-from relay_server.edges.documents import SERVED, Documents, operations
-from relay_server.edges.video.resource import Video
-from relay_server.fleet import StopOrder
-from relay_server.openapi import Operation, operations_in
-from relay_server.rounds import Rounds
+import relay_server
+from relay_server.common.timers import PeriodicTimers
+from relay_server.fleet.order import FleetStopOrder
+from relay_server.http.admin_socket import AdminSocket
+from relay_server.http.openapi.http import SERVED, ApiDocuments, operations
+from relay_server.http.openapi.operation import ApiOperation, operations_in
+from relay_server.video.http import VideoResource
 from tests.relay_server.edges.http_client import World
 
 BRANCHES = {"below", "beside"}
@@ -32,8 +32,8 @@ BRANCHES = {"below", "beside"}
 
 
 def modules() -> Iterator[Any]:
-    """All modules of the edge."""
-    for found in pkgutil.walk_packages(edges.__path__, f"{edges.__name__}."):
+    """All modules of the relay."""
+    for found in pkgutil.walk_packages(relay_server.__path__, "relay_server."):
         yield importlib.import_module(found.name)
 
 
@@ -65,7 +65,7 @@ def world(tmp_path: Path) -> World:
 @pytest.mark.parametrize("kind", applications(), ids=lambda kind: kind.__name__)
 def test_every_route_is_described(kind: Any) -> None:
     """Each with its methods and its address; and whoever has routes is among those that are told of."""
-    assert kind in (*SERVED, Documents)
+    assert kind in (*SERVED, ApiDocuments)
     app = kind.app
     for rule in app.url_map.iter_rules():
         if rule.endpoint.removesuffix("_branch") in BRANCHES:
@@ -83,8 +83,11 @@ def test_every_route_is_described(kind: Any) -> None:
 def test_what_is_no_route_of_klein_is_described() -> None:
     """Of a robot's cameras: all addresses that are answered, and the websocket's."""
     clock = Clock()
-    video: Any = Video(clock, Rounds(clock), None, None, None)  # type: ignore[arg-type]
-    told = {each.path.removeprefix("/robots/{robot}/video/") for each in operations_in(vars(Video).values())}
+    video: Any = VideoResource(clock, PeriodicTimers(clock), None, None, None)  # type: ignore[arg-type]
+    told = {
+        each.path.removeprefix("/robots/{robot}/video/")
+        for each in operations_in(vars(VideoResource).values())
+    }
     assert told == {each.decode() for each in video._answers} | {"ws"}
 
 
@@ -99,7 +102,7 @@ def test_the_bodies_described_are_those_that_are_validated() -> None:
                 if name != "kind":
                     read.add(id(vars(module)[name]))
     told = {id(each.body) for each in operations() if each.media[0] == "application/json" and each.body}
-    assert read - {id(StopOrder)} == told
+    assert read - {id(FleetStopOrder)} == told
 
 
 def test_what_an_operation_needs_is_told_once() -> None:
@@ -144,7 +147,7 @@ def test_documents_are_only_read(world: World, path: str) -> None:
 def test_each_operation_says_what_it_is() -> None:
     """A summary of few words, and at least one answer that is no error."""
     for each in operations():
-        assert isinstance(each, Operation)
+        assert isinstance(each, ApiOperation)
         assert 0 < len(each.summary) < 80, each.path
         assert any(status < 400 for status in each.answers), each.path
 

@@ -9,21 +9,23 @@ from typing import Any
 
 import pytest
 
-from relay_db.queries import MemoryPlace, MemoryRecord
+from relay_db.queries import EventCursor, StoredEventRecord
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import BadCredentials, Principal
-from relay_server.edges import events as module
-from relay_server.memory import Ask, Following, Forms, Full, NewEvent
-from relay_server.resources import Idempotency
+from relay_server.events import http as module
+from relay_server.events.query import EventFormatter, EventQuery
+from relay_server.events.service import EventFollower, NewEvent
+from relay_server.events.writer import EventQueueFull
+from relay_server.http.idempotency import Idempotency
 from tests.relay_server.edges.http_client import Transport, World
 
 HERE = "/api/v1/events"
 ANN = {"Authorization": "Bearer ann"}
 
 
-def event(number: int) -> MemoryRecord:
+def event(number: int) -> StoredEventRecord:
     """One about nothing."""
-    return MemoryRecord(number, "main", 1.5, "=app", "k", None, "ann", '{"n":1}', 0)
+    return StoredEventRecord(number, "main", 1.5, "=app", "k", None, "ann", '{"n":1}', 0)
 
 
 class Desk:
@@ -32,8 +34,8 @@ class Desk:
     def __init__(self) -> None:
         self.asked: list[Any] = []
         self.error: Exception | None = None
-        self.news_to_tell: list[MemoryRecord] = []
-        self.followers: list[Following] = []
+        self.news_to_tell: list[StoredEventRecord] = []
+        self.followers: list[EventFollower] = []
 
     def wall(self) -> float:
         """Unix time."""
@@ -51,27 +53,27 @@ class Desk:
         if self.error is not None:
             raise self.error
 
-    async def count(self, principal: Principal, ask: Ask) -> tuple[int, MemoryPlace | None]:
+    async def count(self, principal: Principal, ask: EventQuery) -> tuple[int, EventCursor | None]:
         """Always the same; there may be more behind what is not asked from a place on."""
-        return 7, MemoryPlace(3.0, 5) if ask.after is None else None
+        return 7, EventCursor(3.0, 5) if ask.after is None else None
 
     async def page(
-        self, principal: Principal, ask: Ask, limit: int, *, uses: bool = True
-    ) -> tuple[list[MemoryRecord], Forms, MemoryPlace | None]:
+        self, principal: Principal, ask: EventQuery, limit: int, *, uses: bool = True
+    ) -> tuple[list[StoredEventRecord], EventFormatter, EventCursor | None]:
         """One at a time."""
         self.asked.append((ask, limit, uses))
         number = 3 if ask.after is None else ask.after.number - 1
         if number == 1 and self.error is not None:
             raise self.error
-        return [event(number)], Forms({}), MemoryPlace(1.5, number) if number > 1 else None
+        return [event(number)], EventFormatter({}), EventCursor(1.5, number) if number > 1 else None
 
-    async def follow_from(self, principal: Principal, number: int | None) -> Following:
+    async def follow_from(self, principal: Principal, number: int | None) -> EventFollower:
         """From anywhere."""
         self.asked.append(number)
-        return Following(number or 0)
+        return EventFollower(number or 0)
 
     @asynccontextmanager
-    async def following(self, following: Following) -> Any:
+    async def following(self, following: EventFollower) -> Any:
         """Keep it."""
         self.followers.append(following)
         try:
@@ -79,14 +81,14 @@ class Desk:
         finally:
             self.followers.remove(following)
 
-    async def news(self, principal: Principal, ask: Ask, following: Following) -> Any:
+    async def news(self, principal: Principal, ask: EventQuery, following: EventFollower) -> Any:
         """What the test has made."""
         following.fresh = False
         if self.error is not None:
             raise self.error
         told, self.news_to_tell = self.news_to_tell, []
         following.number = max([following.number, *(each.number for each in told)])
-        return told, Forms({}), False
+        return told, EventFormatter({}), False
 
 
 @pytest.fixture
@@ -125,7 +127,7 @@ def test_what_is_sent_again_with_its_key_is_written_once(world: World, desk: Des
 
 def test_when_too_many_wait_it_is_said_when_to_come_again(world: World, desk: Desk) -> None:
     """A database that fails is told without."""
-    desk.error = Full("too many")
+    desk.error = EventQueueFull("too many")
     answer = world.ask("POST", HERE, {"kind": "x"}, **ANN)
     assert (answer.status, answer.headers["retry-after"], answer.json["code"]) == (503, "2", "full")
 

@@ -15,14 +15,20 @@ from twisted.logger import capturedLogs
 from relay_db.queries import RobotRecord
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import Principal
-from relay_server.edges import fleet as module
-from relay_server.fleet import Order, Plan, Result
-from relay_server.fleet.result import Outcome
-from relay_server.moments import HEADER, MomentNeeded, Moments, TooOld
+from relay_server.common.freshness_tokens import (
+    HEADER,
+    FreshnessTokenExpired,
+    FreshnessTokenRequired,
+    FreshnessTokens,
+)
+from relay_server.fleet import http as module
+from relay_server.fleet.order import Order
+from relay_server.fleet.result import TaskOutcome, TaskResult
+from relay_server.fleet.service import FleetPlan
 from tests.relay_server.edges.http_client import HOST, Transport, World, parse
 
 HERE = "/api/v1/fleet"
-MOMENTS = Moments(lambda: 1000)
+MOMENTS = FreshnessTokens(lambda: 1000)
 ANN = {"Authorization": "Bearer ann"}
 STOP = {"robots": ["*"], "do": "stop"}
 SET = {"robots": ["*"], "do": "set", "name": "/driver:speed", "value": 1}
@@ -36,14 +42,14 @@ class Desk:
         self.sent: list[int | None] = []
         self.busy = False
         self.ended: list[str] = []
-        self.tells: Callable[[Result], Awaitable[None]] | None = None
+        self.tells: Callable[[TaskResult], Awaitable[None]] | None = None
         self.over: Deferred[None] = Deferred()
 
     async def groups(self, asker: Principal) -> list[dict[str, Any]]:
         """One."""
         return [{"name": "cleaners", "robots": ["rover"], "of": asker.name}]
 
-    async def plan(self, asker: Principal, order: Order, address: str, sent: int | None = None) -> Plan:
+    async def plan(self, asker: Principal, order: Order, address: str, sent: int | None = None) -> FleetPlan:
         """Two robots, whatever is asked."""
         order.check()
         if order.robots == ["nobody"]:
@@ -51,10 +57,10 @@ class Desk:
         self.orders.append((asker.name, order, address))
         self.sent.append(sent)
         robots = {name: RobotRecord(1, name, "main", "") for name in ("rover", "tank")}
-        return Plan(order, asker, address, robots, ["x"])
+        return FleetPlan(order, asker, address, robots, ["x"])
 
     async def carry_out(
-        self, plan: Plan, begin: Callable[[], None], tell: Callable[[Result], Awaitable[None]]
+        self, plan: FleetPlan, begin: Callable[[], None], tell: Callable[[TaskResult], Awaitable[None]]
     ) -> None:
         """Until the test says that it is over."""
         if self.busy:
@@ -74,7 +80,7 @@ class Desk:
 
         async def told() -> None:
             assert self.tells is not None
-            await self.tells(Result(robot, Outcome(*outcome), 0.25))
+            await self.tells(TaskResult(robot, TaskOutcome(*outcome), 0.25))
 
         return Deferred.fromCoroutine(told())
 
@@ -240,13 +246,15 @@ def test_an_order_is_dated_by_the_moment_it_gives_back(world: World, desk: Desk)
     assert desk.sent == [1000, None, None]
 
 
-@pytest.mark.parametrize(("error", "status"), [(MomentNeeded("say when"), 428), (TooOld("too old"), 412)])
+@pytest.mark.parametrize(
+    ("error", "status"), [(FreshnessTokenRequired("say when"), 428), (FreshnessTokenExpired("too old"), 412)]
+)
 def test_an_order_that_may_be_old_is_not_begun(
     world: World, desk: Desk, monkeypatch: pytest.MonkeyPatch, error: Exception, status: int
 ) -> None:
     """The answer says so by its status."""
 
-    async def plan(*_: object) -> Plan:
+    async def plan(*_: object) -> FleetPlan:
         raise error
 
     monkeypatch.setattr(desk, "plan", plan)

@@ -14,10 +14,14 @@ from twisted.internet.defer import Deferred
 from twisted.web.test.requesthelper import DummyRequest
 
 from relay_protocol.errors import Invalid, NotFound
-from relay_server.edges import goals as module
-from relay_server.edges.asked import APPLIED, wait_preferred
-from relay_server.edges.once import Once
-from relay_server.resources import HEADER, Asker, Goal, Idempotency, Listing, Moments, Owner, Told
+from relay_server.common.freshness_tokens import HEADER, FreshnessTokens
+from relay_server.http.idempotency import Idempotency
+from relay_server.http.idempotent_requests import IdempotentRequests
+from relay_server.http.request_params import APPLIED, wait_preferred
+from relay_server.resources import goals_http as module
+from relay_server.resources.goals import GoalOwner, GoalReply, HttpGoal
+from relay_server.resources.page import PageQuery
+from relay_server.resources.service import RequestOrigin
 from tests.relay_server.edges.http_client import ANN as ANN_HERSELF
 from tests.relay_server.edges.http_client import HOST, Transport, World, parse
 from tests.relay_server.steering import outcome
@@ -34,13 +38,13 @@ class Desk:
         client = SimpleNamespace(new_id=lambda: "1", closed=None, do=self._cancel)
         robot = SimpleNamespace(name="rover")
         guest: Any = SimpleNamespace(client=client, session=SimpleNamespace(robot=robot))
-        self.goal = Goal(
+        self.goal = HttpGoal(
             clock,
             lambda: 5.0,
             guest,
             lambda: None,
             id="g",
-            owner=Owner(1, "main", None),
+            owner=GoalOwner(1, "main", None),
             action="/count",
             type="",
             moves=False,
@@ -51,26 +55,26 @@ class Desk:
     def _cancel(self, operation: object) -> None:
         self.cancelled = True
 
-    async def members(self, asker: Asker, listing: Listing) -> dict[str, Any]:
+    async def members(self, asker: RequestOrigin, listing: PageQuery) -> dict[str, Any]:
         """One."""
         return {"goals": [self.goal.summary()], "next": ""}
 
-    def find(self, asker: Asker, id: str) -> Goal:
+    def find(self, asker: RequestOrigin, id: str) -> HttpGoal:
         """Only this."""
         if (id, asker.principal.name) != ("g", "ann"):
             raise NotFound("there is no such goal")
         return self.goal
 
-    async def told(self, asker: Asker, goal: Goal) -> Told:
+    async def told(self, asker: RequestOrigin, goal: HttpGoal) -> GoalReply:
         """All of it."""
-        return Told(goal.json(), goal.over)
+        return GoalReply(goal.json(), goal.over)
 
-    async def state(self, asker: Asker, id: str, wait: float, unlike: frozenset[str]) -> Told:
+    async def state(self, asker: RequestOrigin, id: str, wait: float, unlike: frozenset[str]) -> GoalReply:
         """As it is."""
         told = await self.told(asker, self.find(asker, id))
         return told._replace(known=told.etag in unlike)
 
-    def cancel(self, asker: Asker, id: str) -> Goal | None:
+    def cancel(self, asker: RequestOrigin, id: str) -> HttpGoal | None:
         """Only what goes on."""
         goal = self.find(asker, id)
         goal.cancel("unwanted")
@@ -87,7 +91,7 @@ def world(tmp_path: Path) -> World:
 def desk(world: World) -> Desk:
     """Who is asked there for goals."""
     made: Any = Desk(world.clock)
-    world.below["goals"] = partial(module.below, world.clock, made, Moments(lambda: 1))
+    world.below["goals"] = partial(module.below, world.clock, made, FreshnessTokens(lambda: 1))
     return made
 
 
@@ -211,18 +215,18 @@ def test_a_preference_that_cannot_be_read_gives_no_goal(world: World) -> None:
     """It is refused in words, before anything is done."""
     given: list[str] = []
 
-    async def give(asker: Asker, name: str, ask: Any, moment: int | None) -> Goal:
+    async def give(asker: RequestOrigin, name: str, ask: Any, moment: int | None) -> HttpGoal:
         given.append(name)
         raise NotFound("there is no such action")
 
     desk: Any = SimpleNamespace(give=give)
-    giving = module.Giving(desk, Once(Idempotency(world.clock), desk))
+    giving = module.GoalSubmission(desk, IdempotentRequests(Idempotency(world.clock), desk))
     request: Any = DummyRequest([b""])
     request.channel = SimpleNamespace(transport=None)
     request.content = BytesIO(b"{}")
     request.requestHeaders.setRawHeaders("content-type", ["application/json"])
     request.requestHeaders.setRawHeaders(b"prefer", [b"wait=\xff"])
-    asker = Asker(ANN_HERSELF, "rover", "192.0.2.9")
+    asker = RequestOrigin(ANN_HERSELF, "rover", "192.0.2.9")
     (error,) = outcome(Deferred.fromCoroutine(giving.give(request, asker, "/count", None)))
     assert isinstance(error, Invalid) and "prefer" in str(error)
     assert given == []

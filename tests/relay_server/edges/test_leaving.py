@@ -10,13 +10,13 @@ import pytest
 from twisted.internet.defer import CancelledError, Deferred
 
 from relay_server.access import Principal
-from relay_server.console import Outcome, Taken
-from relay_server.control import Answer
-from relay_server.edges import control
-from relay_server.moments import HEADER, Moments
+from relay_server.common.freshness_tokens import HEADER, FreshnessTokens
+from relay_server.control import http as control
+from relay_server.control.service import StopResult, TakeResult
+from relay_server.control.types import ControlReply
 from tests.relay_server.edges.http_client import HOST, World
 
-MOMENTS = Moments(lambda: 1000)
+MOMENTS = FreshnessTokens(lambda: 1000)
 
 
 class Console:
@@ -27,17 +27,19 @@ class Console:
         self.asked: list[tuple[str, str]] = []
         self.done: list[str] = []
 
-    async def stop(self, principal: Principal, robot: str, why: str, address: str) -> Outcome:
+    async def stop(self, principal: Principal, robot: str, why: str, address: str) -> StopResult:
         """Wait, then stop it."""
         self.asked.append((robot, why))
         await self._wait()
-        return Outcome(True, {"by": principal.name})
+        return StopResult(True, {"by": principal.name})
 
-    async def take(self, principal: Principal, robot: str, why: str, address: str, seconds: float) -> Taken:
+    async def take(
+        self, principal: Principal, robot: str, why: str, address: str, seconds: float
+    ) -> TakeResult:
         """Wait, then take control."""
         self.asked.append((robot, why))
         await self._wait()
-        return Taken(Answer(True, "you have control"), {})
+        return TakeResult(ControlReply(True, "you have control"), {})
 
     async def resume(self, principal: Principal, robot: str, why: str, address: str, sent: int) -> None:
         """Wait, then resume it."""

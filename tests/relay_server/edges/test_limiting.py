@@ -9,11 +9,11 @@ import pytest
 from twisted.internet.task import Clock
 from twisted.web.resource import IResource
 
-from relay_server.console import Outcome
-from relay_server.edges import control
-from relay_server.edges.api import Api
-from relay_server.edges.limiting import RequestLimits
-from relay_server.moments import Moments
+from relay_server.common.freshness_tokens import FreshnessTokens
+from relay_server.control import http as control
+from relay_server.control.service import StopResult
+from relay_server.http.api import Api
+from relay_server.http.rate_limits import RequestLimits
 from tests.relay_server.edges.http_client import World, parse
 from tests.relay_server.edges.websocket_client import Client, MemoryGate
 
@@ -28,10 +28,10 @@ class Stopping:
     def __init__(self) -> None:
         self.stops = 0
 
-    async def stop(self, *asked: Any) -> Outcome:
+    async def stop(self, *asked: Any) -> StopResult:
         """Stop a robot."""
         self.stops += 1
-        return Outcome(True, None)
+        return StopResult(True, None)
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_no_stop_is_ever_held_back(world: World) -> None:
     stopping = Stopping()
 
     def below(api: Api, robot: str) -> IResource:
-        return control.below(stopping, Moments(lambda: 1), "stop", api, robot)  # type: ignore[arg-type]
+        return control.below(stopping, FreshnessTokens(lambda: 1), "stop", api, robot)  # type: ignore[arg-type]
 
     world.below["stop"] = below
     for _ in range(BURST + 1):
@@ -115,7 +115,9 @@ def test_no_stop_is_ever_held_back(world: World) -> None:
 
 def test_who_can_not_prove_himself_is_told_so_by_a_stop(world: World) -> None:
     """By 401, not by how many there were."""
-    world.below["stop"] = lambda api, robot: control.below(Stopping(), Moments(lambda: 1), "stop", api, robot)  # type: ignore[arg-type]
+    world.below["stop"] = lambda api, robot: control.below(
+        Stopping(), FreshnessTokens(lambda: 1), "stop", api, robot
+    )  # type: ignore[arg-type]
     for _ in range(BURST * 2):
         assert world.ask("POST", "/api/v1/robots/rover/stop").status == 401
 

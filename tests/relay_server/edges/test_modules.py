@@ -14,9 +14,11 @@ import pytest
 from relay_protocol import link
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
-from relay_server.edges import modules as module
-from relay_server.resources import HEADER, Asker, ModuleDesk, Moments
-from relay_server.resources.forms import FORMS
+from relay_server.common.freshness_tokens import HEADER, FreshnessTokens
+from relay_server.http.media_types import FORMS
+from relay_server.resources import nodes_http as module
+from relay_server.resources.nodes import NodeService
+from relay_server.resources.service import RequestOrigin
 from tests.relay_server.edges.http_client import World
 from tests.relay_server.memory import World as Robots
 
@@ -45,7 +47,7 @@ class Hall:
 class Desk:
     """Makes what takes long."""
 
-    async def made(self, asker: Asker, work: Callable[[], Any]) -> Any:
+    async def made(self, asker: RequestOrigin, work: Callable[[], Any]) -> Any:
         """Here and now."""
         return work()
 
@@ -61,7 +63,7 @@ def world(tmp_path: Path, hall: Any) -> World:
     """A site with the modules of one robot."""
     made = World(tmp_path)
     desk: Any = Desk()
-    made.below["modules"] = partial(module.below, ModuleDesk(hall), Moments(lambda: 1), desk)
+    made.below["modules"] = partial(module.below, NodeService(hall), FreshnessTokens(lambda: 1), desk)
     return made
 
 

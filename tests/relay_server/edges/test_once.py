@@ -11,12 +11,13 @@ from twisted.web.test.requesthelper import DummyRequest
 
 from relay_protocol.errors import Invalid, Refused
 from relay_protocol.rights import Operation
-from relay_server.edges.once import Once, see_no_key, send
-from relay_server.resources import KEY_HEADER, Asker, Idempotency, Reply
+from relay_server.http.idempotency import KEY_HEADER, Idempotency, StoredReply
+from relay_server.http.idempotent_requests import IdempotentRequests, see_no_key, send
+from relay_server.resources.service import RequestOrigin
 from tests.relay_server.edges.http_client import ANN
 from tests.relay_server.steering import outcome, result
 
-ASKER = Asker(ANN, "rover", "192.0.2.9")
+ASKER = RequestOrigin(ANN, "rover", "192.0.2.9")
 
 
 class Desk:
@@ -24,7 +25,7 @@ class Desk:
 
     withdrawn = False
 
-    async def may(self, asker: Asker, operation: Operation, name: str) -> None:
+    async def may(self, asker: RequestOrigin, operation: Operation, name: str) -> None:
         """As it says."""
         if self.withdrawn:
             raise Refused(f"no more {operation} on {name}")
@@ -36,7 +37,7 @@ class Requests:
     def __init__(self) -> None:
         self.desk = Desk()
         self.done = 0
-        self._once = Once(Idempotency(Clock()), self.desk)  # type: ignore[arg-type]
+        self._once = IdempotentRequests(Idempotency(Clock()), self.desk)  # type: ignore[arg-type]
 
     def send(self, *keys: str, name: str = "reset", body: bytes = b"{}") -> Any:
         """A request with these keys."""
@@ -47,9 +48,9 @@ class Requests:
         request.requestHeaders.setRawHeaders(KEY_HEADER, keys)
         return self._once.reply(request, ASKER, Operation.CALL, name, self._work)
 
-    async def _work(self) -> Reply:
+    async def _work(self) -> StoredReply:
         self.done += 1
-        return Reply(200, b"%d" % self.done)
+        return StoredReply(200, b"%d" % self.done)
 
 
 @pytest.fixture
@@ -99,9 +100,9 @@ def test_where_a_key_is_not_understood_it_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reply", "location"), [(Reply(204), None), (Reply(202, b"{}", "/there"), ["/there"])]
+    ("reply", "location"), [(StoredReply(204), None), (StoredReply(202, b"{}", "/there"), ["/there"])]
 )
-def test_a_reply_is_sent_as_it_is(reply: Reply, location: list[str] | None) -> None:
+def test_a_reply_is_sent_as_it_is(reply: StoredReply, location: list[str] | None) -> None:
     """Status, body and where to go on."""
     request: Any = DummyRequest([b""])
     body = send(request, reply)

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from twisted.internet.task import Clock
 
 from relay_protocol.pacing import FIRST
-from relay_server import wsframe
-from relay_server.edges.fastpath.sending import PlainWriter, Stalls
-from relay_server.edges.pacing import Pacer
-from relay_server.outbox import Outbox
+from relay_server.common import websocket_frames
+from relay_server.common.pacing import Pacer
+from relay_server.common.send_queue import SendQueue
+from relay_server.common.socket_writer import PlainWriter, Stalls
 
 TICK = 0.005
 
@@ -29,9 +29,15 @@ class Wire:
         """When each frame was there."""
         self.pings = 0
         self.writer = PlainWriter(self)
-        self.outbox = Outbox(self.writer.write, self.clock.seconds, lambda: None)
+        self.outbox = SendQueue(self.writer.write, self.clock.seconds, lambda: None)
         self.pacer = Pacer(
-            self.writer, self.outbox, self.clock, self.clock.seconds, self.ping, wsframe.Fragments, None
+            self.writer,
+            self.outbox,
+            self.clock,
+            self.clock.seconds,
+            self.ping,
+            websocket_frames.Fragments,
+            None,
         )
 
     def write(self, data: bytes) -> None:
@@ -44,7 +50,7 @@ class Wire:
         self.pings += 1
         payload = self.pings.to_bytes(8, "big")
         self.pacer.probing(payload)
-        self.writer.urgent(wsframe.ping(payload))
+        self.writer.urgent(websocket_frames.ping(payload))
 
     def pass_time(self, seconds: float) -> None:
         """Let what is on its way arrive, and pings be answered."""
@@ -53,18 +59,18 @@ class Wire:
             while self.way and self.way[0][0] <= self.clock.seconds():
                 at, data = self.way.pop(0)
                 self.came.append((at, data))
-                if data[0] == wsframe.PING:
+                if data[0] == websocket_frames.PING:
                     self.pacer.answered(data[2:])
 
     def payloads(self) -> list[bytes]:
         """Whole messages that came."""
         found, part = [], b""
         for _, frame in self.came:
-            if frame[0] == wsframe.PING:
+            if frame[0] == websocket_frames.PING:
                 continue
             head = 2 if frame[1] < 126 else 4 if frame[1] == 126 else 10
             part += frame[head:]
-            if frame[0] & wsframe.FIN:
+            if frame[0] & websocket_frames.FIN:
                 found.append(part)
                 part = b""
         return found
@@ -74,7 +80,7 @@ def test_a_fast_connection_gets_large_messages_whole_after_the_first_ones() -> N
     """The window opens within some round trips; nothing is lost or divided then."""
     wire = Wire(100e6)
     for number in range(10):
-        wire.outbox.data("cloud", wsframe.text(b"%d" % number * 300_000))
+        wire.outbox.data("cloud", websocket_frames.text(b"%d" % number * 300_000))
         wire.pass_time(0.1)
     assert [len(each) for each in wire.payloads()] == [300_000] * 10
     whole = [frame for _, frame in wire.came if len(frame) > 300_000]
@@ -87,13 +93,13 @@ def test_a_ping_goes_between_the_pieces_of_a_large_message() -> None:
     wire = Wire(100_000)
     wire.ping()
     wire.pass_time(1)
-    wire.outbox.data("cloud", wsframe.text(bytes(1_000_000)))
+    wire.outbox.data("cloud", websocket_frames.text(bytes(1_000_000)))
     wire.pass_time(2)
     sent = wire.clock.seconds()
     wire.ping()
     payload = wire.pings.to_bytes(8, "big")
     wire.pass_time(1)
-    back = next(at for at, frame in wire.came if frame == wsframe.ping(payload))
+    back = next(at for at, frame in wire.came if frame == websocket_frames.ping(payload))
     assert back - sent <= 0.3
     assert not wire.payloads()
     wire.pass_time(10)
@@ -104,7 +110,7 @@ def test_what_is_on_its_way_is_bounded_before_anything_is_known() -> None:
     """A connection that answers nothing gets no more than the first window."""
     wire = Wire(1.0)
     for _ in range(50):
-        wire.outbox.data("cloud", wsframe.text(bytes(100_000)))
+        wire.outbox.data("cloud", websocket_frames.text(bytes(100_000)))
     assert sum(len(data) for _, data in wire.way) <= 1.1 * FIRST
     assert wire.outbox.dropped > 0
 
@@ -112,12 +118,12 @@ def test_what_is_on_its_way_is_bounded_before_anything_is_known() -> None:
 def test_nothing_but_control_frames_follows_the_end() -> None:
     """A message that was begun is not finished behind a close frame (RFC 6455 section 5.5.1)."""
     wire = Wire(100_000)
-    wire.outbox.data("cloud", wsframe.text(bytes(1_000_000)))
+    wire.outbox.data("cloud", websocket_frames.text(bytes(1_000_000)))
     wire.pacer.stop()
     wire.outbox.close()
     before = len(wire.way)
     wire.pass_time(20)
-    assert {frame[0] for _, frame in wire.came[before:]} <= {wsframe.PING}
+    assert {frame[0] for _, frame in wire.came[before:]} <= {websocket_frames.PING}
 
 
 @given(
@@ -131,7 +137,7 @@ def test_answers_all_arrive_in_order_whatever_their_size(rate: float, sizes: lis
     wire = Wire(rate)
     sent = [bytes([65 + number]) * size for number, size in enumerate(sizes)]
     for payload in sent:
-        wire.outbox.control(wsframe.text(payload))
+        wire.outbox.control(websocket_frames.text(payload))
         wire.pass_time(gap)
     wire.pass_time(3 + 3 * sum(sizes) / rate)
     assert wire.payloads() == sent

@@ -16,11 +16,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from relay_protocol import limits
-from relay_server import closing
-from relay_server.edges import telling
-from relay_server.edges.pages import MESSAGE_BYTES, PageFactory, PageGate
-from relay_server.edges.sources import Sources
-from relay_server.origins import Origins
+from relay_server.auth.origins import Origins
+from relay_server.common import close_codes
+from relay_server.http import live_updates
+from relay_server.http.update_sources import Sources
+from relay_server.ws.updates import MESSAGE_BYTES, UpdatesFactory, UpdatesGate
 from tests.relay_server.edges.http_client import MemoryDesk, World
 from tests.relay_server.edges.websocket_client import Client
 
@@ -36,9 +36,9 @@ class Tab:
     def __init__(self, **headers: str) -> None:
         self.clock = Clock()
         self.desk = MemoryDesk()
-        sources = Sources(self.clock, {telling.FIRST: self.desk.robots}, self.desk.on_change)
-        self.gate = PageGate(self.clock, self.desk, Origins("http", [ORIGIN]), "sb", sources)
-        self.client = Client(self.gate, PATH, clock=self.clock, factory=PageFactory, **(headers or TOKEN))
+        sources = Sources(self.clock, {live_updates.FIRST: self.desk.robots}, self.desk.on_change)
+        self.gate = UpdatesGate(self.clock, self.desk, Origins("http", [ORIGIN]), "sb", sources)
+        self.client = Client(self.gate, PATH, clock=self.clock, factory=UpdatesFactory, **(headers or TOKEN))
 
     def passes(self, seconds: float) -> None:
         """Time, in which the client answers pings."""
@@ -80,9 +80,9 @@ def test_auth_may_be_the_first_message() -> None:
 @pytest.mark.parametrize(
     ("path", "headers", "status", "code"),
     [
-        (PATH, {"Authorization": "Bearer bad"}, 401, closing.UNAUTHENTICATED),
-        (PATH, {"Cookie": "sb=ann"}, 403, closing.FORBIDDEN),
-        (PATH + "?ticket=good", {}, 401, closing.UNAUTHENTICATED),
+        (PATH, {"Authorization": "Bearer bad"}, 401, close_codes.UNAUTHENTICATED),
+        (PATH, {"Cookie": "sb=ann"}, 403, close_codes.FORBIDDEN),
+        (PATH + "?ticket=good", {}, 401, close_codes.UNAUTHENTICATED),
     ],
 )
 def test_a_refused_program_reads_a_status_and_a_browser_a_close_code(
@@ -90,7 +90,7 @@ def test_a_refused_program_reads_a_status_and_a_browser_a_close_code(
 ) -> None:
     """A cookie counts only with an Origin that is listed; a ticket opens one robot and nothing else."""
     gate = Tab().gate
-    given: dict[str, Any] = {"clock": gate.clock, "factory": PageFactory, **headers}
+    given: dict[str, Any] = {"clock": gate.clock, "factory": UpdatesFactory, **headers}
     assert Client(gate, path, **given).status == status
     browser = Client(gate, path, Origin="http://evil.example", **given)
     assert (browser.status, browser.closed) == (101, code)
@@ -102,9 +102,9 @@ def test_a_relay_that_is_going_down_tells_its_pages_and_lets_nobody_in() -> None
     tab = Tab()
     tab.gate.say_goodbye("the relay is going down")
     tab.client.run()
-    assert tab.client.closed == closing.GOING_AWAY
+    assert tab.client.closed == close_codes.GOING_AWAY
     assert tab.gone()
-    later = Client(tab.gate, PATH, clock=tab.clock, factory=PageFactory, **TOKEN)
+    later = Client(tab.gate, PATH, clock=tab.clock, factory=UpdatesFactory, **TOKEN)
     assert later.status == 503
 
 
@@ -118,10 +118,10 @@ def test_changes_are_told_and_so_is_what_is_not_known() -> None:
     tab.desk.changed()
     tab.client.run()
     assert tab.told == [ROBOTS]
-    tab.passes(telling.QUIET_SECONDS)
+    tab.passes(live_updates.QUIET_SECONDS)
     assert tab.told == [ROBOTS, ROBOTS]
     tab.desk.up = False
-    tab.passes(telling.STREAM_SECONDS)
+    tab.passes(live_updates.STREAM_SECONDS)
     assert tab.told[-1] == {"event": "unknown", "data": {"reason": "the database does not answer"}}
 
 
@@ -132,12 +132,13 @@ def test_it_ends_with_the_credentials() -> None:
     del tab.desk.tokens["ann"]
     tab.desk.changed()
     tab.client.run()
-    assert (tab.client.closed, tab.told) == (closing.UNAUTHENTICATED, [ROBOTS])
+    assert (tab.client.closed, tab.told) == (close_codes.UNAUTHENTICATED, [ROBOTS])
     assert tab.gone()
 
 
 @pytest.mark.parametrize(
-    ("size", "code"), [(1, closing.INVALID), (MESSAGE_BYTES + 1, closing.TOO_BIG), (0, closing.INVALID)]
+    ("size", "code"),
+    [(1, close_codes.INVALID), (MESSAGE_BYTES + 1, close_codes.TOO_BIG), (0, close_codes.INVALID)],
 )
 def test_a_page_has_nothing_to_say(size: int, code: int) -> None:
     """What is larger than a few bytes is not read at all."""
@@ -154,7 +155,7 @@ def test_text_that_is_not_utf8_closes_with_1007(headers: dict[str, str], fin: bo
     tab = Tab(**headers)
     tab.client.core.send_text(b"\xff", fin)
     tab.client.run()
-    assert tab.client.closed == closing.NOT_UTF8
+    assert tab.client.closed == close_codes.NOT_UTF8
 
 
 def test_binary_messages_are_not_taken() -> None:
@@ -162,7 +163,7 @@ def test_binary_messages_are_not_taken() -> None:
     tab = Tab()
     tab.client.core.send_binary(b"x")
     tab.client.run()
-    assert tab.client.closed == closing.FORBIDDEN
+    assert tab.client.closed == close_codes.FORBIDDEN
     assert tab.gone()
 
 
@@ -179,7 +180,7 @@ def test_a_page_that_answers_no_ping_is_closed() -> None:
     for _ in range(9):
         tab.clock.advance(1.0)
     tab.client.run()
-    assert tab.client.closed == closing.TOO_SLOW
+    assert tab.client.closed == close_codes.TOO_SLOW
     assert tab.gone()
 
 
@@ -193,8 +194,8 @@ def test_a_page_that_takes_nothing_is_closed() -> None:
         tab.desk.changed()
         tab.passes(0.5)
     assert (len(tab.told), tab.client.closed) == (before, None)
-    tab.passes(telling.STALL_SECONDS)
-    assert (len(tab.told), tab.client.closed) == (before, closing.TOO_SLOW)
+    tab.passes(live_updates.STALL_SECONDS)
+    assert (len(tab.told), tab.client.closed) == (before, close_codes.TOO_SLOW)
     assert tab.gone()
 
 
@@ -208,7 +209,7 @@ def test_a_page_that_takes_again_stays() -> None:
     tab.client.end.resume()
     tab.client.run()
     assert len(tab.told) == before + 1
-    tab.passes(telling.STALL_SECONDS * 2)
+    tab.passes(live_updates.STALL_SECONDS * 2)
     assert tab.client.closed is None
 
 
@@ -233,10 +234,10 @@ def test_what_fails_in_the_relay_is_told_without_internals() -> None:
     tab = Tab()
     tab.passes(1.0)
     (client,) = tab.gate._open
-    client._telling._sources = Sources(tab.clock, {telling.FIRST: broken}, tab.desk.on_change)
+    client._telling._sources = Sources(tab.clock, {live_updates.FIRST: broken}, tab.desk.on_change)
     tab.desk.changed()
     tab.client.run()
-    assert tab.client.closed == closing.INTERNAL
+    assert tab.client.closed == close_codes.INTERNAL
     assert tab.client.core.close_rcvd is not None
     assert "secret" not in tab.client.core.close_rcvd.reason
     assert tab.gone()
@@ -286,4 +287,4 @@ async def test_a_page_follows_at_the_address_of_the_stream(house: House) -> None
         while True:
             await hears(page)
     assert closed.value.rcvd is not None
-    assert closed.value.rcvd.code == closing.UNAUTHENTICATED
+    assert closed.value.rcvd.code == close_codes.UNAUTHENTICATED

@@ -10,7 +10,7 @@ import pytest
 
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
-from relay_server.edges import presence as module
+from relay_server.resources import people_http as module
 from tests.relay_server.edges.http_client import World
 
 HERE = "/api/v1/robots/rover/people"

@@ -12,9 +12,9 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import NotFound, Unavailable
 from relay_server.access import Principal
-from relay_server.edges import recordings as module
-from relay_server.recording import Ask
-from relay_server.resources import Idempotency
+from relay_server.http.idempotency import Idempotency
+from relay_server.recordings import http as module
+from relay_server.recordings.recordings import RecordingRequest
 from tests.relay_server.edges.http_client import HOST, Answer, Transport, World, parse
 
 HERE = "/api/v1/robots/rover/recordings"
@@ -67,18 +67,20 @@ class Desk:
     """Keeps what it is asked; one recording is there."""
 
     def __init__(self) -> None:
-        self.asks: list[Ask] = []
+        self.asks: list[RecordingRequest] = []
         self.deleted: list[str] = []
         self.pages: list[tuple[int, str]] = []
         self.file = File()
 
-    async def start(self, principal: Principal, robot: str, ask: Ask, address: str) -> dict[str, Any]:
+    async def start(
+        self, principal: Principal, robot: str, ask: RecordingRequest, address: str
+    ) -> dict[str, Any]:
         """It begins."""
         assert (principal.name, robot, address) == ("ann", "rover", "192.0.2.9")
         self.asks.append(ask)
         return {"id": "a"}
 
-    async def may_start(self, principal: Principal, robot: str, ask: Ask, address: str) -> None:
+    async def may_start(self, principal: Principal, robot: str, ask: RecordingRequest, address: str) -> None:
         """Still."""
 
     async def possible(self, principal: Principal, robot: str, address: str) -> dict[str, Any]:
@@ -147,7 +149,7 @@ def test_each_address_does_its_own(world: World, desk: Desk) -> None:
     assert world.ask("GET", HERE, **ANN).json == {"recordings": [{"id": "a"}], "next": None}
     answer = world.ask("POST", HERE, {"topics": ["/odom"], "seconds": 5}, **ANN)
     assert (answer.status, answer.headers["location"]) == (201, f"{HERE}/a")
-    assert desk.asks == [Ask(topics=["/odom"], seconds=5.0)]
+    assert desk.asks == [RecordingRequest(topics=["/odom"], seconds=5.0)]
     assert world.ask("GET", f"{HERE}/a", **ANN).json == {"id": "a"}
     assert world.ask("GET", f"{HERE}/new", **ANN).json == {"topics": ["/odom"]}
     again = {"Idempotency-Key": "k", **ANN}

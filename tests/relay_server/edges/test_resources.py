@@ -13,20 +13,22 @@ import pytest
 from twisted.internet.defer import Deferred
 
 from relay_protocol.errors import NotFound, Refused, SwitchboardError
-from relay_server.edges import resources as module
-from relay_server.edges.once import Once
-from relay_server.edges.resources import RobotResources
-from relay_server.inside import MaybeDone
-from relay_server.resources import HEADER, Asker, Listing, Moments, Wanted
-from relay_server.resources.background import Background
-from relay_server.resources.forms import FORMS
-from relay_server.resources.states import Param, State
+from relay_server.common.freshness_tokens import HEADER, FreshnessTokens
+from relay_server.http.idempotent_requests import IdempotentRequests
+from relay_server.http.media_types import FORMS
+from relay_server.http_sessions.loopback_client import MaybeDone
+from relay_server.resources import http as module
+from relay_server.resources.etags import ParamState, TopicState
+from relay_server.resources.http import TopicResource
+from relay_server.resources.page import PageQuery
+from relay_server.resources.service import RequestOrigin, TopicQuery
+from relay_server.resources.topic_context import TopicContext
 from tests.relay_server.edges.http_client import HOST, World, parse
 
 HERE = "/api/v1/robots/rover"
 ANN = {"Authorization": "Bearer ann"}
 MEDIA = [each.media for each in FORMS]
-NEWEST = State("/said", "std_msgs/msg/String", 5.0, b'{"data":"hello"}')
+NEWEST = TopicState("/said", "std_msgs/msg/String", 5.0, b'{"data":"hello"}')
 
 
 SERVICE = {"name": "/reset", "types": ["std_srvs/srv/Trigger"], "providers": ["/base"], "moves": True}
@@ -40,11 +42,11 @@ class Desk:
         self.cut: SwitchboardError | None = None
         """What comes in between when parameters are read or deleted."""
 
-    async def members(self, asker: Asker, kind: str, listing: Listing) -> dict[str, Any]:
+    async def members(self, asker: RequestOrigin, kind: str, listing: PageQuery) -> dict[str, Any]:
         """None."""
         return {kind: [], "next": "", "online": True}
 
-    async def member(self, asker: Asker, kind: str, name: str) -> dict[str, Any]:
+    async def member(self, asker: RequestOrigin, kind: str, name: str) -> dict[str, Any]:
         """One of each kind."""
         if (asker.robot, kind, name) not in (
             ("rover", "topics", "said"),
@@ -54,45 +56,45 @@ class Desk:
             raise NotFound("there is none, or you have no right on it")
         return SERVICE
 
-    async def see(self, asker: Asker) -> None:
+    async def see(self, asker: RequestOrigin) -> None:
         """One robot is there."""
         if asker.robot != "rover":
             raise NotFound("there is no such robot, or you have no right on it")
 
-    async def state(self, asker: Asker, name: str, wanted: Wanted) -> tuple[State, bool]:
+    async def state(self, asker: RequestOrigin, name: str, wanted: TopicQuery) -> tuple[TopicState, bool]:
         """What is said."""
         return NEWEST, NEWEST.etag in wanted.unlike
 
-    async def param(self, asker: Asker, name: str) -> Param:
+    async def param(self, asker: RequestOrigin, name: str) -> ParamState:
         """A truth."""
         if self.cut is not None:
             raise self.cut
         if (asker.robot, name) != ("rover", "node:truth"):
             raise NotFound("there is none")
-        return Param(name, b"true")
+        return ParamState(name, b"true")
 
-    async def remove_param(self, asker: Asker, name: str, match: str | None) -> None:
+    async def remove_param(self, asker: RequestOrigin, name: str, match: str | None) -> None:
         """Nothing comes of it."""
         if self.cut is not None:
             raise self.cut
 
     async def call(
-        self, asker: Asker, name: str, args: Any, type_name: str, seconds: float, moment: int | None
+        self, asker: RequestOrigin, name: str, args: Any, type_name: str, seconds: float, moment: int | None
     ) -> bytes:
         """How long it may take."""
         return str(seconds).encode()
 
-    async def background(self, asker: Asker, state: State) -> Background:
+    async def background(self, asker: RequestOrigin, state: TopicState) -> TopicContext:
         """Nothing."""
-        return Background({}, False)
+        return TopicContext({}, False)
 
-    async def made(self, asker: Asker, work: Callable[[], Any]) -> Any:
+    async def made(self, asker: RequestOrigin, work: Callable[[], Any]) -> Any:
         """Here and now."""
         return work()
 
     @asynccontextmanager
     async def follow(
-        self, asker: Asker, name: str, throttle_ms: float, tell: Callable[[bytes], None]
+        self, asker: RequestOrigin, name: str, throttle_ms: float, tell: Callable[[bytes], None]
     ) -> AsyncIterator[Any]:
         """Said once, at once."""
         tell(NEWEST.value)
@@ -108,14 +110,14 @@ def desk() -> Desk:
 @pytest.fixture
 def world(tmp_path: Path, desk: Any) -> World:
     """A site in front of it."""
-    made, moments, unused = World(tmp_path), Moments(lambda: 1), SimpleNamespace()
+    made, moments, unused = World(tmp_path), FreshnessTokens(lambda: 1), SimpleNamespace()
 
     def below(part: str, api: Any, robot: str) -> Any:
-        resources = RobotResources(
+        resources = TopicResource(
             made.clock,
             desk,
             moments,
-            Once(unused, desk),  # type: ignore[arg-type]
+            IdempotentRequests(unused, desk),  # type: ignore[arg-type]
             unused,  # type: ignore[arg-type]
             part,
             api,

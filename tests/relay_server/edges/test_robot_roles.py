@@ -10,8 +10,8 @@ from relay_db import queries
 from relay_protocol import identity, limits, link
 from relay_protocol.errors import Unavailable
 from relay_protocol.frames import encode_json, encode_sample
-from relay_server import limiter, passwords
-from relay_server.channel import State
+from relay_server.auth import login_limiter, passwords
+from relay_server.channels.states import ChannelState
 from tests.relay_server.edges.robot_ends import RELAY, Hall, Robot, until
 from tests.relay_server.memory import STRING, text
 
@@ -77,11 +77,11 @@ async def test_codes_that_are_not_good_are_told_the_same(hall: Hall) -> None:
 async def test_guessing_codes_is_limited_and_a_good_one_makes_good(hall: Hall) -> None:
     """Ten tries for one robot from one network; a robot that enrolls may prove itself at once."""
     code = await code_for(hall, "c-3po")
-    for _ in range(limiter.FAILURES - 1):
+    for _ in range(login_limiter.FAILURES - 1):
         end = await enrolling(hall, "wrong")
         assert "too many" not in end.refusal()["reason"]
     assert (await enrolling(hall, code)).hears()[0]["op"] == "enrolled"
-    for _ in range(limiter.FAILURES):
+    for _ in range(login_limiter.FAILURES):
         await enrolling(hall, "wrong")
     code = await code_for(hall, "c-3po")
     refusal = (await enrolling(hall, code)).refusal()
@@ -159,7 +159,7 @@ async def test_a_robot_joins_its_channel_and_samples_flow(hall: Hall) -> None:
     channel = hall.world.channels.of(hall.presence)
     joined = end.hears()[0]
     assert joined == {"op": "joined", "channel": channel.name, "at": hall.world.now_ns()}
-    assert channel.state is State.OPEN
+    assert channel.state is ChannelState.OPEN
     got: list[tuple[int, bytes]] = []
     channel.subscriptions.sample = lambda number, body, time, stamp: got.append((number, body))  # type: ignore[method-assign]
     end.sends(encode_sample(7, 1, text("hi")))
@@ -168,7 +168,7 @@ async def test_a_robot_joins_its_channel_and_samples_flow(hall: Hall) -> None:
     end.says(link.Ping(t=5))
     assert {"op": "pong", "t": 5, "at": hall.world.now_ns()} in end.hears()
     end.says(link.Bye(reason="restarting"))
-    assert channel.state is State.OPENING
+    assert channel.state is ChannelState.OPENING
 
 
 @pytest_twisted.ensureDeferred
@@ -182,7 +182,7 @@ async def test_a_ticket_that_is_not_good_opens_nothing(hall: Hall) -> None:
         assert end.refusal()["reason"] == "the channel ticket is unknown, used or too old"
         end.breaks()
     assert hall.presence is not None
-    assert hall.world.channels.of(hall.presence).state is State.OPEN
+    assert hall.world.channels.of(hall.presence).state is ChannelState.OPEN
 
 
 @pytest.mark.parametrize(
@@ -230,7 +230,7 @@ async def test_losing_the_control_link_ends_the_channel_link(hall: Hall) -> None
     assert end.hears()[-1]["op"] == "bye"
     assert not end.transport.connected
     assert hall.presence is not None
-    assert hall.world.channels.of(hall.presence).state is State.WAITING
+    assert hall.world.channels.of(hall.presence).state is ChannelState.WAITING
 
 
 @pytest_twisted.ensureDeferred
@@ -270,7 +270,7 @@ async def test_a_link_closed_by_the_relay_is_dropped_if_the_robot_does_not_close
 @pytest_twisted.ensureDeferred
 async def test_a_stranger_in_its_network_locks_no_robot_out(hall: Hall) -> None:
     """He fails with the robot's name, or another's, and keys of his own."""
-    for number in range(limiter.FAILURES + 1):
+    for number in range(login_limiter.FAILURES + 1):
         stranger = hall.dial()
         stranger.prove(stranger.hello("r2-d2", f"{number:064x}"), key=NEW_KEY)
         await stranger.answered()

@@ -8,20 +8,14 @@ import pytest
 import pytest_twisted
 
 from relay_protocol import PROTOCOL_VERSION, limits, link
-from relay_protocol.frames import (
-    encode_json,
-    encode_part,
-    encode_picture_part,
-    encode_sample,
-    encode_video,
-)
-from relay_server.edges.robot_video import QUESTIONS_AT_ONCE
-from relay_server.video import State, Stream
+from relay_protocol.frames import encode_json, encode_part, encode_picture_part, encode_sample, encode_video
+from relay_server.robots.link_roles import QUESTIONS_AT_ONCE
+from relay_server.video.stream import CameraStream, StreamState
 from tests.relay_server.edges.robot_ends import Hall, Robot
 from tests.relay_server.video.watching import CAMERA, Watcher, jpeg
 
 
-async def asked_to_show(hall: Hall) -> tuple[Robot, Stream, Watcher, str]:
+async def asked_to_show(hall: Hall) -> tuple[Robot, CameraStream, Watcher, str]:
     """A registered robot with a camera somebody watches, and the ticket it was given."""
     robot = await hall.registered()
     robot.says(link.Cameras(cameras=[link.Camera(name=CAMERA)]))
@@ -35,13 +29,13 @@ async def asked_to_show(hall: Hall) -> tuple[Robot, Stream, Watcher, str]:
     return robot, stream, watcher, ask["ticket"]
 
 
-async def joined(hall: Hall) -> tuple[Robot, Stream, Watcher]:
+async def joined(hall: Hall) -> tuple[Robot, CameraStream, Watcher]:
     """A stream's link, open."""
     end, stream, watcher, _ = await linked(hall)
     return end, stream, watcher
 
 
-async def linked(hall: Hall) -> tuple[Robot, Stream, Watcher, Robot]:
+async def linked(hall: Hall) -> tuple[Robot, CameraStream, Watcher, Robot]:
     """A stream's link, open, and last the robot's control link."""
     robot, stream, watcher, ticket = await asked_to_show(hall)
     end = hall.dial()
@@ -65,7 +59,7 @@ def long_jpeg(kilobytes: int) -> bytes:
 async def test_a_robot_joins_a_stream_and_pictures_flow(hall: Hall) -> None:
     """Also a large one; each is acknowledged, and what is played is told."""
     end, stream, watcher = await joined(hall)
-    assert stream.state is State.OPEN
+    assert stream.state is StreamState.OPEN
     end.says(link.Playing(width=32, height=24, quality=80))
     end.sends(encode_video(1, 1_700_000_000_500_000_000, jpeg()))
     large = jpeg()[:2] + (b"\xff\xfe\xff\xff" + bytes(65533)) * 60 + jpeg()[2:]
@@ -82,7 +76,7 @@ async def test_a_robot_joins_a_stream_and_pictures_flow(hall: Hall) -> None:
         {"op": "pong", "t": 5, "at": hall.world.now_ns()},
     ]
     end.says(link.Bye(reason="restarting"))
-    assert stream.state is State.OPENING
+    assert stream.state is StreamState.OPENING
     assert not end.transport.connected
 
 
@@ -124,7 +118,7 @@ async def test_parts_are_not_so_small_that_answers_cost_more_than_pictures(hall:
     end.sends(encode_picture_part(1, 5, len(body), 0, body[:1]))
     end.sends(encode_picture_part(1, 5, len(body), 1, body[1 : 1 + size]))
     assert "at least 1024 bytes" in end.refusal()["reason"]
-    assert stream.state is not State.OPEN
+    assert stream.state is not StreamState.OPEN
     assert watcher.error is None
 
 
@@ -135,11 +129,11 @@ async def test_a_robot_that_begins_ever_new_pictures_by_one_byte_is_cut(hall: Ha
     for number in range(20):
         end.sends(encode_picture_part(number, 5, 5000, 0, b"\xff"))
         passes(hall, robot, 1)
-    assert stream.state is State.OPEN
+    assert stream.state is StreamState.OPEN
     for number in range(QUESTIONS_AT_ONCE + 1):
         end.sends(encode_picture_part(number, 5, 5000, 0, b"\xff"))
     assert "at least 1024 bytes" in end.refusal()["reason"]
-    assert stream.state is not State.OPEN
+    assert stream.state is not StreamState.OPEN
 
 
 @pytest_twisted.ensureDeferred
@@ -152,7 +146,7 @@ async def test_a_part_of_what_was_given_up_ends_the_stream(hall: Hall) -> None:
     end.sends(encode_picture_part(1, 5, len(body), 8, body[8:]))
     assert "does not follow" in end.refusal()["reason"]
     assert len(watcher.pictures) == 1
-    assert stream.state is not State.OPEN
+    assert stream.state is not StreamState.OPEN
 
 
 @pytest_twisted.ensureDeferred
@@ -163,7 +157,7 @@ async def test_the_ticket_of_a_stream_is_good_once(hall: Hall) -> None:
     again = hall.dial()
     again.says(link.Join(version=PROTOCOL_VERSION, ticket=ticket))
     assert "unknown, used or too old" in again.refusal()["reason"]
-    assert stream.state is State.OPEN
+    assert stream.state is StreamState.OPEN
 
 
 @pytest.mark.parametrize(
@@ -200,7 +194,7 @@ async def test_what_has_no_place_on_a_streams_link_ends_it(hall: Hall, data: byt
     end.sends(data)
     assert words in end.refusal()["reason"]
     assert watcher.pictures == []
-    assert stream.state is not State.OPEN
+    assert stream.state is not StreamState.OPEN
 
 
 @pytest.mark.parametrize(
@@ -225,7 +219,7 @@ async def test_what_can_not_be_is_not_told_to_viewers(hall: Hall, lie: str) -> N
     end.sends(encode_json(f'{{"op":"playing",{lie},{rest}}}'.encode()))
     assert lie.split('"')[1] in end.refusal()["reason"]
     assert watcher.played == []
-    assert stream.state is State.OPENING
+    assert stream.state is StreamState.OPENING
 
 
 @pytest_twisted.ensureDeferred
@@ -234,7 +228,7 @@ async def test_html_instead_of_a_picture_ends_the_stream(hall: Hall) -> None:
     end, stream, watcher = await joined(hall)
     end.sends(encode_video(1, 1, b"<html></html>"))
     assert str(watcher.error).startswith("robot r2-d2 sent what is no picture")
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED
     assert list(hall.world.videos) == []
 
 
@@ -287,7 +281,7 @@ async def test_losing_the_control_link_ends_the_streams_link(hall: Hall) -> None
     robot.breaks()
     assert end.hears()[-1]["op"] == "bye"
     assert not end.transport.connected
-    assert stream.state is State.WAITING
+    assert stream.state is StreamState.WAITING
     assert watcher.error is None
 
 
@@ -298,4 +292,4 @@ async def test_a_robot_that_is_busy_hears_nothing_more(hall: Hall) -> None:
     end.sends(encode_json(json.dumps({"op": "not_playing", "reason": "too warm", "busy": True}).encode()))
     assert end.hears()[-1]["op"] == "bye"
     assert str(watcher.error) == "too warm"
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED

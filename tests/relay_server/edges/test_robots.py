@@ -10,11 +10,11 @@ import pytest_twisted
 from relay_db import queries
 from relay_protocol import identity, limits, link
 from relay_protocol.frames import encode_json, encode_sample, encode_video
-from relay_server import limiter
-from relay_server.edges.robot_roles import FLAPPING_SECONDS, MOST_PATIENCE
-from relay_server.edges.robots import PINGS, REPLACED_SECONDS
-from relay_server.journal import BURST
-from relay_server.registry import REPLACE_SECONDS
+from relay_server.auth import login_limiter
+from relay_server.events.bus import BURST
+from relay_server.robots.connection import PINGS, REPLACED_SECONDS
+from relay_server.robots.link_roles import FLAPPING_SECONDS, MOST_PATIENCE
+from relay_server.robots.registry import REPLACE_SECONDS
 from tests.relay_server.edges.robot_ends import FINGERPRINT, KEY, Hall, until
 
 # --- registering ------------------------------------------------------------------------------------------
@@ -65,7 +65,7 @@ async def test_a_robot_that_fails_too_often_is_refused_before_the_database_is_as
     hall: Hall, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten failures of one robot from one network; the right key must wait then, from elsewhere it need not."""
-    for _ in range(limiter.FAILURES):
+    for _ in range(login_limiter.FAILURES):
         robot = hall.dial()
         robot.prove(robot.hello(), key=bytes(reversed(KEY)))
         await robot.answered()
@@ -77,12 +77,12 @@ async def test_a_robot_that_fails_too_often_is_refused_before_the_database_is_as
         await robot.answered()
     refusal = robot.refusal()
     assert "too many failures" in refusal["reason"]
-    assert refusal["retry_after"] == limiter.WINDOW
+    assert refusal["retry_after"] == login_limiter.WINDOW
     other = hall.dial()
     other.connection.address = "198.51.100.1"
     assert (await other.registers())["op"] == "welcome"
     await until(lambda: hall.journal._waiting == 0)
-    assert len(await hall.store.read(queries.list_events, kind="robot.refused")) == limiter.FAILURES
+    assert len(await hall.store.read(queries.list_events, kind="robot.refused")) == login_limiter.FAILURES
 
 
 @pytest_twisted.ensureDeferred

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from relay_protocol import limits
-from relay_server.edges import site as module
+from relay_server.http import site as module
 from tests.relay_server.edges.http_client import Answer, World, parse
 
 GET = b"GET /healthz HTTP/1.1\r\nHost: x\r\n"

@@ -12,8 +12,8 @@ from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import Unavailable
-from relay_server.edges import sources as module
-from relay_server.edges.sources import COALESCE_SECONDS, Shown, Sources
+from relay_server.http import update_sources as module
+from relay_server.http.update_sources import COALESCE_SECONDS, Shown, Sources
 from tests.relay_server.edges.http_client import ANN, ROOT, World
 
 BOB = dataclasses.replace(ANN, user_id=3, name="bob")

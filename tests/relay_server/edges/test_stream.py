@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from relay_server.access import Principal
-from relay_server.edges import telling
-from relay_server.edges.sources import COALESCE_SECONDS
+from relay_server.http import live_updates
+from relay_server.http.update_sources import COALESCE_SECONDS
 from tests.relay_server.edges.http_client import ROOT, World, parse
 
 
@@ -60,7 +60,7 @@ def test_it_goes_on(world: World) -> None:
     world.clock.advance(COALESCE_SECONDS)
     world.desk.changed()
     assert events(transport) == ["robots"]
-    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, live_updates.QUIET_SECONDS])
     assert events(transport) == ["robots"]
 
 
@@ -80,7 +80,7 @@ def test_the_stream_ends_with_the_credentials(world: World) -> None:
     transport = streaming(world)
     del world.desk.tokens["ann"]
     events(transport)
-    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, live_updates.QUIET_SECONDS])
     assert events(transport) == ["ended"]
     assert world.desk.listeners == []
 
@@ -90,11 +90,11 @@ def test_a_database_that_is_away_does_not_end_the_stream(world: World) -> None:
     transport = streaming(world)
     events(transport)
     world.desk.up = False
-    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, live_updates.QUIET_SECONDS])
     assert b'event: unknown\ndata: {"reason":"the database does not answer"}\n\n' in transport.value()
     transport.clear()
     world.desk.up = True
-    world.clock.pump([COALESCE_SECONDS, telling.QUIET_SECONDS])
+    world.clock.pump([COALESCE_SECONDS, live_updates.QUIET_SECONDS])
     assert events(transport) == ["robots"]
 
 
@@ -108,6 +108,6 @@ def test_a_client_that_takes_nothing_of_its_stream_is_cut(world: World) -> None:
         world.desk.changed()
     assert transport.value() == b""
     assert transport.connected
-    world.clock.advance(telling.STALL_SECONDS)
+    world.clock.advance(live_updates.STALL_SECONDS)
     assert not transport.connected
     assert world.desk.listeners == []

@@ -12,9 +12,9 @@ from twisted.internet.task import Clock
 
 from relay_protocol.errors import Unavailable
 from relay_server.access import BadCredentials, Principal
-from relay_server.edges import telling as module
-from relay_server.edges.sources import COALESCE_SECONDS, Sources
-from relay_server.edges.telling import Telling
+from relay_server.http import live_updates as module
+from relay_server.http.live_updates import LiveUpdates
+from relay_server.http.update_sources import COALESCE_SECONDS, Sources
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 Rows = list[dict[str, Any]]
@@ -36,7 +36,7 @@ class Room:
         self.full_after = 1000
         self.during: Callable[[], None] = lambda: None
         sources = {"robots": self._robots, "alerts": self._alerts}
-        self.telling = Telling(
+        self.telling = LiveUpdates(
             self.clock, self, self._principal, Sources(self.clock, sources, self._on_change)
         )
 
@@ -248,7 +248,7 @@ def test_a_look_that_hangs_is_the_only_one(room: Room) -> None:
         looks += 1
         return looked()
 
-    room.telling = Telling(room.clock, room, counted, Sources(room.clock, {}, room._on_change))
+    room.telling = LiveUpdates(room.clock, room, counted, Sources(room.clock, {}, room._on_change))
     room.answers = Deferred()
     room.begin()
     for _ in range(20):

@@ -9,8 +9,8 @@ import pytest
 from klein import Klein
 from twisted.internet.defer import CancelledError, Deferred
 
-from relay_server.edges import asked
-from relay_server.edges.time_limit import ROBOT_SECONDS
+from relay_server.http import request_params
+from relay_server.http.time_limit import ROBOT_SECONDS
 from tests.relay_server.edges.http_client import World, parse
 
 SECONDS = 10.0
@@ -121,7 +121,7 @@ def waiting(api: Any, slow: Slow) -> Any:
     app = Klein()
 
     async def work(request: Any) -> Any:
-        asked.wait_preferred(request)
+        request_params.wait_preferred(request)
         return await slow.answer
 
     app.route("/")(lambda request: api.answer(request, work(request)))

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from relay_server.edges.vanished import NOTICED_SECONDS, notice
+from relay_server.common.tcp import NOTICED_SECONDS, enable_tcp_keepalive
 
 
 class Wrapped:
@@ -36,7 +36,7 @@ class Connection:
 def test_the_kernel_asks_soon_whether_the_other_end_is_there(wrap: Any) -> None:
     """Also through TLS, and gives up in time, whether or not something was sent."""
     with socket.socket() as handle:
-        notice(wrap(Connection(handle)))
+        enable_tcp_keepalive(wrap(Connection(handle)))
         assert handle.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
         idle, interval, times = (
             handle.getsockopt(socket.IPPROTO_TCP, option)
@@ -49,4 +49,4 @@ def test_the_kernel_asks_soon_whether_the_other_end_is_there(wrap: Any) -> None:
 
 def test_in_memory_there_is_nothing_to_ask() -> None:
     """And nothing happens."""
-    notice(Wrapped(None))
+    enable_tcp_keepalive(Wrapped(None))

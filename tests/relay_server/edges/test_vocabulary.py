@@ -12,8 +12,8 @@ from rdflib import RDF, RDFS, Graph, URIRef
 
 from relay_protocol.ros_types import TypeRegistry
 from relay_server.access import Principal
-from relay_server.edges import vocabulary as module
-from relay_server.resources.terms import DOCUMENTS, HTML
+from relay_server.http.rdf import http as module
+from relay_server.http.rdf.vocabulary_page import DOCUMENTS, HTML
 from tests.relay_server.edges.http_client import HOST, World
 
 HERE = "/api/v1/vocabulary"
@@ -57,7 +57,7 @@ def world(tmp_path: Path) -> World:
     """A site with a vocabulary."""
     made = World(tmp_path)
     parts: tuple[Any, ...] = Access(), Registry(), Threads()
-    made.beside["vocabulary"] = partial(module.beside, module.Meanings(*parts))
+    made.beside["vocabulary"] = partial(module.beside, module.TypeDocs(*parts))
     return made
 
 

@@ -12,11 +12,11 @@ from twisted.python.failure import Failure
 from websockets.frames import Frame, Opcode
 
 from relay_protocol import limits
-from relay_server import closing, wsframe
-from relay_server.auth import Opening
-from relay_server.edges import bounded
-from relay_server.edges.caps import AddressCap
-from relay_server.edges.websocket import ClientProtocol
+from relay_server.auth.authenticator import TicketPurpose
+from relay_server.common import close_codes, websocket_frames
+from relay_server.http.connection_limits import ConnectionLimits
+from relay_server.ws import bounded
+from relay_server.ws.client import ClientProtocol
 from tests.relay_server.edges.websocket_client import AUTH, Client, MemoryGate, Transport
 
 
@@ -32,12 +32,12 @@ def gate() -> MemoryGate:
         ("/robots/rover", {"Authorization": "Bearer good"}, ("bearer", "good")),
         ("/robots/rover", {"Authorization": "bearer  good "}, ("bearer", "good")),
         ("/robots/rover", {"subprotocol": "bearer.good"}, ("bearer", "good")),
-        ("/robots/rover?ticket=good", {}, ("ticket", "good", Opening("rover"))),
+        ("/robots/rover?ticket=good", {}, ("ticket", "good", TicketPurpose("rover"))),
         ("/robots/rover", {"Cookie": "good", "Origin": "http://relay:9090"}, ("cookie", "good")),
         ("/robots/rover?ticket=bad", {"Authorization": "Bearer good"}, ("bearer", "good")),
         ("/robots/%72over", {"Authorization": "Bearer good"}, ("bearer", "good")),
         ("/robots/rover/", {"Authorization": "Bearer good"}, ("bearer", "good")),
-        ("/robots/rover/?ticket=good", {}, ("ticket", "good", Opening("rover"))),
+        ("/robots/rover/?ticket=good", {}, ("ticket", "good", TicketPurpose("rover"))),
     ],
 )
 def test_credentials_of_the_handshake_let_a_client_in(
@@ -57,10 +57,10 @@ def test_credentials_of_the_handshake_let_a_client_in(
 @pytest.mark.parametrize(
     ("path", "headers", "status", "code"),
     [
-        ("/robots/rover", {"Authorization": "Bearer bad"}, 401, closing.UNAUTHENTICATED),
-        ("/robots/rover?ticket=bad", {}, 401, closing.UNAUTHENTICATED),
-        ("/robots/tank", {"Authorization": "Bearer good"}, 403, closing.NOT_FOUND),
-        ("/robots/away", {"Authorization": "Bearer good"}, 503, closing.UNAVAILABLE),
+        ("/robots/rover", {"Authorization": "Bearer bad"}, 401, close_codes.UNAUTHENTICATED),
+        ("/robots/rover?ticket=bad", {}, 401, close_codes.UNAUTHENTICATED),
+        ("/robots/tank", {"Authorization": "Bearer good"}, 403, close_codes.NOT_FOUND),
+        ("/robots/away", {"Authorization": "Bearer good"}, 503, close_codes.UNAVAILABLE),
     ],
 )
 def test_a_refused_program_reads_a_status_and_a_browser_a_close_code(
@@ -103,10 +103,10 @@ def test_auth_may_be_the_first_message(gate: MemoryGate) -> None:
 @pytest.mark.parametrize(
     ("text", "code"),
     [
-        ('{"op":"auth","mac":"bad"}', closing.UNAUTHENTICATED),
-        ('{"op":"subscribe","topic":"/x"}', closing.UNAUTHENTICATED),
-        ("junk", closing.UNAUTHENTICATED),
-        ("x" * (limits.UNPROVEN_BYTES + 1), closing.TOO_BIG),
+        ('{"op":"auth","mac":"bad"}', close_codes.UNAUTHENTICATED),
+        ('{"op":"subscribe","topic":"/x"}', close_codes.UNAUTHENTICATED),
+        ("junk", close_codes.UNAUTHENTICATED),
+        ("x" * (limits.UNPROVEN_BYTES + 1), close_codes.TOO_BIG),
     ],
 )
 def test_any_other_first_message_ends_the_connection(gate: MemoryGate, text: str, code: int) -> None:
@@ -128,7 +128,7 @@ def test_who_says_nothing_is_closed_by_an_absolute_deadline(gate: MemoryGate) ->
     assert client.closed is None
     client.clock.advance(0.2)
     client.run()
-    assert client.closed == closing.UNAUTHENTICATED
+    assert client.closed == close_codes.UNAUTHENTICATED
 
 
 @pytest.mark.parametrize("size", [0, 1000])
@@ -141,14 +141,14 @@ def test_what_waits_for_the_proof_is_bounded(gate: MemoryGate, size: int) -> Non
         if client.transport.connected:
             client.core.send_text(b"x" * size)
             client.run()
-    assert client.closed == closing.TOO_BIG
+    assert client.closed == close_codes.TOO_BIG
 
 
 def test_a_fault_of_ours_is_told_without_internals(gate: MemoryGate) -> None:
     """The log tells more."""
     client = Client(gate, "/robots/broken")
     client.says(AUTH)
-    assert client.closed == closing.INTERNAL
+    assert client.closed == close_codes.INTERNAL
     assert client.core.close_rcvd is not None
     assert "insides" not in client.core.close_rcvd.reason
 
@@ -173,7 +173,7 @@ def test_a_binary_message_ends_the_session(gate: MemoryGate) -> None:
     client = Client(gate, Authorization="Bearer good")
     client.core.send_binary(b"x")
     client.run()
-    assert client.closed == closing.FORBIDDEN
+    assert client.closed == close_codes.FORBIDDEN
     assert gate.sessions[0].got[:2] == ["start", "end"]
 
 
@@ -181,14 +181,14 @@ def test_samples_for_a_client_that_is_closing_are_let_go(gate: MemoryGate) -> No
     """They come from a robot that serves others: nothing may break there."""
     client = Client(gate, Authorization="Bearer good")
     send: Callable[[bytes], None] = gate.sessions[0].transport.send
-    send(wsframe.text(b'{"n":1}'))
+    send(websocket_frames.text(b'{"n":1}'))
     client.transport.loseConnection = lambda: None  # type: ignore[method-assign]
     client.core.send_close(1000)
     client.run()
-    send(wsframe.text(b'{"n":2}'))
+    send(websocket_frames.text(b'{"n":2}'))
     client.transport.connected = False
     client.end.connectionLost(Failure(ConnectionDone()))
-    send(wsframe.text(b'{"n":3}'))
+    send(websocket_frames.text(b'{"n":3}'))
     assert client.heard == [b'{"n":1}']
     assert gate.sessions[0].got == ["start", "end"]
 
@@ -198,16 +198,16 @@ def test_nothing_follows_a_close_whoever_began_it(gate: MemoryGate, ours: bool) 
     """What the session's outbox lets through goes to the socket without another look."""
     client = Client(gate, Authorization="Bearer good")
     session = gate.sessions[0]
-    session.outbox.control(wsframe.text(b'{"n":1}'))
+    session.outbox.control(websocket_frames.text(b'{"n":1}'))
     client.transport.loseConnection = lambda: None  # type: ignore[method-assign]
     if ours:
-        session.transport.close(closing.GOING_AWAY, "going down")
+        session.transport.close(close_codes.GOING_AWAY, "going down")
     else:
         client.core.send_close(1000)
         client.run()
     closed_at = len(client.transport.value())
-    session.outbox.control(wsframe.text(b'{"n":2}'))
-    session.outbox.data("t", wsframe.text(b'{"n":3}'))
+    session.outbox.control(websocket_frames.text(b'{"n":2}'))
+    session.outbox.data("t", websocket_frames.text(b'{"n":3}'))
     assert not session.outbox.passing
     assert len(client.transport.value()) == closed_at
 
@@ -233,7 +233,7 @@ def test_the_transports_pauses_reach_the_session(gate: MemoryGate) -> None:
 def test_long_reasons_are_cut_to_what_a_close_frame_holds(gate: MemoryGate) -> None:
     """In whole characters (RFC 6455 section 5.5.1)."""
     client = Client(gate, Authorization="Bearer good")
-    gate.sessions[0].transport.close(closing.FORBIDDEN, "ü" * 500)
+    gate.sessions[0].transport.close(close_codes.FORBIDDEN, "ü" * 500)
     client.run()
     assert client.core.close_rcvd is not None
     assert client.core.close_rcvd.reason == "ü" * 61
@@ -242,7 +242,7 @@ def test_long_reasons_are_cut_to_what_a_close_frame_holds(gate: MemoryGate) -> N
 
 def test_strangers_are_capped_whatever_their_addresses(gate: MemoryGate) -> None:
     """The one too many is told to come back; whoever proves itself, or leaves, makes room."""
-    cap = AddressCap(50, strangers=2)
+    cap = ConnectionLimits(50, strangers=2)
     first, second = Client(gate, cap=cap), Client(gate, cap=cap)
     assert Client(gate, cap=cap, Authorization="Bearer good").status == 503
     first.says(AUTH)
@@ -269,7 +269,7 @@ def test_a_large_frame_before_the_proof_is_refused_by_its_length(gate: MemoryGat
     client = Client(gate)
     client.end.dataReceived(frame_head(limits.UNPROVEN_BYTES + 1))
     client.run()
-    assert client.closed == closing.TOO_BIG
+    assert client.closed == close_codes.TOO_BIG
 
 
 @pytest.mark.parametrize("kind", [0x89, 0x8A, 0x01], ids=["pings", "pongs", "unfinished text"])
@@ -283,7 +283,7 @@ def test_frames_without_a_message_count_as_bytes_before_the_proof(gate: MemoryGa
                 (bytes([kind & 0x80 | (kind & 0x0F if kind & 8 else 0), 0x80]) + bytes(4)) * 100
             )
             client.run()
-    assert client.closed == closing.TOO_BIG
+    assert client.closed == close_codes.TOO_BIG
 
 
 def test_a_session_takes_and_sends_larger_messages(gate: MemoryGate) -> None:
@@ -293,12 +293,12 @@ def test_a_session_takes_and_sends_larger_messages(gate: MemoryGate) -> None:
     client.says("x" * limits.CLIENT_MESSAGE)
     assert len(gate.sessions[0].got[-1]) == limits.CLIENT_MESSAGE
     picture = b"y" * (limits.CLIENT_MESSAGE + 1)
-    gate.sessions[0].transport.send(wsframe.text(picture))
+    gate.sessions[0].transport.send(websocket_frames.text(picture))
     client.run()
     assert client.heard == [picture]
     client.end.dataReceived(frame_head(limits.CLIENT_MESSAGE + 1))
     client.run()
-    assert client.closed == closing.TOO_BIG
+    assert client.closed == close_codes.TOO_BIG
 
 
 def test_one_deadline_counts_for_handshake_and_proof_together(gate: MemoryGate) -> None:
@@ -390,11 +390,11 @@ def test_a_close_comes_after_all_that_was_sent_before(gate: MemoryGate) -> None:
     client = Client(gate, Authorization="Bearer good")
     transport = gate.sessions[0].transport
     for number in range(3):
-        transport.send(wsframe.text(b"%d" % number))
-    transport.close(closing.FORBIDDEN, "enough")
+        transport.send(websocket_frames.text(b"%d" % number))
+    transport.close(close_codes.FORBIDDEN, "enough")
     client.run()
     assert client.heard == [b"0", b"1", b"2"]
-    assert client.closed == closing.FORBIDDEN
+    assert client.closed == close_codes.FORBIDDEN
 
 
 def test_what_comes_in_one_piece_with_the_proof_is_taken_as_after_it(gate: MemoryGate) -> None:
@@ -431,7 +431,7 @@ def test_who_has_closed_a_connection_is_known(gate: MemoryGate, how: str) -> Non
         client.core.send_close(1000)
         client.run()
     elif how == "by the relay":
-        client.end.close(closing.FORBIDDEN, "your right was revoked")
+        client.end.close(close_codes.FORBIDDEN, "your right was revoked")
         client.run()
     else:
         client.end.connectionLost(Failure(ConnectionLost()))
@@ -461,7 +461,7 @@ def test_text_that_is_not_utf8_closes_with_1007(
     for payload, fin in frames[1:]:
         client.core.send_continuation(payload, fin)
     client.run()
-    assert client.closed == closing.NOT_UTF8
+    assert client.closed == close_codes.NOT_UTF8
     assert not client.transport.connected
     assert [session.got for session in gate.sessions] == [["start", "end"]] * len(gate.sessions)
     if gate.wait is not None:
@@ -528,7 +528,7 @@ def test_utf8_is_told_from_what_is_not(gate: MemoryGate, octets: str, how: str) 
             client.end.dataReceived(sent[place : place + step])
         client.run()
     assert gate.sessions[0].got[1:] == ([payload] if SEQUENCES[octets] else ["end"])
-    assert client.closed == (None if SEQUENCES[octets] else closing.NOT_UTF8)
+    assert client.closed == (None if SEQUENCES[octets] else close_codes.NOT_UTF8)
 
 
 @pytest.mark.parametrize(
@@ -555,7 +555,7 @@ def test_no_session_begins_on_a_connection_that_has_failed(gate: MemoryGate) -> 
     client.end.dataReceived(b"".join(client.core.data_to_send()))
     gate.wait.callback(None)
     client.run()
-    assert client.closed == closing.NOT_UTF8
+    assert client.closed == close_codes.NOT_UTF8
     assert not gate.sessions
     assert gate.admitted == 0
 
@@ -568,7 +568,7 @@ def test_the_close_for_text_that_is_not_utf8_waits_for_the_clients(gate: MemoryG
     client.end.dataReceived(b"".join(client.core.data_to_send()))
     assert client.transport.connected
     client.run()
-    assert client.closed == closing.NOT_UTF8
+    assert client.closed == close_codes.NOT_UTF8
     assert gate.sessions[0].got == ["start", "end"]
 
 
@@ -616,7 +616,7 @@ def test_the_frames_of_a_message_are_bounded(
     for _ in range(100):
         client.core.send_continuation(payload, fin=False)
     client.run()
-    assert client.closed == closing.TOO_BIG
+    assert client.closed == close_codes.TOO_BIG
     assert len(client.end.message_data) <= 11
 
 

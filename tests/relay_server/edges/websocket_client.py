@@ -15,11 +15,11 @@ from websockets.uri import parse_uri
 
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_server.access import BadCredentials, Principal
-from relay_server.auth import Opening
-from relay_server.edges.caps import AddressCap
-from relay_server.edges.limiting import RequestLimits
-from relay_server.edges.websocket import ClientFactory
-from relay_server.outbox import Outbox
+from relay_server.auth.authenticator import TicketPurpose
+from relay_server.common.send_queue import SendQueue
+from relay_server.http.connection_limits import ConnectionLimits
+from relay_server.http.rate_limits import RequestLimits
+from relay_server.ws.client import ClientFactory
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 AUTH = '{"op":"auth","mac":"good"}'
@@ -30,7 +30,7 @@ class MemorySession:
 
     def __init__(self, transport: Any) -> None:
         self.transport = transport
-        self.outbox = Outbox(transport.send, lambda: 0.0, lambda: None)
+        self.outbox = SendQueue(transport.send, lambda: 0.0, lambda: None)
         self.got: list[Any] = []
         self.not_before = 0
         self.since: list[int | None] = []
@@ -95,7 +95,7 @@ class MemoryGate:
         """An access token."""
         return await self._prove("bearer", token)
 
-    async def ticket(self, ticket: str, asked: Opening) -> Principal:
+    async def ticket(self, ticket: str, asked: TicketPurpose) -> Principal:
         """A ticket."""
         return await self._prove("ticket", ticket, asked)
 
@@ -172,7 +172,7 @@ class Client:
         gate: Any,
         path: str = "/robots/rover",
         tail: bytes = b"",
-        cap: AddressCap | None = None,
+        cap: ConnectionLimits | None = None,
         clock: Clock | None = None,
         factory: type[ClientFactory] = ClientFactory,
         request_limits: RequestLimits | None = None,
@@ -180,7 +180,7 @@ class Client:
     ) -> None:
         self.eof = False
         self.clock = clock or Clock()
-        self.cap = cap or AddressCap(5)
+        self.cap = cap or ConnectionLimits(5)
         self.cap.enter("192.168.1.1")
         counted = request_limits or RequestLimits(0.0, self.clock.seconds)
         made = factory(self.clock, lambda: round(self.clock.seconds() * 1e9), gate, self.cap, counted)

@@ -18,16 +18,16 @@ from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_server.access import Principal
 from relay_server.audit_log import AuditLog
-from relay_server.control import Actor
-from relay_server.fleet import FleetDesk, Order, Result
-from relay_server.fleet import desk as module
-from relay_server.fleet.desk import LOCAL, Plan
-from relay_server.fleet.result import VALUES_BYTES
-from relay_server.frontdesk import LOOKUP_SECONDS, NOT_LOOKED_UP
-from relay_server.inside.publishing import MATCHING_SECONDS, SUBSCRIBER_SECONDS
-from relay_server.journal import Journal
-from relay_server.moments import MomentNeeded, TooOld
-from relay_server.session import Session
+from relay_server.common.freshness_tokens import FreshnessTokenExpired, FreshnessTokenRequired
+from relay_server.control.audit import Actor
+from relay_server.events.bus import EventBus
+from relay_server.fleet import service as module
+from relay_server.fleet.order import Order
+from relay_server.fleet.result import VALUES_BYTES, TaskResult
+from relay_server.fleet.service import LOCAL, FleetPlan, FleetService
+from relay_server.http_sessions.one_shot_publisher import MATCHING_SECONDS, SUBSCRIBER_SECONDS
+from relay_server.sessions.manager import LOOKUP_SECONDS, NOT_LOOKED_UP
+from relay_server.sessions.session import Session
 from tests.relay_server.edges.robot_ends import until
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import MOTION, STRING, TRIGGER, MemoryClient, hangs
@@ -45,7 +45,7 @@ def order(do: str, *robots: str, **fields: Any) -> Order:
 class Given:
     """An order that was given, and what came of it."""
 
-    def __init__(self, running: Deferred[None], results: list[Result]) -> None:
+    def __init__(self, running: Deferred[None], results: list[TaskResult]) -> None:
         self.running = running
         self.results = results
         self.errors: list[type[BaseException]] = []
@@ -64,14 +64,14 @@ class Fleet:
     def __init__(self, front: Desk) -> None:
         self.front = front
         self.world = front.world
-        self.journal = Journal(front.store, front.wall)
+        self.journal = EventBus(front.store, front.wall)
         folder = Path(front.store.database.url.removeprefix("sqlite:///")).parent
         self.audit = AuditLog(self.world.clock, front.store, folder, self.journal.tell)
         self.desk = self.new_desk()
 
-    def new_desk(self) -> FleetDesk:
+    def new_desk(self) -> FleetService:
         """One that has carried out nothing so far."""
-        return FleetDesk(
+        return FleetService(
             self.world.clock,
             self.front.desk,
             self.front.access,
@@ -96,9 +96,9 @@ class Fleet:
         """
         plan = await self.desk.plan(asker, given, HERE, self.world.now_ns() - int(ago * 1e9))
         begun: list[None] = []
-        results: list[Result] = []
+        results: list[TaskResult] = []
 
-        async def tell(result: Result) -> None:
+        async def tell(result: TaskResult) -> None:
             results.append(result)
 
         running = Deferred.fromCoroutine(self.desk.carry_out(plan, lambda: begun.append(None), tell))
@@ -480,9 +480,9 @@ async def test_no_robot_that_is_here_waits_for_the_database_to_be_stopped(
         "unmatched": ["group:all"],
         "missed": NOT_LOOKED_UP,
     }
-    results: list[Result] = []
+    results: list[TaskResult] = []
 
-    async def tell(each: Result) -> None:
+    async def tell(each: TaskResult) -> None:
         results.append(each)
 
     given = outcome(fleet.desk.carry_out(plan, lambda: None, tell))
@@ -593,11 +593,11 @@ async def test_rights_count_as_they_are_when_a_robot_has_its_turn(fleet: Fleet) 
     assert not fleet.front.access._permits
 
 
-async def carried_out(fleet: Fleet, plan: Plan) -> Result:
+async def carried_out(fleet: Fleet, plan: FleetPlan) -> TaskResult:
     """What comes of an order to one robot."""
-    results: list[Result] = []
+    results: list[TaskResult] = []
 
-    async def tell(result: Result) -> None:
+    async def tell(result: TaskResult) -> None:
         results.append(result)
 
     await fleet.desk.carry_out(plan, lambda: None, tell)
@@ -635,13 +635,15 @@ async def test_what_moves_robots_says_when_it_was_sent(fleet: Fleet) -> None:
         ("set", {"name": "driver:speed", "value": 1}),
     ):
         asked = order(do, **fields)
-        with pytest.raises(MomentNeeded, match="this moves rover: say when this was sent"):
+        with pytest.raises(FreshnessTokenRequired, match="this moves rover: say when this was sent"):
             await fleet.desk.plan(ann, asked, HERE)
-        with pytest.raises(TooOld, match=f"{moving.deadline_ms + 1} ms ago; rover takes nothing older"):
+        with pytest.raises(
+            FreshnessTokenExpired, match=f"{moving.deadline_ms + 1} ms ago; rover takes nothing older"
+        ):
             await fleet.desk.plan(ann, asked, HERE, now - late)
         assert (await fleet.desk.plan(ann, asked, HERE, now)).robots
     for asked in (order("resume"), order("call", service="relay/resume")):
-        with pytest.raises(MomentNeeded, match="lets robots move again"):
+        with pytest.raises(FreshnessTokenRequired, match="lets robots move again"):
             await fleet.desk.plan(ann, asked, HERE)
         assert (await fleet.desk.plan(ann, asked, HERE, now - late)).robots
     for asked in (
@@ -661,9 +663,9 @@ async def test_what_has_become_too_old_by_its_turn_moves_nothing(fleet: Fleet) -
         await fleet.ann(), order("call", service="/reset"), HERE, fleet.world.now_ns()
     )
     fleet.world.clock.advance(1.5)
-    results: list[Result] = []
+    results: list[TaskResult] = []
 
-    async def tell(result: Result) -> None:
+    async def tell(result: TaskResult) -> None:
         results.append(result)
 
     await fleet.desk.carry_out(plan, lambda: None, tell)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_server.fleet import matching as module
-from relay_server.fleet.matching import Meant, meant
+from relay_server.fleet import selection as module
+from relay_server.fleet.selection import Selection, select_robots
 
 ROBOTS = ("cleaner-1", "cleaner-2", "cleaner-10", "other")
 GROUPS = {"cleaners": ("cleaner-1", "cleaner-2", "secret"), "mine": ("other",), "empty": ()}
@@ -35,21 +35,23 @@ GROUPS = {"cleaners": ("cleaner-1", "cleaner-2", "secret"), "mine": ("other",), 
 )
 def test_names_patterns_and_groups(asked: list[str], robots: list[str], unmatched: list[str]) -> None:
     """Each robot once, none that may not be meant; what means none is told."""
-    assert meant(asked, ROBOTS, GROUPS) == Meant(robots, unmatched)
+    assert select_robots(asked, ROBOTS, GROUPS) == Selection(robots, unmatched)
 
 
 def test_a_name_is_looked_up_and_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand of them are not held against all robots, whether they mean one or none."""
     compared: list[str] = []
     monkeypatch.setattr(module, "fnmatchcase", lambda name, pattern: compared.append(pattern))
-    assert meant(["other", "tank", "Other"], ROBOTS, GROUPS) == Meant(["other"], ["tank", "Other"])
+    assert select_robots(["other", "tank", "Other"], ROBOTS, GROUPS) == Selection(
+        ["other"], ["tank", "Other"]
+    )
     assert compared == []
 
 
 @given(st.lists(st.text("ab*?[]", max_size=5), max_size=4), st.sets(st.text("ab", min_size=1, max_size=4)))
 def test_nothing_is_meant_that_does_not_match(asked: list[str], robots: set[str]) -> None:
     """And nothing that matches is left out."""
-    found = meant(asked, robots, {})
+    found = select_robots(asked, robots, {})
     assert found.robots == sorted(
         name for name in robots if any(fnmatchcase(name, each) or each == name for each in asked)
     )

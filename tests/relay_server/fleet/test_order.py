@@ -10,14 +10,14 @@ import pytest
 
 from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, MalformedMessage
-from relay_server.fleet.order import PATTERNS, TARGETS, Order, StopOrder
+from relay_server.fleet.order import PATTERNS, TARGETS, FleetStopOrder, Order
 
 
 def order(**fields: Any) -> Order:
     """An order as it comes, checked."""
     body = json.dumps({"robots": ["*"], **fields}).encode()
     if fields.get("do") == "stop":
-        made = jsontext.decode(msgspec.json.Decoder(StopOrder), body).order
+        made = jsontext.decode(msgspec.json.Decoder(FleetStopOrder), body).order
     else:
         made = jsontext.decode(msgspec.json.Decoder(Order), body)
     made.check()

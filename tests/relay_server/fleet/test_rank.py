@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.internet.defer import CancelledError, Deferred
 
-from relay_server.fleet.rank import side_by_side
+from relay_server.common.gather import bounded_gather
 
 
 class Field:
@@ -33,7 +33,7 @@ class Field:
 def test_some_have_their_turn_at_a_time() -> None:
     """The next when one is done; it is over with the last."""
     field, over = Field(), []
-    running = Deferred.fromCoroutine(side_by_side("abcde", field.do, at_once=2))
+    running = Deferred.fromCoroutine(bounded_gather("abcde", field.do, at_once=2))
     running.addCallback(over.append)
     assert field.begun == ["a", "b"]
     field.done("b")
@@ -48,7 +48,7 @@ def test_some_have_their_turn_at_a_time() -> None:
 def test_who_gives_up_ends_what_has_begun() -> None:
     """And nothing else begins."""
     field, ends = Field(), []
-    running = Deferred.fromCoroutine(side_by_side("abcde", field.do, at_once=2))
+    running = Deferred.fromCoroutine(bounded_gather("abcde", field.do, at_once=2))
     running.addErrback(lambda failure: ends.append(failure.type))
     running.cancel()
     assert sorted(field.given_up) == ["a", "b"]
@@ -59,7 +59,7 @@ def test_who_gives_up_ends_what_has_begun() -> None:
 def test_what_goes_wrong_ends_the_others() -> None:
     """An error that nobody foresaw is not one of a single robot."""
     field, ends = Field(), []
-    running = Deferred.fromCoroutine(side_by_side("abc", field.do, at_once=2))
+    running = Deferred.fromCoroutine(bounded_gather("abc", field.do, at_once=2))
     running.addErrback(lambda failure: ends.append(failure.type))
     field.open["a"].errback(ZeroDivisionError())
     assert field.given_up == ["b"]
@@ -69,5 +69,5 @@ def test_what_goes_wrong_ends_the_others() -> None:
 def test_no_robots_are_done_at_once() -> None:
     """There is nothing to wait for."""
     over: list[None] = []
-    Deferred.fromCoroutine(side_by_side([], Field().do)).addCallback(over.append)
+    Deferred.fromCoroutine(bounded_gather([], Field().do)).addCallback(over.append)
     assert over == [None]

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from relay_protocol import rosbridge
-from relay_server import forms
-from relay_server.forms import Form, fragments
+from relay_server.channels import encodings
+from relay_server.channels.encodings import MessageEncoding
 from tests.relay_server.memory import messages_in
 
 
@@ -29,7 +29,7 @@ def data_of(parts: list[bytes]) -> list[str]:
 def test_fragments_join_to_the_message(text: str, size: int) -> None:
     """Joined in order they are the message, whatever is in it, and none is larger than asked for."""
     message = json.dumps({"op": "publish", "msg": text}, ensure_ascii=False).encode("utf-8", "replace")
-    parts = fragments.divide(message, size)
+    parts = encodings.divide(message, size)
     if len(message) <= size:
         assert parts == [message]
         return
@@ -41,14 +41,14 @@ def test_fragments_join_to_the_message(text: str, size: int) -> None:
 def test_short_messages_stay_whole() -> None:
     """A message as long as a fragment may be is not divided."""
     message = b'{"op":"status"}'.ljust(100)
-    assert fragments.divide(message, 100) == [message]
-    assert fragments.divide(message, 0) == [message]
-    assert len(fragments.divide(message, 99)) == 2
+    assert encodings.divide(message, 100) == [message]
+    assert encodings.divide(message, 0) == [message]
+    assert len(encodings.divide(message, 99)) == 2
 
 
 def test_each_message_has_its_own_id() -> None:
     """Fragments of two messages can't be mixed up."""
-    first, second = (json.loads(fragments.divide(b"x" * 200, 100)[0])["id"] for _ in range(2))
+    first, second = (json.loads(encodings.divide(b"x" * 200, 100)[0])["id"] for _ in range(2))
     assert first != second
 
 
@@ -56,15 +56,15 @@ def test_each_message_has_its_own_id() -> None:
 def test_the_number_of_fragments_is_bounded(letter: str) -> None:
     """Of a very long message the fragments are larger than asked for."""
     message = (letter * 1_500_000).encode()
-    parts = fragments.divide(message, 64)
-    assert len(parts) <= fragments.MOST
+    parts = encodings.divide(message, 64)
+    assert len(parts) <= encodings.MOST_FRAGMENTS
     assert "".join(data_of(parts)).encode() == message
 
 
 def test_frames_of_fragments_follow_each_other() -> None:
     """All fragments of a message are text frames in one piece for the outbox."""
     message = rosbridge.publish("/chatter", json.dumps({"data": "x" * 300}).encode())
-    frames = messages_in(forms.frames(message, Form("none", 100)))
+    frames = messages_in(encodings.frames(message, MessageEncoding("none", 100)))
     assert len(frames) == 4
     assert {first for first, _ in frames} == {0x81}
     assert "".join(data_of([payload for _, payload in frames])).encode() == message
@@ -73,11 +73,13 @@ def test_frames_of_fragments_follow_each_other() -> None:
 def test_a_png_is_divided_too() -> None:
     """The text that carries a PNG is a message like others."""
     message = rosbridge.publish("/chatter", json.dumps({"data": "x" * 300}).encode())
-    frames = [payload for _, payload in messages_in(forms.frames(message, Form("png", 64)))]
+    frames = [payload for _, payload in messages_in(encodings.frames(message, MessageEncoding("png", 64)))]
     assert json.loads("".join(data_of(frames)))["op"] == "png"
 
 
 def test_binary_messages_are_not_divided() -> None:
     """CBOR comes whole, whatever size of fragments was asked for."""
     message = json.dumps({"values": "x" * 300}).encode()
-    assert [first for first, _ in messages_in(forms.frames(message, Form("cbor", 64)))] == [0x82]
+    assert [first for first, _ in messages_in(encodings.frames(message, MessageEncoding("cbor", 64)))] == [
+        0x82
+    ]

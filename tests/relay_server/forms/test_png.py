@@ -9,8 +9,8 @@ import json
 import pytest
 from PIL import Image
 
-from relay_server import forms
-from relay_server.forms import Form, png
+from relay_server.channels import encodings
+from relay_server.channels.encodings import MessageEncoding
 from tests.relay_server.memory import messages_in
 
 
@@ -25,7 +25,7 @@ def picture_of(message: bytes) -> Image.Image:
 def test_the_pixels_are_the_bytes(length: int) -> None:
     """8-bit RGB without alpha, rows from the top left, padded with line feeds, about square."""
     message = (b'"' + b"0123456789" * 10_000)[: length - 1] + b'"'
-    picture = picture_of(png.encode(message))
+    picture = picture_of(encodings.encode(message))
     assert picture.mode == "RGB"
     assert picture.tobytes().rstrip(b"\n") == message
     width, height = picture.size
@@ -36,7 +36,7 @@ def test_the_pixels_are_the_bytes(length: int) -> None:
 def test_characters_beyond_ascii_are_escaped() -> None:
     """The same JSON in ASCII: in browsers roslib 1.x takes each byte for a character."""
     message = json.dumps({"data": "naïve 😀 \\u00e9 \x7f"}, ensure_ascii=False).encode()
-    data = picture_of(png.encode(message)).tobytes()
+    data = picture_of(encodings.encode(message)).tobytes()
     assert data.isascii()
     assert json.loads(data) == json.loads(message)
 
@@ -44,14 +44,14 @@ def test_characters_beyond_ascii_are_escaped() -> None:
 def test_what_is_ascii_already_stays_as_it_is() -> None:
     """Quotes, backslashes and white space, also next to characters that are escaped."""
     message = '{"a\\"é\\\\é\\\\": "\\\\\\"\\n\\u00e9",\r\n\t"b" : ["\\/", "é\\\\"]}'
-    data = picture_of(png.encode(message.encode())).tobytes().rstrip(b"\n")
+    data = picture_of(encodings.encode(message.encode())).tobytes().rstrip(b"\n")
     assert data.decode() == message.replace("é", "\\u00e9")
     assert json.loads(data) == json.loads(message)
 
 
 def test_nothing_but_pixels() -> None:
     """No chunk tells a browser to change the colours, which are letters here."""
-    data = base64.b64decode(json.loads(png.encode(b'{"op":"status"}'))["data"])
+    data = base64.b64decode(json.loads(encodings.encode(b'{"op":"status"}'))["data"])
     at, kinds = 8, []
     while at < len(data):
         kinds.append(data[at + 4 : at + 8])
@@ -61,7 +61,7 @@ def test_nothing_but_pixels() -> None:
 
 def test_long_answers_come_plain() -> None:
     """What would keep the relay busy for too long is sent as JSON."""
-    for length, op in ((png.MOST, "png"), (png.MOST + 1, "status")):
+    for length, op in ((encodings.MOST_PNG, "png"), (encodings.MOST_PNG + 1, "status")):
         message = b'{"op":"status"}'.ljust(length)
-        [(first, payload)] = messages_in(forms.frames(message, Form("png")))
+        [(first, payload)] = messages_in(encodings.frames(message, MessageEncoding("png")))
         assert (first, json.loads(payload)["op"]) == (0x81, op)

@@ -12,9 +12,15 @@ from twisted.internet.defer import Deferred
 
 from relay_protocol import rosbridge
 from relay_protocol.errors import Invalid, Refused, SwitchboardError, Unavailable
-from relay_server import closing, wsframe
-from relay_server.inside.client import FAILED, Answer, InsideClient, MaybeDone, texts_in
-from relay_server.session import Session
+from relay_server.common import close_codes, websocket_frames
+from relay_server.http_sessions.loopback_client import (
+    FAILED,
+    LoopbackClient,
+    MaybeDone,
+    ServiceReply,
+    texts_in,
+)
+from relay_server.sessions.session import Session
 
 NOTHING = msgspec.Raw(b"{}")
 
@@ -50,28 +56,28 @@ def other() -> Other:
 
 
 @pytest.fixture
-def client(other: Other) -> InsideClient:
+def client(other: Other) -> LoopbackClient:
     """Its client, who has begun."""
-    made = InsideClient()
+    made = LoopbackClient()
     made.begin(cast(Session, other))
     return made
 
 
-def says(client: InsideClient, **message: Any) -> None:
+def says(client: LoopbackClient, **message: Any) -> None:
     """The session says something."""
-    client.send(wsframe.text(json.dumps(message).encode()))
+    client.send(websocket_frames.text(json.dumps(message).encode()))
 
 
-def asks(client: InsideClient, service: str) -> tuple[list[Answer], list[SwitchboardError]]:
+def asks(client: LoopbackClient, service: str) -> tuple[list[ServiceReply], list[SwitchboardError]]:
     """Call a service; where answer and error will be."""
-    answers: list[Answer] = []
+    answers: list[ServiceReply] = []
     errors: list[SwitchboardError] = []
     running = Deferred.fromCoroutine(client.call(service, NOTHING))
     running.addCallbacks(answers.append, lambda failure: errors.append(failure.value))
     return answers, errors
 
 
-def test_it_begins_as_a_client_who_wants_to_hear_errors(client: InsideClient, other: Other) -> None:
+def test_it_begins_as_a_client_who_wants_to_hear_errors(client: LoopbackClient, other: Other) -> None:
     """And answers pings at once."""
     assert other.started
     assert [(each["op"], each["level"]) for each in other.heard] == [("set_level", "warning")]
@@ -79,7 +85,7 @@ def test_it_begins_as_a_client_who_wants_to_hear_errors(client: InsideClient, ot
     assert other.pongs == [b"12345678"]
 
 
-def test_each_call_gets_its_own_answer(client: InsideClient, other: Other) -> None:
+def test_each_call_gets_its_own_answer(client: LoopbackClient, other: Other) -> None:
     """In whatever order they come; one that nobody waits for is passed over."""
     first, _ = asks(client, "/a")
     second, _ = asks(client, "/b")
@@ -92,7 +98,7 @@ def test_each_call_gets_its_own_answer(client: InsideClient, other: Other) -> No
     assert [each.read for each in first] == [{"sum": 3}]
 
 
-def test_what_goes_wrong_later_is_told_to_who_asked(client: InsideClient) -> None:
+def test_what_goes_wrong_later_is_told_to_who_asked(client: LoopbackClient) -> None:
     """Once; where there is no answer to wait for."""
     client.check("a")
     says(client, op="status", level="error", msg="no such topic", id="a")
@@ -105,7 +111,7 @@ def test_what_goes_wrong_later_is_told_to_who_asked(client: InsideClient) -> Non
 
 @pytest.mark.parametrize(("level", "kind"), [("error", Invalid), ("warning", Refused)])
 def test_what_is_told_meanwhile_is_raised(
-    client: InsideClient, other: Other, level: str, kind: type[SwitchboardError]
+    client: LoopbackClient, other: Other, level: str, kind: type[SwitchboardError]
 ) -> None:
     """Of this operation, and of no other."""
     asked = rosbridge.Publish(id="mine", topic="/a")
@@ -116,7 +122,7 @@ def test_what_is_told_meanwhile_is_raised(
         client.do(asked)
 
 
-def test_why_operations_failed_is_not_kept_for_ever(client: InsideClient) -> None:
+def test_why_operations_failed_is_not_kept_for_ever(client: LoopbackClient) -> None:
     """Of so many, the latest."""
     for number in range(2 * FAILED):
         says(client, op="status", level="error", msg="no", id=f"{number}")
@@ -126,9 +132,11 @@ def test_why_operations_failed_is_not_kept_for_ever(client: InsideClient) -> Non
         client.check(f"{2 * FAILED - 1}")
 
 
-@pytest.mark.parametrize(("code", "kind"), [(closing.GOING_AWAY, Unavailable), (closing.FORBIDDEN, Refused)])
+@pytest.mark.parametrize(
+    ("code", "kind"), [(close_codes.GOING_AWAY, Unavailable), (close_codes.FORBIDDEN, Refused)]
+)
 def test_a_session_that_is_closed_ends_what_waits(
-    client: InsideClient, code: int, kind: type[SwitchboardError]
+    client: LoopbackClient, code: int, kind: type[SwitchboardError]
 ) -> None:
     """With the reason, now and for whatever is tried later."""
     answers, errors = asks(client, "/a")
@@ -143,13 +151,13 @@ def test_a_session_that_is_closed_ends_what_waits(
             attempt()
 
 
-def test_a_call_that_was_not_sent_was_not_done(client: InsideClient, other: Other) -> None:
+def test_a_call_that_was_not_sent_was_not_done(client: LoopbackClient, other: Other) -> None:
     """Refused at once, or asked for when the session is over."""
     other.meanwhile = lambda: says(
         client, op="status", level="error", msg="no", id=str(other.heard[-1]["id"])
     )
     _, refused = asks(client, "/a")
-    client.close(closing.FORBIDDEN, "your right was revoked")
+    client.close(close_codes.FORBIDDEN, "your right was revoked")
     _, late = asks(client, "/a")
     assert [type(each) for each in refused + late] == [Invalid, Refused]
 
@@ -159,6 +167,7 @@ def test_texts_are_found_in_frames(length: int) -> None:
     """Of every length, and nothing else than texts."""
     payloads = [b"a" * length, b"b", b"c" * length]
     frames = b"".join(
-        wsframe.text(each) + wsframe.binary(b"x" * 130) + wsframe.ping(b"y") for each in payloads
+        websocket_frames.text(each) + websocket_frames.binary(b"x" * 130) + websocket_frames.ping(b"y")
+        for each in payloads
     )
     assert list(texts_in(frames)) == payloads

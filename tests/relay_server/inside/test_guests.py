@@ -10,20 +10,20 @@ from relay_protocol import rosbridge
 from relay_protocol.errors import NotFound, Refused, Unavailable
 from relay_protocol.rights import Operation
 from relay_server.access import Principal
-from relay_server.frontdesk import GoingDown
-from relay_server.inside import Guests, MaybeDone
-from relay_server.inside import guests as module
-from relay_server.inside.guests import LINGER_SECONDS
-from relay_server.session.publishing import Publishing
+from relay_server.http_sessions import pool as module
+from relay_server.http_sessions.loopback_client import MaybeDone
+from relay_server.http_sessions.pool import LINGER_SECONDS, SessionPool
+from relay_server.sessions.manager import ShuttingDown
+from relay_server.sessions.publishing import PublishHandler
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import TRIGGER
 from tests.relay_server.steering import outcome
 
 
 @pytest.fixture
-def guests(front: Desk) -> Guests:
+def guests(front: Desk) -> SessionPool:
     """Those who come to it by HTTP."""
-    return Guests(front.world.clock, front.desk, front.world.now_ns)
+    return SessionPool(front.world.clock, front.desk, front.world.now_ns)
 
 
 def passes(front: Desk, seconds: float) -> None:
@@ -31,14 +31,14 @@ def passes(front: Desk, seconds: float) -> None:
     front.world.clock.pump([0.5] * round(seconds / 0.5))
 
 
-async def once(guests: Guests, principal: Principal) -> int:
+async def once(guests: SessionPool, principal: Principal) -> int:
     """One request; the number of its connection."""
     async with guests.at(principal, "rover", HERE) as guest:
         return guest.session.number
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_connection_is_kept_from_one_request_to_the_next(front: Desk, guests: Guests) -> None:
+async def test_a_connection_is_kept_from_one_request_to_the_next(front: Desk, guests: SessionPool) -> None:
     """And ends when none has come for so long, with all that was there for it."""
     ann, _ = await front.logged_in()
     first = await once(guests, ann)
@@ -52,7 +52,7 @@ async def test_a_connection_is_kept_from_one_request_to_the_next(front: Desk, gu
 
 
 @pytest_twisted.ensureDeferred
-async def test_it_does_not_end_while_a_request_is_answered(front: Desk, guests: Guests) -> None:
+async def test_it_does_not_end_while_a_request_is_answered(front: Desk, guests: SessionPool) -> None:
     """However long that takes; two at a time share it."""
     ann, _ = await front.logged_in()
     async with guests.at(ann, "rover", HERE) as guest:
@@ -64,14 +64,14 @@ async def test_it_does_not_end_while_a_request_is_answered(front: Desk, guests: 
 
 
 @pytest_twisted.ensureDeferred
-async def test_each_token_has_its_own(front: Desk, guests: Guests) -> None:
+async def test_each_token_has_its_own(front: Desk, guests: SessionPool) -> None:
     """One may be for less than the other."""
     (one, _), (other, _) = await front.logged_in(), await front.logged_in()
     assert await once(guests, one) != await once(guests, other)
 
 
 @pytest_twisted.ensureDeferred
-async def test_one_that_was_closed_is_not_used_again(front: Desk, guests: Guests) -> None:
+async def test_one_that_was_closed_is_not_used_again(front: Desk, guests: SessionPool) -> None:
     """Whoever has a right again comes in anew."""
     ann, _ = await front.logged_in()
     async with guests.at(ann, "rover", HERE) as guest:
@@ -84,7 +84,9 @@ async def test_one_that_was_closed_is_not_used_again(front: Desk, guests: Guests
 
 
 @pytest_twisted.ensureDeferred
-async def test_one_user_has_so_many(front: Desk, guests: Guests, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_one_user_has_so_many(
+    front: Desk, guests: SessionPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Until one of them ends; who is turned away leaves nothing."""
     monkeypatch.setattr(module, "GUESTS", 1)
     (one, _), (other, _) = await front.logged_in(), await front.logged_in()
@@ -97,16 +99,16 @@ async def test_one_user_has_so_many(front: Desk, guests: Guests, monkeypatch: py
 
 
 @pytest_twisted.ensureDeferred
-async def test_nobody_comes_in_who_may_not_or_comes_too_late(front: Desk, guests: Guests) -> None:
+async def test_nobody_comes_in_who_may_not_or_comes_too_late(front: Desk, guests: SessionPool) -> None:
     """No right, no robot, or no relay any more."""
     ann, _ = await front.logged_in()
     with pytest.raises(NotFound):
         async with guests.at(ann, "hidden", HERE):
             raise AssertionError
     front.desk.say_goodbye("the relay is going down")
-    with pytest.raises(GoingDown):
+    with pytest.raises(ShuttingDown):
         await once(guests, ann)
-    with pytest.raises(GoingDown):
+    with pytest.raises(ShuttingDown):
         async with guests.visit(ann, "rover", HERE):
             raise AssertionError
     assert not front.access._permits
@@ -114,7 +116,7 @@ async def test_nobody_comes_in_who_may_not_or_comes_too_late(front: Desk, guests
 
 @pytest_twisted.ensureDeferred
 async def test_a_visit_counts_as_long_as_it_lasts(
-    front: Desk, guests: Guests, monkeypatch: pytest.MonkeyPatch
+    front: Desk, guests: SessionPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Among those that are kept, and leaves nothing."""
     monkeypatch.setattr(module, "GUESTS", 2)
@@ -133,21 +135,23 @@ async def test_a_visit_counts_as_long_as_it_lasts(
 
 @pytest_twisted.ensureDeferred
 async def test_what_is_not_dated_is_too_old(
-    front: Desk, guests: Guests, monkeypatch: pytest.MonkeyPatch
+    front: Desk, guests: SessionPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever forgets to say since when moves nothing, though pings are answered at once."""
     ann, _ = await front.logged_in()
     passes(front, 5)
     async with guests.at(ann, "rover", HERE) as guest:
         ages: list[int] = []
-        monkeypatch.setattr(Publishing, "publish", lambda self, ask: ages.append(guest.session.not_before))
+        monkeypatch.setattr(
+            PublishHandler, "publish", lambda self, ask: ages.append(guest.session.not_before)
+        )
         guest.client.do(rosbridge.Publish(topic="/a"))
         guest.client.do(rosbridge.Publish(topic="/a"), since=5)
         assert ages == [0, 5]
 
 
 @pytest_twisted.ensureDeferred
-async def test_one_that_is_kept_goes_when_it_is_let_go(front: Desk, guests: Guests) -> None:
+async def test_one_that_is_kept_goes_when_it_is_let_go(front: Desk, guests: SessionPool) -> None:
     """Once, however often that is said."""
     ann, _ = await front.logged_in()
     guest, leave = await guests.keep(ann, "rover", HERE)
@@ -163,7 +167,7 @@ async def test_one_that_is_kept_goes_when_it_is_let_go(front: Desk, guests: Gues
 
 
 @pytest_twisted.ensureDeferred
-async def test_who_waits_still_when_it_ends_is_told_so(front: Desk, guests: Guests) -> None:
+async def test_who_waits_still_when_it_ends_is_told_so(front: Desk, guests: SessionPool) -> None:
     """Nothing that was asked of it comes any more."""
     ann, _ = await front.logged_in()
     front.world.robot_comes()
@@ -175,7 +179,7 @@ async def test_who_waits_still_when_it_ends_is_told_so(front: Desk, guests: Gues
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_somebody_may_is_told_without_a_connection(front: Desk, guests: Guests) -> None:
+async def test_what_somebody_may_is_told_without_a_connection(front: Desk, guests: SessionPool) -> None:
     """By that which there is, where there is one; nothing is left of it."""
     ann, _ = await front.logged_in()
     async with guests.permit(ann, "rover", HERE) as permit:

@@ -13,13 +13,13 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Refused, SwitchboardError, Unavailable
 from relay_server.access import Principal
-from relay_server.console import Console
-from relay_server.control import Desk as ControlDesk
-from relay_server.control import NotDone
-from relay_server.control.terms import ControlRules
-from relay_server.inside import LINGER_SECONDS, Guests
-from relay_server.inside.holding import GIVEN_BACK, OVER
-from relay_server.session import Session
+from relay_server.control.commands import NotDone
+from relay_server.control.controller import RobotController as ControlDesk
+from relay_server.control.service import ControlService
+from relay_server.control.types import ControlRules
+from relay_server.http_sessions.control_requests import GIVEN_BACK, OVER
+from relay_server.http_sessions.pool import LINGER_SECONDS, SessionPool
+from relay_server.sessions.session import Session
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.steering import outcome
 
@@ -32,9 +32,9 @@ class Place:
     def __init__(self, front: Desk) -> None:
         self.front = front
         self.world = front.world
-        self.guests = Guests(self.world.clock, front.desk, self.world.now_ns)
+        self.guests = SessionPool(self.world.clock, front.desk, self.world.now_ns)
         offices = front.desk, front.access, self.world.desks, self.world.registry, front.store
-        self.console = Console(self.world.clock, *offices, self.guests)
+        self.console = ControlService(self.world.clock, *offices, self.guests)
         self.users = {"ann": front.ann}
         self._principals: dict[str, Principal] = {}
         with front.store.database.begin() as s:

@@ -13,10 +13,10 @@ from twisted.internet.task import Clock
 
 from relay_protocol import rosbridge
 from relay_protocol.errors import Refused, SwitchboardError, Unavailable
-from relay_server import closing, wsframe
-from relay_server.clock import within
-from relay_server.inside import InsideClient, MaybeDone
-from relay_server.inside.publishing import LOOK_SECONDS, MATCHING_SECONDS, Speaker
+from relay_server.common import close_codes, websocket_frames
+from relay_server.common.clock import with_timeout
+from relay_server.http_sessions.loopback_client import LoopbackClient, MaybeDone
+from relay_server.http_sessions.one_shot_publisher import LOOK_SECONDS, MATCHING_SECONDS, OneShotPublisher
 from tests.relay_server.steering import outcome
 
 TOPIC, TYPE = "/said", "std_msgs/msg/String"
@@ -44,13 +44,13 @@ class Stage:
             do=lambda operation, since: self.done.append(operation),
         )
         self.robot: Any = robot
-        self.client = InsideClient()
+        self.client = LoopbackClient()
         self.client.begin(session)
-        self.speaker = Speaker(self.clock, self.client, session, TOPIC)
+        self.speaker = OneShotPublisher(self.clock, self.client, session, TOPIC)
 
     def says(self) -> list[Any]:
         """Publish a message that waits for nobody; what comes of it."""
-        late = within(self.clock, 5.0, self.speaker.say(BODY, TYPE), "too late")
+        late = with_timeout(self.clock, 5.0, self.speaker.say(BODY, TYPE), "too late")
         return outcome(late)
 
     def commands(self) -> list[Any]:
@@ -61,7 +61,7 @@ class Stage:
     def refuses(self, words: str) -> None:
         """The relay refuses the first message after all."""
         status = {"op": "status", "level": "error", "msg": words, "id": self.said[0]}
-        self.client.send(wsframe.text(json.dumps(status).encode()))
+        self.client.send(websocket_frames.text(json.dumps(status).encode()))
 
     @property
     def said(self) -> list[str]:
@@ -82,7 +82,7 @@ def test_a_message_that_was_said_may_have_arrived(stage: Stage) -> None:
     told = stage.says()
     stage.clock.advance(MATCHING_SECONDS)
     assert len(stage.said) == 2 and (before, told) == ([], [])
-    stage.client.close(closing.FORBIDDEN, "your right was revoked")
+    stage.client.close(close_codes.FORBIDDEN, "your right was revoked")
     stage.clock.advance(MATCHING_SECONDS)
     assert [type(each) for each in before + told] == [MaybeDone, MaybeDone]
     (never,) = stage.says()
@@ -92,7 +92,7 @@ def test_a_message_that_was_said_may_have_arrived(stage: Stage) -> None:
 def test_a_message_that_was_not_said_has_not(stage: Stage) -> None:
     """The session was cut while it waited to be."""
     told = stage.says()
-    stage.client.close(closing.GOING_AWAY, "the relay is going down")
+    stage.client.close(close_codes.GOING_AWAY, "the relay is going down")
     stage.clock.advance(MATCHING_SECONDS)
     assert [type(each) for each in told] == [Unavailable] and stage.said == []
 
@@ -120,7 +120,7 @@ def test_a_command_that_was_said_may_have_moved_the_robot(stage: Stage, why: str
     told = stage.commands()
     assert len(stage.said) == 1 and told == []
     if why == "cut":
-        stage.client.close(closing.FORBIDDEN, "your right was revoked")
+        stage.client.close(close_codes.FORBIDDEN, "your right was revoked")
     elif why == "offline":
         stage.robot.control = None
     for _ in range(int(1 / LOOK_SECONDS) + 2):

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from relay_protocol import link
-from relay_server.local.catalogue import SERVICES, STATUS, TYPE_NAMES, TYPES
+from relay_server.relay_node.interfaces import SERVICES, STATUS, TYPE_NAMES, TYPES
 
 SPEC = (Path(__file__).parents[3] / "protocol" / "SPEC.md").read_text("utf-8")
 SECTION = SPEC[SPEC.index("### 1.7 ") : SPEC.index("## 2. ")]

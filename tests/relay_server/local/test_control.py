@@ -8,8 +8,8 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.local import control
-from relay_server.local.catalogue import OWN_SERVICES, TYPES
+from relay_server.relay_node import control
+from relay_server.relay_node.interfaces import OWN_SERVICES, TYPES
 from tests.relay_server.local.asking import ask
 from tests.relay_server.memory import STRING, Person, World
 

@@ -8,9 +8,9 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.local import control, rosapi
-from relay_server.local.catalogue import SERVICES, TYPES
-from relay_server.local.view import KEPT, _kept
+from relay_server.relay_node import control, rosapi
+from relay_server.relay_node.interfaces import SERVICES, TYPES
+from relay_server.relay_node.view import KEPT, _kept
 from tests.relay_server.local.asking import OWN_SERVICES, ask
 from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World
 

@@ -8,7 +8,7 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.local.catalogue import SERVICES, STATUS, TYPES
+from relay_server.relay_node.interfaces import SERVICES, STATUS, TYPES
 from tests.relay_server.local.asking import ask
 from tests.relay_server.memory import STRING, Person, World, text
 from tests.relay_server.video.watching import CAMERA, Watcher

@@ -9,9 +9,9 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Level
-from relay_server.local import params
-from relay_server.local.params import ALL_SECONDS, SURVEYS, SURVEYS_OF_USER
-from relay_server.local.together import AT_A_TIME
+from relay_server.common.gather import AT_A_TIME
+from relay_server.relay_node import params
+from relay_server.relay_node.params import ALL_SECONDS, SURVEYS, SURVEYS_OF_USER
 from tests.relay_server.local.asking import answers, ask, asked, begin, fails
 from tests.relay_server.memory import Person, World
 

@@ -7,7 +7,7 @@ from collections import deque
 import pytest
 from twisted.internet.defer import CancelledError, Deferred
 
-from relay_server.local.together import AT_A_TIME, side_by_side
+from relay_server.common.gather import AT_A_TIME, gather_per_key
 
 
 class Work:
@@ -26,7 +26,7 @@ class Work:
 def test_the_next_begins_when_one_is_done() -> None:
     """All are done in the end."""
     work = Work()
-    done = Deferred.fromCoroutine(side_by_side(deque(range(50)), work.ask))
+    done = Deferred.fromCoroutine(gather_per_key(deque(range(50)), work.ask))
     for number in range(50):
         assert len(work.waiting) == min(50, AT_A_TIME + number)
         work.waiting[number].callback(None)
@@ -35,7 +35,7 @@ def test_the_next_begins_when_one_is_done() -> None:
 
 def test_nothing_to_do_is_done() -> None:
     """At once."""
-    assert Deferred.fromCoroutine(side_by_side(deque(), Work().ask)).called
+    assert Deferred.fromCoroutine(gather_per_key(deque(), Work().ask)).called
 
 
 def test_thousands_that_are_done_at_once_are_no_recursion() -> None:
@@ -44,13 +44,13 @@ def test_thousands_that_are_done_at_once_are_no_recursion() -> None:
     async def ask(item: int) -> None:
         """Done already."""
 
-    assert Deferred.fromCoroutine(side_by_side(deque(range(50_000)), ask)).called
+    assert Deferred.fromCoroutine(gather_per_key(deque(range(50_000)), ask)).called
 
 
 def test_what_goes_wrong_is_told() -> None:
     """The error itself, not that there was one."""
     work = Work()
-    done = Deferred.fromCoroutine(side_by_side(deque(range(3)), work.ask))
+    done = Deferred.fromCoroutine(gather_per_key(deque(range(3)), work.ask))
     work.waiting[1].errback(RuntimeError("broken"))
     errors: list[BaseException] = []
     done.addErrback(lambda failure: errors.append(failure.value))
@@ -61,7 +61,7 @@ def test_who_cancels_ends_them_all() -> None:
     """None begins after that."""
     work = Work()
     items = deque(range(50))
-    done = Deferred.fromCoroutine(side_by_side(items, work.ask))
+    done = Deferred.fromCoroutine(gather_per_key(items, work.ask))
     done.cancel()
     with pytest.raises(CancelledError):
         done.result.raiseException()  # type: ignore[attr-defined]

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
-from relay_server import budget
-from relay_server.local import types
-from relay_server.local.catalogue import TYPE_NAMES
-from relay_server.local.together import AT_A_TIME
+from relay_server.common import cpu_quota
+from relay_server.common.gather import AT_A_TIME
+from relay_server.relay_node import types
+from relay_server.relay_node.interfaces import TYPE_NAMES
 from tests.relay_server.local.asking import ask, begin
 from tests.relay_server.memory import STRING, TRIGGER, TWIST, Person, World
 
@@ -232,7 +232,7 @@ def test_the_answers_of_many_who_wait_for_one_type_are_made_in_turns(world: Worl
     begin(operator, "/rosapi/message_details", type_name)
     define(world, "geometry_msgs/msg/TwistStamped", TWIST_STAMPED)
     assert len(first()["typedefs"]) == 3
-    operator.session.allowance.requests.spend(2 * budget.REQUESTS_RESERVE)
+    operator.session.allowance.requests.spend(2 * cpu_quota.REQUESTS_RESERVE)
     world.clock.advance(0)
     refused = operator.hears("service_response")[0]["values"]
     assert refused.startswith("too much at once")

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from relay_protocol.errors import Invalid
-from relay_server.local.values import from_parameter, to_parameter
+from relay_server.relay_node.params import from_parameter, to_parameter
 
 VALUES: list[tuple[Any, int | None, int, str]] = [
     (True, None, 1, "bool_value"),

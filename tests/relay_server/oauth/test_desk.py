@@ -12,14 +12,13 @@ from twisted.internet import reactor
 
 from relay_db import queries
 from relay_protocol.errors import Unavailable
-from relay_server import passwords
 from relay_server.access import Access, BadCredentials
-from relay_server.auth import Authenticator, TooManyTries
-from relay_server.journal import Journal
-from relay_server.limiter import FAILURES
-from relay_server.oauth import OAuthDesk, OAuthError, TokenAsk
-from relay_server.oauth.desk import ACCESS_SECONDS, REFRESH_SECONDS
-from relay_server.store import Store
+from relay_server.auth import passwords
+from relay_server.auth.authenticator import Authenticator, TooManyTries
+from relay_server.auth.login_limiter import FAILURES
+from relay_server.common.database import AsyncDatabase
+from relay_server.events.bus import EventBus
+from relay_server.oauth.service import ACCESS_SECONDS, REFRESH_SECONDS, OAuthError, OAuthService, TokenRequest
 
 HERE = "192.0.2.1"
 PASSWORD = "correct horse"
@@ -29,15 +28,15 @@ KEY, SECRET = "swp_1", "swb_secret"
 class World:
     """A desk, ann with a password, and a program of hers."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: AsyncDatabase) -> None:
         self.now = 1000.0
         self.store = store
         self.auth = Authenticator(reactor, store, lambda: self.now, lambda: self.now)  # type: ignore[arg-type]
         self.access = Access(store, lambda: self.now)
-        journal = Journal(store, lambda: self.now)
+        journal = EventBus(store, lambda: self.now)
         self.told: list[tuple[str, dict[str, Any]]] = []
         journal.listen(lambda kind, robot, data: self.told.append((kind, data)))
-        self.desk = OAuthDesk(store, self.auth, self.access, journal, lambda: self.now, lambda: self.now)
+        self.desk = OAuthService(store, self.auth, self.access, journal, lambda: self.now, lambda: self.now)
 
     async def fill(self, scope: str | None = None) -> None:
         """Ann and her program."""
@@ -47,13 +46,13 @@ class World:
 
     async def by_password(self, scope: str | None = None, password: str = PASSWORD) -> dict[str, Any]:
         """What ann gets."""
-        ask = TokenAsk("password", username="ann", password=password, scope=scope)
+        ask = TokenRequest("password", username="ann", password=password, scope=scope)
         return (await self.desk.token(ask, None, HERE)).told()
 
     async def by_secret(self, scope: str | None = None, realm: str | None = None) -> dict[str, Any]:
         """What her program gets."""
         program = await self.desk.program("", "POST", "/", HERE, (KEY, SECRET))
-        ask = TokenAsk("client_credentials", scope=scope, realm=realm)
+        ask = TokenRequest("client_credentials", scope=scope, realm=realm)
         return (await self.desk.token(ask, program, HERE)).told()
 
     async def joins(self, realm: str) -> None:
@@ -66,7 +65,7 @@ class World:
 
     async def refreshed(self, token: str, scope: str | None = None) -> dict[str, Any]:
         """What follows on a refresh token."""
-        ask = TokenAsk("refresh_token", refresh_token=token, scope=scope)
+        ask = TokenRequest("refresh_token", refresh_token=token, scope=scope)
         return (await self.desk.token(ask, None, HERE)).told()
 
     async def error(self, asking: Any) -> str:
@@ -77,7 +76,7 @@ class World:
 
 
 @pytest.fixture
-def there(store: Store) -> Iterator[World]:
+def there(store: AsyncDatabase) -> Iterator[World]:
     """The world."""
     world = World(store)
     world.auth.start()
@@ -108,7 +107,7 @@ async def test_a_wrong_password_gives_none(there: World) -> None:
     assert await there.error(there.by_password(password="wrong")) == "invalid_grant"
     said = {"user": "ann", "realm": "default", "address": HERE, "reason": "bad_credentials"}
     assert there.told[-1] == ("login.refused", said)
-    ask = TokenAsk("password", username=f"{'x' * 100}@LAB1", password="wrong")
+    ask = TokenRequest("password", username=f"{'x' * 100}@LAB1", password="wrong")
     assert await there.error(there.desk.token(ask, None, HERE)) == "invalid_grant"
     assert there.told[-1] == ("login.refused", {**said, "user": f"{'x' * 100}@LAB1", "realm": "lab1"})
     for _ in range(FAILURES - 1):
@@ -179,13 +178,13 @@ async def test_what_can_not_be_granted(there: World) -> None:
     await there.fill()
     desk = there.desk
     for ask, error in (
-        (TokenAsk("password"), "invalid_request"),
-        (TokenAsk("refresh_token"), "invalid_request"),
-        (TokenAsk("authorization_code"), "unsupported_grant_type"),
+        (TokenRequest("password"), "invalid_request"),
+        (TokenRequest("refresh_token"), "invalid_request"),
+        (TokenRequest("authorization_code"), "unsupported_grant_type"),
     ):
         assert await there.error(desk.token(ask, None, HERE)) == error
     with pytest.raises(BadCredentials, match="prove the program"):
-        await desk.token(TokenAsk("client_credentials"), None, HERE)
+        await desk.token(TokenRequest("client_credentials"), None, HERE)
 
 
 @pytest_twisted.ensureDeferred
@@ -196,7 +195,7 @@ async def test_a_program_that_was_removed_meanwhile_gets_none(there: World) -> N
     assert program is not None
     await there.store.write(queries.remove_program, program.id)
     with pytest.raises(BadCredentials):
-        await there.desk.token(TokenAsk("client_credentials"), program, HERE)
+        await there.desk.token(TokenRequest("client_credentials"), program, HERE)
 
 
 def basic(key: str, secret: str) -> str:

@@ -7,11 +7,10 @@ import re
 import httpx
 import pytest
 
-from relay_server import passwords
 from relay_server.access import BadCredentials
-from relay_server.oauth import Digest, StaleNonce
+from relay_server.auth import passwords
 from relay_server.oauth import digest as module
-from relay_server.oauth.digest import NONCE_SECONDS
+from relay_server.oauth.digest import NONCE_SECONDS, Digest, StaleNonce
 
 KEY, SECRET = "swp_1", "swb_secret"
 KNOWN = passwords.verifier(KEY, SECRET)

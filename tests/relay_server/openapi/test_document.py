@@ -9,7 +9,8 @@ import pytest
 from msgspec import Meta
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
-from relay_server.openapi import Answer, Credential, Operation, document, header, query, raw
+from relay_server.http.openapi.document import document
+from relay_server.http.openapi.operation import ApiOperation, Credential, Response, header, query, raw
 
 
 class Wish(msgspec.Struct, forbid_unknown_fields=True):
@@ -39,19 +40,22 @@ Other = type(
     "Wish", (msgspec.Struct,), {"__annotations__": {"name": str}, "__module__": "relay_server.other.desk"}
 )
 
-GIVE = Operation(
+GIVE = ApiOperation(
     method="POST",
     path="/api/v1/robots/{robot}/wishes",
     tag="robots",
     summary="Wish",
     parameters=(query("limit", "most", Annotated[int, Meta(ge=1, le=9)]), header("If-Match", "tags")),
     body=Wish,
-    answers={200: Answer("granted", (Granted, Counted)), 204: Answer("not told", headers={"ETag": "a tag"})},
+    answers={
+        200: Response("granted", (Granted, Counted)),
+        204: Response("not told", headers={"ETag": "a tag"}),
+    },
     errors=(409,),
 )
 
 
-def made(*operations: Operation) -> dict[str, Any]:
+def made(*operations: ApiOperation) -> dict[str, Any]:
     """The document of some operations, which is valid."""
     found = document(operations, "1.2.3", "sb")
     OpenAPIV31SpecValidator(found).validate()
@@ -109,7 +113,7 @@ def test_parameters_are_those_of_path_query_and_headers(told: dict[str, Any]) ->
 )
 def test_what_can_go_wrong_with_any_request_is_told(credential: Credential, errors: set[str]) -> None:
     """By what it needs, whether it has a body, and whether its address names something."""
-    told = made(Operation(**{**vars(GIVE), "credential": credential}))
+    told = made(ApiOperation(**{**vars(GIVE), "credential": credential}))
     responses = told["paths"][GIVE.path]["post"]["responses"]
     assert {status for status in responses if status >= "400"} == errors
     assert all("$ref" in responses[status] for status in errors)
@@ -117,7 +121,7 @@ def test_what_can_go_wrong_with_any_request_is_told(credential: Credential, erro
 
 def test_types_of_one_name_are_told_apart() -> None:
     """By the room that they are in."""
-    other = Operation(**{**vars(GIVE), "path": "/api/v1/other", "body": Other})
+    other = ApiOperation(**{**vars(GIVE), "path": "/api/v1/other", "body": Other})
     names = made(GIVE, other)["components"]["schemas"]
     assert "OtherWish" in names
     assert sum(name.endswith("Wish") for name in names) == 2
@@ -126,5 +130,5 @@ def test_types_of_one_name_are_told_apart() -> None:
 def test_each_operation_has_a_name_of_its_own() -> None:
     """Letters and underscores, by method and address."""
     assert GIVE.id == "post_robots_by_robot_wishes"
-    live = Operation(**{**vars(GIVE), "path": "/robots/{robot}/wishes"})
+    live = ApiOperation(**{**vars(GIVE), "path": "/robots/{robot}/wishes"})
     assert live.id == "post_live_robots_by_robot_wishes"

@@ -7,8 +7,9 @@ from html.parser import HTMLParser
 
 import pytest
 
-from relay_server.edges.documents import operations
-from relay_server.openapi import document, page
+from relay_server.http.openapi.docs_ui import page
+from relay_server.http.openapi.document import document
+from relay_server.http.openapi.http import operations
 
 EMPTY = {"meta", "link", "img", "br", "wbr"}
 

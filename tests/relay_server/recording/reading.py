@@ -8,10 +8,10 @@ from typing import NamedTuple
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from relay_server.recording.mcap_file import Track
+from relay_server.recordings.mcap_file import McapChannel
 
-CHATTER = Track("/chatter", "std_msgs/msg/String", "cdr", "string data\n")
-WORDS = Track("/words", "std_msgs/msg/String", "json")
+CHATTER = McapChannel("/chatter", "std_msgs/msg/String", "cdr", "string data\n")
+WORDS = McapChannel("/words", "std_msgs/msg/String", "json")
 
 
 class Read(NamedTuple):

@@ -8,7 +8,7 @@ import json
 import pytest
 
 from relay_protocol.ros_types import TypeRegistry
-from relay_server.recording import compressed
+from relay_server.recordings import recorder
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "png"])
@@ -16,19 +16,19 @@ from relay_server.recording import compressed
 def test_a_picture_is_a_message_of_its_type(codec: str, size: int) -> None:
     """The codec of all other messages reads it, and writes the same bytes."""
     types = TypeRegistry()
-    types.add(compressed.TYPE, compressed.TEXT)
+    types.add(recorder.TYPE, recorder.TEXT)
     picture = bytes(number % 256 for number in range(size))
-    message = compressed.message(picture, 1_700_000_000_123_456_789, codec)
-    fields = json.loads(types.to_json(compressed.TYPE, message))
+    message = recorder.message(picture, 1_700_000_000_123_456_789, codec)
+    fields = json.loads(types.to_json(recorder.TYPE, message))
     assert fields == {
         "header": {"stamp": {"sec": 1_700_000_000, "nanosec": 123_456_789}, "frame_id": ""},
         "format": codec,
         "data": base64.b64encode(picture).decode(),
     }
-    assert types.from_json(compressed.TYPE, fields, 0) == message
+    assert types.from_json(recorder.TYPE, fields, 0) == message
 
 
 def test_the_topic_is_named_as_image_transport_has_it() -> None:
     """One that has the name already keeps it."""
-    assert compressed.topic_of("/front/image_raw") == "/front/image_raw/compressed"
-    assert compressed.topic_of("/front/image_raw/compressed") == "/front/image_raw/compressed"
+    assert recorder.topic_of("/front/image_raw") == "/front/image_raw/compressed"
+    assert recorder.topic_of("/front/image_raw/compressed") == "/front/image_raw/compressed"

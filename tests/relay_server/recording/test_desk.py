@@ -19,46 +19,52 @@ from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import NO_ROBOT, Access, Principal
-from relay_server.frontdesk import Admission
-from relay_server.journal import Journal
-from relay_server.recording import Ask, Library, RecordingDesk, Recordings
-from relay_server.recording import recordings as module
-from relay_server.recording.desk import FETCH_SECONDS
-from relay_server.recording.library import NO_ROOM_NOW, Entry
-from relay_server.recording.mcap_file import McapFile
-from relay_server.recording.mender import PAUSE_SECONDS
-from relay_server.recording.recordings import FINISH_SECONDS, THREADS, USER_RECORDINGS, WAITING
-from relay_server.recording.rights import why_denied
-from relay_server.recording.writer import Writer
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
+from relay_server.events.bus import EventBus
+from relay_server.recordings import recordings as module
+from relay_server.recordings.library import NO_ROOM_NOW, Library, RecordingEntry
+from relay_server.recordings.mcap_file import McapFile
+from relay_server.recordings.recordings import (
+    FINISH_SECONDS,
+    THREADS,
+    USER_RECORDINGS,
+    WAITING,
+    RecordingRequest,
+    Recordings,
+)
+from relay_server.recordings.repair import PAUSE_SECONDS
+from relay_server.recordings.rights import why_denied
+from relay_server.recordings.service import FETCH_SECONDS, RecordingService
+from relay_server.recordings.writer import RecordingWriter
+from relay_server.sessions.manager import AuthorizedSession
 from tests.relay_server.edges.robot_ends import until
 from tests.relay_server.memory import World, text
 from tests.relay_server.recording.reading import read
 
 HERE = "192.0.2.1"
-CHATTER = Ask(topics=["chatter"], megabytes=1)
+CHATTER = RecordingRequest(topics=["chatter"], megabytes=1)
 ROVER = RobotRecord(1, "rover", "default", "")
 
 
 class Doors:
     """Lets in who has a right; of the front desk no more is needed."""
 
-    def __init__(self, store: Store, access: Access, world: World) -> None:
+    def __init__(self, store: AsyncDatabase, access: Access, world: World) -> None:
         self._store = store
         self._access = access
         self._world = world
         self.inside = 0
 
-    async def admit(self, principal: Principal, robot: str, address: str) -> Admission:
+    async def admit(self, principal: Principal, robot: str, address: str) -> AuthorizedSession:
         """Somebody who has a right on the robot."""
         record = await self._store.read(queries.find_robot, robot, principal.realm)
         permit = None if record is None else await self._access.permit(principal, record)
         if permit is None:
             raise NotFound(NO_ROBOT)
         self.inside += 1
-        return Admission(permit, self._world.robot, address)
+        return AuthorizedSession(permit, self._world.robot, address)
 
-    def turn_away(self, admission: Admission) -> None:
+    def turn_away(self, admission: AuthorizedSession) -> None:
         """He leaves."""
         self.inside -= 1
         self._access.release(admission.permit)
@@ -67,16 +73,16 @@ class Doors:
 class Desk:
     """A desk, and what it is made of."""
 
-    def __init__(self, store: Store, folder: Path) -> None:
+    def __init__(self, store: AsyncDatabase, folder: Path) -> None:
         self.store = store
         self.folder = folder
         self.world = World()
         self.access = Access(store, self.wall)
         self.doors = Doors(store, self.access, self.world)
         self.recordings = self.begins()
-        self.journal = Journal(store, self.wall)
+        self.journal = EventBus(store, self.wall)
         # Doors are all of a front desk that it needs.
-        self.desk = RecordingDesk(self.doors, self.recordings, store, self.journal, self.wall)  # type: ignore[arg-type]
+        self.desk = RecordingService(self.doors, self.recordings, store, self.journal, self.wall)  # type: ignore[arg-type]
         with store.database.begin() as session:
             self._robot = queries.add_robot(session, "rover").id
         self.ann, self.bob, self.eve = (self._principal(name) for name in ("ann", "bob", "eve"))
@@ -94,9 +100,9 @@ class Desk:
         """Unix time."""
         return 1000.0 + self.world.clock.seconds()
 
-    def others(self, limit: int) -> Entry:
+    def others(self, limit: int) -> RecordingEntry:
         """A recording of another realm, that runs."""
-        entry = Entry("z", 99, "rover", 99, "zoe", ("/odom",), (), 1.0, limit, 60.0, realm="lab1")
+        entry = RecordingEntry("z", 99, "rover", 99, "zoe", ("/odom",), (), 1.0, limit, 60.0, realm="lab1")
         self.recordings.library.add(entry)
         return entry
 
@@ -183,7 +189,7 @@ class Desk:
 
 
 @pytest.fixture
-def desk(store: Store, tmp_path: Path) -> Iterator[Desk]:
+def desk(store: AsyncDatabase, tmp_path: Path) -> Iterator[Desk]:
     """A desk, and a robot that is at work."""
     made = Desk(store, tmp_path / "recordings")
     made.world.at_work()
@@ -297,7 +303,7 @@ async def test_pictures_are_not_to_be_had_by_recording_their_topic(desk: Desk) -
     """Nor is the file, for who may not view them; also after the topic has gone, and after a restart."""
     image = link.Topic(types=["sensor_msgs/msg/CompressedImage"], publishers=["/eye"])
     desk.world.registry.graph(desk.world.robot, link.Graph(topics={"/eye/compressed": image}))
-    wanted = Ask(topics=["/eye/compressed"], megabytes=1)
+    wanted = RecordingRequest(topics=["/eye/compressed"], megabytes=1)
     done = await desk.desk.start(desk.bob, "rover", wanted, HERE)
     await desk.desk.stop(desk.bob, "rover", done["id"], HERE)
     await desk.deny("ann", "view:/eye/*")
@@ -388,7 +394,7 @@ async def test_a_right_that_is_revoked_ends_recording_and_download(desk: Desk) -
 @pytest_twisted.ensureDeferred
 async def test_names_without_slash_are_taken_as_if_they_had_one(desk: Desk) -> None:
     """Those of cameras like those of topics; what is named in both ways is recorded once."""
-    ask = Ask(topics=["chatter", "/chatter"], cameras=["camera", "/camera"], megabytes=1)
+    ask = RecordingRequest(topics=["chatter", "/chatter"], cameras=["camera", "/camera"], megabytes=1)
     begun = await desk.desk.start(desk.ann, "rover", ask, HERE)
     assert (begun["topics"], begun["cameras"]) == (("/chatter",), ("/camera",))
     await desk.desk.stop(desk.ann, "rover", begun["id"], HERE)
@@ -398,13 +404,13 @@ async def test_names_without_slash_are_taken_as_if_they_had_one(desk: Desk) -> N
 async def test_what_can_not_be_recorded_leaves_nothing(desk: Desk) -> None:
     """No file, no place taken, nobody inside."""
     for ask in (
-        Ask(),
-        Ask(topics=["no name"]),
-        Ask(topics=["/camera/compressed"], cameras=["/camera"]),
-        Ask(topics=["/camera/compressed"], cameras=["camera"]),
-        Ask(cameras=["/"]),
-        Ask(cameras=["a\nb"]),
-        Ask(topics=["/nowhere"], megabytes=1),
+        RecordingRequest(),
+        RecordingRequest(topics=["no name"]),
+        RecordingRequest(topics=["/camera/compressed"], cameras=["/camera"]),
+        RecordingRequest(topics=["/camera/compressed"], cameras=["camera"]),
+        RecordingRequest(cameras=["/"]),
+        RecordingRequest(cameras=["a\nb"]),
+        RecordingRequest(topics=["/nowhere"], megabytes=1),
     ):
         await failure(desk.desk.start(desk.ann, "rover", ask, HERE), Invalid)
     assert list(desk.folder.iterdir()) == []
@@ -416,7 +422,8 @@ async def test_what_can_not_be_recorded_leaves_nothing(desk: Desk) -> None:
 async def test_no_more_is_recorded_than_there_is_room_for(desk: Desk) -> None:
     """By the size of all together, and by how many run for one user."""
     assert "of which 5 MB are left" in await failure(
-        desk.desk.start(desk.ann, "rover", Ask(topics=["/chatter"], megabytes=6), HERE), Unavailable
+        desk.desk.start(desk.ann, "rover", RecordingRequest(topics=["/chatter"], megabytes=6), HERE),
+        Unavailable,
     )
     for _ in range(USER_RECORDINGS):
         await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
@@ -611,8 +618,8 @@ async def test_a_long_list_comes_in_pages(desk: Desk) -> None:
 @pytest_twisted.ensureDeferred
 async def test_a_disk_that_hangs_does_not_keep_the_relay(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     """It leaves; the file is recovered at the next start."""
-    finish, stuck = Writer.finish, list[Writer]()
-    monkeypatch.setattr(Writer, "finish", lambda writer: stuck.append(writer))
+    finish, stuck = RecordingWriter.finish, list[RecordingWriter]()
+    monkeypatch.setattr(RecordingWriter, "finish", lambda writer: stuck.append(writer))
     begun = await desk.desk.start(desk.ann, "rover", CHATTER, HERE)
     leaving = Deferred.fromCoroutine(desk.recordings.shut("going down"))
     desk.world.clock.advance(FINISH_SECONDS)

@@ -8,15 +8,15 @@ import pytest
 
 from relay_protocol.errors import Invalid, NotFound, Unavailable
 from relay_protocol.realms import DEFAULT_REALM
-from relay_server.recording import library as module
-from relay_server.recording.library import NO_ROOM_NOW, Entry, Library, State, text_of
+from relay_server.recordings import library as module
+from relay_server.recordings.library import NO_ROOM_NOW, Library, RecordingEntry, RecordingState, text_of
 
 
 def entry(
     id: str = "a", *, robot: int = 1, begun: float = 1.0, limit: int = 1000, realm: str = DEFAULT_REALM
-) -> Entry:
+) -> RecordingEntry:
     """A recording that runs."""
-    return Entry(
+    return RecordingEntry(
         id, robot, "rover", 7, "ann", ("/odom",), (), begun=begun, limit=limit, seconds=60.0, realm=realm
     )
 
@@ -46,7 +46,7 @@ def test_what_runs_takes_what_it_may_become(library: Library) -> None:
     library.add(first)
     with pytest.raises(Unavailable, match="delete some"):
         library.add(entry("b", limit=1001))
-    first.state, first.bytes = State.COMPLETE, 500
+    first.state, first.bytes = RecordingState.COMPLETE, 500
     library.add(entry("b", limit=2500))
     library.forget(first)
     assert library.used == 2500
@@ -55,7 +55,7 @@ def test_what_runs_takes_what_it_may_become(library: Library) -> None:
 def test_it_is_all_there_after_a_new_start(library: Library, tmp_path: Path) -> None:
     """What ran is incomplete then, and what was begun only to be replaced is gone."""
     running, done = entry("a"), entry("b")
-    done.state, done.bytes, done.problems = State.COMPLETE, 5, ["late"]
+    done.state, done.bytes, done.problems = RecordingState.COMPLETE, 5, ["late"]
     for each in (running, done):
         library.save(each.id, text_of(each))
     folder = tmp_path / "recordings"
@@ -71,9 +71,9 @@ def test_it_is_all_there_after_a_new_start(library: Library, tmp_path: Path) -> 
     assert folder.stat().st_mode & 0o077 == 0
 
 
-@pytest.mark.parametrize("state", [State.RECORDING, State.INCOMPLETE])
+@pytest.mark.parametrize("state", [RecordingState.RECORDING, RecordingState.INCOMPLETE])
 def test_what_broke_off_takes_the_room_that_its_file_has(
-    library: Library, tmp_path: Path, state: State
+    library: Library, tmp_path: Path, state: RecordingState
 ) -> None:
     """A relay that was killed wrote nothing down of that, nor did one that could not mend it."""
     broken, unbegun = entry("a"), entry("b")
@@ -90,7 +90,7 @@ def test_what_broke_off_takes_the_room_that_its_file_has(
 def test_a_copy_takes_room_too(library: Library) -> None:
     """As long as it is there."""
     broken = entry("b", limit=2500)
-    broken.state, broken.bytes = State.INCOMPLETE, 1500
+    broken.state, broken.bytes = RecordingState.INCOMPLETE, 1500
     library.add(broken)
     library.copied = broken
     assert (library.left(DEFAULT_REALM), library.left("lab1")) == (0, 3000)

@@ -10,12 +10,19 @@ from mcap.reader import make_reader
 from rosbags.interfaces import QosDurability, QosLiveliness, QosReliability
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from relay_server.recording.mcap_file import CHUNKS, Full, McapFile, Track, chunk_bytes, mend
+from relay_server.recordings.mcap_file import (
+    CHUNKS,
+    McapChannel,
+    McapFile,
+    McapFileFull,
+    chunk_bytes,
+    repair_file,
+)
 from tests.relay_server.memory import text
 from tests.relay_server.recording.reading import CHATTER, WORDS, profile, read
 
 
-def write(path: Path, count: int, *, finish: bool = True, track: Track = CHATTER) -> None:
+def write(path: Path, count: int, *, finish: bool = True, track: McapChannel = CHATTER) -> None:
     """So many messages, each in a chunk of its own."""
     with path.open("wb") as stream:
         file = McapFile(stream, 10**6, track.encoding == "cdr")
@@ -67,7 +74,7 @@ def test_what_is_latched_is_played_as_latched(tmp_path: Path, broken: bool) -> N
             file.finish()
             assert file.size == path.stat().st_size
     if broken:
-        assert mend(path, lambda: False) == 3
+        assert repair_file(path, lambda: False) == 3
     assert [each.body for each in read(path)] == [text("0"), text("1"), text("2")]
     reader = McapReader(path)
     reader.open()
@@ -94,7 +101,7 @@ def test_a_file_is_never_larger_than_its_limit(tmp_path: Path, size: int, flush:
     body = os.urandom(size)
     with path.open("wb") as stream:
         file = McapFile(stream, limit, ros=True)
-        with pytest.raises(Full):
+        with pytest.raises(McapFileFull):
             for number in range(100_000):
                 track = CHATTER._replace(topic=f"/t{number % 50}", latched=number % 2 == 0)
                 file.add(track, number, number, body)
@@ -119,7 +126,7 @@ def test_what_is_whole_of_a_file_is_kept(tmp_path: Path, cut: int) -> None:
     write(path, 10, finish=False)
     whole = path.read_bytes()
     path.write_bytes(whole[:-cut])
-    kept = mend(path, lambda: False)
+    kept = repair_file(path, lambda: False)
     bodies = [each.body for each in read(path)]
     assert bodies == [text(f"{number}") for number in range(len(bodies))]
     assert kept == len(bodies) >= 8
@@ -132,7 +139,7 @@ def test_a_whole_file_stays_what_it_is(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, 3, track=WORDS)
     before = read(path)
-    assert mend(path, lambda: False) == 3
+    assert repair_file(path, lambda: False) == 3
     assert read(path) == before
     assert profile(path) == ""
 
@@ -142,7 +149,7 @@ def test_of_a_file_that_says_nothing_an_empty_one_is_made(tmp_path: Path, left: 
     """It can be opened at least."""
     path = tmp_path / "a.mcap"
     path.write_bytes(left)
-    assert mend(path, lambda: False) == 0
+    assert repair_file(path, lambda: False) == 0
     assert read(path) == []
 
 
@@ -151,6 +158,6 @@ def test_mending_stops_when_it_is_told_to(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, 10, finish=False)
     before = path.read_bytes()
-    assert mend(path, lambda: True) is None
+    assert repair_file(path, lambda: True) is None
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -14,11 +14,11 @@ from twisted.internet import reactor
 from twisted.internet.task import Clock
 from twisted.logger import capturedLogs
 
-from relay_server.recording import mender as module
-from relay_server.recording.library import Entry, Library, State
-from relay_server.recording.mcap_file import McapFile
-from relay_server.recording.mender import PAUSE_SECONDS, TRIES, Mender
-from relay_server.store import Threads
+from relay_server.common.database import BoundedThreadPool
+from relay_server.recordings import repair as module
+from relay_server.recordings.library import Library, RecordingEntry, RecordingState
+from relay_server.recordings.mcap_file import McapFile
+from relay_server.recordings.repair import PAUSE_SECONDS, TRIES, Repair
 from tests.relay_server.memory import text
 from tests.relay_server.recording.reading import CHATTER, read
 
@@ -33,13 +33,13 @@ class Shop:
         self.clock = Clock()
         self.library = Library(folder, 10**6)
         self.library.open()
-        self.threads = Threads(reactor, "test", 1, 8, "too much")  # type: ignore[arg-type]  # to mypy it is a module
+        self.threads = BoundedThreadPool(reactor, "test", 1, 8, "too much")  # type: ignore[arg-type]  # to mypy it is a module
         self.threads.start()
         self.stopping = threading.Event()
         self.busy: set[str] = set()
-        self.saved: list[tuple[str, State]] = []
+        self.saved: list[tuple[str, RecordingState]] = []
         self.dropped: list[str] = []
-        self.mender = Mender(
+        self.mender = Repair(
             self.clock,
             self.library,
             self.threads,
@@ -49,16 +49,18 @@ class Shop:
             drop=self._drop,
         )
 
-    async def _save(self, entry: Entry) -> None:
+    async def _save(self, entry: RecordingEntry) -> None:
         self.saved.append((entry.id, entry.state))
 
-    async def _drop(self, entry: Entry) -> None:
+    async def _drop(self, entry: RecordingEntry) -> None:
         self.dropped.append(entry.id)
 
-    def broken(self, id: str = "a", *, file: bool = True) -> Entry:
+    def broken(self, id: str = "a", *, file: bool = True) -> RecordingEntry:
         """A recording that broke off, with two whole messages."""
-        entry = Entry(id, 1, "rover", 7, "ann", ("/chatter",), (), begun=1.0, limit=1000, seconds=60.0)
-        entry.state = State.INCOMPLETE
+        entry = RecordingEntry(
+            id, 1, "rover", 7, "ann", ("/chatter",), (), begun=1.0, limit=1000, seconds=60.0
+        )
+        entry.state = RecordingState.INCOMPLETE
         if file:
             with self.library.path(entry).open("wb") as stream:
                 begun = McapFile(stream, 10**6, ros=True)
@@ -100,12 +102,12 @@ async def test_what_breaks_off_is_readable_after_a_pause(shop: Shop) -> None:
     written = shop.library.path(entry).stat().st_mtime
     shop.mender.later(entry)
     await shop.waits(PAUSE_SECONDS - 1)
-    assert entry.state is State.INCOMPLETE
+    assert entry.state is RecordingState.INCOMPLETE
     await shop.waits(1)
-    assert (entry.state, entry.messages, entry.ended) == (State.RECOVERED, 2, written)
+    assert (entry.state, entry.messages, entry.ended) == (RecordingState.RECOVERED, 2, written)
     assert entry.bytes == shop.library.path(entry).stat().st_size
     assert [each.body for each in read(shop.library.path(entry))] == [text("a"), text("b")]
-    assert shop.saved == [("a", State.RECOVERED)]
+    assert shop.saved == [("a", RecordingState.RECOVERED)]
     assert shop.clock.getDelayedCalls() == []
 
 
@@ -117,12 +119,12 @@ async def test_it_is_tried_a_few_times_and_then_with_all_others(
     entry = shop.broken()
     size = entry.bytes
     with monkeypatch.context() as bad:
-        bad.setattr(module, "mend", fails_with(errno.EIO))
+        bad.setattr(module, "repair_file", fails_with(errno.EIO))
         shop.mender.later(entry)
         for left in reversed(range(TRIES)):
             await shop.waits()
             assert len(shop.clock.getDelayedCalls()) == min(1, left)
-    assert (entry.state, shop.library.used) == (State.INCOMPLETE, size)
+    assert (entry.state, shop.library.used) == (RecordingState.INCOMPLETE, size)
     shop.mender.recover()
     await shop.mender.done
     assert entry.state.value == "recovered"
@@ -138,7 +140,7 @@ async def test_what_had_no_room_is_readable_soon_after_there_is(
     entry = shop.broken()
     with capturedLogs() as logged, monkeypatch.context() as full:
         if isinstance(lack, int):
-            full.setattr(module, "mend", fails_with(lack))
+            full.setattr(module, "repair_file", fails_with(lack))
         else:
             full.setattr(shop.library, "reserve", NO_DISK)
         if at_the_start:
@@ -149,7 +151,7 @@ async def test_what_had_no_room_is_readable_soon_after_there_is(
         for _ in range(4 * TRIES):
             await shop.waits()
             assert len(shop.clock.getDelayedCalls()) == 1
-    assert (entry.state, len(logged)) == (State.INCOMPLETE, 1)
+    assert (entry.state, len(logged)) == (RecordingState.INCOMPLETE, 1)
     await shop.waits()
     assert entry.state.value == "recovered"
     assert shop.clock.getDelayedCalls() == []
@@ -159,12 +161,12 @@ async def test_what_had_no_room_is_readable_soon_after_there_is(
 async def test_lack_of_room_takes_none_of_the_tries(shop: Shop, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor does it give more, also when all others are tried meanwhile."""
     entry = shop.broken()
-    monkeypatch.setattr(module, "mend", fails_with(errno.ENOSPC))
+    monkeypatch.setattr(module, "repair_file", fails_with(errno.ENOSPC))
     shop.mender.later(entry)
     await shop.waits()
     shop.mender.recover()
     await shop.mender.done
-    monkeypatch.setattr(module, "mend", fails_with(errno.EIO))
+    monkeypatch.setattr(module, "repair_file", fails_with(errno.EIO))
     for left in reversed(range(TRIES)):
         await shop.waits()
         assert len(shop.clock.getDelayedCalls()) == min(1, left)
@@ -187,13 +189,13 @@ async def test_a_copy_counts_while_it_is_made(shop: Shop, monkeypatch: pytest.Mo
     """Nobody is promised the same room."""
     entry = shop.broken()
     counted: list[int] = []
-    mend = module.mend
+    mend = module.repair_file
 
     def noted(path: Path, stopping: Callable[[], bool]) -> int | None:
         counted.append(shop.library.used)
         return mend(path, stopping)
 
-    monkeypatch.setattr(module, "mend", noted)
+    monkeypatch.setattr(module, "repair_file", noted)
     size = entry.bytes
     shop.mender.recover()
     await shop.mender.done
@@ -207,17 +209,17 @@ async def test_a_copy_stops_when_others_fill_the_disk(shop: Shop, monkeypatch: p
     entry = shop.broken()
     path = shop.library.path(entry)
     before = path.read_bytes()
-    mend = module.mend
+    mend = module.repair_file
 
     def filled(path: Path, stopping: Callable[[], bool]) -> int | None:
         shop.library.reserve = NO_DISK
         return mend(path, stopping)
 
     monkeypatch.setattr(module, "LOOK_SECONDS", 0.0)
-    monkeypatch.setattr(module, "mend", filled)
+    monkeypatch.setattr(module, "repair_file", filled)
     shop.mender.recover()
     await shop.mender.done
-    assert (entry.state, path.read_bytes()) == (State.INCOMPLETE, before)
+    assert (entry.state, path.read_bytes()) == (RecordingState.INCOMPLETE, before)
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -227,17 +229,17 @@ async def test_one_that_can_not_be_mended_does_not_keep_the_others(
 ) -> None:
     """Whatever it has."""
     bad, good = shop.broken("a"), shop.broken("b")
-    mend = module.mend
+    mend = module.repair_file
 
     def fails(path: Path, stopping: Callable[[], bool]) -> int | None:
         if path.stem == "a":
             raise KeyError("surprise")
         return mend(path, stopping)
 
-    monkeypatch.setattr(module, "mend", fails)
+    monkeypatch.setattr(module, "repair_file", fails)
     shop.mender.recover()
     await shop.mender.done
-    assert (bad.state, good.state) == (State.INCOMPLETE, State.RECOVERED)
+    assert (bad.state, good.state) == (RecordingState.INCOMPLETE, RecordingState.RECOVERED)
 
 
 @pytest_twisted.ensureDeferred
@@ -256,12 +258,12 @@ async def test_nobody_mends_what_others_work_on(shop: Shop) -> None:
     shop.busy.add("a")
     shop.mender.recover()
     await shop.mender.done
-    assert entry.state is State.INCOMPLETE
+    assert entry.state is RecordingState.INCOMPLETE
     shop.library.forget(entry)
     shop.busy.clear()
     shop.mender.later(entry)
     await shop.waits()
-    assert (entry.state, shop.saved) == (State.INCOMPLETE, [])
+    assert (entry.state, shop.saved) == (RecordingState.INCOMPLETE, [])
 
 
 @pytest_twisted.ensureDeferred
@@ -276,4 +278,4 @@ async def test_a_relay_that_goes_down_mends_nothing_more(shop: Shop) -> None:
     assert shop.clock.getDelayedCalls() == []
     shop.mender.recover()
     await shop.mender.done
-    assert entry.state is State.INCOMPLETE
+    assert entry.state is RecordingState.INCOMPLETE

@@ -13,13 +13,13 @@ from relay_protocol.errors import Invalid, Refused, Unavailable
 from relay_protocol.frames import VideoFrame
 from relay_protocol.rights import Grant, Level, Rules
 from relay_server.access import Permit, Principal
-from relay_server.recording import compressed
-from relay_server.recording import recorder as module
-from relay_server.recording.library import Entry, State
-from relay_server.recording.mcap_file import McapFile, Track
-from relay_server.recording.recorder import AGAIN_SECONDS, HELD, STAMPS_END, Recorder
-from relay_server.recording.rights import why_denied
-from relay_server.recording.writer import Message, Outcome
+from relay_server.recordings import recorder
+from relay_server.recordings import recorder as module
+from relay_server.recordings.library import RecordingEntry, RecordingState
+from relay_server.recordings.mcap_file import McapChannel, McapFile
+from relay_server.recordings.recorder import AGAIN_SECONDS, HELD, STAMPS_END, Recorder
+from relay_server.recordings.rights import why_denied
+from relay_server.recordings.writer import RecordedMessage, WriteOutcome
 from tests.relay_server.memory import STRING, World, text
 from tests.relay_server.recording.reading import read
 from tests.relay_server.video import watching as video
@@ -31,21 +31,21 @@ HERE = "/chatter"
 class Paper:
     """A writer that keeps what it is given."""
 
-    def __init__(self, ended: Callable[[Outcome], None]) -> None:
+    def __init__(self, ended: Callable[[WriteOutcome], None]) -> None:
         self._ended = ended
         self.begun = self.closing = False
         self.room = 1000
         self.messages = 0
         self.bytes = 77
         self.broken = 0
-        self.written: list[Message] = []
+        self.written: list[RecordedMessage] = []
 
     def start(self) -> None:
         """Begin."""
         assert not self.begun
         self.begun = True
 
-    def put(self, message: Message) -> bool:
+    def put(self, message: RecordedMessage) -> bool:
         """Keep it."""
         if len(self.written) >= self.room:
             return False
@@ -60,7 +60,7 @@ class Paper:
 
     def ends(self, finished: bool = True, reason: str = "") -> None:
         """It has ended."""
-        self._ended(Outcome(finished, reason))
+        self._ended(WriteOutcome(finished, reason))
 
     @property
     def bodies(self) -> list[bytes]:
@@ -76,7 +76,7 @@ class Desk:
     ) -> None:
         self.world = world
         what = "id", 1, "rover", 7, "ann", topics, cameras
-        self.entry = Entry(*what, begun=1.0, limit=10**6, seconds=600.0, realm="main")
+        self.entry = RecordingEntry(*what, begun=1.0, limit=10**6, seconds=600.0, realm="main")
         principal = Principal(7, "ann", "main", False, 1, None)
         self.permit = Permit(principal, 1, Rules([Grant(Level.OPERATOR)]))
         self.over: list[Recorder] = []
@@ -95,11 +95,11 @@ class Desk:
             ended=self.over.append,
         )
 
-    def _paper(self, ended: Callable[[Outcome], None]) -> Paper:
+    def _paper(self, ended: Callable[[WriteOutcome], None]) -> Paper:
         self.papers.append(Paper(ended))
         return self.papers[-1]
 
-    def _save(self, entry: Entry) -> Deferred[bool]:
+    def _save(self, entry: RecordingEntry) -> Deferred[bool]:
         self.saved.append(entry.pictures)
         self.saving.append(Deferred())
         return self.saving[-1]
@@ -153,7 +153,7 @@ def test_samples_are_written_as_they_came(world: World) -> None:
     assert desk.paper.bodies == [text("5"), text("6"), text("7")]
     assert [(each.log_time, each.publish_time) for each in desk.paper.written] == [(5, 5), (6, 6), (7, 7)]
     (track,) = {each.track for each in desk.paper.written}
-    assert track == Track(HERE, STRING, "cdr", "string data\n")
+    assert track == McapChannel(HERE, STRING, "cdr", "string data\n")
 
 
 def test_samples_of_a_robot_that_speaks_json_are_written_as_json(world: World) -> None:
@@ -161,7 +161,7 @@ def test_samples_of_a_robot_that_speaks_json_are_written_as_json(world: World) -
     desk, number = begun(world, "json")
     world.channel.sample(number, b' {"data":  "a"}', 5)
     world.channel.sample(number, b"no json", 6)
-    assert desk.paper.written[0].track == Track(HERE, STRING, "json")
+    assert desk.paper.written[0].track == McapChannel(HERE, STRING, "json")
     first, second = desk.paper.written
     assert first.make is not None and first.make(first.body) == b'{"data":"a"}'
     with pytest.raises(Exception, match="JSON"):
@@ -196,7 +196,7 @@ def test_a_robot_that_comes_back_goes_on_in_the_same_file(world: World) -> None:
     number = desk.hears()
     world.channel.sample(number, text("b"), 6)
     assert desk.paper.bodies == [text("a"), text("b")]
-    assert desk.entry.state is State.RECORDING
+    assert desk.entry.state is RecordingState.RECORDING
 
 
 def test_what_finds_no_room_is_counted(world: World) -> None:
@@ -217,13 +217,13 @@ def test_it_ends_when_its_time_is_over(world: World) -> None:
     assert not desk.paper.closing
     world.clock.advance(1)
     assert desk.paper.closing
-    assert desk.entry.state is State.FINISHING
+    assert desk.entry.state is RecordingState.FINISHING
     assert world.link.all(link.Unsubscribe) == [link.Unsubscribe(number=number)]
     desk.recorder.stop("too late")
     assert desk.over == []
     desk.paper.ends()
     assert desk.over == [desk.recorder]
-    assert (desk.entry.state, desk.entry.reason) == (State.COMPLETE, "it has taken its time")
+    assert (desk.entry.state, desk.entry.reason) == (RecordingState.COMPLETE, "it has taken its time")
     assert desk.entry.ended == 5.0
     world.clock.advance(10)
     assert world.channel.state.value == "new", "the channel has closed, and this is another one"
@@ -233,12 +233,12 @@ def test_it_ends_when_the_writer_does(world: World) -> None:
     """At its size, or when the disk is full."""
     desk, _ = begun(world)
     desk.paper.ends(True, "it has reached its size")
-    assert (desk.entry.state, desk.entry.reason) == (State.COMPLETE, "it has reached its size")
+    assert (desk.entry.state, desk.entry.reason) == (RecordingState.COMPLETE, "it has reached its size")
     assert not world.channel.members
     other = Desk(world)
     other.starts()
     other.paper.ends(False, "the disk is full")
-    assert (other.entry.state, other.entry.reason) == (State.INCOMPLETE, "the disk is full")
+    assert (other.entry.state, other.entry.reason) == (RecordingState.INCOMPLETE, "the disk is full")
 
 
 @pytest.mark.parametrize("denied", ["record:/chatter", "subscribe:/chatter", "*:*"])
@@ -284,7 +284,7 @@ def test_pictures_of_a_topic_take_the_right_to_view_them(world: World) -> None:
     """A topic that begins to carry some ends the recording, which is the business of who may view from then on."""
     desk, _ = begun(world)
     desk.rights(f"view:{HERE}")
-    assert desk.entry.state is State.RECORDING
+    assert desk.entry.state is RecordingState.RECORDING
     told = link.Graph(topics={HERE: link.Topic(types=["sensor_msgs/msg/Image"], publishers=["/eye"])})
     world.registry.graph(world.robot, told)
     assert desk.paper.closing
@@ -426,9 +426,9 @@ def test_pictures_are_written_as_messages(world: World) -> None:
     for number in (1, 2):
         video.shows(world, stream, number)
     first, second = desk.paper.written
-    assert first.track == Track(f"{CAMERA}/compressed", compressed.TYPE, "cdr", compressed.TEXT)
+    assert first.track == McapChannel(f"{CAMERA}/compressed", recorder.TYPE, "cdr", recorder.TEXT)
     assert first.log_time == first.publish_time
-    assert desk.paper.bodies[0] == compressed.message(jpeg(), first.log_time, "jpeg")
+    assert desk.paper.bodies[0] == recorder.message(jpeg(), first.log_time, "jpeg")
     assert second.log_time >= first.log_time
     desk.recorder.stop("enough")
     assert not stream.viewers
@@ -446,7 +446,7 @@ def test_a_clock_that_can_not_be_breaks_nothing(world: World, stamp: int, tmp_pa
         stream.picture(VideoFrame(number, stamp, jpeg()))
     now = world.channel.now_ns()
     assert [(each.log_time, each.publish_time) for each in desk.paper.written] == [(now, now)] * 2
-    assert desk.paper.bodies[0] == compressed.message(jpeg(), now, "jpeg")
+    assert desk.paper.bodies[0] == recorder.message(jpeg(), now, "jpeg")
     assert [each.partition(":")[0] for each in desk.entry.problems] == [CAMERA]
     with (tmp_path / "a.mcap").open("wb") as file:
         book = McapFile(file, 10**7, ros=True)

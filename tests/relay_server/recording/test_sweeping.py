@@ -15,13 +15,13 @@ from twisted.internet.task import Clock
 from relay_db import queries
 from relay_protocol.errors import Unavailable
 from relay_protocol.realms import DEFAULT_REALM
-from relay_server.channel import Channels
-from relay_server.journal import Journal
-from relay_server.recording import Library, Recordings, kept_of, sweep
-from relay_server.recording.library import Entry, State, text_of
-from relay_server.recording.sweeping import SLACK_SECONDS
-from relay_server.store import Store
-from relay_server.video import Videos
+from relay_server.channels.channels import Channels
+from relay_server.common.database import AsyncDatabase
+from relay_server.events.bus import EventBus
+from relay_server.recordings.library import Library, RecordingEntry, RecordingState, kept_of, text_of
+from relay_server.recordings.recordings import Recordings
+from relay_server.recordings.retention import SLACK_SECONDS, sweep
+from relay_server.video.streams import CameraStreams
 
 BEGUN = 1000.0
 
@@ -29,19 +29,24 @@ BEGUN = 1000.0
 class Left:
     """A folder of recordings, as a relay finds it."""
 
-    def __init__(self, store: Store, folder: Path) -> None:
+    def __init__(self, store: AsyncDatabase, folder: Path) -> None:
         self.store = store
         self.folder = folder
         clock = Clock()
         library = Library(folder, 10**6)
         channels = Channels(clock, linger=1.0, new_ticket=str, wall_ns=lambda: 0)
-        videos = Videos(clock, new_ticket=str)
+        videos = CameraStreams(clock, new_ticket=str)
         self.recordings = Recordings(reactor, clock, library, channels, videos, lambda: BEGUN)
-        self.journal = Journal(store, lambda: BEGUN)
+        self.journal = EventBus(store, lambda: BEGUN)
         folder.mkdir()
 
     def recording(
-        self, id: str, robot: str, state: State = State.COMPLETE, *, realm: str = DEFAULT_REALM
+        self,
+        id: str,
+        robot: str,
+        state: RecordingState = RecordingState.COMPLETE,
+        *,
+        realm: str = DEFAULT_REALM,
     ) -> int:
         """A recording of a robot; the robot's number."""
         with self.store.database.begin() as session:
@@ -50,7 +55,7 @@ class Left:
             found = queries.find_robot(session, robot, realm) or queries.add_robot(
                 session, robot, realm=realm
             )
-        entry = Entry(
+        entry = RecordingEntry(
             id, found.id, robot, 1, "ann", ("/odom",), (), BEGUN, 1000, 60.0, state=state, realm=realm
         )
         (self.folder / f"{id}.json").write_bytes(text_of(entry))
@@ -75,7 +80,7 @@ class Left:
 
 
 @pytest.fixture
-def left(store: Store, tmp_path: Path) -> Iterator[Left]:
+def left(store: AsyncDatabase, tmp_path: Path) -> Iterator[Left]:
     """An empty folder."""
     made = Left(store, tmp_path / "recordings")
     yield made
@@ -86,7 +91,7 @@ def left(store: Store, tmp_path: Path) -> Iterator[Left]:
 async def test_recordings_go_with_their_robot(left: Left) -> None:
     """Those of others stay, also of one that has the name now."""
     rover = left.recording("a", "rover")
-    left.recording("b", "rover", State.RECORDING)
+    left.recording("b", "rover", RecordingState.RECORDING)
     left.recording("c", "tank")
     left.removes(rover, "rover")
     left.recording("d", "rover")
@@ -177,7 +182,7 @@ async def test_what_can_not_be_deleted_stays_for_now(
     left.recordings.open()
     does = getattr(left.recordings, how)
 
-    def refuses(entry: Entry, *reason: str) -> Any:
+    def refuses(entry: RecordingEntry, *reason: str) -> Any:
         if entry.id == "a":
             raise Unavailable("not now")
         return does(entry, *reason)
@@ -192,7 +197,7 @@ async def test_what_can_not_be_deleted_stays_for_now(
 
 def test_what_is_kept_of_a_robot_is_counted(left: Left) -> None:
     """By what is on the disk; files that say nothing count for nobody."""
-    rover = left.recording("a", "rover", State.RECORDING)
+    rover = left.recording("a", "rover", RecordingState.RECORDING)
     left.recording("b", "rover")
     left.recording("c", "tank")
     (left.folder / "a.mcap").unlink()
@@ -211,10 +216,10 @@ async def test_what_was_recorded_in_a_realm_goes_when_the_robot_is_taken_out_of_
             queries.add_realm(session, realm)
             queries.share_robot(session, rover, realm)
     for id, realm in (("b", "lab1"), ("c", "lab2"), ("d", "lab3")):
-        entry = Entry(
+        entry = RecordingEntry(
             id, rover, "rover", 1, "ann", ("/odom",), (), BEGUN, 1000, 60.0, realm=realm, home=DEFAULT_REALM
         )
-        entry.state = State.COMPLETE
+        entry.state = RecordingState.COMPLETE
         (left.folder / f"{id}.json").write_bytes(text_of(entry))
         (left.folder / f"{id}.mcap").write_bytes(b"x")
     with left.store.database.begin() as session:

@@ -13,9 +13,9 @@ import pytest
 from switchboard_waiting import wait_for
 
 from relay_protocol.errors import Invalid
-from relay_server.recording import writer as module
-from relay_server.recording.mcap_file import mend
-from relay_server.recording.writer import Message, Outcome, Writer, flush_pause
+from relay_server.recordings import writer as module
+from relay_server.recordings.mcap_file import repair_file
+from relay_server.recordings.writer import RecordedMessage, RecordingWriter, WriteOutcome, flush_pause
 from tests.relay_server.memory import text
 from tests.relay_server.recording.reading import CHATTER, read
 
@@ -44,15 +44,17 @@ class Book:
     def __init__(self, path: Path, limit: int = 10**7) -> None:
         self.reactor = Reactor()
         self.path = path
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[WriteOutcome] = []
         self.nearly_full = False
-        self.writer = Writer(self.reactor, path, limit, True, lambda: self.nearly_full, self.outcomes.append)
+        self.writer = RecordingWriter(
+            self.reactor, path, limit, True, lambda: self.nearly_full, self.outcomes.append
+        )
 
     def put(self, word: str, make: Callable[[bytes], bytes] | None = None) -> bool:
         """A message."""
-        return self.writer.put(Message(CHATTER, 1, 1, text(word), make))
+        return self.writer.put(RecordedMessage(CHATTER, 1, 1, text(word), make))
 
-    def finish(self) -> Outcome:
+    def finish(self) -> WriteOutcome:
         """The end."""
         self.writer.finish()
         self.reactor.run()
@@ -70,7 +72,7 @@ def test_what_is_put_is_written(book: Book) -> None:
     book.writer.start()
     for number in range(100):
         assert book.put(f"{number}")
-    assert book.finish() == Outcome(True, "")
+    assert book.finish() == WriteOutcome(True, "")
     assert [each.body for each in read(book.path)] == [text(f"{number}") for number in range(100)]
     assert (book.writer.messages, book.writer.bytes) == (100, book.path.stat().st_size)
 
@@ -115,7 +117,7 @@ def test_whatever_a_message_does_the_file_goes_on(book: Book, error: type[Except
     for word in ("a", "b"):
         book.put(word, broken)
     book.put("c")
-    assert book.finish() == Outcome(True, "")
+    assert book.finish() == WriteOutcome(True, "")
     assert [each.body for each in read(book.path)] == [text("c")]
     assert book.writer.broken == 2
 
@@ -163,7 +165,7 @@ def test_it_ends_whole_when_the_disk_is_nearly_full(book: Book, monkeypatch: pyt
     book.nearly_full = True
     book.writer.start()
     book.reactor.run()
-    assert book.outcomes == [Outcome(True, "the disk is nearly full")]
+    assert book.outcomes == [WriteOutcome(True, "the disk is nearly full")]
     assert [each.body for each in read(book.path)] == [text("a")]
     assert not book.put("late")
 
@@ -175,7 +177,7 @@ def test_it_ends_by_itself_at_its_size(tmp_path: Path) -> None:
         book.put(os.urandom(10_000).hex())
     book.writer.start()
     book.reactor.run()
-    assert book.outcomes == [Outcome(True, "it has reached its size")]
+    assert book.outcomes == [WriteOutcome(True, "it has reached its size")]
     assert 1 <= len(read(book.path)) < 10
     assert book.path.stat().st_size <= 100_000
 
@@ -185,7 +187,7 @@ def test_a_file_that_can_not_be_written_ends_it_in_words(tmp_path: Path) -> None
     book = Book(tmp_path / "none" / "a.mcap")
     book.writer.start()
     book.reactor.run()
-    assert book.outcomes == [Outcome(False, "the file can't be written: No such file or directory")]
+    assert book.outcomes == [WriteOutcome(False, "the file can't be written: No such file or directory")]
     assert not book.put("x")
 
 
@@ -198,7 +200,7 @@ def test_what_came_is_in_the_file_soon(book: Book, monkeypatch: pytest.MonkeyPat
 
     def kept() -> bool:
         shutil.copyfile(book.path, killed)
-        return mend(killed, lambda: False) == 1
+        return repair_file(killed, lambda: False) == 1
 
     wait_for("the message is in the file", lambda: book.path.exists() and kept())
     book.finish()

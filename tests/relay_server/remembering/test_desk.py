@@ -13,31 +13,31 @@ from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
 from relay_db import queries
-from relay_db.queries import MemoryTally, recalling
+from relay_db.queries import StoredEventCounts, event_search
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_protocol.scopes import Scope
 from relay_server.access import Access, Principal
-from relay_server.memory import desk as module
-from relay_server.memory.asks import Ask, ask_of
-from relay_server.memory.desk import Following, MemoryDesk, NewEvent, Recent
-from relay_server.memory.noticing import Noticing
-from relay_server.memory.quota import Quota
-from relay_server.memory.writer import Writer
-from relay_server.registry import Registry
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
+from relay_server.events import service as module
+from relay_server.events.collector import EventCollector
+from relay_server.events.query import EventQuery, ask_of
+from relay_server.events.quota import EventQuota
+from relay_server.events.service import EventFollower, EventService, NewEvent, RecentEvents
+from relay_server.events.writer import EventWriter
+from relay_server.robots.registry import RobotRegistry
 from tests.relay_server.memory import Time
 
 
 class Room:
     """A memory: ann may use rover, bob hidden, root administers; cleo is of another realm, with a rover of her own."""
 
-    def __init__(self, store: Store, time: Time) -> None:
+    def __init__(self, store: AsyncDatabase, time: Time) -> None:
         self.store, self.time = store, time
         self.access = Access(store, time)
-        self.recent = Recent(100)
-        self.quota = Quota(Clock(), store, time, of_source=20, kept=1000.0, of_realm=50)
-        self.writer = Writer(reactor, store, time, self._written)
-        self.desk = MemoryDesk(store, self.access, self.writer, self.quota, self.recent, time)
+        self.recent = RecentEvents(100)
+        self.quota = EventQuota(Clock(), store, time, of_source=20, kept=1000.0, of_realm=50)
+        self.writer = EventWriter(reactor, store, time, self._written)
+        self.desk = EventService(store, self.access, self.writer, self.quota, self.recent, time)
         self.people: dict[str, Principal] = {}
         self.robots: dict[str, int] = {}
         with store.database.begin() as s:
@@ -51,12 +51,12 @@ class Room:
                 record = queries.add_robot(s, robot, realm=realm)
                 self.robots.setdefault(robot, record.id)
                 queries.grant_right(s, record.id, "viewer", user_id=self.people[user].user_id)
-        self.registry = Registry(time)
+        self.registry = RobotRegistry(time)
         for name, number in self.robots.items():
             self.registry.presence(number, name, "default")
-        self.noticing = Noticing(self.writer, self.registry, time, lambda: time.now)
+        self.noticing = EventCollector(self.writer, self.registry, time, lambda: time.now)
 
-    def _written(self, events: list[queries.MemoryRecord]) -> None:
+    def _written(self, events: list[queries.StoredEventRecord]) -> None:
         self.quota.written(events)
         self.recent.written(events)
 
@@ -81,7 +81,7 @@ def decoded(told: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 @pytest.fixture
-def room(store: Store, time: Time) -> Iterator[Room]:
+def room(store: AsyncDatabase, time: Time) -> Iterator[Room]:
     """Nothing is remembered."""
     yield Room(store, time)
 
@@ -100,7 +100,7 @@ async def test_an_event_comes_back_as_it_was_written(room: Room) -> None:
         "data": {"who": "Bö", "n": [1]},
         "used": 0,
     }
-    found, forms, more = await room.desk.page(room.people["ann"], Ask(), 10)
+    found, forms, more = await room.desk.page(room.people["ann"], EventQuery(), 10)
     assert decoded([forms.json(each) for each in found]) == [told] and more is None
 
 
@@ -198,11 +198,11 @@ async def test_what_a_query_gives_or_counts_is_used(room: Room) -> None:
     ann = room.people["ann"]
     assert await room.desk.count(ann, ask_of({"data.n": "0"}, 0.0)) == (1, None)
     for _ in range(2):
-        _, _, more = await room.desk.page(ann, Ask(), 2)
+        _, _, more = await room.desk.page(ann, EventQuery(), 2)
         assert more is not None
-    await room.desk.page(ann, Ask(), 10, uses=False)
+    await room.desk.page(ann, EventQuery(), 10, uses=False)
     await room.quota.look()
-    found, _, _ = await room.desk.page(ann, Ask(), 10)
+    found, _, _ = await room.desk.page(ann, EventQuery(), 10)
     assert [(each.number, each.used) for each in found] == [(3, 2), (2, 2), (1, 1)]
     for _ in range(2):
         await room.write("bob", *({"kind": "y"} for _ in range(60)))
@@ -217,7 +217,7 @@ async def test_a_source_has_no_more_than_its_share(room: Room) -> None:
     """Its least used and oldest go; other sources keep theirs, and so does the same one of another realm."""
     for _ in range(3):
         await room.write("ann", *({"kind": "x", "source": "busy"} for _ in range(10)))
-        await room.desk.page(room.people["ann"], Ask(), 1)
+        await room.desk.page(room.people["ann"], EventQuery(), 1)
     await room.write("ann", {"kind": "y", "source": "quiet"})
     await room.write("cleo", {"kind": "x", "source": "busy"})
     await room.quota.look()
@@ -274,14 +274,14 @@ async def test_who_follows_hears_what_is_new_and_his_to_see(room: Room) -> None:
         assert await heard(room, following, ann) == ["c"]
         assert await heard(room, following, ann) == []
     assert await heard(room, again, ann) == ["b", "c"]
-    room.recent = room.desk._recent = Recent(2)
-    assert await heard(room, Following(0), ann) == ["a", "b", "c"]
+    room.recent = room.desk._recent = RecentEvents(2)
+    assert await heard(room, EventFollower(0), ann) == ["a", "b", "c"]
     await room.write("ann", *({"kind": "d"} for _ in range(5)))
-    assert await heard(room, Following(1), ann) == ["b", "c", *"ddddd"]
-    assert await heard(room, Following(7), ann, kind="e") == []
+    assert await heard(room, EventFollower(1), ann) == ["b", "c", *"ddddd"]
+    assert await heard(room, EventFollower(7), ann, kind="e") == []
 
 
-async def heard(room: Room, following: Following, who: Principal, **query: str) -> list[str]:
+async def heard(room: Room, following: EventFollower, who: Principal, **query: str) -> list[str]:
     """The kinds of what is new."""
     events, _, _ = await room.desk.news(who, ask_of(query, 0.0), following)
     return [each.kind for each in events]
@@ -332,7 +332,7 @@ async def test_the_stream_and_the_database_see_the_same(room: Room) -> None:
     for query in QUERIES:
         for who in ("ann", "bob", "root", "cleo"):
             asked = await room.reads(who, **query)
-            assert await heard(room, Following(0), room.people[who], **query) == asked[::-1], (who, query)
+            assert await heard(room, EventFollower(0), room.people[who], **query) == asked[::-1], (who, query)
 
 
 class Slow:
@@ -358,7 +358,7 @@ def slow(room: Room) -> Slow:
 async def counting(room: Room, who: str) -> Deferred[Any]:
     """Somebody asks how many events there are."""
     await room.access.robots(room.people[who])
-    return Deferred.fromCoroutine(room.desk.count(room.people[who], Ask()))
+    return Deferred.fromCoroutine(room.desk.count(room.people[who], EventQuery()))
 
 
 @pytest_twisted.ensureDeferred
@@ -375,9 +375,9 @@ async def test_who_leaves_does_not_make_room_for_another_read_while_his_goes_on(
     await counting(room, "bob")
     with pytest.raises(Unavailable):
         await (await counting(room, "cleo"))
-    slow.reads[0].callback(MemoryTally(1, [1], None))
+    slow.reads[0].callback(StoredEventCounts(1, [1], None))
     assert len(slow.reads) == 2
-    slow.reads[1].callback(MemoryTally(7, [], None))
+    slow.reads[1].callback(StoredEventCounts(7, [], None))
     assert await third == (7, None)
     assert len(slow.reads) == 3
 
@@ -389,7 +389,7 @@ async def test_a_read_that_fails_is_not_the_end_of_reading(room: Room, slow: Slo
     slow.reads[0].errback(Unavailable("locked"))
     with pytest.raises(Unavailable, match="locked"):
         await first
-    slow.reads[1].callback(MemoryTally(1, [1], None))
+    slow.reads[1].callback(StoredEventCounts(1, [1], None))
     assert await second == (1, None)
 
 
@@ -404,10 +404,10 @@ async def test_nobody_takes_the_places_of_all(
         await (await counting(room, "ann"))
     other = await counting(room, "bob")
     for at in range(3):
-        slow.reads[at].callback(MemoryTally(at, [], None))
+        slow.reads[at].callback(StoredEventCounts(at, [], None))
     assert [(await each)[0] for each in (*mine, other)] == [0, 1, 2]
     again = await counting(room, "ann")
-    slow.reads[3].callback(MemoryTally(5, [], None))
+    slow.reads[3].callback(StoredEventCounts(5, [], None))
     assert await again == (5, None)
 
 
@@ -419,7 +419,7 @@ async def test_where_nothing_can_be_seen_nobody_looks(room: Room, slow: Slow) ->
         ask = ask_of({"robot": robot}, 0.0)
         found, _, more = await room.desk.page(ann, ask, 10)
         assert (found, more, await room.desk.count(ann, ask)) == ([], None, (0, None))
-        after = ask._replace(after=queries.MemoryPlace(1.0, 1))
+        after = ask._replace(after=queries.EventCursor(1.0, 1))
         assert (await room.desk.page(ann, after, 10))[2] is None
     assert slow.reads == []
 
@@ -430,8 +430,8 @@ async def test_a_page_looks_at_so_much_and_says_where_the_next_one_begins(
 ) -> None:
     """Also where it found nothing yet; by and by all is found, and counted."""
     monkeypatch.setattr(module, "LOOKS", 2)
-    monkeypatch.setattr(recalling, "LOOKED_AT", 4)
-    monkeypatch.setattr(recalling, "_SLICES", (1, 1, 4))
+    monkeypatch.setattr(event_search, "LOOKED_AT", 4)
+    monkeypatch.setattr(event_search, "_SLICES", (1, 1, 4))
     ann, sizes, numbers = room.people["ann"], [], []
     await room.write("ann", *({"kind": "k", "data": {"n": n % 15}} for n in range(30)))
     ask = ask_of({"data.n": "0"}, 0.0)
@@ -457,13 +457,13 @@ async def test_few_that_were_counted_are_used_wherever_they_were_found(
     """Behind the first look, too, and by several; not where there may be more, nor where they are too many."""
     monkeypatch.setattr(module, "LOOKS", 4)
     monkeypatch.setattr(module, "COUNTED_USED", 2)
-    monkeypatch.setattr(recalling, "LOOKED_AT", 4)
+    monkeypatch.setattr(event_search, "LOOKED_AT", 4)
     await room.write("ann", *({"kind": "k", "data": {"n": n, "of7": n % 7, "of8": n % 8}} for n in range(15)))
     ann = room.people["ann"]
     for query, count in (({"data.n": "4"}, 1), ({"data.of8": "0"}, 2), ({"data.of7": "0"}, 3), ({}, 15)):
         assert await room.desk.count(ann, ask_of(query, 0.0)) == (count, None)
     monkeypatch.setattr(module, "LOOKS", 2)
-    assert (await room.desk.count(ann, ask_of({"data.n": "13"}, 0.0)))[1] == queries.MemoryPlace(1000.0, 8)
+    assert (await room.desk.count(ann, ask_of({"data.n": "13"}, 0.0)))[1] == queries.EventCursor(1000.0, 8)
     await room.quota.look()
     found, _, _ = await room.desk.page(ann, ask_of({"kind": "k"}, 0.0), 20, uses=False)
     assert {each.number for each in found if each.used} == {1, 5, 9}
@@ -485,7 +485,7 @@ async def test_of_a_realm_that_is_gone_no_follower_hears_in_one_of_its_name(room
     await room.write("ann", {"kind": "here"})
     await emptied(room)
     room.recent.forget("lab")
-    assert await heard(room, Following(0), room.people["cleo"]) == []
+    assert await heard(room, EventFollower(0), room.people["cleo"]) == []
     assert room.recent.since("default", 0) is not None
 
 
@@ -499,12 +499,14 @@ async def test_a_realm_that_is_gone_counts_for_none_of_its_name(room: Room) -> N
     await emptied(room)
     room.quota.forget("lab")
     with room.store.database.begin() as s:
-        fresh = [queries.NewMemory("lab", 1000.0, f"n{each}", "fresh", None, None, "{}") for each in range(5)]
+        fresh = [
+            queries.NewStoredEvent("lab", 1000.0, f"n{each}", "fresh", None, None, "{}") for each in range(5)
+        ]
         room.quota.written([each for each in queries.remember(s, fresh) if each is not None])
     await room.quota.look()
-    page = await room.desk.page(cleo, Ask(), 100, uses=False)
+    page = await room.desk.page(cleo, EventQuery(), 100, uses=False)
     assert [(each.kind, each.used) for each in page[0]] == [("fresh", 0)] * 5
     room.quota.forget("lab")
     room.time.now += 2000
     await room.quota.purge()
-    assert (await room.desk.page(cleo, Ask(), 100))[0] == []
+    assert (await room.desk.page(cleo, EventQuery(), 100))[0] == []

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from relay_db.queries import MemoryRecord, NameIs
+from relay_db.queries import NameIs, StoredEventRecord
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.memory.asks import Forms
-from relay_server.memory.guarding import FIELDS, may_ask
+from relay_server.events.query import EventFormatter
+from relay_server.events.visibility import FIELDS, may_ask
 
 VIEWER = Rules([Grant(Level.VIEWER, (), ())])
 NARROW = Rules([Grant(Level.OPERATOR, (), ("*:/secret*", "view:/eye"))])
@@ -33,14 +33,14 @@ NAMED = [
 """Events, and whether a viewer and somebody who is denied something are told what they name."""
 
 
-def record(kind: str, data: dict[str, Any], source: str = "relay:rover") -> MemoryRecord:
+def record(kind: str, data: dict[str, Any], source: str = "relay:rover") -> StoredEventRecord:
     """An event about rover."""
-    return MemoryRecord(1, "default", 1.0, source, kind, 1, "ann", json.dumps(data), 0)
+    return StoredEventRecord(1, "default", 1.0, source, kind, 1, "ann", json.dumps(data), 0)
 
 
-def read(rules: Rules, event: MemoryRecord) -> Any:
+def read(rules: Rules, event: StoredEventRecord) -> Any:
     """What its reader is told."""
-    forms = Forms({1: "rover"}, {1: rules})
+    forms = EventFormatter({1: "rover"}, {1: rules})
     told = json.loads(bytes(forms.json(event)["data"]))
     assert json.loads(forms.cells(event)[-1]) == told
     return told

@@ -8,27 +8,27 @@ from typing import Any
 import pytest
 from twisted.internet.task import Clock
 
-from relay_db.queries import AlertRecord, NewMemory
+from relay_db.queries import AlertRecord, NewStoredEvent
 from relay_protocol import link
-from relay_server.journal import Journal
-from relay_server.memory.limits import NOTED_AT_ONCE
-from relay_server.memory.noticing import Noticing
-from relay_server.memory.writer import Writer
-from relay_server.registry import SETTLING_SECONDS, Registry
+from relay_server.events.bus import EventBus
+from relay_server.events.collector import EventCollector
+from relay_server.events.limits import NOTED_AT_ONCE
+from relay_server.events.writer import EventWriter
+from relay_server.robots.registry import SETTLING_SECONDS, RobotRegistry
 from tests.relay_server.memory import FIBONACCI, STRING, TRIGGER, TWIST, Person, Time, World
 
 GO = {"linear": {"x": 0.5}}
 
 
-class Notes(Writer):
+class Notes(EventWriter):
     """A writer that keeps what it is given."""
 
     def __init__(self) -> None:
         store: Any = None
         super().__init__(Clock(), store, lambda: 0.0, lambda events: None)
-        self.events: list[NewMemory] = []
+        self.events: list[NewStoredEvent] = []
 
-    def note(self, event: NewMemory) -> None:
+    def note(self, event: NewStoredEvent) -> None:
         """Keep it."""
         self.events.append(event)
 
@@ -40,14 +40,16 @@ def notes() -> Notes:
 
 
 @pytest.fixture
-def noticing(notes: Notes, time: Time) -> Noticing:
+def noticing(notes: Notes, time: Time) -> EventCollector:
     """What takes notes; it knows rover."""
-    registry = Registry(time)
+    registry = RobotRegistry(time)
     registry.presence(1, "rover", "lab")
-    return Noticing(notes, registry, time, time)
+    return EventCollector(notes, registry, time, time)
 
 
-def test_an_event_of_a_robot_is_in_its_name_and_says_who_did_it(notes: Notes, noticing: Noticing) -> None:
+def test_an_event_of_a_robot_is_in_its_name_and_says_who_did_it(
+    notes: Notes, noticing: EventCollector
+) -> None:
     """In the robot's realm; addresses are for owners, and not everybody who reads is one."""
     noticing.happened(
         "control.taken",
@@ -62,10 +64,10 @@ def test_an_event_of_a_robot_is_in_its_name_and_says_who_did_it(notes: Notes, no
 
 def test_an_event_of_a_shared_robot_is_told_in_all_its_realms(time: Time, notes: Notes) -> None:
     """Who did it is a user in his own realm, in the others a full name; what nobody did is the same."""
-    registry = Registry(time)
+    registry = RobotRegistry(time)
     registry.share({1: frozenset({"lab2"})})
     assert registry.presence(1, "rover", "lab").realms == {"lab", "lab2"}
-    noticing = Noticing(notes, registry, time, time)
+    noticing = EventCollector(notes, registry, time, time)
     noticing.happened("control.taken", "user:ann@lab2", 1, {"why": "why not"})
     noticing.happened("control.released", "user:bob", 1, {})
     noticing.happened("robot.offline", "relay", 1, {})
@@ -83,10 +85,10 @@ def test_an_event_of_a_shared_robot_is_told_in_all_its_realms(time: Time, notes:
 
 def test_who_is_of_another_realm_takes_no_room_from_what_becomes_of_a_robot(time: Time, notes: Notes) -> None:
     """His share is his own, and what the robot does by itself has another."""
-    registry = Registry(time)
+    registry = RobotRegistry(time)
     registry.share({1: frozenset({"lab2"})})
     registry.presence(1, "rover", "lab")
-    noticing = Noticing(notes, registry, time, time)
+    noticing = EventCollector(notes, registry, time, time)
     for _ in range(NOTED_AT_ONCE + 5):
         noticing.happened("call.begun", "user:ann@lab2", 1, {"service": "/reset"})
     noticing.happened("robot.offline", "relay", 1, {})
@@ -97,10 +99,10 @@ def test_who_is_of_another_realm_takes_no_room_from_what_becomes_of_a_robot(time
 
 def test_a_recording_is_told_at_home_without_what_is_in_it(time: Time, notes: Notes) -> None:
     """Its realm is that of who recorded; why it ended may name what not everybody of the robot may see."""
-    registry = Registry(time)
+    registry = RobotRegistry(time)
     registry.share({1: frozenset({"lab2"})})
     registry.presence(1, "rover", "lab")
-    noticing = Noticing(notes, registry, time, time)
+    noticing = EventCollector(notes, registry, time, time)
     noticing.happened("recording.started", "user:ann@lab2", 1, {"recording": "r1", "address": "192.0.2.1"})
     ended = {"recording": "r1", "state": "complete", "reason": "you may not view /eye", "bytes": 5}
     noticing.happened("recording.ended", "user:ann@lab2", 1, ended)
@@ -113,7 +115,7 @@ def test_a_recording_is_told_at_home_without_what_is_in_it(time: Time, notes: No
 
 def test_nodes_that_come_and_go_are_told_once(world: World, notes: Notes) -> None:
     """While the robot is there and has told of those that it had when it came, however it tells of them."""
-    noticing = Noticing(notes, world.registry, world.clock.seconds, world.clock.seconds)
+    noticing = EventCollector(notes, world.registry, world.clock.seconds, world.clock.seconds)
     world.registry.on_modules(noticing.modules)
 
     def told(**graph: Any) -> list[tuple[str, str]]:
@@ -139,17 +141,17 @@ def test_nodes_that_come_and_go_are_told_once(world: World, notes: Notes) -> Non
 
 
 def test_nodes_that_flutter_take_no_room_from_what_becomes_of_the_robot(
-    notes: Notes, noticing: Noticing, time: Time
+    notes: Notes, noticing: EventCollector, time: Time
 ) -> None:
     """They have a share of their own."""
-    rover = Registry(time).presence(1, "rover", "lab")
+    rover = RobotRegistry(time).presence(1, "rover", "lab")
     noticing.modules(rover, [f"/n{each}" for each in range(NOTED_AT_ONCE + 5)], [])
     noticing.happened("robot.stopped", "relay", 1, {})
     assert (len(notes.events), notes.dropped) == (NOTED_AT_ONCE + 1, 5)
     assert notes.events[0][2:6] == ("relay:rover", "module.up", 1, None)
 
 
-def test_a_refused_login_is_told_in_full(notes: Notes, noticing: Noticing) -> None:
+def test_a_refused_login_is_told_in_full(notes: Notes, noticing: EventCollector) -> None:
     """Only administrators read it."""
     data = {"user": "ann", "address": "192.0.2.1", "reason": "bad_credentials"}
     noticing.happened("login.refused", "relay", None, data)
@@ -157,7 +159,7 @@ def test_a_refused_login_is_told_in_full(notes: Notes, noticing: Noticing) -> No
     assert (event.realm, event.source, event.user, json.loads(event.data)) == ("default", "relay", None, data)
 
 
-def test_a_refused_login_is_told_in_the_realm_that_was_named(notes: Notes, noticing: Noticing) -> None:
+def test_a_refused_login_is_told_in_the_realm_that_was_named(notes: Notes, noticing: EventCollector) -> None:
     """Whether there is such a realm or not; which it is belongs to the event, and not to what it says."""
     noticing.happened("login.refused", "relay", None, {"user": "ann@LAB", "realm": "lab"})
     assert [(each.realm, json.loads(each.data)) for each in notes.events] == [("lab", {"user": "ann@LAB"})]
@@ -165,14 +167,14 @@ def test_a_refused_login_is_told_in_the_realm_that_was_named(notes: Notes, notic
 
 @pytest.mark.parametrize("realm", [None, ""])
 def test_a_refused_login_of_no_realm_is_told_to_nobody(
-    notes: Notes, noticing: Noticing, realm: str | None
+    notes: Notes, noticing: EventCollector, realm: str | None
 ) -> None:
     """A program that nobody has, or a realm that can't be; the journal has it all the same."""
     noticing.happened("login.refused", "relay", None, {"program": "swp_1", "realm": realm})
     assert (notes.events, notes.dropped) == ([], 0)
 
 
-def test_a_flood_in_one_realm_leaves_room_in_others(notes: Notes, noticing: Noticing) -> None:
+def test_a_flood_in_one_realm_leaves_room_in_others(notes: Notes, noticing: EventCollector) -> None:
     """Of logins, and of what users of the same name do; what strangers name for realms has one share together."""
     notes.exist(["lab", "plant"])
 
@@ -187,13 +189,13 @@ def test_a_flood_in_one_realm_leaves_room_in_others(notes: Notes, noticing: Noti
     assert refused("plant") == 1
     notes.events.clear()
     for realm in ("lab", "plant"):
-        event = NewMemory(realm, 5.0, "directory", "registered", None, "ann", "{}")
+        event = NewStoredEvent(realm, 5.0, "directory", "registered", None, "ann", "{}")
         for _ in range(NOTED_AT_ONCE + 5):
             noticing.note(event)
     assert [each.realm for each in notes.events] == ["lab"] * NOTED_AT_ONCE + ["plant"] * NOTED_AT_ONCE
 
 
-def test_what_is_not_for_the_memory_leaves_nothing(notes: Notes, noticing: Noticing) -> None:
+def test_what_is_not_for_the_memory_leaves_nothing(notes: Notes, noticing: EventCollector) -> None:
     """Nor does what is about a robot that is gone."""
     noticing.happened("client.refused", "user:ann", 1, {})
     for kind in ("video.joined", "video.left"):
@@ -202,7 +204,7 @@ def test_what_is_not_for_the_memory_leaves_nothing(notes: Notes, noticing: Notic
     assert notes.events == []
 
 
-def test_what_comes_too_often_is_counted(notes: Notes, noticing: Noticing, time: Time) -> None:
+def test_what_comes_too_often_is_counted(notes: Notes, noticing: EventCollector, time: Time) -> None:
     """Of one user on one robot; others are not concerned."""
     for _ in range(NOTED_AT_ONCE + 50):
         noticing.happened("call.begun", "user:ann", 1, {"service": "/x"})
@@ -213,7 +215,7 @@ def test_what_comes_too_often_is_counted(notes: Notes, noticing: Noticing, time:
     assert len(notes.events) == NOTED_AT_ONCE + 2
 
 
-def test_data_that_is_too_large_is_left_out(notes: Notes, noticing: Noticing) -> None:
+def test_data_that_is_too_large_is_left_out(notes: Notes, noticing: EventCollector) -> None:
     """The event is not."""
     noticing.happened("goal.begun", "user:ann", 1, {f"field{n}": "\N{GRINNING FACE}" * 255 for n in range(3)})
     assert set(json.loads(notes.events[0].data)) == {"left_out"}
@@ -221,7 +223,7 @@ def test_data_that_is_too_large_is_left_out(notes: Notes, noticing: Noticing) ->
 
 @pytest.mark.parametrize(("kind", "told"), [("battery", True), ("stale", False), ("diagnostics", False)])
 def test_words_of_an_alert_are_told_where_they_take_no_further_right(
-    notes: Notes, noticing: Noticing, kind: str, told: bool
+    notes: Notes, noticing: EventCollector, kind: str, told: bool
 ) -> None:
     """That there is one is told in any case."""
     alert = AlertRecord(
@@ -237,7 +239,7 @@ def test_words_of_an_alert_are_told_where_they_take_no_further_right(
 def test_a_witness_of_the_journal_hears_who_says_so(time: Time, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also of what is not kept there."""
     store: Any = None
-    journal = Journal(store, time)
+    journal = EventBus(store, time)
     monkeypatch.setattr(journal, "_write", lambda *_: None)
     heard: list[Any] = []
     journal.witness(lambda *what: heard.append(what))
@@ -342,9 +344,9 @@ def test_a_goal_is_noted_when_it_begins_and_ends(world: World) -> None:
     ]
 
 
-def test_what_is_put_together_elsewhere_is_kept_as_it_is(notes: Notes, noticing: Noticing) -> None:
+def test_what_is_put_together_elsewhere_is_kept_as_it_is(notes: Notes, noticing: EventCollector) -> None:
     """As much as of anything else."""
-    event = NewMemory("lab", 5.0, "relay:rover", "registered", 1, "ann", "{}")
+    event = NewStoredEvent("lab", 5.0, "relay:rover", "registered", 1, "ann", "{}")
     for _ in range(NOTED_AT_ONCE + 1):
         noticing.note(event)
     assert notes.events == [event] * NOTED_AT_ONCE and notes.dropped == 1

@@ -12,27 +12,27 @@ from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 from twisted.logger import capturedLogs
 
-from relay_db.queries import MemoryRecord, NewMemory
+from relay_db.queries import NewStoredEvent, StoredEventRecord
 from relay_protocol.errors import NotFound, Unavailable
-from relay_server.memory import writer as module
-from relay_server.memory.limits import DROPS_SECONDS, GATHER_SECONDS, RETRY_SECONDS
-from relay_server.memory.writer import Full, Writer
+from relay_server.events import writer as module
+from relay_server.events.limits import DROPS_SECONDS, GATHER_SECONDS, RETRY_SECONDS
+from relay_server.events.writer import EventQueueFull, EventWriter
 
 
 class Paper:
     """A store that writes when the test says so."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[list[NewMemory], Deferred[list[MemoryRecord | None]]]] = []
+        self.asked: list[tuple[list[NewStoredEvent], Deferred[list[StoredEventRecord | None]]]] = []
         self.number = 0
 
-    def write(self, query: Any, events: list[NewMemory]) -> Deferred[list[MemoryRecord | None]]:
+    def write(self, query: Any, events: list[NewStoredEvent]) -> Deferred[list[StoredEventRecord | None]]:
         """One transaction."""
-        done: Deferred[list[MemoryRecord | None]] = Deferred()
+        done: Deferred[list[StoredEventRecord | None]] = Deferred()
         self.asked.append((events, done))
         return done
 
-    def commit(self, *gone: str) -> list[NewMemory]:
+    def commit(self, *gone: str) -> list[NewStoredEvent]:
         """It is safe; what it holds.
 
         :param gone: realms that are not there any more
@@ -42,7 +42,7 @@ class Paper:
         first = self.number - len(events) + 1
         done.callback(
             [
-                None if each.realm in gone else MemoryRecord(first + at, *each, used=0)
+                None if each.realm in gone else StoredEventRecord(first + at, *each, used=0)
                 for at, each in enumerate(events)
             ]
         )
@@ -60,12 +60,12 @@ class Scene:
         self.clock, self.paper = Clock(), Paper()
         self.told: list[int] = []
         store: Any = self.paper
-        self.writer = Writer(self.clock, store, lambda: 7.0, self._written)
+        self.writer = EventWriter(self.clock, store, lambda: 7.0, self._written)
 
-    def _written(self, events: list[MemoryRecord]) -> None:
+    def _written(self, events: list[StoredEventRecord]) -> None:
         self.told += [each.number for each in events]
 
-    def write(self, count: int = 1) -> Deferred[list[MemoryRecord]]:
+    def write(self, count: int = 1) -> Deferred[list[StoredEventRecord]]:
         """Somebody brings so many at once."""
         return Deferred.fromCoroutine(self.writer.write([new()] * count))
 
@@ -74,9 +74,9 @@ class Scene:
         self.clock.advance(GATHER_SECONDS)
 
 
-def new(realm: str = "default", kind: str = "x") -> NewMemory:
+def new(realm: str = "default", kind: str = "x") -> NewStoredEvent:
     """An event."""
-    return NewMemory(realm, 1.0, "app", kind, None, None, "{}")
+    return NewStoredEvent(realm, 1.0, "app", kind, None, None, "{}")
 
 
 @pytest.fixture
@@ -157,7 +157,7 @@ def test_when_the_queue_is_full_who_brings_more_has_to_come_again(
     for _ in range(5):
         scene.writer.note(new())
     scene.write(7)
-    with fails(scene.write(1), Full):
+    with fails(scene.write(1), EventQueueFull):
         pass
     scene.writer.note(new("lab"))
     assert (scene.writer.waiting, scene.writer.dropped) == (10, 3)

@@ -11,14 +11,17 @@ from rdflib.compare import isomorphic
 
 from relay_protocol.errors import Invalid, NotFound
 from relay_server.access import Principal
-from relay_server.resources import Asker, CameraDesk, Listing
-from relay_server.resources.describing import Place, camera_graph, members_graph
-from relay_server.resources.forms import FORMS, Form
-from relay_server.resources.syntax import read, write
-from relay_server.video import NO_CAMERA
+from relay_server.http.media_types import FORMS, MediaType
+from relay_server.http.rdf.encode import camera_graph, members_graph
+from relay_server.http.rdf.serialize import read, write
+from relay_server.resources.cameras import CameraService
+from relay_server.resources.location import ResourceLocation
+from relay_server.resources.page import PageQuery
+from relay_server.resources.service import RequestOrigin
+from relay_server.video.ports import NO_CAMERA
 
-ASKER = Asker(Principal(1, "ann", "main", False, 1, None), "rover", "192.0.2.1")
-PLACE = Place("https://robots.example:8443", "rover")
+ASKER = RequestOrigin(Principal(1, "ann", "main", False, 1, None), "rover", "192.0.2.1")
+PLACE = ResourceLocation("https://robots.example:8443", "rover")
 OWN = Namespace("https://robots.example:8443/api/v1/vocabulary/switchboard#")
 SHOWN = {"viewers": 2, "state": "open", "settings": {"width": 320, "crop": [0, 0, 0, 0]}, "playing": None}
 
@@ -44,10 +47,10 @@ async def look(principal: Principal, robot: str) -> list[dict[str, Any]]:
 @pytest_twisted.ensureDeferred
 async def test_a_page_of_cameras() -> None:
     """In the order of their names, by name and type, some at a time."""
-    desk = CameraDesk(look)
+    desk = CameraService(look)
 
     async def names(**listing: Any) -> tuple[list[str], str]:
-        page = await desk.members(ASKER, Listing(**listing))
+        page = await desk.members(ASKER, PageQuery(**listing))
         return [each["name"] for each in page["cameras"]], page["next"]
 
     assert await names() == (["/back", "/front", "/gate/usb"], "")
@@ -55,13 +58,13 @@ async def test_a_page_of_cameras() -> None:
     assert await names(name="/gate/*") == (["/gate/usb"], "")
     assert await names(type="sensor_msgs/msg/Image") == (["/back", "/front"], "")
     with pytest.raises(NotFound):
-        await desk.members(ASKER._replace(robot="other"), Listing())
+        await desk.members(ASKER._replace(robot="other"), PageQuery())
 
 
 @pytest_twisted.ensureDeferred
 async def test_one_camera_tells_where_its_pictures_are() -> None:
     """With or without the slash at its beginning; one that may not be viewed is like none."""
-    desk = CameraDesk(look)
+    desk = CameraService(look)
     place = "/robots/rover/video"
     assert await desk.camera(ASKER, "gate/usb") == {
         **GATE,
@@ -81,9 +84,9 @@ async def test_one_camera_tells_where_its_pictures_are() -> None:
 
 @pytest.mark.parametrize("form", FORMS[1:])
 @pytest_twisted.ensureDeferred
-async def test_a_camera_is_a_sensor(form: Form) -> None:
+async def test_a_camera_is_a_sensor(form: MediaType) -> None:
     """With numbers that are numbers; what is not known is not said, and its pictures are resources."""
-    graph = camera_graph(await CameraDesk(look).camera(ASKER, "front"), PLACE)
+    graph = camera_graph(await CameraService(look).camera(ASKER, "front"), PLACE)
     node, robot = URIRef(PLACE.of("cameras", "/front")), URIRef(PLACE.address)
     assert str(node) == "https://robots.example:8443/api/v1/robots/rover/cameras/front"
     assert set(graph.objects(node, RDF.type)) == {OWN.Camera, SOSA.Sensor}
@@ -94,12 +97,12 @@ async def test_a_camera_is_a_sensor(form: Form) -> None:
         "https://robots.example:8443/robots/rover/video/snapshot?topic=%2Ffront"
     )
     assert isomorphic(read(write(graph, form), form, str(node)), graph)
-    bare = camera_graph(await CameraDesk(look).camera(ASKER, "back"), PLACE)
+    bare = camera_graph(await CameraService(look).camera(ASKER, "back"), PLACE)
     assert not {OWN.width, OWN.fps, OWN.seen, OWN.encoding} & set(bare.predicates())
 
 
 @pytest.mark.parametrize("form", FORMS[1:])
-def test_cameras_are_members_of_their_collection(form: Form) -> None:
+def test_cameras_are_members_of_their_collection(form: MediaType) -> None:
     """As topics are of theirs."""
     graph = members_graph("cameras", {"cameras": [FRONT, GATE], "next": ""}, PLACE)
     collection = URIRef(PLACE.of("cameras"))

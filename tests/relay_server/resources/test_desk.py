@@ -16,18 +16,18 @@ from twisted.logger import LogEvent, globalLogPublisher
 
 from relay_db import queries
 from relay_protocol.errors import Invalid, Refused, Unavailable
-from relay_server.budget import Budget
-from relay_server.edges.representing import Workshop
-from relay_server.inside import Guests
-from relay_server.resources import Asker, ResourceDesk
+from relay_server.common.cpu_quota import Quota
+from relay_server.http.negotiation import ConversionPool
+from relay_server.http_sessions.pool import SessionPool
+from relay_server.resources.service import RequestOrigin, RobotResourceService
 from tests.harness.switchboard_waiting import PATIENCE
 from tests.relay_server.front_desk import HERE, Desk
 
 
 @pytest.fixture
-def threads() -> Iterator[Workshop]:
+def threads() -> Iterator[ConversionPool]:
     """Where it is done."""
-    made = Workshop(reactor)
+    made = ConversionPool(reactor)
     made.start()
     yield made
     made.stop()
@@ -67,21 +67,21 @@ class Slow:
 class Asking(NamedTuple):
     """A desk, and who asks there: ann."""
 
-    desk: ResourceDesk
-    asker: Asker
-    share: Budget
+    desk: RobotResourceService
+    asker: RequestOrigin
+    share: Quota
 
     def made(self, work: Callable[[], Any]) -> Deferred[Any]:
         """Ask for something."""
         return Deferred.fromCoroutine(self.desk.made(self.asker, work))
 
 
-async def asking(front: Desk, threads: Workshop) -> Asking:
+async def asking(front: Desk, threads: ConversionPool) -> Asking:
     """Ann's rover is there."""
     front.world.robot_comes()
-    guests = Guests(front.world.clock, front.desk, front.world.now_ns)
-    desk = ResourceDesk(front.world.clock, guests, threads, front.world.now_ns, front.wall)
-    asker = Asker(await front.by_token(front.ann), "rover", HERE)
+    guests = SessionPool(front.world.clock, front.desk, front.world.now_ns)
+    desk = RobotResourceService(front.world.clock, guests, threads, front.world.now_ns, front.wall)
+    asker = RequestOrigin(await front.by_token(front.ann), "rover", HERE)
     async with guests.at(*asker) as guest:
         return Asking(desk, asker, guest.session.allowance.requests)
 
@@ -97,7 +97,7 @@ async def until(condition: Callable[[], Any]) -> None:
 
 
 @pytest_twisted.ensureDeferred
-async def test_long_work_is_on_the_account_of_who_asks(front: Desk, threads: Workshop) -> None:
+async def test_long_work_is_on_the_account_of_who_asks(front: Desk, threads: ConversionPool) -> None:
     """Also what fails; who has used up his share gets no more."""
     desk, asker, share = await asking(front, threads)
     before = share.left
@@ -113,7 +113,7 @@ async def test_long_work_is_on_the_account_of_who_asks(front: Desk, threads: Wor
 
 
 @pytest_twisted.ensureDeferred
-async def test_one_user_leaves_room_for_others(front: Desk, threads: Workshop) -> None:
+async def test_one_user_leaves_room_for_others(front: Desk, threads: ConversionPool) -> None:
     """What he asks for while two pieces of his wait or are made is refused, also where who asked has left."""
     ann, slow = await asking(front, threads), Slow()
     with front.store.database.begin() as session:
@@ -138,7 +138,7 @@ async def test_one_user_leaves_room_for_others(front: Desk, threads: Workshop) -
 
 
 @pytest_twisted.ensureDeferred
-async def test_the_share_is_looked_at_when_it_is_his_turn(front: Desk, threads: Workshop) -> None:
+async def test_the_share_is_looked_at_when_it_is_his_turn(front: Desk, threads: ConversionPool) -> None:
     """What waited while it was used up is not made."""
     ann, slow = await asking(front, threads), Slow()
     try:
@@ -154,7 +154,7 @@ async def test_the_share_is_looked_at_when_it_is_his_turn(front: Desk, threads: 
 
 
 @pytest_twisted.ensureDeferred
-async def test_a_relay_that_goes_down_makes_no_more(front: Desk, threads: Workshop) -> None:
+async def test_a_relay_that_goes_down_makes_no_more(front: Desk, threads: ConversionPool) -> None:
     """What is being made is finished; what waits for its turn fails."""
     ann, slow = await asking(front, threads), Slow()
     try:
@@ -170,7 +170,9 @@ async def test_a_relay_that_goes_down_makes_no_more(front: Desk, threads: Worksh
 
 
 @pytest_twisted.ensureDeferred
-async def test_what_fails_for_who_has_left_is_no_failure_of_the_relay(front: Desk, threads: Workshop) -> None:
+async def test_what_fails_for_who_has_left_is_no_failure_of_the_relay(
+    front: Desk, threads: ConversionPool
+) -> None:
     """Nothing is left in the log."""
     told: list[Any] = []
 

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import pytest
 
-from relay_server.resources.forms import (
+from relay_server.http.media_types import (
     EVENTS,
     FORMS,
     JSON,
     JSON_LD,
     RDF_XML,
     TURTLE,
-    Form,
+    MediaType,
     NotAcceptable,
-    UnknownForm,
+    UnsupportedMediaType,
     of_any_form,
     preferred,
     sent,
     tags_of,
     wanted,
 )
-from relay_server.resources.states import tag_of
+from relay_server.resources.etags import tag_of
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ from relay_server.resources.states import tag_of
         ("text/event-stream;q=0.9, application/json", JSON),
     ],
 )
-def test_the_form_that_is_wanted_most_is_given(accept: str | None, form: Form) -> None:
+def test_the_form_that_is_wanted_most_is_given(accept: str | None, form: MediaType) -> None:
     """By the qualities of 'Accept'; JSON where nothing else is asked for."""
     assert wanted(accept, (*FORMS, EVENTS)) is form
 
@@ -67,7 +67,7 @@ def test_who_takes_no_form_is_told_those_there_are(accept: str) -> None:
         ("application/json;q=0.5, Text/Event-Stream", EVENTS),
     ],
 )
-def test_where_the_first_form_is_for_everybody(accept: str | None, form: Form) -> None:
+def test_where_the_first_form_is_for_everybody(accept: str | None, form: MediaType) -> None:
     """Whoever takes none of those there are gets it."""
     assert preferred(accept, (JSON, EVENTS)) is form
 
@@ -76,7 +76,7 @@ def test_a_body_says_its_form() -> None:
     """With whatever parameters; what is none that is read is refused."""
     assert sent("Text/Turtle; charset=utf-8") is TURTLE
     for unknown in (None, "", "text/plain", "text/event-stream"):
-        with pytest.raises(UnknownForm, match=r"application/rdf\+xml"):
+        with pytest.raises(UnsupportedMediaType, match=r"application/rdf\+xml"):
             sent(unknown)
 
 

@@ -15,31 +15,23 @@ from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
 from relay_server.access import Principal
-from relay_server.control import NotDone
-from relay_server.control.record import Actor
-from relay_server.edges.representing import Workshop
-from relay_server.inside import Guests
-from relay_server.inside.guests import LINGER_SECONDS
-from relay_server.resources import (
-    Ask,
-    Asker,
-    Goal,
-    GoalDesk,
-    Listing,
-    MomentNeeded,
-    ResourceDesk,
-    TooOld,
-)
-from relay_server.resources import goal as limits
+from relay_server.common.freshness_tokens import FreshnessTokenExpired, FreshnessTokenRequired
+from relay_server.control.audit import Actor
+from relay_server.control.commands import NotDone
+from relay_server.http.negotiation import ConversionPool
+from relay_server.http_sessions.pool import LINGER_SECONDS, SessionPool
+from relay_server.resources import goals as limits
 from relay_server.resources import goals as module
-from relay_server.resources.goal import NEXT, State
+from relay_server.resources.goals import NEXT, GoalRequest, GoalService, GoalState, HttpGoal
+from relay_server.resources.page import PageQuery
+from relay_server.resources.service import RequestOrigin, RobotResourceService
 from tests.relay_server.channel.goal_ends import FEEDBACK, RESULT
 from tests.relay_server.edges.robot_ends import until
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import FIBONACCI, MOTION, TWIST
 
 COUNT, SPIN = "/count", "/spin"
-THREE = Ask(b'{"order":3}')
+THREE = GoalRequest(b'{"order":3}')
 
 
 class House:
@@ -48,12 +40,14 @@ class House:
     def __init__(self, front: Desk) -> None:
         self.front = front
         self.world = front.world
-        self.guests = Guests(self.world.clock, front.desk, self.world.now_ns)
+        self.guests = SessionPool(self.world.clock, front.desk, self.world.now_ns)
         # Not started: nothing of a goal takes long.
-        threads = Workshop(reactor)
-        resources = ResourceDesk(self.world.clock, self.guests, threads, self.world.now_ns, front.wall)
-        self.desk = GoalDesk(self.world.clock, self.guests, resources, front.wall)
-        self.ann = Asker(Principal(0, "", "", False, 0, None), "rover", HERE)
+        threads = ConversionPool(reactor)
+        resources = RobotResourceService(
+            self.world.clock, self.guests, threads, self.world.now_ns, front.wall
+        )
+        self.desk = GoalService(self.world.clock, self.guests, resources, front.wall)
+        self.ann = RequestOrigin(Principal(0, "", "", False, 0, None), "rover", HERE)
 
     async def begin(self) -> None:
         """The robot is there, and has told of its types; it was asked for one goal by then."""
@@ -69,9 +63,11 @@ class House:
         self.world.define()
         goal = await giving
         self.finishes()
-        assert goal.state is State.SUCCEEDED
+        assert goal.state is GoalState.SUCCEEDED
 
-    def giving(self, name: str = COUNT, ask: Ask = THREE, moment: int | None = None) -> Deferred[Goal]:
+    def giving(
+        self, name: str = COUNT, ask: GoalRequest = THREE, moment: int | None = None
+    ) -> Deferred[HttpGoal]:
         """Ann gives a goal; fires when that is done."""
         return Deferred.fromCoroutine(self.desk.give(self.ann, name, ask, moment))
 
@@ -95,7 +91,7 @@ class House:
             body = self.world.cdr(FEEDBACK, sequence=list(sequence))
             self.world.channel.message(link.ActionFeedback(id=goal.id, cdr=body))
 
-    async def status(self, goal: Goal, asker: Asker | None = None) -> Any:
+    async def status(self, goal: HttpGoal, asker: RequestOrigin | None = None) -> Any:
         """What is told of a goal, without a look at it."""
         return json.loads((await self.desk.told(asker or self.ann, goal)).body)
 
@@ -120,8 +116,11 @@ async def refusal(work: Any) -> SwitchboardError:
 
 def test_what_is_over_stays_so() -> None:
     """Every state but two is an end."""
-    assert {state for state, following in NEXT.items() if following} == {State.ACTIVE, State.CANCELLING}
-    assert set(NEXT) == set(State)
+    assert {state for state, following in NEXT.items() if following} == {
+        GoalState.ACTIVE,
+        GoalState.CANCELLING,
+    }
+    assert set(NEXT) == set(GoalState)
 
 
 @pytest_twisted.ensureDeferred
@@ -225,7 +224,7 @@ async def test_a_goal_is_cancelled_by_who_gave_it(front: Desk) -> None:
     goal = await house.giving()
     assert house.desk.cancel(house.ann, goal.id) is goal
     assert house.desk.cancel(house.ann, goal.id) is goal
-    assert (len(house.cancelled()), goal.state) == (1, State.CANCELLING)
+    assert (len(house.cancelled()), goal.state) == (1, GoalState.CANCELLING)
     house.finishes(status=5)
     status = await house.status(goal)
     assert (status["state"], status["reason"]) == ("canceled", "it was cancelled by who gave it")
@@ -261,8 +260,8 @@ async def test_what_moves_the_robot_is_dated_and_takes_control(front: Desk) -> N
     """As commands are; who loses control is told who has it."""
     house = await house_of(front)
     now = house.world.now_ns()
-    assert isinstance(await refusal(house.giving(SPIN)), MomentNeeded)
-    assert isinstance(await refusal(house.giving(SPIN, moment=now - 600_000_000)), TooOld)
+    assert isinstance(await refusal(house.giving(SPIN)), FreshnessTokenRequired)
+    assert isinstance(await refusal(house.giving(SPIN, moment=now - 600_000_000)), FreshnessTokenExpired)
     assert not house.sent()
     goal = await house.giving(SPIN, moment=now)
     lease = house.world.desks.of(house.world.robot).lease
@@ -295,7 +294,7 @@ async def test_a_relay_that_goes_down_says_so(front: Desk) -> None:
     front.desk.say_goodbye("the relay is going down")
     assert len(house.cancelled()) == 1
     await waiting
-    assert (goal.state, goal.reason) == (State.CANCELED, "the relay is going down")
+    assert (goal.state, goal.reason) == (GoalState.CANCELED, "the relay is going down")
 
 
 @pytest_twisted.ensureDeferred
@@ -305,7 +304,7 @@ async def test_a_robot_that_is_lost_has_ended_its_goals(front: Desk) -> None:
     goal = await house.giving()
     house.world.robot_goes()
     house.world.channel.link_lost(house.world.link)
-    assert goal.state is State.ABORTED and "lost its connection" in (goal.reason or "")
+    assert goal.state is GoalState.ABORTED and "lost its connection" in (goal.reason or "")
     assert isinstance(await refusal(house.giving()), Unavailable)
 
 
@@ -329,7 +328,7 @@ async def test_a_right_that_is_withdrawn_ends_what_is_shown(front: Desk) -> None
         queries.revoke_right(session, front.rover.id, user_id=front.ann.id)
     await front.access.refresh()
     assert (await house.status(done))["state"] == "succeeded"
-    assert (await house.desk.members(house.ann, Listing()))["goals"]
+    assert (await house.desk.members(house.ann, PageQuery()))["goals"]
 
 
 @pytest_twisted.ensureDeferred
@@ -348,9 +347,9 @@ async def test_goals_are_their_owners(front: Desk) -> None:
         with pytest.raises(NotFound):
             house.desk.cancel(other, goal.id)
     for other in others:
-        assert (await house.desk.members(other, Listing()))["goals"] == []
+        assert (await house.desk.members(other, PageQuery()))["goals"] == []
     hidden = house.ann._replace(robot="hidden")
-    assert isinstance(await refusal(house.desk.members(hidden, Listing())), NotFound)
+    assert isinstance(await refusal(house.desk.members(hidden, PageQuery())), NotFound)
     same, _ = await front.logged_in()
     assert house.desk.find(house.ann._replace(principal=same), goal.id) is goal
     assert len(goal.id) >= 40
@@ -366,19 +365,19 @@ async def test_goals_are_listed_in_the_order_in_which_they_were_given(front: Des
         given.append((await house.giving()).id)
     house.passes(0.25)
     await house.giving(SPIN, moment=house.world.now_ns())
-    page = await house.desk.members(house.ann, Listing(name="/c*", limit=3))
+    page = await house.desk.members(house.ann, PageQuery(name="/c*", limit=3))
     assert [each["id"] for each in page["goals"]][1:] == given[:2]
     assert "feedback" not in page["goals"][0]
-    rest = await house.desk.members(house.ann, Listing(name="/c*", after=page["next"]))
+    rest = await house.desk.members(house.ann, PageQuery(name="/c*", after=page["next"]))
     assert [each["id"] for each in rest["goals"]] == given[2:] and rest["next"] == ""
-    assert (await house.desk.members(house.ann, Listing(type="other/action/Type")))["goals"] == []
+    assert (await house.desk.members(house.ann, PageQuery(type="other/action/Type")))["goals"] == []
 
 
 @pytest_twisted.ensureDeferred
 async def test_what_can_not_begin_is_refused_in_words(front: Desk) -> None:
     """And leaves nothing, neither a goal nor a connection that is kept."""
     house = await house_of(front)
-    wrong = await refusal(house.giving(ask=Ask(b'{"order":"five"}')))
+    wrong = await refusal(house.giving(ask=GoalRequest(b'{"order":"five"}')))
     assert isinstance(wrong, NotDone) and "order" in str(wrong)
     assert isinstance(await refusal(house.giving("/nowhere")), NotFound)
     assert isinstance(await refusal(house.giving("no name!")), Invalid)
@@ -387,7 +386,7 @@ async def test_what_can_not_begin_is_refused_in_words(front: Desk) -> None:
         queries.grant_right(session, front.rover.id, "viewer", user_id=front.ann.id)
     await front.access.refresh()
     assert isinstance(await refusal(house.giving()), Refused)
-    assert len((await house.desk.members(house.ann, Listing()))["goals"]) == 1
+    assert len((await house.desk.members(house.ann, PageQuery()))["goals"]) == 1
     house.passes(LINGER_SECONDS)
     assert not list(front.desk)
 
@@ -403,12 +402,12 @@ async def test_one_user_has_so_many(front: Desk, monkeypatch: pytest.MonkeyPatch
     house.finishes()
     goals.append(await house.giving())
     house.finishes()
-    kept = {each["id"] for each in (await house.desk.members(house.ann, Listing()))["goals"]}
+    kept = {each["id"] for each in (await house.desk.members(house.ann, PageQuery()))["goals"]}
     assert kept == {each.id for each in goals[1:]}
     monkeypatch.setattr(module, "KEPT_BYTES", 1)
     last = await house.giving()
     house.finishes()
-    (only,) = (await house.desk.members(house.ann, Listing()))["goals"]
+    (only,) = (await house.desk.members(house.ann, PageQuery()))["goals"]
     assert only["id"] == last.id
 
 

@@ -16,20 +16,20 @@ from ros_messages import EVERY, LETTERS, installed, messages, whole_text
 
 from relay_protocol import jsontext
 from relay_protocol.ros_types import TypeRegistry
-from relay_server.resources.background import Background
-from relay_server.resources.describing import Place, members_graph, param_graph, state_graph
-from relay_server.resources.forms import FORMS, JSON, Form
-from relay_server.resources.graphs import LONGEST_LIST, MOST_VALUES
-from relay_server.resources.states import Param, State
-from relay_server.resources.syntax import read, write
-from relay_server.resources.values import message_in, value_in
+from relay_server.http.media_types import FORMS, JSON, MediaType
+from relay_server.http.rdf.decode import message_in, value_in
+from relay_server.http.rdf.encode import LONGEST_LIST, MOST_VALUES, members_graph, param_graph, state_graph
+from relay_server.http.rdf.serialize import read, write
+from relay_server.resources.etags import ParamState, TopicState
+from relay_server.resources.location import ResourceLocation
+from relay_server.resources.topic_context import TopicContext
 
 TYPES = installed()
 REGISTRY = TypeRegistry()
 for owner in {each.owner for each in TYPES.values()}:
     REGISTRY.add(owner, whole_text(owner))
 
-PLACE = Place("https://robots.example:8443", "rover")
+PLACE = ResourceLocation("https://robots.example:8443", "rover")
 TOPIC = "/arm/joint 1"
 PATH = "/api/v1/robots/rover/topics/arm/joint%201"
 WORDS = Namespace("https://robots.example:8443/api/v1/vocabulary/")
@@ -41,11 +41,11 @@ RDF_FORMS = FORMS[1:]
 def graph_of(type_name: str, value: Any, *, known: bool = True, moves: bool = False) -> Graph:
     """The graph of a topic that says this."""
     definitions = REGISTRY.definitions(type_name) if known else {}
-    state = State(TOPIC, type_name, 1_700_000_000.25, jsontext.encode(value))
-    return state_graph(state, Background(definitions, moves), PLACE)
+    state = TopicState(TOPIC, type_name, 1_700_000_000.25, jsontext.encode(value))
+    return state_graph(state, TopicContext(definitions, moves), PLACE)
 
 
-def there_and_back(graph: Graph, form: Form) -> Graph:
+def there_and_back(graph: Graph, form: MediaType) -> Graph:
     """The graph that is read from the text of a graph."""
     return read(write(graph, form), form, PLACE.of("topics", TOPIC))
 
@@ -80,13 +80,13 @@ VALUES = st.recursive(
 
 
 @pytest.mark.parametrize("form", RDF_FORMS)
-def test_any_json_survives_as_a_parameter(form: Form) -> None:
+def test_any_json_survives_as_a_parameter(form: MediaType) -> None:
     """Whatever a node's parameter may be, and what robots without types say."""
 
     @settings(EVERY, max_examples=60)
     @given(VALUES)
     def check(value: Any) -> None:
-        graph = param_graph(Param("node:x.y", jsontext.encode(value)), PLACE)
+        graph = param_graph(ParamState("node:x.y", jsontext.encode(value)), PLACE)
         again = read(write(graph, form), form, PLACE.of("params", "node:x.y"))
         assert same(value_in(again, "/api/v1/robots/rover/params/node%3Ax.y"), value)
 
@@ -94,7 +94,7 @@ def test_any_json_survives_as_a_parameter(form: Form) -> None:
 
 
 @pytest.mark.parametrize("form", RDF_FORMS)
-def test_all_forms_tell_the_same_graph(form: Form) -> None:
+def test_all_forms_tell_the_same_graph(form: MediaType) -> None:
     """Not only the same message; also with lists that begin with zero, and texts XML can't hold."""
     value = {
         "name": ["", '"\\\n\t', "\r\x01\uffff"],
@@ -107,7 +107,7 @@ def test_all_forms_tell_the_same_graph(form: Form) -> None:
 
 
 @pytest.mark.parametrize("form", RDF_FORMS)
-def test_without_definitions_values_say_what_they_are(form: Form) -> None:
+def test_without_definitions_values_say_what_they_are(form: MediaType) -> None:
     """A robot that does not tell its types is read all the same."""
     value = {"data": 1, "more": {"a b": [1, None]}, "list": [[1.5], {}], "on": True}
     said = message_in(there_and_back(graph_of("made_up/msg/Thing", value, known=False), form), PATH)

@@ -9,14 +9,15 @@ from twisted.internet.defer import Deferred
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import Invalid, Refused, Unavailable
-from relay_server.control import NotDone
-from relay_server.inside import MaybeDone
-from relay_server.resources import Idempotency, KeyReused, Owner, Reply, Target, key_in
-from relay_server.resources import idempotency as module
+from relay_server.control.commands import NotDone
+from relay_server.http import idempotency as module
+from relay_server.http.idempotency import Idempotency, KeyReused, StoredReply, Target, key_in
+from relay_server.http_sessions.loopback_client import MaybeDone
+from relay_server.resources.goals import GoalOwner
 from tests.relay_server.steering import outcome, result
 
-ANN = Owner(1, "default", None)
-DONE = Reply(200, b'"done"')
+ANN = GoalOwner(1, "default", None)
+DONE = StoredReply(200, b'"done"')
 
 
 class Requests:
@@ -25,10 +26,10 @@ class Requests:
     def __init__(self) -> None:
         self.clock = Clock()
         self.memory = Idempotency(self.clock)
-        self.work: list[Deferred[Reply]] = []
+        self.work: list[Deferred[StoredReply]] = []
         self.withdrawn = False
 
-    def send(self, key: str = "k", body: bytes = b"{}", owner: Owner = ANN, **target: str) -> list[Any]:
+    def send(self, key: str = "k", body: bytes = b"{}", owner: GoalOwner = ANN, **target: str) -> list[Any]:
         """One request; the list holds its answer, or its error, as soon as there is one."""
         return outcome(self.request(key, body, owner, **target))
 
@@ -36,15 +37,15 @@ class Requests:
         self,
         key: str = "k",
         body: bytes = b"{}",
-        owner: Owner = ANN,
+        owner: GoalOwner = ANN,
         robot: str = "rover",
         address: str = "/a",
-    ) -> Deferred[Reply]:
+    ) -> Deferred[StoredReply]:
         """The same, to be given up."""
         target = Target(owner, robot, address, key)
         return Deferred.fromCoroutine(self.memory.once(target, body, self._do, self._may))
 
-    async def _do(self) -> Reply:
+    async def _do(self) -> StoredReply:
         self.work.append(Deferred())
         return await self.work[-1]
 
@@ -73,8 +74,8 @@ def test_the_first_answer_is_given_again(requests: Requests) -> None:
     "other",
     [
         {"key": "l"},
-        {"owner": Owner(2, "default", None)},
-        {"owner": Owner(1, "default", "viewer")},
+        {"owner": GoalOwner(2, "default", None)},
+        {"owner": GoalOwner(1, "default", "viewer")},
         {"robot": "other"},
         {"address": "/b"},
     ],
@@ -150,10 +151,10 @@ def test_so_many_answers_are_kept(requests: Requests, monkeypatch: pytest.Monkey
     monkeypatch.setattr(module, "ANSWERS_BYTES", 100)
     for key, size in (("a", 10), ("b", 10), ("c", 10), ("d", 10)):
         requests.send(key)
-        requests.work[-1].callback(Reply(200, b"x" * size))
+        requests.work[-1].callback(StoredReply(200, b"x" * size))
     assert (len(requests.send("b")), len(requests.send("a"))) == (1, 0)
     requests.send("e")
-    requests.work[-1].callback(Reply(200, b"x" * 1000))
+    requests.work[-1].callback(StoredReply(200, b"x" * 1000))
     assert len(requests.send("e")) == 1
     assert [len(requests.send(key)) for key in "d"] == [0]
     requests.work[4].callback(DONE)
@@ -166,7 +167,7 @@ def test_so_many_are_under_way(requests: Requests, monkeypatch: pytest.MonkeyPat
     requests.send("a"), requests.send("b")
     (error,) = requests.send("c")
     assert isinstance(error, Unavailable)
-    assert requests.send("c", owner=Owner(2, "default", None)) == []
+    assert requests.send("c", owner=GoalOwner(2, "default", None)) == []
     requests.work[0].callback(DONE)
     assert requests.send("c") == []
 
@@ -196,7 +197,7 @@ def test_a_key_that_makes_no_sense_is_refused(values: list[str]) -> None:
 def test_an_answer_at_once_is_an_answer(requests: Requests) -> None:
     """What waits for nothing is done within the request."""
 
-    async def work() -> Reply:
+    async def work() -> StoredReply:
         return DONE
 
     target = Target(ANN, "rover", "/a", "k")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol.errors import Invalid
-from relay_server.resources import Listing
+from relay_server.resources.page import PageQuery
 
 MEMBERS = {f"/{name}": [f"a/msg/{name.upper()}"] for name in "dcab"}
 
 
 def names(**query: str) -> tuple[list[str], str]:
     """The names of a page, and behind which there are more."""
-    page, after = Listing.of(query).page(MEMBERS, lambda types: types)
+    page, after = PageQuery.of(query).page(MEMBERS, lambda types: types)
     return [name for name, _ in page], after
 
 
@@ -33,9 +33,9 @@ def test_members_are_chosen_by_name_and_type() -> None:
 
 def test_what_has_no_types_is_not_asked_for_by_type() -> None:
     """That is told, rather than that there is nothing of this type."""
-    assert Listing.of({"name": "/b"}, typed=False).name == "/b"
+    assert PageQuery.of({"name": "/b"}, typed=False).name == "/b"
     with pytest.raises(Invalid, match="no parameter 'type'; there are name, after, limit"):
-        Listing.of({"type": "a/msg/C"}, typed=False)
+        PageQuery.of({"type": "a/msg/C"}, typed=False)
 
 
 @pytest.mark.parametrize(
@@ -53,4 +53,4 @@ def test_what_has_no_types_is_not_asked_for_by_type() -> None:
 def test_what_makes_no_sense_is_refused(query: dict[str, str]) -> None:
     """In words."""
     with pytest.raises(Invalid):
-        Listing.of(query)
+        PageQuery.of(query)

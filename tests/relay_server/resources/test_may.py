@@ -9,9 +9,9 @@ from twisted.internet import reactor
 from relay_db import queries
 from relay_protocol.errors import NotFound, Refused
 from relay_protocol.rights import Operation
-from relay_server.edges.representing import Workshop
-from relay_server.inside import Guests
-from relay_server.resources import Asker, ResourceDesk
+from relay_server.http.negotiation import ConversionPool
+from relay_server.http_sessions.pool import SessionPool
+from relay_server.resources.service import RequestOrigin, RobotResourceService
 from tests.relay_server.front_desk import HERE, Desk
 
 
@@ -21,10 +21,10 @@ async def test_what_may_be_done_is_judged_as_it_is_now(front: Desk) -> None:
     with front.store.database.begin() as session:
         queries.grant_right(session, front.rover.id, "viewer", user_id=front.ann.id)
     clock = front.world.clock
-    guests = Guests(clock, front.desk, front.world.now_ns)
+    guests = SessionPool(clock, front.desk, front.world.now_ns)
     # Not started: nothing of this takes long.
-    desk = ResourceDesk(clock, guests, Workshop(reactor), front.world.now_ns, front.wall)
-    ann = Asker(await front.by_token(front.ann), "rover", HERE)
+    desk = RobotResourceService(clock, guests, ConversionPool(reactor), front.world.now_ns, front.wall)
+    ann = RequestOrigin(await front.by_token(front.ann), "rover", HERE)
     for name in ("reset", "/count", "/relays/stop"):
         with pytest.raises(Refused):
             await desk.may(ann, Operation.CALL, name)

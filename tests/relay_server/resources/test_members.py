@@ -10,24 +10,27 @@ from twisted.internet import reactor
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Unavailable
-from relay_server.edges.representing import Workshop
-from relay_server.inside import Guests
-from relay_server.resources import Asker, Listing, ResourceDesk
+from relay_server.http.negotiation import ConversionPool
+from relay_server.http_sessions.pool import SessionPool
+from relay_server.resources.page import PageQuery
+from relay_server.resources.service import RequestOrigin, RobotResourceService
 from tests.relay_server.front_desk import HERE, Desk
 from tests.relay_server.memory import GRAPH
 
 
-async def asking(front: Desk, *deny: str) -> tuple[ResourceDesk, Asker]:
+async def asking(front: Desk, *deny: str) -> tuple[RobotResourceService, RequestOrigin]:
     """A desk, and ann who asks there about her rover.
 
     :param deny: what she may not
     """
     with front.store.database.begin() as session:
         queries.grant_right(session, front.rover.id, "operator", deny=deny, user_id=front.ann.id)
-    guests = Guests(front.world.clock, front.desk, front.world.now_ns)
+    guests = SessionPool(front.world.clock, front.desk, front.world.now_ns)
     # Not started: nothing of this takes long.
-    desk = ResourceDesk(front.world.clock, guests, Workshop(reactor), front.world.now_ns, front.wall)
-    return desk, Asker(await front.by_token(front.ann), "rover", HERE)
+    desk = RobotResourceService(
+        front.world.clock, guests, ConversionPool(reactor), front.world.now_ns, front.wall
+    )
+    return desk, RequestOrigin(await front.by_token(front.ann), "rover", HERE)
 
 
 @pytest_twisted.ensureDeferred
@@ -37,7 +40,7 @@ async def test_members_are_told_as_they_are_listed(front: Desk) -> None:
     front.world.robot_comes(graph=structs.replace(GRAPH, actions={"/counts": counts}))
     desk, ann = await asking(front)
     for kind in ("topics", "services", "actions"):
-        listed = (await desk.members(ann, kind, Listing(limit=1000)))[kind]
+        listed = (await desk.members(ann, kind, PageQuery(limit=1000)))[kind]
         assert listed, kind
         for each in listed:
             assert await desk.member(ann, kind, each["name"]) == each

@@ -9,8 +9,8 @@ import pytest_twisted
 
 from relay_protocol.errors import NotFound
 from relay_server.access import Principal
-from relay_server.resources import Listing
-from relay_server.resources.robots import RobotDesk, robot_tag, robots_tag
+from relay_server.resources.page import PageQuery
+from relay_server.resources.robots import RobotService, robot_tag, robots_tag
 
 ANN = Principal(1, "ann", "main", False, 1, None)
 
@@ -31,10 +31,10 @@ class Overview:
 @pytest_twisted.ensureDeferred
 async def test_a_page_is_in_the_order_of_names_and_says_where_the_next_begins() -> None:
     """Shell wildcards name what is meant."""
-    desk = RobotDesk(Overview())
+    desk = RobotService(Overview())
 
     async def names(**asked: str) -> tuple[list[str], str]:
-        page = await desk.members(ANN, Listing.of(asked, typed=False))
+        page = await desk.members(ANN, PageQuery.of(asked, typed=False))
         return [each["name"] for each in page["robots"]], cast(str, page["next"])
 
     assert await names() == (["arm", "rex", "rover"], "")
@@ -46,7 +46,7 @@ async def test_a_page_is_in_the_order_of_names_and_says_where_the_next_begins() 
 @pytest_twisted.ensureDeferred
 async def test_one_is_found_by_its_whole_name() -> None:
     """There are no wildcards in an address."""
-    desk = RobotDesk(Overview())
+    desk = RobotService(Overview())
     assert (await desk.robot(ANN, "arm"))["name"] == "arm"
     for other in ("a*", "tank"):
         with pytest.raises(NotFound):

@@ -12,9 +12,9 @@ from rdflib import Graph
 
 from relay_protocol import jsontext
 from relay_protocol.errors import SwitchboardError
-from relay_server.resources.forms import JSON_LD, RDF_XML, TURTLE, Form
-from relay_server.resources.syntax import NAMESPACES, read
-from relay_server.resources.values import message_in, value_in
+from relay_server.http.media_types import JSON_LD, RDF_XML, TURTLE, MediaType
+from relay_server.http.rdf.decode import message_in, value_in
+from relay_server.http.rdf.serialize import NAMESPACES, read
 
 PATH = "/api/v1/robots/rover/topics/cmd_vel"
 BASE = f"http://robots.example{PATH}"
@@ -58,7 +58,7 @@ def linked(**value: Any) -> Graph:
     return read(jsontext.encode({"@id": BASE, **value}), JSON_LD, BASE)
 
 
-def refused(body: bytes | str, form: Form) -> str:
+def refused(body: bytes | str, form: MediaType) -> str:
     """Why a body is refused."""
     with pytest.raises(SwitchboardError) as error:
         message_in(read(body.encode() if isinstance(body, str) else body, form, BASE), PATH)
@@ -220,14 +220,14 @@ def test_values_are_not_xml() -> None:
         (JSON_LD, '{"http://x/b":{"@list":[' + "1," * 30_000 + "1]}}"),
     ],
 )
-def test_what_takes_long_is_refused_before_it_is_read(form: Form, body: str) -> None:
+def test_what_takes_long_is_refused_before_it_is_read(form: MediaType, body: str) -> None:
     """Lists of thousands took a second; twice as many take no more than that to be counted."""
     assert "more than 2048" in refused(body, form)
     least = min(_cpu(body, form) for _ in range(5))
     assert least < 0.05
 
 
-def _cpu(body: str, form: Form) -> float:
+def _cpu(body: str, form: MediaType) -> float:
     began = time.process_time()
     refused(body, form)
     return time.process_time() - began
@@ -249,7 +249,7 @@ def test_prefixes_are_few(declares: str) -> None:
     assert len(read((few + fields).encode(), TURTLE, BASE)) == 2
 
 
-def nested(form: Form, depth: int) -> str:
+def nested(form: MediaType, depth: int) -> str:
     """A message within a message, and so on."""
     if form is TURTLE:
         return PREFIXES + "<> sosa:hasResult " + "[ f:x " * depth + "1" + " ]" * depth + " ."
@@ -262,7 +262,7 @@ def nested(form: Form, depth: int) -> str:
 
 @pytest.mark.parametrize("form", [TURTLE, JSON_LD, RDF_XML])
 @pytest.mark.parametrize("depth", [100, 400])
-def test_deep_nesting_is_refused(form: Form, depth: int) -> None:
+def test_deep_nesting_is_refused(form: MediaType, depth: int) -> None:
     """In words, however deep."""
     assert "deep" in refused(nested(form, depth), form)
 
@@ -299,7 +299,7 @@ def test_a_shared_node_does_not_stand_for_many() -> None:
         ),
     ],
 )
-def test_what_is_huge_or_odd_is_refused_in_words(form: Form, body: str) -> None:
+def test_what_is_huge_or_odd_is_refused_in_words(form: MediaType, body: str) -> None:
     """A body is small, and does not become large by being read."""
     assert len(body) <= BODY + 1024
     assert 0 < len(refused(body, form)) < 500

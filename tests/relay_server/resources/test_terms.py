@@ -9,10 +9,9 @@ from rdflib import OWL, RDF, RDFS, XSD, Graph, Literal, URIRef
 
 from relay_protocol import jsontext
 from relay_protocol.ros_types import TypeRegistry
-from relay_server.openapi.answers import Robot
-from relay_server.resources.background import Background
-from relay_server.resources.describing import (
-    Place,
+from relay_server.http.media_types import MediaType
+from relay_server.http.openapi.schemas import RobotInfo
+from relay_server.http.rdf.encode import (
     camera_graph,
     members_graph,
     module_graph,
@@ -20,12 +19,22 @@ from relay_server.resources.describing import (
     robot_graph,
     state_graph,
 )
-from relay_server.resources.forms import Form
-from relay_server.resources.states import Param, State
-from relay_server.resources.terms import DOCUMENTS, FIELDS, HTML, OWN, WORDS, fixed, is_fixed, of_type
+from relay_server.http.rdf.vocabulary_page import (
+    DOCUMENTS,
+    FIELDS,
+    HTML,
+    OWN,
+    WORDS,
+    fixed,
+    is_fixed,
+    of_type,
+)
+from relay_server.resources.etags import ParamState, TopicState
+from relay_server.resources.location import ResourceLocation
+from relay_server.resources.topic_context import TopicContext
 
 BASE = "https://robots.example:8443"
-PLACE = Place(BASE, "rover")
+PLACE = ResourceLocation(BASE, "rover")
 HERE = f"{BASE}/api/v1/vocabulary/"
 RDF_DOCUMENTS = [each for each in DOCUMENTS if each is not HTML]
 ODD = "made_up/msg/Odd"
@@ -62,11 +71,11 @@ def registry() -> TypeRegistry:
 
 def said(type_name: str, value: Any) -> Graph:
     """The graph of a topic that says this."""
-    state = State("/said", type_name, 1.0, jsontext.encode(value))
-    return state_graph(state, Background(registry().definitions(type_name), False), PLACE)
+    state = TopicState("/said", type_name, 1.0, jsontext.encode(value))
+    return state_graph(state, TopicContext(registry().definitions(type_name), False), PLACE)
 
 
-def parsed(body: bytes, form: Form) -> Graph:
+def parsed(body: bytes, form: MediaType) -> Graph:
     """The graph in a document."""
     return Graph().parse(data=body, format=form.media)
 
@@ -86,10 +95,10 @@ def used() -> set[str]:
         members_graph("modules", {"modules": [module], "next": "x", "online": True}, PLACE),
         module_graph(module, PLACE),
         robot_graph(
-            {"name": "rover", **dict.fromkeys(Robot.__annotations__, "x"), "clients": [shown]}, PLACE
+            {"name": "rover", **dict.fromkeys(RobotInfo.__annotations__, "x"), "clients": [shown]}, PLACE
         ),
         camera_graph({**camera, "streams": [shown], "addresses": addresses}, PLACE),
-        param_graph(Param("n:p", b'{"a":"\\u0001"}'), PLACE),
+        param_graph(ParamState("n:p", b'{"a":"\\u0001"}'), PLACE),
         said(ODD, {"stamp": {"sec": 1, "nanosec": 2}}),
         *(said(f"made_up/msg/{each.title()}", {"data": [1] * 101}) for each in NUMBERS if each != "byte"),
     ]
@@ -106,13 +115,13 @@ def test_every_word_that_is_used_has_a_meaning() -> None:
     """Whoever follows its address finds it there."""
     found = used()
     assert {"Topic", "Camera", "value", "dateTime", "doubleList", "base64Text", "snapshot"} <= found
-    assert {"Robot", "collections", *Robot.__annotations__} <= found
+    assert {"Robot", "collections", *RobotInfo.__annotations__} <= found
     assert {"Module", "publishes", "subscribes", "services"} <= found
     assert found <= set(WORDS)
 
 
 @pytest.mark.parametrize("form", RDF_DOCUMENTS)
-def test_the_relays_own_words_are_told_in_every_form(form: Form) -> None:
+def test_the_relays_own_words_are_told_in_every_form(form: MediaType) -> None:
     """With what they are, a label, a sentence and what their values are, at the address asked for."""
     graph = parsed(fixed(OWN, form, BASE), form)
     assert (URIRef(f"{HERE}{OWN}"), RDF.type, OWL.Ontology) in graph
@@ -140,7 +149,7 @@ def test_no_other_document_is_the_same_everywhere() -> None:
 
 
 @pytest.mark.parametrize("form", RDF_DOCUMENTS)
-def test_a_type_is_told_with_its_fields(form: Form) -> None:
+def test_a_type_is_told_with_its_fields(form: MediaType) -> None:
     """Each with its type as ROS writes it, and with that of its values where there is but one."""
     graph = parsed(of_type(registry().definitions(ODD)[ODD], form, BASE), form)
     odd = URIRef(f"{HERE}made_up/Odd")

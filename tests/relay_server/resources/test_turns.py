@@ -7,14 +7,14 @@ import pytest_twisted
 from twisted.internet.defer import CancelledError, Deferred
 
 from relay_protocol.errors import NotFound, Unavailable
-from relay_server.resources.turns import PIECES, WAITING, Turns
+from relay_server.common.fair_lock import PIECES, WAITING, FairLock
 
 
 class Bench:
     """Those who take turns."""
 
     def __init__(self) -> None:
-        self.turns = Turns()
+        self.turns = FairLock()
         self.had: list[int] = []
 
     def come(self, user: int, work: Deferred[None] | None = None) -> Deferred[None]:

@@ -7,11 +7,12 @@ from typing import Any
 import pytest
 
 from relay_protocol import link
-from relay_protocol.link.moving import Order
+from relay_protocol.link.motion import Order
 from relay_protocol.rights import Level
-from relay_server.control import Actor, ControlRules
-from relay_server.session import calling
-from relay_server.session import publishing as module
+from relay_server.control.audit import Actor
+from relay_server.control.types import ControlRules
+from relay_server.sessions import publishing as module
+from relay_server.sessions import service_calls
 from tests.relay_server.memory import FIBONACCI, STRING, TRIGGER, TWIST, Person, World
 
 STOP = {"linear": {"x": 0.0}}
@@ -459,9 +460,9 @@ def test_a_route_is_kept_while_nobody_else_takes_control(
     drive(ann)
     drive(ann)
     looked: list[str] = []
-    real = module.Publishing._find
+    real = module.PublishHandler._find
     monkeypatch.setattr(
-        module.Publishing, "_find", lambda self, ask: (looked.append(ask.topic), real(self, ask))[1]
+        module.PublishHandler, "_find", lambda self, ask: (looked.append(ask.topic), real(self, ask))[1]
     )
     drive(ann)
     world.desks.of(world.robot).told(link.Safety(holder=ann.session.number, moving=True))
@@ -540,7 +541,7 @@ def test_who_has_used_up_his_share_may_still_stop_and_let_go(
     at_work(world)
     ann = driver(world, "ann", 1)
     drive(ann)
-    monkeypatch.setattr(calling, "CALLS", 1)
+    monkeypatch.setattr(service_calls, "CALLS", 1)
     ann.says("call_service", service="/reset", type=TRIGGER)
     ann.says("call_service", id="more", service="/reset", type=TRIGGER)
     assert "calls of this connection are waiting" in ann.hears("service_response")[0]["values"]

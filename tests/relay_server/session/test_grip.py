@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from relay_server.session.grip import LET_GO_NS, STILL_BYTES, TOPICS, Grips, is_still
+from relay_server.sessions.rearm import LET_GO_NS, STILL_BYTES, TOPICS, ReleaseTracker, is_zero_command
 
 TWIST = "geometry_msgs/msg/Twist"
 STAMPED = "geometry_msgs/msg/TwistStamped"
@@ -43,18 +43,18 @@ HEADER = {"stamp": {"sec": 7}, "frame_id": "base"}
 )
 def test_zero_goes_by_the_type(type_name: str, message: Any, still: bool) -> None:
     """As the robot judges it; what can't be told counts as moving."""
-    assert is_still(type_name, json.dumps(message).encode()) is still
+    assert is_zero_command(type_name, json.dumps(message).encode()) is still
 
 
 def test_what_is_long_or_no_json_counts_as_moving() -> None:
     """It is not looked at, or can't be."""
-    assert not is_still(TWIST, b'{"linear":' + b" " * STILL_BYTES + b"{}}")
-    assert not is_still(TWIST, b"{")
+    assert not is_zero_command(TWIST, b'{"linear":' + b" " * STILL_BYTES + b"{}}")
+    assert not is_zero_command(TWIST, b"{")
 
 
 def test_silence_and_zero_are_letting_go() -> None:
     """On that topic; each command counts anew."""
-    grips = Grips()
+    grips = ReleaseTracker()
     assert not grips.holds("/a", 0)
     grips.in_vain("/a", 0)
     grips.in_vain("/b", 0)
@@ -70,7 +70,7 @@ def test_silence_and_zero_are_letting_go() -> None:
 
 def test_topics_that_are_remembered_are_bounded() -> None:
     """The longest quiet are forgotten first."""
-    grips = Grips()
+    grips = ReleaseTracker()
     for number in range(TOPICS):
         grips.in_vain(f"/t{number}", 0)
     grips.in_vain("/t0", 0)

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from relay_protocol import limits, link
-from relay_server.session import core
-from relay_server.session import incoming as module
+from relay_server.sessions import fragments as module
+from relay_server.sessions import session
 from tests.relay_server.memory import TWIST, Person, World
 
 
@@ -168,7 +168,7 @@ def test_fragments_in_fragments_are_refused(person: Person) -> None:
 
 def test_junk_in_fragments_is_counted(person: Person) -> None:
     """A hundred messages that are no rosbridge cut the client, also when they come in fragments."""
-    for _ in range(core.MALFORMED - 1):
+    for _ in range(session.MALFORMED - 1):
         send(person, "m", "{", "}")
     assert person.client.closed is None
     send(person, "m", "no", " JSON")

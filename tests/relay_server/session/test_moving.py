@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from relay_protocol import link
-from relay_protocol.link.moving import Order
+from relay_protocol.link.motion import Order
 from relay_protocol.rights import Level
 from tests.relay_server.memory import FIBONACCI, TRIGGER, TWIST, Person, World
 

@@ -8,7 +8,7 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.session import publishing as module
+from relay_server.sessions import publishing as module
 from tests.relay_server.memory import MOTION, STRING, TWIST, Person, World
 
 GO = {"linear": {"x": 0.5}}
@@ -38,9 +38,9 @@ def drive(person: Person, **more: Any) -> None:
 def found(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The topics whose route is looked for from now on."""
     looked: list[str] = []
-    real = module.Publishing._find
+    real = module.PublishHandler._find
     monkeypatch.setattr(
-        module.Publishing, "_find", lambda self, ask: (looked.append(ask.topic), real(self, ask))[1]
+        module.PublishHandler, "_find", lambda self, ask: (looked.append(ask.topic), real(self, ask))[1]
     )
     return looked
 

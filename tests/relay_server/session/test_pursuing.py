@@ -9,7 +9,7 @@ import pytest
 from relay_protocol import link
 from relay_protocol.errors import Refused
 from relay_protocol.rights import Grant, Level, Rules
-from relay_server.session import pursuing as module
+from relay_server.sessions import goals as module
 from tests.relay_server.memory import FIBONACCI, Person, World
 
 RESULT, FEEDBACK = f"{FIBONACCI}_Result", f"{FIBONACCI}_Feedback"

@@ -8,14 +8,9 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.errors import NotFound, Unavailable
-from relay_server.video import State, Stream, TooOften
-from relay_server.video.hub import (
-    ROBOT_STREAMS,
-    STREAMS_A_SECOND,
-    STREAMS_AT_ONCE,
-    USER_VIEWERS,
-)
-from relay_server.video.stream import LINGER_SECONDS, STREAM_VIEWERS
+from relay_server.video.ports import TooManyStreamStarts
+from relay_server.video.stream import LINGER_SECONDS, STREAM_VIEWERS, CameraStream, StreamState
+from relay_server.video.streams import ROBOT_STREAMS, STREAMS_A_SECOND, STREAMS_AT_ONCE, USER_VIEWERS
 from tests.relay_server.memory import MemoryLink, World
 from tests.relay_server.video.watching import (
     CAMERA,
@@ -30,7 +25,7 @@ from tests.relay_server.video.watching import (
 )
 
 
-def showing(world: World, width: int, height: int, camera: str = CAMERA, **settings: object) -> Stream:
+def showing(world: World, width: int, height: int, camera: str = CAMERA, **settings: object) -> CameraStream:
     """An open stream whose pictures have this size."""
     wanted = link.VideoSettings(width=width, height=height, **settings)  # type: ignore[arg-type]
     stream = Watcher(user=width).watch(world, wanted, camera)
@@ -45,7 +40,7 @@ def busy(world: World, settings: link.VideoSettings, camera: str = CAMERA) -> Wa
     stream = watcher.watch(world, settings, camera)
     robot_joins(world)
     stream.message(link.NotPlaying(reason="two streams are all I can", busy=True))
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED
     return watcher
 
 
@@ -144,7 +139,7 @@ def test_a_user_begins_streams_only_so_fast(world: World) -> None:
         watcher.leave()
     shared = Watcher(8).watch(world)
     assert len(world.videos.of(world.robot)) == 1
-    with pytest.raises(TooOften, match="you begin streams of robot rover") as caught:
+    with pytest.raises(TooManyStreamStarts, match="you begin streams of robot rover") as caught:
         Watcher().watch(world, link.VideoSettings(width=16))
     assert caught.value.retry_after == 1 / STREAMS_A_SECOND
     assert Watcher().watch(world) is shared
@@ -152,7 +147,7 @@ def test_a_user_begins_streams_only_so_fast(world: World) -> None:
     world.videos.watch(other, CAMERA, link.VideoSettings(), Watcher())
     world.clock.advance(caught.value.retry_after)
     Watcher().watch(world, link.VideoSettings(width=16))
-    with pytest.raises(TooOften):
+    with pytest.raises(TooManyStreamStarts):
         Watcher().watch(world, link.VideoSettings(width=17))
 
 
@@ -179,7 +174,7 @@ def test_a_robot_has_so_many_streams(world: World) -> None:
     (only,) = streams[3].viewers
     streams[3].detach(only)
     assert Watcher(1).watch(world, camera=OTHER) not in streams
-    assert streams[3].state is State.CLOSED
+    assert streams[3].state is StreamState.CLOSED
     assert len(world.videos.of(world.robot)) == ROBOT_STREAMS
 
 
@@ -301,7 +296,7 @@ def test_a_stream_that_nobody_asked_for_gives_way(world: World) -> None:
     world.control.take(link.OpenVideo)
     shared.detach(owner)
     world.clock.advance(0)
-    assert shared.state is State.CLOSED
+    assert shared.state is StreamState.CLOSED
     (whole,) = world.videos.of(world.robot)
     assert (whole.settings, whole.viewers) == (link.VideoSettings(), {early, tape})
     told = [type(each) for each in world.control.said if not isinstance(each, link.KeyFrame)]

@@ -6,8 +6,14 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol import link
-from relay_server.video.keys import ALONE_KEY_SECONDS, KEY_SECONDS, MOST_KEY_SECONDS, STEADY_SECONDS, Keys
-from relay_server.video.stream import Stream
+from relay_server.video.keyframes import (
+    ALONE_KEY_SECONDS,
+    KEY_SECONDS,
+    MOST_KEY_SECONDS,
+    STEADY_SECONDS,
+    Keyframes,
+)
+from relay_server.video.stream import CameraStream
 from tests.relay_server.memory import MemoryLink, World
 from tests.relay_server.video.watching import DELTA, KEY, Watcher, robot_comes, robot_joins, shows
 
@@ -21,7 +27,7 @@ class Robot:
 
     def __init__(self) -> None:
         self.clock = Clock()
-        self.keys = Keys(self.clock, self._asked, lambda: self.shared)
+        self.keys = Keyframes(self.clock, self._asked, lambda: self.shared)
         self.asked: list[float] = []
         self.shared = True
         """Whether others watch too."""
@@ -162,7 +168,7 @@ def test_who_left_is_asked_for_no_more(robot: Robot) -> None:
     assert robot.asked == [0, 20]
 
 
-def begun(world: World, viewer: Watcher, *others: Watcher) -> tuple[Stream, MemoryLink]:
+def begun(world: World, viewer: Watcher, *others: Watcher) -> tuple[CameraStream, MemoryLink]:
     """A stream of H.264 whose first key frame these viewers have seen, and the robot's end of it."""
     robot_comes(world)
     stream = viewer.watch(world, H264)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from relay_server.video.pictures import EVEN_SECONDS, SPAN_SECONDS, STALE_SECONDS, WAVER_SECONDS, Lateness
+from relay_server.video.frames import EVEN_SECONDS, SPAN_SECONDS, STALE_SECONDS, WAVER_SECONDS, DelayEstimator
 from tests.relay_server.memory import World
 from tests.relay_server.video.watching import Watcher, robot_comes, robot_joins, shows
 
 FPS = 10
 
 
-def seen(delays: list[float], lateness: Lateness, began: float = 0.0) -> list[bool]:
+def seen(delays: list[float], lateness: DelayEstimator, began: float = 0.0) -> list[bool]:
     """Whether each of the pictures that come ten a second may be shown.
 
     :param delays: of each, by the two clocks, seconds
@@ -23,7 +23,7 @@ def seen(delays: list[float], lateness: Lateness, began: float = 0.0) -> list[bo
 @pytest.mark.parametrize("by", [0.6, 5.0, 3600.0])
 def test_after_a_clock_was_set_back_pictures_are_shown_within_two_seconds(by: float) -> None:
     """They come as evenly as ever, so that nothing can have held them up."""
-    lateness = Lateness()
+    lateness = DelayEstimator()
     wavering = [0.02 * (number % 5) for number in range(100)]
     assert all(seen(wavering, lateness))
     shown = seen([by + each for each in wavering], lateness, 10.0)
@@ -34,14 +34,14 @@ def test_after_a_clock_was_set_back_pictures_are_shown_within_two_seconds(by: fl
 
 def test_a_clock_that_is_set_forward_hides_nothing() -> None:
     """What comes sooner than ever is known at once."""
-    lateness = Lateness()
+    lateness = DelayEstimator()
     assert all(seen([3.0] * 20, lateness))
     assert all(seen([-3.0] * 20, lateness, 2.0))
 
 
 def test_what_comes_late_and_unevenly_is_held_up() -> None:
     """As long as the last ones that came in time are remembered, nothing of it is shown."""
-    lateness = Lateness()
+    lateness = DelayEstimator()
     assert all(seen([0.0] * 20, lateness))
     uneven = [1.0 + 2 * WAVER_SECONDS * (number % 2) for number in range(int(FPS * (SPAN_SECONDS - 3)))]
     assert not any(seen(uneven, lateness, 2.0))
@@ -49,7 +49,7 @@ def test_what_comes_late_and_unevenly_is_held_up() -> None:
 
 def test_a_heap_after_a_stall_is_not_shown() -> None:
     """All at once come pictures of several seconds, each later than the next."""
-    lateness = Lateness()
+    lateness = DelayEstimator()
     assert all(seen([0.0] * 20, lateness))
     late = [lateness.of(2.0 + number / FPS, 8.0 + number / 1000) for number in range(60)]
     assert late[0] == pytest.approx(6.0)
@@ -58,7 +58,7 @@ def test_a_heap_after_a_stall_is_not_shown() -> None:
 
 def test_two_late_pictures_are_too_few_to_learn_from() -> None:
     """A slow stream has its old ones in a row as well."""
-    lateness = Lateness()
+    lateness = DelayEstimator()
     assert lateness.of(0.0, 0.0) == 0
     assert lateness.of(1.0, 4.0) == pytest.approx(3.0)
     assert lateness.of(4.0, 7.0) == pytest.approx(3.0)

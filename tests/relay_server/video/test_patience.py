@@ -6,14 +6,15 @@ import pytest
 from msgspec import structs
 
 from relay_protocol import link
-from relay_server.video import NothingCame, Stream, Wish
-from relay_server.video.patience import (
+from relay_server.video.first_frame_timeout import (
     COMING_SECONDS,
     FIRST_PICTURE_SECONDS,
     MOST_SECONDS,
     UNKNOWN_SECONDS,
 )
-from relay_server.video.pictures import STALE_SECONDS
+from relay_server.video.frames import STALE_SECONDS
+from relay_server.video.ports import NoFrame, StreamRequest
+from relay_server.video.stream import CameraStream
 from tests.relay_server.memory import World
 from tests.relay_server.video.watching import CAMERA, KEY, Watcher, jpeg, robot_comes, robot_joins, shows
 
@@ -31,13 +32,13 @@ def waits(world: World, watcher: Watcher, before: float = 0.0) -> float:
     began = world.clock.seconds()
     while watcher.error is None:
         world.clock.advance(0.5)
-    assert isinstance(watcher.error, NothingCame)
+    assert isinstance(watcher.error, NoFrame)
     waited = world.clock.seconds() - began
     assert f"has given no picture for {before + waited:.0f} s" in str(watcher.error)
     return waited
 
 
-def slow_stream(world: World, fps: float = 0.05) -> Stream:
+def slow_stream(world: World, fps: float = 0.05) -> CameraStream:
     """One that is asked to give few pictures, watched by somebody who has had one."""
     robot_comes(world)
     stream = Watcher().watch(world, link.VideoSettings(fps=fps))
@@ -123,7 +124,7 @@ def test_a_picture_that_comes_too_late_is_none_for_who_waits(
     if goes:
         assert str(watcher.error) == "robot rover is offline"
     else:
-        assert isinstance(watcher.error, NothingCame)
+        assert isinstance(watcher.error, NoFrame)
 
 
 def test_a_recording_takes_what_comes_too_late_to_be_shown(world: World) -> None:
@@ -131,7 +132,7 @@ def test_a_recording_takes_what_comes_too_late_to_be_shown(world: World) -> None
     stream = slow_stream(world, 15)
     world.clock.advance(1)
     recording = Watcher()
-    stream.attach(recording, Wish(stream.settings, first=True))
+    stream.attach(recording, StreamRequest(stream.settings, first=True))
     world.clock.advance(1)
     shows(world, stream, 2, late=5.0)
     world.clock.advance(FIRST_PICTURE_SECONDS)
@@ -164,7 +165,7 @@ def test_parts_of_a_picture_are_not_waited_for_for_ever(world: World) -> None:
     assert watcher.error is None
     served.watch(world)
     world.clock.advance(1)
-    assert isinstance(watcher.error, NothingCame)
+    assert isinstance(watcher.error, NoFrame)
     assert "has given no picture for 120 s" in str(watcher.error)
     shows(world, stream)
     assert served.numbers == [1]
@@ -178,7 +179,7 @@ def test_who_comes_to_a_slow_stream_sees_its_newest_picture(world: World) -> Non
     stamp = 1.7e9 + world.clock.seconds()
     world.clock.advance(19)
     late = Watcher()
-    stream.attach(late, Wish(stream.settings, newest=True))
+    stream.attach(late, StreamRequest(stream.settings, newest=True))
     late.stream = stream
     world.clock.advance(0)
     (picture,) = late.pictures
@@ -197,12 +198,12 @@ def test_a_picture_whose_successor_is_overdue_is_shown_to_nobody(world: World) -
     recording.watch(world, stream.settings)
     world.clock.advance(2)
     late = Watcher()
-    stream.attach(late, Wish(stream.settings, newest=True))
+    stream.attach(late, StreamRequest(stream.settings, newest=True))
     world.clock.advance(0)
     fast = slow_stream(world, 5)
     world.clock.advance(1)
-    stream.attach(late, Wish(stream.settings, newest=True))
-    fast.attach(Watcher(), Wish(fast.settings, newest=True))
+    stream.attach(late, StreamRequest(stream.settings, newest=True))
+    fast.attach(Watcher(), StreamRequest(fast.settings, newest=True))
     world.clock.advance(0)
     assert recording.pictures == []
     assert late.pictures == []
@@ -219,7 +220,7 @@ def test_a_picture_that_is_the_only_one_so_far_holds_for_a_while(world: World) -
         shows(world, stream, number)
         world.clock.advance(seconds)
         late = Watcher()
-        stream.attach(late, Wish(stream.settings, newest=True))
+        stream.attach(late, StreamRequest(stream.settings, newest=True))
         world.clock.advance(0)
         seen.append(late.numbers)
         stream.detach(late)
@@ -235,7 +236,7 @@ def test_a_camera_that_gave_one_picture_and_no_more_is_waited_for_no_longer_than
     shows(world, stream, 1)
     world.clock.advance(UNKNOWN_SECONDS + 1)
     late = Watcher()
-    stream.attach(late, Wish(stream.settings, newest=True))
+    stream.attach(late, StreamRequest(stream.settings, newest=True))
     late.stream = stream
     assert waits(world, late) == FIRST_PICTURE_SECONDS
 
@@ -250,7 +251,7 @@ def test_a_camera_that_has_died_is_no_slow_one(world: World) -> None:
     world.clock.advance(5)
     camera_gives(world, 0.1)
     late = Watcher()
-    stream.attach(late, Wish(stream.settings, newest=True))
+    stream.attach(late, StreamRequest(stream.settings, newest=True))
     world.clock.advance(0)
     assert late.pictures == []
 
@@ -267,7 +268,7 @@ def test_a_picture_that_its_publisher_keeps_is_shown_to_all_who_come(world: Worl
     stamp = 1.7e9 + world.clock.seconds()
     world.clock.advance(86400)
     late = Watcher()
-    stream.attach(late, Wish(stream.settings, newest=newest))
+    stream.attach(late, StreamRequest(stream.settings, newest=newest))
     world.clock.advance(0)
     (picture,) = late.pictures
     assert picture.number == 2
@@ -285,7 +286,7 @@ def test_a_picture_that_is_kept_no_more_is_shown_to_nobody(world: World) -> None
     stream.message(link.Playing(width=32, height=24, quality=80))
     world.clock.advance(UNKNOWN_SECONDS + 1)
     late = Watcher()
-    stream.attach(late, Wish(stream.settings, newest=True))
+    stream.attach(late, StreamRequest(stream.settings, newest=True))
     world.clock.advance(0)
     assert late.pictures == []
 

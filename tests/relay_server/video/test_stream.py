@@ -7,20 +7,23 @@ from msgspec import structs
 
 from relay_protocol import link
 from relay_protocol.errors import MalformedMessage, NotFound, Unavailable
-from relay_server.video import NO_CAMERA, NothingCame, NotMade, State
-from relay_server.video.keys import KEY_SECONDS
-from relay_server.video.patience import FIRST_PICTURE_SECONDS
-from relay_server.video.pictures import STALE_SECONDS
-from relay_server.video.states import LINKED, NEXT, Event
+from relay_server.video.first_frame_timeout import FIRST_PICTURE_SECONDS
+from relay_server.video.frames import STALE_SECONDS
+from relay_server.video.keyframes import KEY_SECONDS
+from relay_server.video.ports import NO_CAMERA, EncoderUnavailable, NoFrame
 from relay_server.video.stream import (
     JOIN_SECONDS,
     LINGER_SECONDS,
+    LINKED,
     MOST_REOPEN_SECONDS,
+    NEXT,
     REOPEN_SECONDS,
     STREAM_VIEWERS,
     TELL_SECONDS,
-    Hooks,
-    Stream,
+    CameraStream,
+    StreamCallbacks,
+    StreamEvent,
+    StreamState,
 )
 from tests.relay_server.memory import MemoryLink, World
 from tests.relay_server.video.watching import (
@@ -41,7 +44,9 @@ H264 = link.VideoSettings(codec="h264")
 PLAYING = link.Playing(width=32, height=24, quality=80)
 
 
-def watched(world: World, settings: link.VideoSettings | None = None) -> tuple[Stream, Watcher, MemoryLink]:
+def watched(
+    world: World, settings: link.VideoSettings | None = None
+) -> tuple[CameraStream, Watcher, MemoryLink]:
     """An open stream with one viewer, and the robot's end."""
     if world.robot.control is None:
         robot_comes(world)
@@ -50,33 +55,33 @@ def watched(world: World, settings: link.VideoSettings | None = None) -> tuple[S
     return stream, watcher, robot_joins(world)
 
 
-def brought_to(world: World, state: State) -> Stream:
+def brought_to(world: World, state: StreamState) -> CameraStream:
     """A stream in this state, by what really happens."""
-    if state is State.NEW:
-        hooks = Hooks(lambda stream: "ticket", *3 * (lambda stream: None,))
-        return Stream(world.clock, world.robot, CAMERA, link.VideoSettings(), "rover#video0", hooks)
+    if state is StreamState.NEW:
+        hooks = StreamCallbacks(lambda stream: "ticket", *3 * (lambda stream: None,))
+        return CameraStream(world.clock, world.robot, CAMERA, link.VideoSettings(), "rover#video0", hooks)
     watcher = Watcher()
     stream = watcher.watch(world)
-    if state is State.WAITING:
+    if state is StreamState.WAITING:
         return stream
     robot_comes(world)
-    if state in (State.OPEN, State.LINGERING):
+    if state in (StreamState.OPEN, StreamState.LINGERING):
         robot_joins(world)
-    if state in (State.LINGERING, State.CLOSED):
+    if state in (StreamState.LINGERING, StreamState.CLOSED):
         watcher.leave()
     return stream
 
 
-@pytest.mark.parametrize("event", Event)
-@pytest.mark.parametrize("state", State)
-def test_every_event_in_every_state(world: World, state: State, event: Event) -> None:
+@pytest.mark.parametrize("event", StreamEvent)
+@pytest.mark.parametrize("state", StreamState)
+def test_every_event_in_every_state(world: World, state: StreamState, event: StreamEvent) -> None:
     """The table says what follows; what it does not list changes nothing."""
     stream = brought_to(world, state)
     assert stream.state is state
     stream._happen(event)
     assert stream.state is NEXT.get((state, event), state)
     assert (stream._link is not None) == (state in LINKED and stream.state in LINKED)
-    assert (stream in world.robot.watchers) == (stream.state is not State.CLOSED)
+    assert (stream in world.robot.watchers) == (stream.state is not StreamState.CLOSED)
 
 
 # --- viewers ----------------------------------------------------------------------------------------------
@@ -186,7 +191,7 @@ def test_a_stream_lingers_after_its_last_viewer(world: World) -> None:
     """Who comes within the time finds it open; after it the robot is told to stop, within 2 s in all."""
     stream, watcher, end = watched(world)
     watcher.leave()
-    assert stream.state is State.LINGERING
+    assert stream.state is StreamState.LINGERING
     world.clock.advance(LINGER_SECONDS - 0.1)
     shows(world, stream, 9)
     assert end.all(link.Took) == [link.Took(number=9)]
@@ -195,10 +200,10 @@ def test_a_stream_lingers_after_its_last_viewer(world: World) -> None:
     world.clock.advance(0)
     assert back.numbers == [9]
     world.clock.advance(LINGER_SECONDS)
-    assert stream.state is State.OPEN
+    assert stream.state is StreamState.OPEN
     back.leave()
     world.clock.advance(LINGER_SECONDS)
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED
     assert end.closed
     assert world.control.all(link.CloseVideo) == [link.CloseVideo(stream=stream.name)]
     assert not [call for call in world.clock.getDelayedCalls() if call.active()]
@@ -211,7 +216,7 @@ def test_nobody_left_before_it_opened(world: World) -> None:
     stream = watcher.watch(world)
     (ask,) = asked(world)
     watcher.leave()
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED
     assert len(world.control.all(link.CloseVideo)) == 1
     assert world.videos.redeem(ask.ticket) is None
     late = MemoryLink()
@@ -249,10 +254,10 @@ def test_who_gets_no_picture_is_told_why(world: World) -> None:
     assert isinstance(nowhere, NotFound)
     assert str(nowhere) == NO_CAMERA
     silent = told(link.VideoSettings(fps=1))
-    assert isinstance(silent, NothingCame)
+    assert isinstance(silent, NoFrame)
     assert "does not open the video" in str(silent)
     dark = told(link.VideoSettings(fps=2))
-    assert isinstance(dark, NothingCame)
+    assert isinstance(dark, NoFrame)
     assert "has given no picture for 10 s" in str(dark)
     world.clock.advance(LINGER_SECONDS)
     assert list(world.videos) == []
@@ -264,7 +269,7 @@ def test_who_has_got_a_picture_waits_for_more(world: World) -> None:
     shows(world, stream, 1)
     world.robot_goes()
     assert end.closed
-    assert stream.state is State.WAITING
+    assert stream.state is StreamState.WAITING
     assert stream.newest is None
     world.clock.advance(3600)
     assert watcher.error is None
@@ -308,7 +313,7 @@ def test_a_robot_that_does_not_join_is_asked_again(world: World) -> None:
     second.watch(world)
     world.clock.advance(JOIN_SECONDS - 1)
     (again,) = asked(world)
-    assert isinstance(first.error, NothingCame)
+    assert isinstance(first.error, NoFrame)
     assert second.error is None
     assert again.stream == ask.stream
     assert world.videos.redeem(ask.ticket) is None
@@ -343,7 +348,7 @@ def test_another_link_is_turned_away(world: World) -> None:
     stream.joined(other)
     assert other.closed
     stream.lost(other)
-    assert stream.state is State.OPEN
+    assert stream.state is StreamState.OPEN
     assert end.closed is None
 
 
@@ -380,7 +385,7 @@ def test_what_is_no_picture_ends_a_stream_that_has_shown_none(world: World) -> N
     with pytest.raises(MalformedMessage):
         shows(world, stream, 1, b"<html>")
     assert str(watcher.error).startswith("robot rover sent what is no picture: ")
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED
 
 
 def test_a_robot_that_can_not_show_it_any_more_is_asked_again(world: World) -> None:
@@ -391,7 +396,7 @@ def test_a_robot_that_can_not_show_it_any_more_is_asked_again(world: World) -> N
     pause = REOPEN_SECONDS
     for _ in range(8):
         stream.message(link.NotPlaying(reason="the JPEG ends in the middle"))
-        assert end.closed and stream.state is State.OPENING
+        assert end.closed and stream.state is StreamState.OPENING
         world.clock.advance(pause / 2)
         assert asked(world) == []
         world.clock.advance(pause / 2)
@@ -403,7 +408,7 @@ def test_a_robot_that_can_not_show_it_any_more_is_asked_again(world: World) -> N
     assert watcher.numbers == [1, 1]
     watcher.leave()
     world.clock.advance(LINGER_SECONDS)
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED
 
 
 def test_a_viewer_who_waits_for_his_first_picture_in_a_bad_spell_is_told_what_is_wrong(world: World) -> None:
@@ -426,7 +431,7 @@ def test_a_robot_that_can_not_show_it_says_why(world: World) -> None:
     stream.message(link.NotPlaying(reason="no module named av"))
     assert type(watcher.error) is Unavailable
     assert str(watcher.error) == "no module named av"
-    assert stream.state is State.CLOSED
+    assert stream.state is StreamState.CLOSED
     assert end.closed
 
 
@@ -435,7 +440,7 @@ def test_of_h264_it_is_told_whether_another_codec_may_do(world: World, busy: boo
     """Not when the robot only makes too many streams."""
     stream, watcher, _ = watched(world, H264)
     stream.message(link.NotPlaying(reason="no module named av", busy=busy))
-    assert type(watcher.error) is (Unavailable if busy else NotMade)
+    assert type(watcher.error) is (Unavailable if busy else EncoderUnavailable)
     assert str(watcher.error) == "no module named av"
 
 
@@ -445,7 +450,7 @@ def test_h264_that_is_none_is_the_encoders_fault(world: World) -> None:
     stream.message(PLAYING)
     with pytest.raises(MalformedMessage):
         shows(world, stream, 1, b"<html>")
-    assert type(watcher.error) is NotMade
+    assert type(watcher.error) is EncoderUnavailable
 
 
 def test_what_the_robot_plays_is_told_when_it_changes(world: World) -> None:

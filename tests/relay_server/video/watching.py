@@ -10,7 +10,8 @@ import numpy as np
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
 from relay_protocol.frames import VideoFrame
-from relay_server.video import Picture, Stream
+from relay_server.video.frames import VideoFrameInfo
+from relay_server.video.stream import CameraStream
 from tests.relay_server.memory import MemoryLink, World
 
 CAMERA = "/camera/image"
@@ -46,12 +47,14 @@ class Watcher:
 
     def __init__(self, user: int = 7) -> None:
         self.user = user
-        self.pictures: list[Picture] = []
+        self.pictures: list[VideoFrameInfo] = []
         self.played: list[link.Playing] = []
-        self.stream: Stream | None = None
+        self.stream: CameraStream | None = None
         self.error: SwitchboardError | None = None
 
-    def watch(self, world: World, settings: link.VideoSettings | None = None, camera: str = CAMERA) -> Stream:
+    def watch(
+        self, world: World, settings: link.VideoSettings | None = None, camera: str = CAMERA
+    ) -> CameraStream:
         """Begin; nothing is told before that is done."""
         stream = world.videos.watch(world.robot, camera, settings or link.VideoSettings(), self)
         assert not self.pictures and not self.played and self.error is None and self.stream is None
@@ -68,7 +71,7 @@ class Watcher:
         """Of the pictures that came."""
         return [picture.number for picture in self.pictures]
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: VideoFrameInfo) -> None:
         """Keep it."""
         assert self.error is None, "a picture after the end"
         self.pictures.append(picture)
@@ -78,7 +81,7 @@ class Watcher:
         assert self.error is None, "told after the end"
         self.played.append(playing)
 
-    def moved(self, stream: Stream) -> None:
+    def moved(self, stream: CameraStream) -> None:
         """Another stream from now on."""
         assert self.stream is not None
         assert self not in self.stream.viewers
@@ -117,7 +120,7 @@ def robot_joins(world: World) -> MemoryLink:
 
 
 def shows(
-    world: World, stream: Stream, number: int = 1, body: bytes | None = None, late: float = 0.0
+    world: World, stream: CameraStream, number: int = 1, body: bytes | None = None, late: float = 0.0
 ) -> None:
     """The robot sends a picture.
 

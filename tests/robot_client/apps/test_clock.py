@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from robot_client.apps.audio import AudioBuffer
 from robot_client.apps.clock import now
 from robot_client.apps.joystick import Joystick
-from robot_client.apps.sounds import Tape
-from robot_client.apps.voice import Voice
+from robot_client.apps.voice import VoiceControl
 
 
 def test_it_counts_suspends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,7 +21,7 @@ def test_it_counts_suspends(monkeypatch: pytest.MonkeyPatch) -> None:
     assert now() == 9.5
 
 
-@pytest.mark.parametrize("made", [Joystick, Voice, Tape])
+@pytest.mark.parametrize("made", [Joystick, VoiceControl, AudioBuffer])
 def test_by_it_looks_words_and_sound_grow_old(made: Any) -> None:
     """Where nobody gives them another clock, as their programs don't."""
     assert inspect.signature(made).parameters["clock"].default is now

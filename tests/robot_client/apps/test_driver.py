@@ -5,8 +5,17 @@ from __future__ import annotations
 import pytest
 from switchboard_socket import Socket
 
-from robot_client.apps.driver import BEAT, LATE, SILENT, STILL, Command, Driver, Limits, Stop
-from robot_client.apps.line import Line, Lost
+from robot_client.apps.connection import Lost, RosbridgeConnection
+from robot_client.apps.driver import (
+    BEAT,
+    LATE,
+    SILENT,
+    STILL,
+    Driver,
+    MaximumSpeeds,
+    StopNotice,
+    VelocityCommand,
+)
 
 
 class Scene:
@@ -14,14 +23,16 @@ class Scene:
 
     def __init__(self) -> None:
         self.now = 100.0
-        self.stop = Stop()
+        self.stop = StopNotice()
         self.connect()
         self.beat()
 
     def connect(self) -> None:
         """A new line."""
         self.socket = Socket()
-        self.driver = Driver(Line(self.socket), "/cmd_vel", "test", lambda: self.now, self.stop)
+        self.driver = Driver(
+            RosbridgeConnection(self.socket), "/cmd_vel", "test", lambda: self.now, self.stop
+        )
 
     def beat(self) -> None:
         """Have the first look at the way answered."""
@@ -44,12 +55,12 @@ class Scene:
 def test_it_drives_only_in_control() -> None:
     """Before it has it, and after, nothing is said to the robot."""
     scene = Scene()
-    scene.driver.drive(Command(0.2, 0.0))
+    scene.driver.drive(VelocityCommand(0.2, 0.0))
     assert scene.socket.driven() == []
     scene.take()
-    scene.driver.drive(Command(0.2, 0.1))
+    scene.driver.drive(VelocityCommand(0.2, 0.1))
     scene.driver.give_back()
-    scene.driver.drive(Command(0.2, 0.0))
+    scene.driver.drive(VelocityCommand(0.2, 0.0))
     assert scene.socket.driven() == [(0.2, 0.1), (0.0, 0.0)]
     assert scene.socket.asked()[-1]["service"] == "/relay/release_control"
 
@@ -92,7 +103,7 @@ def test_control_that_is_lost_is_heard() -> None:
     """And why; then not even a zero is said, which nobody would obey."""
     scene = Scene()
     scene.take()
-    scene.driver.drive(Command(0.2, 0.0))
+    scene.driver.drive(VelocityCommand(0.2, 0.0))
     scene.socket.control(holder="somebody")
     scene.hear()
     assert (scene.driver.in_control, scene.driver.obstacle) == (False, "somebody has control")
@@ -116,13 +127,13 @@ def test_the_robots_limits_of_the_level_count() -> None:
     """Those of the other level do not; without any the command goes as it is."""
     scene = Scene()
     scene.take()
-    scene.driver.drive(Command(2.0, -3.0))
+    scene.driver.drive(VelocityCommand(2.0, -3.0))
     limits = {"operator": {"linear": 0.5, "angular": None}, "owner": {"linear": 9.0, "angular": 9.0}}
     scene.socket.control(holder="me", you=True, limits=limits)
     scene.socket.status("operator")
     scene.hear()
-    assert scene.driver.limits.within(Limits(1.0, 1.0)) == Limits(0.5, 1.0)
-    scene.driver.drive(Command(-2.0, -3.0))
+    assert scene.driver.limits.within(MaximumSpeeds(1.0, 1.0)) == MaximumSpeeds(0.5, 1.0)
+    scene.driver.drive(VelocityCommand(-2.0, -3.0))
     assert scene.socket.driven() == [(2.0, -3.0), (-0.5, -3.0)]
 
 
@@ -131,7 +142,7 @@ def test_zero_is_said_once() -> None:
     scene = Scene()
     scene.take()
     scene.driver.still()
-    scene.driver.drive(Command(0.2, 0.0))
+    scene.driver.drive(VelocityCommand(0.2, 0.0))
     scene.driver.still()
     scene.driver.still()
     assert scene.socket.driven() == [(0.2, 0.0), STILL]
@@ -143,7 +154,7 @@ def test_a_stop_needs_no_control() -> None:
     scene.driver.stop()
     assert scene.socket.sent[-1]["service"] == "/relay/stop"
     scene.take()
-    scene.driver.drive(Command(0.2, 0.0))
+    scene.driver.drive(VelocityCommand(0.2, 0.0))
     scene.driver.stop()
     zero, stop = scene.socket.sent[-2:]
     assert (zero["op"], stop["service"]) == ("publish", "/relay/stop")
@@ -204,7 +215,7 @@ def test_a_stop_that_a_broken_line_does_not_take_is_not_forgotten(monkeypatch: p
     """Nor where the zero before it is what breaks."""
     scene = Scene()
     scene.take()
-    scene.driver.drive(Command(0.2, 0.0))
+    scene.driver.drive(VelocityCommand(0.2, 0.0))
 
     def broken(text: str) -> None:
         raise OSError("broken")
@@ -266,7 +277,14 @@ def test_what_comes_on_the_programs_own_topics_is_handed_over() -> None:
     """As it came."""
     heard: list[tuple[str, object]] = []
     socket = Socket()
-    driver = Driver(Line(socket), "/cmd_vel", "test", lambda: 0.0, Stop(), lambda *each: heard.append(each))
+    driver = Driver(
+        RosbridgeConnection(socket),
+        "/cmd_vel",
+        "test",
+        lambda: 0.0,
+        StopNotice(),
+        lambda *each: heard.append(each),
+    )
     socket.coming.append({"op": "publish", "topic": "/scan", "msg": {"ranges": []}})
     driver.hear(0.0)
     assert heard == [("/scan", {"ranges": []})]

@@ -10,6 +10,8 @@ import pytest
 from click.testing import CliRunner
 from switchboard_socket import Socket
 
+from robot_client.apps.connection import Lost, RosbridgeConnection
+from robot_client.apps.event_client import Unanswered
 from robot_client.apps.greeting import (
     BEAT,
     BEGUN,
@@ -19,12 +21,10 @@ from robot_client.apps.greeting import (
     STRANGER,
     SURE,
     Greeting,
-    Manners,
+    GreetingConfig,
     main,
     persons,
 )
-from robot_client.apps.line import Line, Lost
-from robot_client.apps.memory import Unanswered
 
 FACES = "/faces/seen"
 
@@ -75,18 +75,18 @@ class Remembered:
 class Scene:
     """A program at work."""
 
-    def __init__(self, memory: Remembered, manners: Manners | None = None) -> None:
+    def __init__(self, memory: Remembered, manners: GreetingConfig | None = None) -> None:
         self.memory = memory
         self.told: list[str] = []
         self.program = Greeting(
-            FACES, "/say", memory, manners or Manners(), self.told.append, lambda: self.memory.now
+            FACES, "/say", memory, manners or GreetingConfig(), self.told.append, lambda: self.memory.now
         )
         self.connect()
 
     def connect(self) -> None:
         """A new line."""
         self.socket = Socket()
-        self.program.begin(Line(self.socket))
+        self.program.begin(RosbridgeConnection(self.socket))
 
     def see(self, *names: str | None, times: int = 2, seconds: float = 0.2) -> None:
         """Pictures with these people in them."""
@@ -171,14 +171,14 @@ def test_strangers_are_greeted_where_that_is_wanted(memory: Remembered) -> None:
     """All of them as one person."""
     Scene(memory).see(None, None)
     assert memory.said == []
-    Scene(memory, Manners(strangers="Good day.")).see(None, None)
+    Scene(memory, GreetingConfig(strangers="Good day.")).see(None, None)
     assert memory.said == ["Good day."]
     assert memory.written[0]["data"] == {"person": STRANGER}
 
 
 def test_the_text_is_as_one_likes(memory: Remembered) -> None:
     """Braces in it or in a name are letters."""
-    Scene(memory, Manners(text="{hi} {name}!")).see("{0}")
+    Scene(memory, GreetingConfig(text="{hi} {name}!")).see("{0}")
     assert memory.said == ["{hi} {0}!"]
 
 

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from switchboard_speech import RATE, Samples, spaced, speech
 
-from robot_client.apps.hearing import (
+from robot_client.apps.audio import BLOCK, SIZE
+from robot_client.apps.command_words import CommandWord
+from robot_client.apps.speech_recognition import (
     BEFORE,
     BEGINS,
     ENDS,
     LONGEST,
     SHORTEST,
     Cutter,
-    Recogniser,
+    Recognizer,
     has_voice,
     may_be_word,
 )
-from robot_client.apps.sounds import BLOCK, SIZE
-from robot_client.apps.words import Word
 
 
 def blocks(samples: Samples) -> list[bytes]:
@@ -28,12 +28,12 @@ def blocks(samples: Samples) -> list[bytes]:
 
 
 @pytest.fixture(scope="module")
-def ear() -> Recogniser:
+def ear() -> Recognizer:
     """Its model takes half a second to read."""
-    return Recogniser()
+    return Recognizer()
 
 
-def heard(ear: Recogniser, samples: Samples) -> list[tuple[Word, float]]:
+def heard(ear: Recognizer, samples: Samples) -> list[tuple[CommandWord, float]]:
     """The words, and the second at which each was found to have ended."""
     return [
         (word, (number + 1) * BLOCK - before)
@@ -42,24 +42,24 @@ def heard(ear: Recogniser, samples: Samples) -> list[tuple[Word, float]]:
     ]
 
 
-def test_all_words_are_heard_and_when_they_ended(ear: Recogniser) -> None:
+def test_all_words_are_heard_and_when_they_ended(ear: Recognizer) -> None:
     """One after the other, to a seventh of a second."""
-    parts = [speech(word.value) for word in Word]
+    parts = [speech(word.value) for word in CommandWord]
     found = heard(ear, spaced(*parts))
-    assert [word for word, _ in found] == list(Word)
+    assert [word for word, _ in found] == list(CommandWord)
     ends = np.cumsum([0.7 + len(part) / RATE for part in parts])
     assert [at for _, at in found] == pytest.approx(ends, abs=0.15)
 
 
-@pytest.mark.parametrize("word", [Word.STOP, Word.AHEAD])
-def test_a_word_is_heard_softly_and_loudly(ear: Recogniser, word: Word) -> None:
+@pytest.mark.parametrize("word", [CommandWord.STOP, CommandWord.AHEAD])
+def test_a_word_is_heard_softly_and_loudly(ear: Recognizer, word: CommandWord) -> None:
     """Over a factor of three."""
     samples = speech(word.value).astype(float)
     for gain in (0.3, 1.0):
         assert [each for each, _ in heard(ear, spaced((samples * gain).astype(np.int16)))] == [word]
 
 
-def test_other_words_and_sentences_are_not_taken_for_those(ear: Recogniser) -> None:
+def test_other_words_and_sentences_are_not_taken_for_those(ear: Recognizer) -> None:
     """Neither such as it was told of nor others."""
     said = [
         "hello",
@@ -84,16 +84,16 @@ def noises() -> list[Samples]:
     return [each.clip(-32000, 32000).astype(np.int16) for each in (hiss, claps, hum, whistle)]
 
 
-def test_noise_is_no_word(ear: Recogniser) -> None:
+def test_noise_is_no_word(ear: Recognizer) -> None:
     """Of no kind, and not for long."""
     assert heard(ear, spaced(*noises())) == []
     assert heard(ear, np.concatenate(noises() * 2)) == []
 
 
-def test_a_word_is_heard_behind_noise(ear: Recogniser) -> None:
+def test_a_word_is_heard_behind_noise(ear: Recognizer) -> None:
     """Hiss and claps have not spoilt what comes after them."""
     found = heard(ear, spaced(*noises()[:2], speech("stop"), gap=1.0))
-    assert [word for word, _ in found] == [Word.STOP]
+    assert [word for word, _ in found] == [CommandWord.STOP]
 
 
 def test_silence_has_no_voice_and_speech_has() -> None:

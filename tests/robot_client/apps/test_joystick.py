@@ -8,14 +8,14 @@ import pytest
 from click.testing import CliRunner
 from switchboard_socket import Socket
 
-from robot_client.apps.driver import LATE, Limits
-from robot_client.apps.grip import Curve, Grip, Look
+from robot_client.apps.connection import RosbridgeConnection
+from robot_client.apps.deadman import Curve, Deadman, GamepadState
+from robot_client.apps.driver import LATE, MaximumSpeeds
 from robot_client.apps.joystick import Joystick, main
-from robot_client.apps.line import Line
 
-LOOSE = Look(0.0, 0.0, False)
-CENTRED = Look(0.0, 0.0, True)
-AHEAD = Look(1.0, 0.0, True)
+LOOSE = GamepadState(0.0, 0.0, False)
+CENTRED = GamepadState(0.0, 0.0, True)
+AHEAD = GamepadState(1.0, 0.0, True)
 
 
 class Pad:
@@ -24,9 +24,9 @@ class Pad:
     name = "pad"
 
     def __init__(self) -> None:
-        self.now: Look | None = LOOSE
+        self.now: GamepadState | None = LOOSE
 
-    def look(self) -> Look | None:
+    def look(self) -> GamepadState | None:
         return self.now
 
 
@@ -38,7 +38,7 @@ class Scene:
         self.pad = Pad()
         self.told: list[str] = []
         self.program = Joystick(
-            self.pad, Grip(Curve()), "/cmd_vel", Limits(0.4, 1.0), self._tell, lambda: self.now
+            self.pad, Deadman(Curve()), "/cmd_vel", MaximumSpeeds(0.4, 1.0), self._tell, lambda: self.now
         )
         self.connect()
 
@@ -50,9 +50,9 @@ class Scene:
         """A new line."""
         self.socket = Socket()
         self.socket.reached = True
-        self.program.begin(Line(self.socket))
+        self.program.begin(RosbridgeConnection(self.socket))
 
-    def look(self, *looks: Look | None, seconds: float = 0.06) -> list[tuple[float, float]]:
+    def look(self, *looks: GamepadState | None, seconds: float = 0.06) -> list[tuple[float, float]]:
         """One look after the other; what was said to the robot then."""
         before = len(self.socket.driven())
         for look in looks:
@@ -85,9 +85,9 @@ def test_the_button_takes_control_first_and_drives_when_it_is_pressed_again() ->
 
 
 @pytest.mark.parametrize(
-    "last", [LOOSE, Look(1.0, 0.0, False), CENTRED, None], ids=["all", "button", "stick", "unplugged"]
+    "last", [LOOSE, GamepadState(1.0, 0.0, False), CENTRED, None], ids=["all", "button", "stick", "unplugged"]
 )
-def test_every_way_of_letting_go_is_zero_at_once(last: Look | None) -> None:
+def test_every_way_of_letting_go_is_zero_at_once(last: GamepadState | None) -> None:
     """Without waiting for the time of the next command."""
     scene = Scene()
     scene.drive()
@@ -119,7 +119,7 @@ def test_after_a_lost_connection_nothing_is_sent_until_the_stick_was_let_go() ->
     scene.program.lost("gone", 0.5)
     scene.connect()
     scene.socket.control(holder="me", you=True)
-    assert scene.look(AHEAD, AHEAD, CENTRED, AHEAD, Look(1.0, 0.0, False), AHEAD) == []
+    assert scene.look(AHEAD, AHEAD, CENTRED, AHEAD, GamepadState(1.0, 0.0, False), AHEAD) == []
     assert scene.look(LOOSE, CENTRED, AHEAD)[-1] == (pytest.approx(0.4), 0.0)
     assert any("gone" in each for each in scene.told)
 
@@ -139,7 +139,7 @@ def test_a_link_that_is_late_ends_driving() -> None:
 def test_the_stop_button_stops_the_robot_without_control() -> None:
     """Once for each press."""
     scene = Scene()
-    pressed = Look(0.0, 0.0, False, stop=True)
+    pressed = GamepadState(0.0, 0.0, False, stop=True)
     scene.look(pressed, pressed, LOOSE, pressed)
     assert len(scene.socket.asked("/relay/stop")) == 2
 
@@ -147,7 +147,7 @@ def test_the_stop_button_stops_the_robot_without_control() -> None:
 def test_a_stop_that_was_not_answered_is_said_again_by_the_next_connection() -> None:
     """What became of it is told."""
     scene = Scene()
-    scene.look(Look(0.0, 0.0, False, stop=True), LOOSE)
+    scene.look(GamepadState(0.0, 0.0, False, stop=True), LOOSE)
     assert "stop asked for, not answered yet" in scene.told[-1]
     scene.program.lost("gone", 0.5)
     scene.connect()
@@ -160,7 +160,7 @@ def test_a_stop_that_was_not_answered_is_said_again_by_the_next_connection() -> 
 def test_the_stop_button_pressed_without_a_connection_stops_by_the_next() -> None:
     """As long as it is held."""
     scene = Scene()
-    pressed = Look(0.0, 0.0, False, stop=True)
+    pressed = GamepadState(0.0, 0.0, False, stop=True)
     scene.look(pressed)
     scene.socket.answer(service="/relay/stop")
     scene.look(pressed, pressed)
@@ -204,9 +204,9 @@ def test_the_robots_limits_are_the_ends_of_the_stick() -> None:
     scene.socket.status("operator")
     scene.look(CENTRED, CENTRED)
     assert scene.look(AHEAD) == [(pytest.approx(0.2), 0.0)]
-    assert scene.look(Look(0.0, 1.0, True)) == [(0.0, pytest.approx(0.5))]
-    half = Curve().bend(Look(0.5, 0.0, True)).ahead
-    assert scene.look(Look(0.5, 0.0, True)) == [(pytest.approx(0.2 * half), 0.0)]
+    assert scene.look(GamepadState(0.0, 1.0, True)) == [(0.0, pytest.approx(0.5))]
+    half = Curve().bend(GamepadState(0.5, 0.0, True)).ahead
+    assert scene.look(GamepadState(0.5, 0.0, True)) == [(pytest.approx(0.2 * half), 0.0)]
 
 
 def test_its_states_are_told_in_words() -> None:

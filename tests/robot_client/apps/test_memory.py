@@ -11,8 +11,8 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from robot_client.apps.line import Refused
-from robot_client.apps.memory import MOST, PAGES, Memory, Place, Unanswered, place
+from robot_client.apps.connection import Refused
+from robot_client.apps.event_client import MOST, PAGES, EventClient, RobotUrl, Unanswered, place
 
 
 class Server(ThreadingHTTPServer):
@@ -57,14 +57,14 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
 
 
 @pytest.fixture
-def memory(server: Server) -> Memory:
-    return Memory(f"ws://127.0.0.1:{server.server_port}/robots/rover")
+def memory(server: Server) -> EventClient:
+    return EventClient(f"ws://127.0.0.1:{server.server_port}/robots/rover")
 
 
 def test_the_addresses_of_http_follow_from_the_websockets() -> None:
     """Behind a path of a proxy too."""
-    assert place("ws://relay:9090/robots/rover") == Place("relay:9090", False, "", "rover")
-    assert place("wss://a.b/x/robots/rover/") == Place("a.b", True, "/x", "rover")
+    assert place("ws://relay:9090/robots/rover") == RobotUrl("relay:9090", False, "", "rover")
+    assert place("wss://a.b/x/robots/rover/") == RobotUrl("a.b", True, "/x", "rover")
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_what_is_no_robots_address_is_refused(url: str) -> None:
         place(url)
 
 
-def test_events_are_asked_for_page_by_page(server: Server, memory: Memory) -> None:
+def test_events_are_asked_for_page_by_page(server: Server, memory: EventClient) -> None:
     """Until there are no more."""
     server.answers = [
         (200, {"events": [{"id": 3}], "next": "p2"}),
@@ -96,7 +96,7 @@ def test_events_are_asked_for_page_by_page(server: Server, memory: Memory) -> No
     assert server.asked[0][2]["Authorization"] == "Bearer secret"
 
 
-def test_an_event_and_a_message_are_sent_as_they_should_be(server: Server, memory: Memory) -> None:
+def test_an_event_and_a_message_are_sent_as_they_should_be(server: Server, memory: EventClient) -> None:
     """The event about the robot, with its number in the answer; the message to its topic."""
     server.answers = [(201, {"id": 12}), (204, b"")]
     assert memory.write("greeted", person="ann") == 12
@@ -115,7 +115,7 @@ def test_an_event_and_a_message_are_sent_as_they_should_be(server: Server, memor
     ("status", "kind"), [(401, Refused), (403, Refused), (404, Refused), (409, Unanswered), (429, Unanswered)]
 )
 def test_errors_are_told_in_the_relays_words(
-    server: Server, memory: Memory, status: int, kind: type[Exception]
+    server: Server, memory: EventClient, status: int, kind: type[Exception]
 ) -> None:
     """As final, or as what may pass."""
     server.answers = [(status, {"title": "no", "detail": "because of the weather"})]
@@ -126,14 +126,14 @@ def test_errors_are_told_in_the_relays_words(
 @pytest.mark.parametrize(
     "answer", [b"<html>", [1], {"events": 3}, {"events": [3], "next": None}, {"events": []}, b""]
 )
-def test_an_answer_of_something_else_is_no_answer(server: Server, memory: Memory, answer: Any) -> None:
+def test_an_answer_of_something_else_is_no_answer(server: Server, memory: EventClient, answer: Any) -> None:
     """As of a page that some proxy puts in its place."""
     server.answers = [(200, answer)]
     with pytest.raises(Unanswered, match="no relay"):
         memory.events("greet*", 60.0)
 
 
-def test_events_without_an_end_are_not_known(server: Server, memory: Memory) -> None:
+def test_events_without_an_end_are_not_known(server: Server, memory: EventClient) -> None:
     """Rather than read for ever."""
     server.answers = [(200, {"events": [], "next": "more"})] * PAGES
     with pytest.raises(Unanswered, match="pages"):
@@ -143,7 +143,7 @@ def test_events_without_an_end_are_not_known(server: Server, memory: Memory) -> 
         memory.events("greet*", 60.0)
 
 
-def test_a_relay_that_is_not_there_is_told(server: Server, memory: Memory) -> None:
+def test_a_relay_that_is_not_there_is_told(server: Server, memory: EventClient) -> None:
     """As one that may come back."""
     server.server_close()
     with pytest.raises(Unanswered, match="does not answer"):

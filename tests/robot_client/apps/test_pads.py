@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from robot_client.apps.grip import Look
-from robot_client.apps.pads import Layout, Pads
+from robot_client.apps.deadman import GamepadState
+from robot_client.apps.gamepads import Gamepads, Layout
 
 pygame = pytest.importorskip("pygame")
 
 UNKNOWN = 0
 """The kind of joystick for which SDL has no names of buttons."""
 
-LOOSE = Look(0.0, 0.0, False)
+LOOSE = GamepadState(0.0, 0.0, False)
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def plug(sdl: ctypes.CDLL) -> int:
 
 def test_a_pad_that_sdl_does_not_know_is_gone_when_it_is_unplugged(sdl: ctypes.CDLL) -> None:
     """Its last state is not what is held."""
-    pads = Pads(Layout())
+    pads = Gamepads(Layout())
     assert pads.look() is None
     number = plug(sdl)
     assert pads.look() == LOOSE
@@ -51,7 +51,7 @@ def test_a_pad_that_sdl_does_not_know_is_gone_when_it_is_unplugged(sdl: ctypes.C
 
 def test_between_two_pads_there_is_none(sdl: ctypes.CDLL) -> None:
     """So what was held on the first ends, though the second is there already."""
-    pads = Pads(Layout())
+    pads = Gamepads(Layout())
     first = plug(sdl)
     assert pads.look() == LOOSE
     plug(sdl)

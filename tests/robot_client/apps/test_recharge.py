@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 from switchboard_socket import Socket
 
-from robot_client.apps.docking import CHARGING, UNKNOWN, Approach, Need, Topics
+from robot_client.apps.connection import RosbridgeConnection
+from robot_client.apps.docking import CHARGING, UNKNOWN, Approach, DockingTopics, Need
 from robot_client.apps.driver import BEAT, LATE
-from robot_client.apps.line import Line
 from robot_client.apps.recharge import (
     AGAIN,
     CALM,
@@ -22,8 +22,8 @@ from robot_client.apps.recharge import (
     PATIENCE,
     ROUND,
     SEEKING_TURN,
-    Phase,
     Recharge,
+    RechargePhase,
     main,
 )
 
@@ -40,7 +40,7 @@ class Scene:
         self.ahead: float | None = 3.0
         """What the scanner tells, in metres; nothing comes where it is none."""
         self.program = Recharge(
-            Topics("/battery_state", "/markers/seen", "/scan"),
+            DockingTopics("/battery_state", "/markers/seen", "/scan"),
             "/cmd_vel",
             7,
             Need(0.2, 0.8),
@@ -55,7 +55,7 @@ class Scene:
         """A new line."""
         self.socket = Socket()
         self.socket.reached = True
-        self.program.begin(Line(self.socket))
+        self.program.begin(RosbridgeConnection(self.socket))
 
     def hear(self, topic: str, **message: Any) -> None:
         """Something comes."""
@@ -94,7 +94,7 @@ class Scene:
         self.socket.answer(service="/relay/take_control")
         self.socket.control(holder="me", you=True)
         assert self.step() == [STILL]
-        assert self.program.phase is Phase.SEEKING
+        assert self.program.phase is RechargePhase.SEEKING
         while not self.step():
             """It lets go, as of what it may have been doing a moment ago."""
 
@@ -103,7 +103,7 @@ class Scene:
         self.take()
         self.marker(distance, bearing)
         self.step()
-        assert self.program.phase is Phase.GOING
+        assert self.program.phase is RechargePhase.GOING
 
 
 def test_nothing_is_done_while_the_battery_is_not_low() -> None:
@@ -135,7 +135,7 @@ def test_a_low_battery_brings_the_robot_to_its_charger() -> None:
     assert scene.told[-1] == "charging"
     scene.battery(0.8, CHARGING)
     scene.step()
-    assert scene.program.phase is Phase.WATCHING
+    assert scene.program.phase is RechargePhase.WATCHING
     assert scene.asked("take_control") == 1
 
 
@@ -183,7 +183,7 @@ def test_somebody_else_comes_first(who: str) -> None:
     else:
         scene.socket.control(holder="ann" if who == "takes" else "")
     driven = scene.step()
-    assert scene.program.phase is Phase.WAITING
+    assert scene.program.phase is RechargePhase.WAITING
     assert "control given back: " in " ".join(scene.told)
     if who in ("asks", "stops"):
         assert driven[-1] == STILL
@@ -238,7 +238,7 @@ def test_a_marker_that_is_lost_is_looked_for_where_it_was() -> None:
     scene.step(FRESH + 0.1)
     assert scene.socket.driven()[-1] == STILL
     scene.step(LOST)
-    assert scene.program.phase is Phase.SEEKING
+    assert scene.program.phase is RechargePhase.SEEKING
     assert scene.step() == [(0.0, -SEEKING_TURN)]
     assert "marker 7 is lost: looking for it" in scene.told
 
@@ -253,7 +253,7 @@ def test_a_glimpse_of_a_marker_is_none() -> None:
         assert scene.step()[-1] == STILL
         for _ in range(6):
             scene.step(GLIMPSE / 4)
-    assert scene.program.phase is Phase.SEEKING
+    assert scene.program.phase is RechargePhase.SEEKING
     assert all(speed == 0.0 for speed, _ in scene.socket.driven())
 
 

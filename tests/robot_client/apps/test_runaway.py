@@ -11,32 +11,32 @@ import pytest
 from click.testing import CliRunner
 from switchboard_socket import Socket
 
-from robot_client.apps.driver import Command
-from robot_client.apps.line import Line, Lost, Refused
-from robot_client.apps.runaway import (
+from robot_client.apps.collision_avoidance import (
     BLIND,
     COMMANDS,
     FLAT,
     SCANS,
-    Manners,
-    Phase,
-    Program,
-    Runaway,
-    Scan,
+    AvoidanceConfig,
+    AvoidancePhase,
+    AvoidanceProgram,
+    CollisionAvoidance,
+    ScanReading,
     main,
     repulsion,
 )
-from robot_client.sim.recorder import Recorder
-from robot_client.sim.robot import SCAN_BEGIN, SCAN_RAYS, SCAN_STEP, Robot
+from robot_client.apps.connection import Lost, Refused, RosbridgeConnection
+from robot_client.apps.driver import VelocityCommand
+from robot_client.sim.recorder import MotionRecorder
+from robot_client.sim.robot import SCAN_BEGIN, SCAN_RAYS, SCAN_STEP, SimRobot
 from robot_client.sim.worlds import WORLDS
 
 STEP = 0.02
 SUPPRESS = "/relay/suppress"
-LEANING = Command(0.25, -0.15)
+LEANING = VelocityCommand(0.25, -0.15)
 """A circle that the room is too small for."""
 
 
-def wall(distance: float, direction: float) -> Scan:
+def wall(distance: float, direction: float) -> ScanReading:
     """A flat wall without end.
 
     :param distance: metres
@@ -46,7 +46,7 @@ def wall(distance: float, direction: float) -> Scan:
     for number in range(SCAN_RAYS):
         facing = math.cos(SCAN_BEGIN + number * SCAN_STEP - direction)
         ranges.append(distance / facing if facing > 1e-3 else math.inf)
-    return Scan(ranges, SCAN_BEGIN, SCAN_STEP)
+    return ScanReading(ranges, SCAN_BEGIN, SCAN_STEP)
 
 
 @pytest.mark.parametrize("direction", [0.0, 1.0, -2.0, math.pi])
@@ -64,12 +64,12 @@ def test_a_wall_pushes_away_from_itself(direction: float) -> None:
 def test_what_met_nothing_pushes_nothing() -> None:
     """Nor does what is far, or no number."""
     for nothing in (math.inf, math.nan, None, 0.0, -1.0, 2.0):
-        assert repulsion(Scan([nothing] * 8, 0.0, 0.5)).strength == 0.0
+        assert repulsion(ScanReading([nothing] * 8, 0.0, 0.5)).strength == 0.0
 
 
 def test_it_watches_until_something_ahead_is_near() -> None:
     """Not what is beside or behind."""
-    runaway = Runaway(Manners(near=0.5))
+    runaway = CollisionAvoidance(AvoidanceConfig(near=0.5))
     assert runaway.see(wall(0.55, 0.0)) is None
     assert runaway.see(wall(0.3, math.pi)) is None
     assert runaway.see(wall(0.3, math.radians(100))) is None
@@ -78,12 +78,12 @@ def test_it_watches_until_something_ahead_is_near() -> None:
 
 def test_it_turns_to_the_side_that_is_free() -> None:
     """And goes on turning that way until it faces off, then leaves, then gives back."""
-    runaway = Runaway(Manners(near=0.5, clear=0.6, speed=0.2, turn=1.0))
-    assert runaway.see(wall(0.4, math.radians(30))) == Command(0.0, -1.0)
-    assert runaway.see(wall(0.4, math.radians(-5))) == Command(0.0, -1.0)
-    assert runaway.see(wall(0.4, math.radians(130))) == Command(0.2, 0.0)
-    assert runaway.phase is Phase.LEAVING
-    assert runaway.see(wall(0.4, math.radians(20))) == Command(0.0, -1.0)
+    runaway = CollisionAvoidance(AvoidanceConfig(near=0.5, clear=0.6, speed=0.2, turn=1.0))
+    assert runaway.see(wall(0.4, math.radians(30))) == VelocityCommand(0.0, -1.0)
+    assert runaway.see(wall(0.4, math.radians(-5))) == VelocityCommand(0.0, -1.0)
+    assert runaway.see(wall(0.4, math.radians(130))) == VelocityCommand(0.2, 0.0)
+    assert runaway.phase is AvoidancePhase.LEAVING
+    assert runaway.see(wall(0.4, math.radians(20))) == VelocityCommand(0.0, -1.0)
     assert runaway.see(wall(0.65, math.radians(130))) is None
 
 
@@ -93,19 +93,19 @@ class Drive:
     def __init__(self) -> None:
         self.now = 0.0
         self.record = io.BytesIO()
-        self.robot = Robot(WORLDS["room"](), Recorder(self.record), 1, lambda: self.now)
-        self.runaway: Runaway | None = Runaway(Manners())
-        self.wanted: Command | None = None
+        self.robot = SimRobot(WORLDS["room"](), MotionRecorder(self.record), 1, lambda: self.now)
+        self.runaway: CollisionAvoidance | None = CollisionAvoidance(AvoidanceConfig())
+        self.wanted: VelocityCommand | None = None
         self.distances: list[float] = []
         self.taken = 0
 
-    def run(self, seconds: float, driver: Command) -> None:
+    def run(self, seconds: float, driver: VelocityCommand) -> None:
         for number in range(round(seconds / STEP)):
             if number % 5 == 0:
                 before, self.wanted = self.wanted, None
                 if self.runaway is not None:
                     ranges: Any = self.robot.scan()
-                    self.wanted = self.runaway.see(Scan(ranges.tolist(), SCAN_BEGIN, SCAN_STEP))
+                    self.wanted = self.runaway.see(ScanReading(ranges.tolist(), SCAN_BEGIN, SCAN_STEP))
                 self.taken += self.wanted is not None and before is None
                 self.robot.command(*(self.wanted or driver))
             self.now += STEP
@@ -122,14 +122,14 @@ def test_a_driver_who_does_not_look_bumps() -> None:
     """Without the program; so the next tests tell something."""
     drive = Drive()
     drive.runaway = None
-    drive.run(20, Command(0.3, 0.0))
+    drive.run(20, VelocityCommand(0.3, 0.0))
     assert drive.bumps == 1
 
 
 def test_straight_at_a_wall_it_turns_the_robot_away_and_gives_it_back() -> None:
     """Again and again; the driver moves most of the time."""
     drive = Drive()
-    drive.run(60, Command(0.3, 0.0))
+    drive.run(60, VelocityCommand(0.3, 0.0))
     assert drive.bumps == 0
     assert drive.taken >= 3
     assert drive.wanted is None or drive.runaway is not None
@@ -157,7 +157,7 @@ def test_leaning_on_a_wall_the_robot_follows_it() -> None:
 class Scanner(Socket):
     """A websocket in memory, by which scans come."""
 
-    def scan(self, scan: Scan) -> None:
+    def scan(self, scan: ScanReading) -> None:
         ranges = [each if each is not None and math.isfinite(each) else None for each in scan.ranges]
         message = {"ranges": ranges, "angle_min": scan.begin, "angle_increment": scan.step}
         self.coming.append({"op": "publish", "topic": "/scan", "msg": message})
@@ -167,17 +167,19 @@ class Scene:
     def __init__(self) -> None:
         self.now = 100.0
         self.told: list[str] = []
-        self.program = Program("/scan", "/cmd_vel", Runaway(Manners()), self.told.append, lambda: self.now)
+        self.program = AvoidanceProgram(
+            "/scan", "/cmd_vel", CollisionAvoidance(AvoidanceConfig()), self.told.append, lambda: self.now
+        )
         self.connect()
 
     def connect(self) -> None:
         """A new line."""
         self.socket = Scanner()
         self.socket.reached = True
-        self.program.begin(Line(self.socket))
+        self.program.begin(RosbridgeConnection(self.socket))
         self.socket.sent.clear()
 
-    def step(self, scan: Scan | None = None, seconds: float = 0.11) -> list[dict[str, Any]]:
+    def step(self, scan: ScanReading | None = None, seconds: float = 0.11) -> list[dict[str, Any]]:
         """One turn of the program; what it said."""
         self.now += seconds
         if scan is not None:

@@ -12,8 +12,8 @@ from typing import Any
 import click
 import pytest
 
-from robot_client.apps import sounds
-from robot_client.apps.sounds import AFTER, BLOCK, KEPT, RATE, SIZE, Moments, Tape
+from robot_client.apps import audio
+from robot_client.apps.audio import AFTER, BLOCK, KEPT, RATE, SIZE, AudioBuffer, BlockTimes
 
 
 def written(path: Path, seconds: float, channels: int = 1, rate: int = RATE) -> Path:
@@ -29,7 +29,7 @@ def written(path: Path, seconds: float, channels: int = 1, rate: int = RATE) -> 
 def test_a_file_is_as_long_as_it_was_spoken(tmp_path: Path) -> None:
     """With silence behind, and a wait before each block."""
     waits: list[float] = []
-    blocks = list(sounds.from_file(written(tmp_path / "a.wav", 0.3), waits.append))
+    blocks = list(audio.from_file(written(tmp_path / "a.wav", 0.3), waits.append))
     assert len(blocks) == round((0.3 + AFTER) / BLOCK)
     assert {len(each) for each in blocks} == {SIZE}
     assert sum(each == b"\x01\x00" * (SIZE // 2) for each in blocks) == 10
@@ -41,7 +41,7 @@ def test_a_file_is_as_long_as_it_was_spoken(tmp_path: Path) -> None:
 def test_a_file_of_another_form_is_refused_in_words(tmp_path: Path, form: dict[str, int]) -> None:
     """What it has, and what is needed."""
     with pytest.raises(click.ClickException, match="16000 Hz"):
-        list(sounds.from_file(written(tmp_path / "a.wav", 0.1, **form)))
+        list(audio.from_file(written(tmp_path / "a.wav", 0.1, **form)))
 
 
 class _Pipe(io.RawIOBase):
@@ -58,7 +58,7 @@ class _Pipe(io.RawIOBase):
 def test_samples_from_a_stream_come_in_whole_blocks() -> None:
     """However they come; what is less at the end is nothing."""
     data = bytes(range(256)) * (2 * SIZE // 256 + 1)
-    blocks = list(sounds.from_stream(_Pipe(data[: 2 * SIZE + 5])))
+    blocks = list(audio.from_stream(_Pipe(data[: 2 * SIZE + 5])))
     assert blocks == [data[:SIZE], data[SIZE : 2 * SIZE]]
 
 
@@ -73,12 +73,12 @@ def test_without_sounddevice_a_microphone_is_refused_in_words(monkeypatch: pytes
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(click.ClickException, match=r"pip install sounddevice.*--wav"):
-        sounds.from_microphone(None)
+        audio.from_microphone(None)
 
 
 def test_blocks_that_come_in_time_ended_when_they_came() -> None:
     """To the jitter."""
-    moments = Moments()
+    moments = BlockTimes()
     assert [moments.of_next(100.0 + n * BLOCK) for n in range(3)] == pytest.approx(
         [100.0 + n * BLOCK for n in range(3)]
     )
@@ -86,7 +86,7 @@ def test_blocks_that_come_in_time_ended_when_they_came() -> None:
 
 def test_blocks_that_were_held_up_ended_before_they_came() -> None:
     """As when the program stood still for a second: all come at once then."""
-    moments = Moments()
+    moments = BlockTimes()
     moments.of_next(100.0)
     late = [moments.of_next(101.0 + BLOCK) for _ in range(10)]
     assert late == pytest.approx([100.0 + (n + 1) * BLOCK for n in range(10)])
@@ -104,7 +104,7 @@ class _Clock:
 
 def test_a_tape_keeps_the_newest() -> None:
     """Who is too slow hears no old things."""
-    tape = Tape(iter([bytes([n]) for n in range(KEPT + 10)]), _Clock())
+    tape = AudioBuffer(iter([bytes([n]) for n in range(KEPT + 10)]), _Clock())
     tape.start()
     tape.join()
     heard = list(tape)
@@ -119,7 +119,7 @@ def test_a_source_that_breaks_ends_the_tape_and_says_why() -> None:
         yield b"a"
         raise OSError("unplugged")
 
-    tape = Tape(source(), _Clock())
+    tape = AudioBuffer(source(), _Clock())
     tape.start()
     (block,) = tape
     assert block == (b"a", pytest.approx(5.0 + 2 * BLOCK))
@@ -136,7 +136,7 @@ def test_sound_that_lay_ready_at_the_start_is_dropped() -> None:
             now += BLOCK if number in (10, 15) else 0.001
             yield bytes([number])
 
-    tape = Tape(source(), lambda: now)
+    tape = AudioBuffer(source(), lambda: now)
     tape.start()
     heard = list(tape)
     assert [each.data[0] for each in heard] == list(range(10, 20))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 
-from robot_client.apps.status import EVERY, StatusLine
+from robot_client.apps.status_line import EVERY, StatusLine
 
 
 class Screen(io.StringIO):

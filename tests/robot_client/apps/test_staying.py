@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from switchboard_socket import Socket
 
-from robot_client.apps.line import Line, Lost, Refused
-from robot_client.apps.staying import Ending, stay
+from robot_client.apps.connection import Lost, Refused, RosbridgeConnection
+from robot_client.apps.reconnect import Ending, run_connected
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +31,7 @@ class Program:
         self.plan = list(plan)
         self.log: list[str] = []
 
-    def begin(self, line: Line) -> None:
+    def begin(self, line: RosbridgeConnection) -> None:
         self.log.append("begin")
 
     def step(self) -> bool:
@@ -52,12 +52,12 @@ class Program:
 
 
 @contextlib.contextmanager
-def connect(url: str) -> Iterator[Line]:
-    yield Line(Socket())
+def connect(url: str) -> Iterator[RosbridgeConnection]:
+    yield RosbridgeConnection(Socket())
 
 
 def run(program: Program, connect: Any = connect) -> None:
-    stay("ws://relay/robots/r", program, Ending(), connect, lambda _: None)
+    run_connected("ws://relay/robots/r", program, Ending(), connect, lambda _: None)
 
 
 def test_a_program_runs_to_its_end_and_lets_go() -> None:
@@ -73,10 +73,10 @@ def test_a_line_that_is_lost_is_made_again() -> None:
     failures = [True, False, True, False]
 
     @contextlib.contextmanager
-    def connect(url: str) -> Iterator[Line]:
+    def connect(url: str) -> Iterator[RosbridgeConnection]:
         if failures.pop(0):
             raise Lost("nobody there")
-        yield Line(Socket())
+        yield RosbridgeConnection(Socket())
 
     run(program, connect)
     assert program.log == [
@@ -110,7 +110,7 @@ def test_a_signal_without_a_line_ends_it_at_once() -> None:
     """There is nothing to let go of."""
     ending = Ending()
     with pytest.raises(SystemExit):
-        stay(
+        run_connected(
             "ws://relay/robots/r",
             Program(Lost("gone")),
             ending,

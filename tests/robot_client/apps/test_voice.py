@@ -8,11 +8,11 @@ import pytest
 from click.testing import CliRunner
 from switchboard_socket import Socket
 
-from robot_client.apps.driver import BEAT, LATE, Limits
-from robot_client.apps.line import Line
-from robot_client.apps.sounds import Block
-from robot_client.apps.voice import KEEP, STALE, Heard, Listening, Voice, main
-from robot_client.apps.words import Orders, Word
+from robot_client.apps.audio import Block
+from robot_client.apps.command_words import CommandWord, WordCommands
+from robot_client.apps.connection import RosbridgeConnection
+from robot_client.apps.driver import BEAT, LATE, MaximumSpeeds
+from robot_client.apps.voice import KEEP, STALE, RecognisedWord, RecognitionThread, VoiceControl, main
 
 
 class Said:
@@ -20,9 +20,9 @@ class Said:
 
     def __init__(self) -> None:
         self.ended = False
-        self.words: list[Heard] = []
+        self.words: list[RecognisedWord] = []
 
-    def heard(self) -> Iterator[Heard]:
+    def heard(self) -> Iterator[RecognisedWord]:
         while self.words:
             yield self.words.pop(0)
 
@@ -34,11 +34,11 @@ class Scene:
         self.now = 100.0
         self.said = Said()
         self.told: list[str] = []
-        self.program = Voice(
+        self.program = VoiceControl(
             self.said,
-            Orders(1.5),
+            WordCommands(1.5),
             "/cmd_vel",
-            Limits(0.4, 1.0),
+            MaximumSpeeds(0.4, 1.0),
             latch,
             lambda state, _: self.told.append(state),
             lambda: self.now,
@@ -50,13 +50,13 @@ class Scene:
         """A new line."""
         self.socket = Socket()
         self.socket.reached = True
-        self.program.begin(Line(self.socket))
+        self.program.begin(RosbridgeConnection(self.socket))
 
-    def step(self, *words: Word, seconds: float = 0.06, age: float = 0.0) -> list[tuple[float, float]]:
+    def step(self, *words: CommandWord, seconds: float = 0.06, age: float = 0.0) -> list[tuple[float, float]]:
         """One step in which these were said; what was said to the robot then."""
         before = len(self.socket.driven())
         self.now += seconds
-        self.said.words += [Heard(each, self.now - age) for each in words]
+        self.said.words += [RecognisedWord(each, self.now - age) for each in words]
         self.goes_on = self.program.step()
         while self.socket.coming:
             self.goes_on = self.program.step()
@@ -71,7 +71,7 @@ class Scene:
 def test_a_word_takes_control_and_then_moves_the_robot() -> None:
     """For a second and a half, then it stands."""
     scene = Scene()
-    assert scene.step(Word.AHEAD) == []
+    assert scene.step(CommandWord.AHEAD) == []
     assert len(scene.socket.asked("/relay/take_control")) == 1
     scene.socket.answer(service="/relay/take_control")
     assert scene.step() == [(pytest.approx(0.2), 0.0)]
@@ -84,11 +84,11 @@ def test_a_word_takes_control_and_then_moves_the_robot() -> None:
 def test_without_control_a_word_is_not_done_later() -> None:
     """Refused, or given when the word is long over."""
     scene = Scene()
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     scene.socket.answer(success=False, service="/relay/take_control")
     assert scene.step() == []
     assert "not done: no" in scene.told[-1]
-    scene.step(Word.LEFT)
+    scene.step(CommandWord.LEFT)
     scene.step(seconds=STALE + 0.1)
     scene.take()
     assert scene.step() == []
@@ -98,11 +98,11 @@ def test_stop_is_zero_at_once() -> None:
     """In control it does not latch: the next word moves the robot."""
     scene = Scene()
     scene.take()
-    scene.step(Word.AHEAD)
-    assert scene.step(Word.STOP, seconds=0.001) == [(0.0, 0.0)]
+    scene.step(CommandWord.AHEAD)
+    assert scene.step(CommandWord.STOP, seconds=0.001) == [(0.0, 0.0)]
     assert scene.socket.asked("/relay/stop") == []
     assert scene.step() == []
-    assert scene.step(Word.BACK) == [(pytest.approx(-0.2), 0.0)]
+    assert scene.step(CommandWord.BACK) == [(pytest.approx(-0.2), 0.0)]
 
 
 def test_stop_without_control_is_the_relays_stop() -> None:
@@ -110,7 +110,7 @@ def test_stop_without_control_is_the_relays_stop() -> None:
     scene = Scene()
     scene.socket.control(holder="somebody")
     scene.step()
-    scene.step(Word.STOP)
+    scene.step(CommandWord.STOP)
     assert len(scene.socket.asked("/relay/stop")) == 1
 
 
@@ -120,7 +120,7 @@ def test_stop_while_somebody_suppresses_the_topic_is_the_relays_stop() -> None:
     scene.socket.control(holder="me", you=True)
     scene.socket.coming[-1]["msg"]["suppressed"] = [{"resource": "/cmd_vel"}]
     scene.step()
-    scene.step(Word.STOP)
+    scene.step(CommandWord.STOP)
     assert len(scene.socket.asked("/relay/stop")) == 1
 
 
@@ -131,7 +131,7 @@ def test_stop_where_the_robot_is_late_is_the_relays_stop() -> None:
     scene.socket.reached = False
     scene.step(seconds=BEAT)
     scene.step(seconds=LATE + 0.1)
-    scene.step(Word.STOP)
+    scene.step(CommandWord.STOP)
     assert len(scene.socket.asked("/relay/stop")) == 1
 
 
@@ -139,13 +139,13 @@ def test_stop_in_control_is_zero_also_where_no_word_moved_the_robot() -> None:
     """Whoever drove before may have left it moving."""
     scene = Scene()
     scene.take()
-    assert scene.step(Word.STOP) == [(0.0, 0.0)]
+    assert scene.step(CommandWord.STOP) == [(0.0, 0.0)]
 
 
 def test_a_stop_is_told_as_asked_for_and_then_as_answered() -> None:
     """It is not done because it was said."""
     scene = Scene()
-    scene.step(Word.STOP)
+    scene.step(CommandWord.STOP)
     assert scene.told[-1] == "stop asked for, not answered yet"
     scene.socket.answer(service="/relay/stop")
     scene.socket.coming[-1]["values"]["done"] = False
@@ -157,7 +157,7 @@ def test_a_stop_that_was_not_answered_is_said_again_by_the_next_connection() -> 
     """The program does not end before, though nothing more is to be heard."""
     scene = Scene()
     scene.said.ended = True
-    scene.step(Word.STOP)
+    scene.step(CommandWord.STOP)
     assert scene.goes_on
     scene.program.lost("gone", 0.1)
     scene.connect()
@@ -172,7 +172,10 @@ def test_a_stop_that_is_said_without_a_connection_is_done_by_the_next() -> None:
     """Of all words it alone."""
     scene = Scene()
     scene.program.lost("gone", 0.1)
-    scene.said.words += [Heard(Word.STOP, scene.now), Heard(Word.LEFT, scene.now)]
+    scene.said.words += [
+        RecognisedWord(CommandWord.STOP, scene.now),
+        RecognisedWord(CommandWord.LEFT, scene.now),
+    ]
     scene.connect()
     assert scene.socket.sent[0]["service"] == "/relay/stop"
     assert scene.said.words == []
@@ -181,7 +184,7 @@ def test_a_stop_that_is_said_without_a_connection_is_done_by_the_next() -> None:
 def test_a_word_that_waited_while_the_program_stood_still_moves_nothing() -> None:
     """Though control was given meanwhile."""
     scene = Scene()
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     scene.socket.answer(service="/relay/take_control")
     assert scene.step(seconds=STALE + 0.5) == []
     assert "ahead: not done: heard too late" in scene.told
@@ -191,8 +194,8 @@ def test_stop_is_the_relays_stop_always_where_that_is_wanted() -> None:
     """After the zero."""
     scene = Scene(latch=True)
     scene.take()
-    scene.step(Word.AHEAD)
-    scene.step(Word.STOP)
+    scene.step(CommandWord.AHEAD)
+    scene.step(CommandWord.STOP)
     zero, stop = scene.socket.sent[-2:]
     assert zero["msg"]["linear"]["x"] == 0.0
     assert stop["service"] == "/relay/stop"
@@ -202,19 +205,19 @@ def test_a_word_that_comes_too_late_moves_nothing() -> None:
     """But *stop* counts however late it comes."""
     scene = Scene()
     scene.take()
-    assert scene.step(Word.AHEAD, age=STALE + 0.1) == []
+    assert scene.step(CommandWord.AHEAD, age=STALE + 0.1) == []
     assert "too late" in scene.told[-1]
-    scene.step(Word.AHEAD)
-    assert scene.step(Word.STOP, age=10.0) == [(0.0, 0.0)]
+    scene.step(CommandWord.AHEAD)
+    assert scene.step(CommandWord.STOP, age=10.0) == [(0.0, 0.0)]
 
 
 def test_what_was_said_without_a_connection_does_not_count() -> None:
     """Nor does what was under way before."""
     scene = Scene()
     scene.take()
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     scene.program.lost("gone", 0.1)
-    scene.said.words.append(Heard(Word.LEFT, scene.now))
+    scene.said.words.append(RecognisedWord(CommandWord.LEFT, scene.now))
     scene.connect()
     scene.take()
     assert scene.step() == []
@@ -225,7 +228,7 @@ def test_a_robot_that_is_stopped_or_anothers_is_let_go_of(who: str) -> None:
     """What was under way is not done later."""
     scene = Scene()
     scene.take()
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     if who == "stopped":
         scene.socket.control(holder="me", you=True, stopped="somebody")
     else:
@@ -240,7 +243,7 @@ def test_a_word_to_a_robot_that_is_stopped_is_told_so() -> None:
     scene = Scene()
     scene.socket.control(holder="me", you=True, stopped="somebody")
     scene.step()
-    assert scene.step(Word.AHEAD) == []
+    assert scene.step(CommandWord.AHEAD) == []
     assert "stopped by somebody" in scene.told[-1]
 
 
@@ -248,11 +251,11 @@ def test_a_link_that_is_late_lets_go() -> None:
     """The robot stands, and a word is told why."""
     scene = Scene()
     scene.take()
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     scene.socket.reached = False
     scene.step(seconds=BEAT)
     assert scene.step(seconds=LATE + 0.1) == [(0.0, 0.0)]
-    assert scene.step(Word.AHEAD) == []
+    assert scene.step(CommandWord.AHEAD) == []
     assert "does not answer" in scene.told[-1]
 
 
@@ -260,7 +263,7 @@ def test_control_is_given_back_when_nothing_is_said() -> None:
     """So that others can drive."""
     scene = Scene()
     scene.take()
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     for _ in range(round(KEEP / 0.5)):
         assert scene.socket.asked("/relay/release_control") == []
         scene.step(seconds=0.5)
@@ -273,7 +276,7 @@ def test_it_ends_when_all_was_said_and_done() -> None:
     scene = Scene()
     scene.take()
     scene.said.ended = True
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     assert scene.goes_on
     steps = 0
     while scene.goes_on:
@@ -287,7 +290,7 @@ def test_the_end_is_zero_and_gives_control_back() -> None:
     """In this order."""
     scene = Scene()
     scene.take()
-    scene.step(Word.AHEAD)
+    scene.step(CommandWord.AHEAD)
     scene.program.leave()
     zero, release = scene.socket.sent[-2:]
     assert zero["msg"]["linear"]["x"] == 0.0
@@ -295,16 +298,16 @@ def test_the_end_is_zero_and_gives_control_back() -> None:
 
 
 class _Ear:
-    def hear(self, data: bytes) -> list[tuple[Word, float]]:
-        return [(Word.LEFT, 0.25)] if data == b"left" else []
+    def hear(self, data: bytes) -> list[tuple[CommandWord, float]]:
+        return [(CommandWord.LEFT, 0.25)] if data == b"left" else []
 
 
 def test_a_word_is_as_old_as_its_end() -> None:
     """By the moment of the block it was found in."""
-    listening = Listening([Block(b"", 9.0), Block(b"left", 10.0)], _Ear())
+    listening = RecognitionThread([Block(b"", 9.0), Block(b"left", 10.0)], _Ear())
     listening.start()
     listening.join()
-    assert list(listening.heard()) == [Heard(Word.LEFT, 9.75)]
+    assert list(listening.heard()) == [RecognisedWord(CommandWord.LEFT, 9.75)]
     assert listening.ended
 
 

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 
 from relay_protocol.link import VideoSettings
-from robot_client.camera.editing import plan
 from robot_client.camera.encoding import Jpeg, Png, make_encoder
 from robot_client.camera.formats import ENCODINGS, Raw, compressed, decoded, image, unpacked
+from robot_client.camera.transforms import plan_transforms
 from tests.robot_client.camera.cards import Pixels, card, coded, compressed_cdr, depth_files, image_cdr
 
 WIDTH, HEIGHT, COLUMNS, TITLE = 240, 180, 6, 24
@@ -51,7 +51,7 @@ def stills() -> dict[str, Pixels]:
         "80 wide, stamp": {"width": 80, "stamp": True},
         "1920 wide, stamp": {"width": 1920, "stamp": True},
     }.items():
-        shown[title] = plan(VideoSettings(**changed), WIDTH, HEIGHT).apply(bgr, NOON)
+        shown[title] = plan_transforms(VideoSettings(**changed), WIDTH, HEIGHT).apply(bgr, NOON)
     picture, _ = make_encoder("h264", WIDTH, HEIGHT, 15).encode(bgr, 80, True)
     shown["h264, key frame"] = h264_decoded([picture])[0]
     return shown
@@ -59,7 +59,7 @@ def stills() -> dict[str, Pixels]:
 
 def _edited(raw: Raw) -> Pixels:
     settings = VideoSettings(width=WIDTH, height=HEIGHT, stamp=True)
-    edited = plan(settings, raw.width, raw.height).apply(raw.pixels, NOON)
+    edited = plan_transforms(settings, raw.width, raw.height).apply(raw.pixels, NOON)
     return decoded(Jpeg().encode(edited, 80, True)[0]).pixels
 
 

@@ -8,21 +8,21 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol import limits, link
-from robot_client.camera.desk import COMPRESSED, IMAGE, TELL_EVERY, CameraDesk
-from robot_client.camera.keeper import CameraKeeper
-from robot_client.camera.lines import Open, Seen, Settings
+from robot_client.camera.ipc import CameraSeen, CameraSettings, OpenStream
+from robot_client.camera.service import COMPRESSED, IMAGE, TELL_EVERY, DaemonCameras
+from robot_client.camera.supervisor import CameraSupervisor
 from robot_client.platforms.base import GraphView
 
 
-class Keeper(CameraKeeper):
+class Keeper(CameraSupervisor):
     """Keeps no process, but what it was asked."""
 
     def __init__(self) -> None:
-        super().__init__(Clock(), Settings(address="", node="", streams=8))
-        self.opened: list[Open] = []
+        super().__init__(Clock(), CameraSettings(address="", node="", streams=8))
+        self.opened: list[OpenStream] = []
         self.closed: list[str] = []
 
-    def open(self, line: Open) -> None:
+    def open(self, line: OpenStream) -> None:
         self.opened.append(line)
 
     def close(self, stream: str, why: str) -> None:
@@ -47,7 +47,7 @@ class Scene:
         self.clock = Clock()
         self.keeper = Keeper()
         self.said: list[Any] = []
-        self.desk = CameraDesk(
+        self.desk = DaemonCameras(
             {"/" + name: source for name, source in configured.items()},
             self.keeper,
             self.said.append,
@@ -58,7 +58,7 @@ class Scene:
         """Names of the latest word."""
         return [each.name for each in self.said[-1].cameras]
 
-    def order(self, camera: str, **settings: Any) -> Open:
+    def order(self, camera: str, **settings: Any) -> OpenStream:
         self.desk.open(
             link.OpenVideo(stream="s", ticket="t", camera=camera, settings=link.VideoSettings(**settings))
         )
@@ -110,8 +110,8 @@ def test_changes_are_told_once_a_second_at_most(scene: Scene) -> None:
 def test_what_was_seen_of_a_camera_is_told_and_kept(scene: Scene) -> None:
     """Size, encoding and rate, also to a relay that comes later; forgotten with the camera."""
     scene.desk.look(topics(a=IMAGE))
-    scene.keeper.on_seen(Seen(camera="/a", encoding="rgb8", width=640, height=480, fps=15.0, at=7.5))
-    scene.keeper.on_seen(Seen(camera="/gone", encoding="rgb8", width=1, height=1, fps=1.0, at=7.5))
+    scene.keeper.on_seen(CameraSeen(camera="/a", encoding="rgb8", width=640, height=480, fps=15.0, at=7.5))
+    scene.keeper.on_seen(CameraSeen(camera="/gone", encoding="rgb8", width=1, height=1, fps=1.0, at=7.5))
     scene.clock.advance(TELL_EVERY)
     known = link.Camera(name="/a", type=IMAGE, encoding="rgb8", width=640, height=480, fps=15.0, seen=7.5)
     assert scene.said[-1].cameras == [known]

@@ -5,28 +5,28 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol.errors import Invalid
-from robot_client.camera.device import Device, read_device
+from robot_client.camera.device import CameraDevice, read_device
 
 
 @pytest.mark.parametrize(
     ("source", "device"),
     [
-        ("v4l2:/dev/video0", Device("/dev/video0")),
-        ("v4l2:/dev/video0?", Device("/dev/video0")),
+        ("v4l2:/dev/video0", CameraDevice("/dev/video0")),
+        ("v4l2:/dev/video0?", CameraDevice("/dev/video0")),
         (
             "v4l2:/dev/video0?width=1280&height=720&fps=30&format=MJPG",
-            Device("/dev/video0", 1280, 720, 30, "MJPG"),
+            CameraDevice("/dev/video0", 1280, 720, 30, "MJPG"),
         ),
-        ("v4l2:/dev/video0?format=YUYV&height=8192&width=1", Device("/dev/video0", 1, 8192, 0, "YUYV")),
-        ("v4l2:/dev/video0?fps=240", Device("/dev/video0", fps=240)),
-        ("v4l2:/dev/video0?format=Y16%20", Device("/dev/video0", format="Y16 ")),
+        ("v4l2:/dev/video0?format=YUYV&height=8192&width=1", CameraDevice("/dev/video0", 1, 8192, 0, "YUYV")),
+        ("v4l2:/dev/video0?fps=240", CameraDevice("/dev/video0", fps=240)),
+        ("v4l2:/dev/video0?format=Y16%20", CameraDevice("/dev/video0", format="Y16 ")),
         (
             "v4l2:/dev/v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0?fps=1",
-            Device("/dev/v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0", fps=1),
+            CameraDevice("/dev/v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0", fps=1),
         ),
     ],
 )
-def test_what_is_asked_for_stands_behind_the_path(source: str, device: Device) -> None:
+def test_what_is_asked_for_stands_behind_the_path(source: str, device: CameraDevice) -> None:
     """In any order; what is left out is the driver's to choose."""
     assert read_device(source) == device
 

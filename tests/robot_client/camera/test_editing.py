@@ -7,9 +7,9 @@ import pytest
 
 from relay_protocol.errors import Invalid
 from relay_protocol.link import VideoSettings
-from robot_client.camera.editing import plan
 from robot_client.camera.encoding import Jpeg
 from robot_client.camera.formats import Pixels, decoded
+from robot_client.camera.transforms import plan_transforms
 
 NOON = 1_763_726_400.789
 """2025-11-21 12:00:00.789 UTC."""
@@ -25,7 +25,7 @@ def numbered(width: int = 8, height: int = 6) -> Pixels:
 
 def edited(picture: Pixels, scale: float = 1.0, **settings: object) -> Pixels:
     """The picture after its edits, of the size that was told before."""
-    planned = plan(VideoSettings(**settings), picture.shape[1], picture.shape[0], scale)
+    planned = plan_transforms(VideoSettings(**settings), picture.shape[1], picture.shape[0], scale)
     shown = planned.apply(picture, NOON)
     assert shown.shape[1::-1] == (planned.width, planned.height)
     assert shown.dtype == np.uint8
@@ -42,7 +42,7 @@ def corners(picture: Pixels) -> list[tuple[int, int]]:
 )
 def test_nothing_to_do_is_nothing_done(settings: dict[str, object]) -> None:
     """The very pixels come back, and the file of a CompressedImage may go out as it is."""
-    planned = plan(VideoSettings(**settings), 8, 6)
+    planned = plan_transforms(VideoSettings(**settings), 8, 6)
     assert not planned.touches
     assert np.shares_memory(planned.apply(picture := numbered(), NOON), picture)
 
@@ -53,12 +53,12 @@ def test_nothing_to_do_is_nothing_done(settings: dict[str, object]) -> None:
 )
 def test_anything_to_do_touches(settings: dict[str, object]) -> None:
     """Then a CompressedImage has to be decoded."""
-    assert plan(VideoSettings(**settings), 8, 6).touches
+    assert plan_transforms(VideoSettings(**settings), 8, 6).touches
 
 
 def test_turned_twice_by_half_is_not_touched() -> None:
     """Rotated by 180 and inverted is as it was."""
-    assert not plan(VideoSettings(rotate=180, invert=True), 8, 6).touches
+    assert not plan_transforms(VideoSettings(rotate=180, invert=True), 8, 6).touches
 
 
 def test_crop_shows_its_part() -> None:
@@ -83,7 +83,7 @@ def test_crop_is_clipped_to_the_picture() -> None:
 def test_crop_of_nothing_is_refused_in_words(crop: tuple[int, int, int, int], words: str) -> None:
     """The viewer reads what the camera has."""
     with pytest.raises(Invalid, match=words):
-        plan(VideoSettings(crop=crop), 8, 6)
+        plan_transforms(VideoSettings(crop=crop), 8, 6)
 
 
 @pytest.mark.parametrize(
@@ -159,15 +159,15 @@ def test_scaling_after_turning_gives_the_same() -> None:
 def test_a_side_that_would_get_too_long_is_refused(settings: dict[str, object]) -> None:
     """What follows from the other side has the same limit."""
     with pytest.raises(Invalid, match="at most 8192"):
-        plan(VideoSettings(**settings), 100, 1000)
+        plan_transforms(VideoSettings(**settings), 100, 1000)
 
 
 def test_pictures_are_not_enlarged_without_bound() -> None:
     """8192×8192 are 200 MB for each stream; a camera that has so many may show them."""
     with pytest.raises(Invalid, match="enlarged"):
-        plan(VideoSettings(width=8192, height=8192), 64, 48)
-    assert plan(VideoSettings(width=3840, height=2160), 64, 48).touches
-    assert not plan(VideoSettings(), 8192, 8192).touches
+        plan_transforms(VideoSettings(width=8192, height=8192), 64, 48)
+    assert plan_transforms(VideoSettings(width=3840, height=2160), 64, 48).touches
+    assert not plan_transforms(VideoSettings(), 8192, 8192).touches
 
 
 @pytest.mark.parametrize("shape", [(480, 640, 3), (480, 640), (1, 1, 3), (3, 3000)])
@@ -184,7 +184,7 @@ def test_time_is_burned_into_a_copy(shape: tuple[int, ...]) -> None:
 def clocks(width: int, height: int, place: float) -> list[Pixels]:
     """The stamp with each digit in one place of the time, after JPEG of middling quality, upon noise."""
     noise = np.random.default_rng(2).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    planned = plan(VideoSettings(stamp=True), width, height)
+    planned = plan_transforms(VideoSettings(stamp=True), width, height)
     return [
         decoded(Jpeg().encode(planned.apply(noise, NOON + digit * place), 60, True)[0]).pixels.astype(int)
         for digit in range(10)

@@ -9,9 +9,9 @@ import pytest
 from twisted.internet.task import Clock
 
 from relay_protocol.errors import Invalid
-from robot_client.camera.feed import LOOK_EVERY, UNKNOWN, Feed
-from robot_client.camera.lines import Seen
-from robot_client.camera.shot import Look, Shot
+from robot_client.camera.frame import Frame, FrameFormat
+from robot_client.camera.ipc import CameraSeen
+from robot_client.camera.latest_frame import LOOK_EVERY, UNKNOWN, LatestFrame
 
 
 def unread() -> Any:
@@ -22,22 +22,22 @@ class Scene:
     def __init__(self) -> None:
         self.clock = Clock()
         self.called: list[Callable[[], None]] = []
-        self.seen: list[Seen] = []
+        self.seen: list[CameraSeen] = []
         self.got: list[int] = []
         self.closed = 0
         self.latched = False
-        self.feed = Feed("/c", self.clock, self.called.append, self.seen.append)
+        self.feed = LatestFrame("/c", self.clock, self.called.append, self.seen.append)
         self.feed.source = self
         self.feed.listeners.add(lambda shot: self.got.append(shot.stamp))
 
     def close(self) -> None:
         self.closed += 1
 
-    def put(self, stamp: int, look: Callable[[], Look] = lambda: Look("rgb8", 64, 48)) -> None:
-        self.feed.put(Shot(stamp, self.clock.seconds(), look, unread))
+    def put(self, stamp: int, look: Callable[[], FrameFormat] = lambda: FrameFormat("rgb8", 64, 48)) -> None:
+        self.feed.put(Frame(stamp, self.clock.seconds(), look, unread))
 
     def keep(self, stamp: int) -> None:
-        self.feed.keep(Shot(stamp, self.clock.seconds(), lambda: Look("rgb8", 64, 48), unread))
+        self.feed.keep(Frame(stamp, self.clock.seconds(), lambda: FrameFormat("rgb8", 64, 48), unread))
 
     def turn(self) -> None:
         """Let the reactor do what it was called for."""
@@ -67,7 +67,7 @@ def test_first_look_is_told_at_once_and_the_rate_later(scene: Scene) -> None:
     """What stays as it was is not told again."""
     scene.put(2_500_000_000)
     scene.turn()
-    assert scene.seen == [Seen(camera="/c", encoding="rgb8", width=64, height=48, fps=0.0, at=2.5)]
+    assert scene.seen == [CameraSeen(camera="/c", encoding="rgb8", width=64, height=48, fps=0.0, at=2.5)]
     for stamp in range(100):
         scene.clock.advance(0.1)
         scene.put(stamp)
@@ -172,7 +172,7 @@ def test_what_was_seen_last_is_told_when_nobody_watches_any_more(scene: Scene) -
         scene.turn()
         scene.clock.advance(LOOK_EVERY)
     scene.feed.close()
-    assert scene.seen[-1] == Seen(camera="/c", encoding="rgb8", width=64, height=48, fps=1.0, at=3.0)
+    assert scene.seen[-1] == CameraSeen(camera="/c", encoding="rgb8", width=64, height=48, fps=1.0, at=3.0)
     unseen = Scene()
     unseen.feed.close()
     assert unseen.seen == []
@@ -182,7 +182,7 @@ def test_new_size_is_told(scene: Scene) -> None:
     """Within a second."""
     scene.put(1)
     scene.turn()
-    scene.put(2, lambda: Look("rgb8", 32, 24))
+    scene.put(2, lambda: FrameFormat("rgb8", 32, 24))
     scene.turn()
     scene.clock.advance(LOOK_EVERY)
     assert (scene.seen[-1].width, scene.seen[-1].height) == (32, 24)
@@ -191,7 +191,7 @@ def test_new_size_is_told(scene: Scene) -> None:
 def test_picture_that_is_none_is_for_the_streams_to_tell(scene: Scene) -> None:
     """It is passed on, and nothing is told of the camera."""
 
-    def broken() -> Look:
+    def broken() -> FrameFormat:
         raise Invalid("no picture")
 
     scene.put(1, broken)

@@ -14,7 +14,7 @@ import pytest
 from relay_protocol.errors import Unavailable
 from robot_client.camera.encoding import Encoder, Jpeg, make_encoder
 from robot_client.camera.formats import Pixels
-from robot_client.sim.camera import Camera
+from robot_client.sim.camera import SimCamera
 from robot_client.sim.world import Pose
 from robot_client.sim.worlds import WORLDS
 from tests.robot_client.camera.cards import PATCHES, card, grey_of, middle_of
@@ -27,7 +27,7 @@ SLICE, IDR, SEI, SPS, PPS = 1, 5, 6, 7, 8
 def drive() -> tuple[Pixels, ...]:
     """Three seconds of a robot that drives a curve, as a camera with a little noise sees them."""
     world = WORLDS["default"]()
-    camera, random, start = Camera(world), np.random.default_rng(4), world.start
+    camera, random, start = SimCamera(world), np.random.default_rng(4), world.start
     poses = [Pose(start.x + 0.01 * i, start.y, start.heading + 0.01 * i) for i in range(45)]
     frames = [camera.render(pose, 0.2, 1_700_000_000 + i / 15) for i, pose in enumerate(poses)]
     return tuple(np.clip(each + random.normal(0, 2, each.shape), 0, 255).astype(np.uint8) for each in frames)

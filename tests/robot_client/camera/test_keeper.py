@@ -7,33 +7,37 @@ from typing import Any
 import pytest
 
 from relay_protocol.link import VideoSettings
-from robot_client.camera.keeper import IDLE, LEAVE, LOOK_EVERY, RESTART, SILENT, CameraKeeper
-from robot_client.camera.lines import (
-    Alive,
+from robot_client.camera.ipc import (
     Answer,
-    Close,
-    Ended,
+    CameraAlive,
+    CameraSeen,
+    CameraSettings,
+    CloseStream,
     Line,
-    Open,
-    Seen,
-    Settings,
-    Silent,
-    Taken,
+    NoFrames,
+    OpenStream,
+    StreamAccepted,
+    StreamEnded,
     decoder,
     encode,
 )
+from robot_client.camera.supervisor import IDLE, LEAVE, LOOK_EVERY, RESTART, SILENT, CameraSupervisor
 from tests.robot_client.processes import Process, Reactor
 
 
-def opening(stream: str) -> Open:
-    return Open(stream=stream, ticket="t", camera="/c", settings=VideoSettings(), topic="/c", heartbeat=2.0)
+def opening(stream: str) -> OpenStream:
+    return OpenStream(
+        stream=stream, ticket="t", camera="/c", settings=VideoSettings(), topic="/c", heartbeat=2.0
+    )
 
 
 class Scene:
     def __init__(self) -> None:
         self.reactor = Reactor(decoder.decode)
         self.alerts: list[str] = []
-        self.keeper = CameraKeeper(self.reactor, Settings(address="relay:1", node="camera", streams=8))
+        self.keeper = CameraSupervisor(
+            self.reactor, CameraSettings(address="relay:1", node="camera", streams=8)
+        )
         self.keeper.on_alert = self._told
 
     def _told(self, level: str, text: str, kind: str = "", about: str = "", over: bool = False) -> None:
@@ -54,7 +58,7 @@ class Scene:
         """Let time pass for a process that says now and then that it lives."""
         for _ in range(round(seconds * 2)):
             self.reactor.advance(0.5)
-            self.answer(Alive())
+            self.answer(CameraAlive())
 
 
 @pytest.fixture
@@ -68,7 +72,7 @@ def test_no_process_before_anybody_wants_a_picture(scene: Scene) -> None:
     scene.keeper.open(opening("a"))
     scene.keeper.open(opening("b"))
     assert len(scene.reactor.processes) == 1
-    assert scene.process.lines[0] == Settings(address="relay:1", node="camera", streams=8)
+    assert scene.process.lines[0] == CameraSettings(address="relay:1", node="camera", streams=8)
     assert scene.told() == [opening("a"), opening("b")]
 
 
@@ -77,8 +81,8 @@ def test_process_leaves_some_time_after_the_last_stream(scene: Scene) -> None:
     scene.keeper.open(opening("a"))
     scene.keeper.open(opening("b"))
     scene.keeper.close("a", "why")
-    assert scene.told()[-1] == Close(stream="a", why="why")
-    scene.answer(Taken(stream="b"), Ended(stream="b", why="lost"))
+    assert scene.told()[-1] == CloseStream(stream="a", why="why")
+    scene.answer(StreamAccepted(stream="b"), StreamEnded(stream="b", why="lost"))
     scene.live(IDLE - 0.5)
     assert not scene.process.closed
     scene.live(0.5)
@@ -102,9 +106,9 @@ def test_stream_in_time_keeps_the_process(scene: Scene) -> None:
 def test_end_of_a_stream_is_not_that_of_the_one_opened_anew(scene: Scene) -> None:
     """The process has not read of the new one when it tells that the old one has ended; it stays for the new one."""
     scene.keeper.open(opening("a"))
-    scene.answer(Taken(stream="a"))
+    scene.answer(StreamAccepted(stream="a"))
     scene.keeper.open(opening("a"))
-    scene.answer(Ended(stream="a", why="lost"), Taken(stream="a"))
+    scene.answer(StreamEnded(stream="a", why="lost"), StreamAccepted(stream="a"))
     scene.live(2 * IDLE)
     assert not scene.process.closed
 
@@ -126,7 +130,7 @@ def test_killed_process_is_started_again(scene: Scene) -> None:
     the new node has another name.
     """
     scene.keeper.open(opening("a"))
-    scene.answer(Taken(stream="a"))
+    scene.answer(StreamAccepted(stream="a"))
     scene.process.end()
     assert scene.alerts == ["module camera error"]
     scene.keeper.open(opening("a"))
@@ -140,7 +144,7 @@ def test_killed_process_is_started_again(scene: Scene) -> None:
 def test_lost_streams_alone_start_nothing(scene: Scene) -> None:
     """Without anybody who asks again, no process is started."""
     scene.keeper.open(opening("a"))
-    scene.answer(Taken(stream="a"))
+    scene.answer(StreamAccepted(stream="a"))
     scene.process.end()
     scene.reactor.advance(60)
     assert len(scene.reactor.processes) == 1
@@ -151,7 +155,7 @@ def test_lost_streams_alone_start_nothing(scene: Scene) -> None:
 def test_stream_told_to_a_dying_process_is_told_to_the_next(scene: Scene) -> None:
     """The relay would wait for it until its ticket ends."""
     scene.keeper.open(opening("a"))
-    scene.answer(Taken(stream="a"))
+    scene.answer(StreamAccepted(stream="a"))
     scene.keeper.open(opening("b"))
     scene.process.end()
     scene.reactor.advance(RESTART[0])
@@ -223,11 +227,11 @@ def test_without_a_process_leaving_is_done_at_once(scene: Scene) -> None:
 @pytest.mark.parametrize("noise", [b"[INFO] hello\n", b"\xff\xfe\n", b"[]\n\n", b"{" * 99999 + b"\n"])
 def test_noise_is_passed_over(scene: Scene, noise: bytes) -> None:
     """What something in its process writes to its output hides none of its answers."""
-    seen: list[Seen] = []
+    seen: list[CameraSeen] = []
     scene.keeper.on_seen = seen.append
     scene.keeper.open(opening("a"))
     scene.process.protocol.outReceived(noise)
-    told = Seen(camera="/c", encoding="rgb8", width=4, height=3, fps=2.0, at=7.5)
+    told = CameraSeen(camera="/c", encoding="rgb8", width=4, height=3, fps=2.0, at=7.5)
     scene.answer(told)
     assert seen == [told]
 
@@ -236,20 +240,20 @@ def test_silent_topics_are_told_to_each_process(scene: Scene) -> None:
     """Whenever they change, and to a process that starts, before its streams."""
     scene.keeper.silence({"/b", "/a"})
     scene.keeper.open(opening("a"))
-    assert scene.told() == [Silent(topics=["/a", "/b"]), opening("a")]
+    assert scene.told() == [NoFrames(topics=["/a", "/b"]), opening("a")]
     scene.keeper.silence([])
-    assert scene.told()[-1] == Silent(topics=[])
+    assert scene.told()[-1] == NoFrames(topics=[])
 
 
 def test_a_process_that_is_missed_is_told_to_be_there_again_or_not_needed(scene: Scene) -> None:
     """Nobody goes on worrying."""
     scene.keeper.open(opening("a"))
-    scene.answer(Taken(stream="a"))
+    scene.answer(StreamAccepted(stream="a"))
     scene.process.end()
     scene.keeper.open(opening("a"))
     scene.reactor.advance(RESTART[0])
-    scene.answer(Alive())
-    scene.answer(Alive())
+    scene.answer(CameraAlive())
+    scene.answer(CameraAlive())
     assert scene.alerts == ["module camera error", "module camera over"]
     scene.process.end()
     scene.reactor.advance(RESTART[1])

@@ -8,9 +8,9 @@ import pytest
 
 from relay_protocol.frames import FrameDecoder, PictureJoiner, PicturePart, VideoFrame
 from relay_protocol.link import Codec, Took, VideoSettings
-from robot_client.camera.leaving import PART, Leaving
-from robot_client.camera.pace import WINDOW, Pace
-from robot_client.camera.shot import Look, Shot
+from robot_client.camera.frame import Frame, FrameFormat
+from robot_client.camera.packetizer import PART, Packetizer
+from robot_client.camera.rate_control import WINDOW, RateControl
 
 LARGE = 10 * PART
 STAMP = 7
@@ -25,15 +25,17 @@ class Road:
 
     def __init__(self, codec: Codec = "jpeg") -> None:
         self.now = 100.0
-        self.pace = Pace(VideoSettings(codec=codec))
-        self.leaving = Leaving(self.pace, lambda data: self.wire.extend(self._decoder.feed(b"".join(data))))
+        self.pace = RateControl(VideoSettings(codec=codec))
+        self.leaving = Packetizer(
+            self.pace, lambda data: self.wire.extend(self._decoder.feed(b"".join(data)))
+        )
         self.wire: list[Any] = []
         """Frames without answer."""
         self._decoder = FrameDecoder(2**25)
 
     def put(self, number: int, size: int, alone: bool = True) -> bytes:
         body = bytes([number]) * size
-        shot = Shot(STAMP, self.now, lambda: Look("rgb8", 640, 480), unread)
+        shot = Frame(STAMP, self.now, lambda: FrameFormat("rgb8", 640, 480), unread)
         self.leaving.put(number, shot, body, self.now, alone)
         return body
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from relay_protocol.errors import Invalid
+from relay_protocol.image_check import look_at
 from relay_protocol.limits import PICTURE_FRAME
 from relay_protocol.link import VideoSettings
-from relay_protocol.pictures import look_at
 from robot_client.camera import formats
-from robot_client.camera.making import Maker, message_shot, pixels_shot
+from robot_client.camera.frame import EncodeRequest, Frame, FrameFormat
+from robot_client.camera.frame_maker import FrameMaker, message_shot, pixels_shot
 from robot_client.camera.messages import Damaged
-from robot_client.camera.shot import Look, Shot, Wish
 from tests.robot_client.camera.cards import coded, compressed_cdr, depth_files, image_cdr
 
-ASKED = Wish(80, 1.0, False, True, 15.0)
+ASKED = EncodeRequest(80, 1.0, False, True, 15.0)
 PIXELS = np.random.default_rng(3).integers(0, 255, (48, 64, 3), np.uint8)
 
 
@@ -29,15 +29,15 @@ def jpeg(quality: int = 97) -> bytes:
     return encoded.tobytes()
 
 
-def file_shot(file: bytes) -> Shot:
-    return Shot(5, 1.0, lambda: Look("jpeg", 64, 48), lambda: formats.decoded(file), lambda: file)
+def file_shot(file: bytes) -> Frame:
+    return Frame(5, 1.0, lambda: FrameFormat("jpeg", 64, 48), lambda: formats.decoded(file), lambda: file)
 
 
 @pytest.mark.parametrize("settings", [VideoSettings(), VideoSettings(quality=100), VideoSettings(width=64)])
 def test_jpeg_of_the_camera_goes_as_it_is(settings: VideoSettings) -> None:
     """Byte for byte, where nothing is asked that changes it."""
     file = jpeg()
-    made = Maker(settings).make(file_shot(file), ASKED)
+    made = FrameMaker(settings).make(file_shot(file), ASKED)
     assert made == (file, 64, 48, "jpeg")
 
 
@@ -55,10 +55,10 @@ def test_how_a_jpeg_wants_to_be_turned_does_not_go_out(orientation: int, order: 
     """Browsers would obey it, and the picture turn when the uplink gets thin; the pixels are the camera's own."""
     plain = jpeg()
     file = plain[:20] + exif(orientation, order) + plain[20:]
-    made = Maker(VideoSettings()).make(file_shot(file), ASKED)
+    made = FrameMaker(VideoSettings()).make(file_shot(file), ASKED)
     assert made.body == (file if orientation == 1 else plain)
     assert look_at("jpeg", made.body) == (64, 48, True)
-    thin = Maker(VideoSettings()).make(file_shot(file), ASKED._replace(reduced=True))
+    thin = FrameMaker(VideoSettings()).make(file_shot(file), ASKED._replace(reduced=True))
     assert (thin.width, thin.height) == (made.width, made.height)
     for body in (made.body, thin.body):
         shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
@@ -81,7 +81,7 @@ def test_other_segments_go_as_they_are(segment: bytes) -> None:
     """Also broken Exif, which tells nobody anything."""
     plain = jpeg()
     file = plain[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + plain[2:]
-    assert Maker(VideoSettings()).make(file_shot(file), ASKED).body == file
+    assert FrameMaker(VideoSettings()).make(file_shot(file), ASKED).body == file
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_other_segments_go_as_they_are(segment: bytes) -> None:
 def test_odd_jpeg_of_the_camera_is_made_anew(odd: Callable[[bytes], bytes]) -> None:
     """Decoders don't mind, but the relay would end the stream over it."""
     file = odd(jpeg())
-    made = Maker(VideoSettings()).make(file_shot(file), ASKED)
+    made = FrameMaker(VideoSettings()).make(file_shot(file), ASKED)
     assert made.body != file
     assert look_at("jpeg", made.body) == (64, 48, True)
 
@@ -112,11 +112,11 @@ def test_odd_jpeg_of_the_camera_is_made_anew(odd: Callable[[bytes], bytes]) -> N
     ],
 )
 def test_edit_or_thin_uplink_makes_another(
-    settings: VideoSettings, wish: Wish, size: tuple[int, int]
+    settings: VideoSettings, wish: EncodeRequest, size: tuple[int, int]
 ) -> None:
     """Smaller than the camera's own."""
     file = jpeg()
-    made = Maker(settings).make(file_shot(file), wish)
+    made = FrameMaker(settings).make(file_shot(file), wish)
     assert (made.width, made.height) == size
     assert formats.decoded(made.body).pixels.shape[:2] == (size[1], size[0])
     assert len(made.body) < len(file)
@@ -124,7 +124,7 @@ def test_edit_or_thin_uplink_makes_another(
 
 def test_pixels_become_what_was_asked_for() -> None:
     """PNG loses nothing; the encoding told is the camera's."""
-    made = Maker(VideoSettings(codec="png")).make(pixels_shot(5, 1.0, PIXELS), ASKED)
+    made = FrameMaker(VideoSettings(codec="png")).make(pixels_shot(5, 1.0, PIXELS), ASKED)
     assert (made.width, made.height, made.encoding) == (64, 48, "bgr8")
     assert np.array_equal(formats.decoded(made.body).pixels, PIXELS)
 
@@ -139,7 +139,7 @@ def test_depth_in_a_png_goes_out_in_colours(format_: str, codec: str) -> None:
     shot = message_shot(5, 1.0, file, True)
     assert shot.jpeg() is None
     assert shot.look() == (encoding, 320, 240)
-    made = Maker(VideoSettings(codec=codec)).make(shot, ASKED)
+    made = FrameMaker(VideoSettings(codec=codec)).make(shot, ASKED)
     assert made.encoding == encoding
     off = np.abs(formats.decoded(made.body).pixels.astype(int) - wanted).mean()
     assert off < (3 if codec == "jpeg" or encoding == "32FC1" else 1e-9)
@@ -149,19 +149,19 @@ def test_jpeg_that_breaks_off_is_called_damaged() -> None:
     """Also where it would go out as it came."""
     for settings in (VideoSettings(), VideoSettings(width=32)):
         with pytest.raises(Damaged, match="ends in the middle"):
-            Maker(settings).make(message_shot(5, 1.0, compressed_cdr(jpeg()[:-300]), True), ASKED)
+            FrameMaker(settings).make(message_shot(5, 1.0, compressed_cdr(jpeg()[:-300]), True), ASKED)
 
 
 def test_picture_too_large_for_a_frame_is_refused() -> None:
     """With what to ask for instead; a camera's own JPEG of that size is encoded anew."""
     noise = np.random.default_rng(4).integers(0, 255, (1400, 1400, 3), np.uint8)
     with pytest.raises(Invalid, match="as JPEG"):
-        Maker(VideoSettings(codec="png")).make(pixels_shot(5, 1.0, noise), ASKED)
+        FrameMaker(VideoSettings(codec="png")).make(pixels_shot(5, 1.0, noise), ASKED)
     noise = np.random.default_rng(5).integers(0, 255, (2400, 2400, 3), np.uint8)
     with pytest.raises(Invalid, match="of less quality"):
-        Maker(VideoSettings(quality=100)).make(pixels_shot(5, 1.0, noise), ASKED._replace(quality=100))
+        FrameMaker(VideoSettings(quality=100)).make(pixels_shot(5, 1.0, noise), ASKED._replace(quality=100))
     padded = jpeg() + bytes(PICTURE_FRAME)
-    assert len(Maker(VideoSettings()).make(file_shot(padded), ASKED).body) < PICTURE_FRAME
+    assert len(FrameMaker(VideoSettings()).make(file_shot(padded), ASKED).body) < PICTURE_FRAME
 
 
 def test_pixels_are_read_once_for_all_streams() -> None:
@@ -172,7 +172,7 @@ def test_pixels_are_read_once_for_all_streams() -> None:
         read.append(1)
         return formats.Raw("bgr8", 64, 48, PIXELS)
 
-    shot = Shot(5, 1.0, lambda: Look("bgr8", 64, 48), counted)
+    shot = Frame(5, 1.0, lambda: FrameFormat("bgr8", 64, 48), counted)
     for width in (64, 32, 16):
-        Maker(VideoSettings(width=width)).make(shot, ASKED)
+        FrameMaker(VideoSettings(width=width)).make(shot, ASKED)
     assert read == [1]

@@ -15,10 +15,10 @@ import pytest
 
 from relay_protocol.frames import FrameDecoder, PicturePart, VideoFrame
 from relay_protocol.link import Took, VideoSettings
-from robot_client.camera.leaving import Leaving
-from robot_client.camera.pace import TARGET, UNDER_WAY, Pace, steps
-from robot_client.camera.shot import Look, Shot
-from robot_client.camera.trip import RoundTrip
+from robot_client.camera.frame import Frame, FrameFormat
+from robot_client.camera.packetizer import Packetizer
+from robot_client.camera.rate_control import TARGET, UNDER_WAY, RateControl, steps
+from robot_client.camera.rtt_probe import RttProbe
 
 TICK = 0.001
 ENCODING = 0.008
@@ -33,11 +33,11 @@ class Taken(NamedTuple):
     step: float
 
 
-def shot(arrived: float) -> Shot:
+def shot(arrived: float) -> Frame:
     def unread() -> Any:
         raise AssertionError("nobody here reads pixels")
 
-    return Shot(0, arrived, lambda: Look("rgb8", 640, 480), unread)
+    return Frame(0, arrived, lambda: FrameFormat("rgb8", 640, 480), unread)
 
 
 class Pipe:
@@ -86,8 +86,8 @@ class Uplink:
         target: float = TARGET,
     ) -> None:
         self.pipe: Pipe = beside.pipe if beside else Pipe(mbit, trip, stalls)
-        self.way: RoundTrip = beside.way if beside else RoundTrip()
-        self.pace = Pace(settings or VideoSettings(), self.way, target)
+        self.way: RttProbe = beside.way if beside else RttProbe()
+        self.pace = RateControl(settings or VideoSettings(), self.way, target)
         self.given_up = 0
         self.most_under_way = 0
         self.taken: list[Taken] = []
@@ -97,7 +97,7 @@ class Uplink:
         self._next = self._ping_at = self.pipe.now
         self._newest: float | None = None
         self._encoding: tuple[float, float] | None = None
-        self._leaving = Leaving(self.pace, self._write)
+        self._leaving = Packetizer(self.pace, self._write)
         self._decoder = FrameDecoder(2**25)
         self._under_way: dict[int, float] = {}
         self._unanswered: list[int] = []
@@ -307,7 +307,7 @@ def test_two_pictures_are_under_way_at_most() -> None:
 
 def test_first_picture_goes_alone() -> None:
     """Before the first answer nothing is known of the link, so nothing is put behind it."""
-    pace = Pace(VideoSettings())
+    pace = RateControl(VideoSettings())
     assert pace.may_send(1.0)
     pace.sent(1, 50_000, 1.0, 0.99)
     assert not pace.may_send(1.1)
@@ -428,6 +428,6 @@ def test_busy_processor_is_not_taken_for_a_thin_link(mbit: float, full: int, sta
 
 def test_unknown_number_is_passed_over() -> None:
     """An answer to no picture changes nothing."""
-    pace = Pace(VideoSettings())
+    pace = RateControl(VideoSettings())
     pace.took(7, 1.0)
     assert pace.delay is None

@@ -23,7 +23,7 @@ from switchboard_processes import mortal
 from switchboard_rtsp import RtspCamera, card
 
 from relay_protocol import frames, link
-from robot_client.platforms.ros2_transport import without_shared_memory
+from robot_client.platforms.ros2.transport import without_shared_memory
 from tests.robot_client.fake_relay import PATIENCE, FakeRelay, Peer
 from tests.robot_client.robot_process import Robot, until
 

@@ -14,14 +14,14 @@ from twisted.logger import capturedLogs
 
 from relay_protocol import frames, link
 from relay_protocol.errors import Invalid, NotFound, SwitchboardError, Unavailable
-from robot_client.camera.leaving import PART
-from robot_client.camera.lines import Open
+from robot_client.camera.frame import Encoded, EncodeRequest, Frame, FrameFormat
+from robot_client.camera.ipc import OpenStream
 from robot_client.camera.messages import Damaged
-from robot_client.camera.shot import Look, Made, Shot, Wish
-from robot_client.camera.stream import BEARS, FAULTS, TELL_EVERY, Busy, Stream
-from robot_client.camera.trip import DOUBT, RoundTrip
-from robot_client.link import VideoLink
-from robot_client.transport import LinkProtocol
+from robot_client.camera.packetizer import PART
+from robot_client.camera.rtt_probe import DOUBT, RttProbe
+from robot_client.camera.stream import BEARS, FAULTS, TELL_EVERY, Busy, EncodedStream
+from robot_client.link.protocol import VideoLink
+from robot_client.link.transport import LinkProtocol
 
 QUIET = ("join", "ping", "pong")
 
@@ -37,17 +37,17 @@ class View:
         self.fps = 15.0
         self.latched = False
         self.closed = 0
-        self.before: Shot | None = None
-        self.wishes: list[Wish] = []
-        self.making: list[tuple[Shot, Deferred[Made]]] = []
+        self.before: Frame | None = None
+        self.wishes: list[EncodeRequest] = []
+        self.making: list[tuple[Frame, Deferred[Encoded]]] = []
 
-    def make(self, shot: Shot, wish: Wish) -> Deferred[Made]:
+    def make(self, shot: Frame, wish: EncodeRequest) -> Deferred[Encoded]:
         self.wishes.append(wish)
-        done: Deferred[Made] = Deferred()
+        done: Deferred[Encoded] = Deferred()
         self.making.append((shot, done))
         return done
 
-    def latest(self) -> Shot | None:
+    def latest(self) -> Frame | None:
         return self.before
 
     def close(self) -> None:
@@ -59,10 +59,10 @@ class Scene:
         self.clock = Clock()
         self.clock.advance(100)
         self.view = View()
-        self.way = RoundTrip()
+        self.way = RttProbe()
         self.gone: list[str] = []
         self._refusal = refusal
-        line = Open(
+        line = OpenStream(
             stream="s",
             ticket="t",
             camera="/c",
@@ -72,7 +72,7 @@ class Scene:
         )
         self.protocol = LinkProtocol(
             VideoLink("t", self.now, 2.0),
-            lambda protocol: Stream(
+            lambda protocol: EncodedStream(
                 line, protocol, self.watch, self.clock, lambda _, why: self.gone.append(why), self.way
             ),
             self.clock,
@@ -86,10 +86,10 @@ class Scene:
     def now(self) -> int:
         return round(self.clock.seconds() * 1e9)
 
-    def watch(self, line: Open, on_shot: Callable[[Shot], None]) -> View:
+    def watch(self, line: OpenStream, on_shot: Callable[[Frame], None]) -> View:
         if self._refusal is not None:
             raise self._refusal
-        self.shoot: Callable[[Shot], None] = on_shot
+        self.shoot: Callable[[Frame], None] = on_shot
         return self.view
 
     def say(self, message: link.Message) -> None:
@@ -102,11 +102,11 @@ class Scene:
         return self
 
     def shot(self, stamp: int) -> None:
-        self.shoot(Shot(stamp, self.clock.seconds(), lambda: Look("rgb8", 64, 48), unread))
+        self.shoot(Frame(stamp, self.clock.seconds(), lambda: FrameFormat("rgb8", 64, 48), unread))
 
     def make(self, size: int = 1000, width: int = 64) -> None:
         """End the making of the latest picture."""
-        self.view.making[-1][1].callback(Made(bytes(size), width, 48, "rgb8"))
+        self.view.making[-1][1].callback(Encoded(bytes(size), width, 48, "rgb8"))
 
     def heard(self) -> list[Any]:
         """What went to the relay, pictures, and messages as dicts, but for pings and the opening."""
@@ -576,7 +576,7 @@ def test_lost_link_holds_up_no_other_stream() -> None:
 def test_stream_begins_with_the_picture_that_was_there() -> None:
     """With its stamp; its age says nothing of the uplink."""
     scene = Scene()
-    scene.view.before = Shot(7, scene.clock.seconds() - 15, lambda: Look("rgb8", 64, 48), unread)
+    scene.view.before = Frame(7, scene.clock.seconds() - 15, lambda: FrameFormat("rgb8", 64, 48), unread)
     scene.joined()
     scene.make()
     assert scene.pictures() == [7]

@@ -10,9 +10,9 @@ from twisted.internet.task import Clock
 
 from relay_protocol.errors import NotFound
 from relay_protocol.link import VideoSettings
-from robot_client.camera.lines import Open, Seen, Settings, Silent
-from robot_client.camera.shot import Shot
-from robot_client.camera.studio import LINGER, Studio
+from robot_client.camera.frame import Frame
+from robot_client.camera.ipc import CameraSeen, CameraSettings, NoFrames, OpenStream
+from robot_client.camera.stream_manager import LINGER, StreamManager
 from tests.robot_client.camera.cards import Coded, image_cdr
 
 
@@ -38,9 +38,9 @@ class Scene:
         self.subscribed: list[tuple[str, bool, str]] = []
         self.subscriptions: list[Subscription] = []
         self.closed = 0
-        self.studio = Studio(
+        self.studio = StreamManager(
             self.reactor,
-            Settings(address="127.0.0.1:1", node="camera", streams=8),
+            CameraSettings(address="127.0.0.1:1", node="camera", streams=8),
             self.told.append,
             lambda name: self,
         )
@@ -55,10 +55,10 @@ class Scene:
     def close(self) -> None:
         self.closed += 1
 
-    def watch(self, topic: str = "", qos: str = "", **more: Any) -> tuple[Any, list[Shot]]:
+    def watch(self, topic: str = "", qos: str = "", **more: Any) -> tuple[Any, list[Frame]]:
         """A stream's view, and what came."""
-        got: list[Shot] = []
-        line = Open(
+        got: list[Frame] = []
+        line = OpenStream(
             stream="s",
             ticket="t",
             camera=more.pop("camera", topic or "/c"),
@@ -74,7 +74,7 @@ class Scene:
         return None if shot is None else level(shot)
 
 
-def level(shot: Shot) -> int:
+def level(shot: Frame) -> int:
     return int(shot.raw().pixels[0, 0])
 
 
@@ -157,11 +157,11 @@ def test_inhibited_camera_has_no_picture_for_new_streams(scene: Scene) -> None:
     view, got = scene.watch("/a")
     scene.subscriptions[0].latched = True
     scene.subscriptions[0].show(grey(1))
-    scene.studio.take(Silent(topics=["/a"]))
+    scene.studio.take(NoFrames(topics=["/a"]))
     assert scene.newest(view) is None
     scene.subscriptions[0].show(grey(2))
     assert [level(shot) for shot in got] == [1]
-    scene.studio.take(Silent(topics=[]))
+    scene.studio.take(NoFrames(topics=[]))
     assert [level(shot) for shot in got] == [1, 2]
     assert scene.newest(view) == 2
 
@@ -215,7 +215,7 @@ def test_slow_camera_is_let_go_after_a_while(scene: Scene) -> None:
     assert not scene.subscriptions[0].closed
     scene.reactor.pump([1] * round(LINGER))
     assert scene.subscriptions[0].closed
-    assert isinstance(scene.told[-1], Seen)
+    assert isinstance(scene.told[-1], CameraSeen)
     assert scene.told[-1].fps == pytest.approx(0.05)
 
 

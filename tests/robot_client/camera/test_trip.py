@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from robot_client.camera.trip import DOUBT, EVERY, LONGEST, PATIENCE, RoundTrip
+from robot_client.camera.rtt_probe import DOUBT, EVERY, LONGEST, PATIENCE, RttProbe
 
 A, B, C = "one stream", "another stream", "a third stream"
 
 
-def doubted(now: float = 100.0) -> RoundTrip:
+def doubted(now: float = 100.0) -> RttProbe:
     """One of 10 ms, with longer measurements up to ``now``."""
-    way = RoundTrip()
+    way = RttProbe()
     way.measured(0.01, now - DOUBT - 1)
     for second in range(round(DOUBT) + 1):
         way.measured(0.5, now - DOUBT + second)
@@ -20,7 +20,7 @@ def doubted(now: float = 100.0) -> RoundTrip:
 
 def test_first_measurement_is_believed_and_shorter_ones_are() -> None:
     """A ping can wait for something, but not come early."""
-    way = RoundTrip()
+    way = RttProbe()
     found = []
     for second, seconds in enumerate((0.05, 0.2, 0.03, 0.04)):
         way.measured(seconds, second)
@@ -38,7 +38,7 @@ def test_longer_measurements_change_nothing_by_themselves() -> None:
 
 def test_wavering_measurements_ask_nothing() -> None:
     """As long as one in three seconds is about as short as it was."""
-    way = RoundTrip()
+    way = RttProbe()
     for second in range(60):
         way.measured((0.05, 0.5, 0.4)[second % 3], second)
         assert way.may_leave(second)

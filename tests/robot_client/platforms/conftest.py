@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 from twisted.internet import reactor
 
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.ros import Peer
 
 

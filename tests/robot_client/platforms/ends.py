@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from relay_protocol import link
 from robot_client.platforms.base import GraphView
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.ros import until
 
 STRING = "std_msgs/msg/String"

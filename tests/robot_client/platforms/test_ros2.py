@@ -12,7 +12,7 @@ from std_msgs.msg import String
 from twisted.internet import reactor, task
 
 from robot_client.platforms.base import Motion
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import STAMPED, STRING, Listener, seen
 from tests.robot_client.ros import Peer, until
 

@@ -9,8 +9,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor, task
 
 from relay_protocol.errors import Invalid
-from robot_client.platforms.base import ABORTED, CANCELED, SUCCEEDED, Offer, ServedGoal
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.base import ABORTED, CANCELED, SUCCEEDED, AdvertisementHandle, ServedGoal
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import node
 from tests.robot_client.ros import Peer, until
 
@@ -32,7 +32,9 @@ class Client:
         self.orders: list[int] = []
         self.goals: list[ServedGoal] = []
         self.unwanted: list[ServedGoal] = []
-        self.offer: Offer = ros.act(action, "example_interfaces/Fibonacci", self.take, self.unwanted.append)
+        self.offer: AdvertisementHandle = ros.act(
+            action, "example_interfaces/Fibonacci", self.take, self.unwanted.append
+        )
 
     def take(self, body: bytes, goal: ServedGoal) -> None:
         self.orders.append(deserialize_message(body, Fibonacci.Goal).order)

@@ -7,9 +7,9 @@ import pytest_twisted
 
 from relay_protocol.link import Topic
 from robot_client.platforms.base import GraphView, OnSample
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.platforms.ros2_battery import BATTERY, Battery
-from robot_client.platforms.ros2_types import Types
+from robot_client.platforms.ros2.battery import BATTERY, BatteryReader
+from robot_client.platforms.ros2.platform import Ros2Platform
+from robot_client.platforms.ros2.types import Types
 from tests.robot_client.ros import Peer, until
 
 
@@ -26,7 +26,7 @@ async def test_battery_is_found(ros: Ros2Platform, peer: Peer) -> None:
 def test_malformed_battery_sample_is_no_charge() -> None:
     """A battery message that is none is passed over."""
     listeners: list[OnSample] = []
-    battery = Battery(Types(), lambda topic, on_sample: listeners.append(on_sample))
+    battery = BatteryReader(Types(), lambda topic, on_sample: listeners.append(on_sample))
     battery.look(GraphView(topics={"/battery": Topic(types=[BATTERY], publishers=["/driver"])}))
     listeners[0](b"\0\1\0\0\xff")
     assert battery.charge() is None

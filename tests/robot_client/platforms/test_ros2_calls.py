@@ -12,8 +12,8 @@ from std_srvs.srv import SetBool, Trigger
 from twisted.internet import reactor, task
 
 from relay_protocol.errors import Invalid, NotFound, Refused, SwitchboardError, Unavailable
-from robot_client.platforms import ros2_calls
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.ros2 import service_calls
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import seen
 from tests.robot_client.ros import Peer
 
@@ -102,14 +102,14 @@ async def test_service_that_is_prepared_need_not_be_found_again(
     ros: Ros2Platform, peer: Peer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However long it was not called; that it is waited for makes none."""
-    monkeypatch.setattr(ros2_calls, "IDLE", -1.0)
+    monkeypatch.setattr(service_calls, "IDLE", -1.0)
     peer.do("serve", "/switch", "invert")
     await seen(ros, lambda graph: "/switch" in graph.services)
     ros.prepare_call("/switch", "std_srvs/srv/SetBool")
     request = bytes(serialize_message(SetBool.Request(data=True)))
     await ros.call("/switch", "std_srvs/srv/SetBool", request, 10)
     ros.graph()
-    monkeypatch.setattr(ros2_calls, "APPEAR", -1.0)
+    monkeypatch.setattr(service_calls, "APPEAR", -1.0)
     assert await ros.call("/switch", "std_srvs/srv/SetBool", request, 10)
     peer.do("unserve", "/switch")
     await seen(ros, lambda graph: "/switch" not in graph.services)

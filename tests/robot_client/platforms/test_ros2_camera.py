@@ -13,8 +13,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
 from robot_client.camera import formats
-from robot_client.platforms.ros2_camera import RosCameras
-from robot_client.platforms.ros2_transport import without_shared_memory
+from robot_client.platforms.ros2.camera import RosCameras
+from robot_client.platforms.ros2.transport import without_shared_memory
 
 PATIENCE = 60.0
 BEST_EFFORT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

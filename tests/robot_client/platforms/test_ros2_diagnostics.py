@@ -13,8 +13,7 @@ from switchboard_processes import Process, running
 
 from relay_protocol.link import Topic
 from robot_client.platforms.base import GraphView, OnSample
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.platforms.ros2_diagnostics import (
+from robot_client.platforms.ros2.diagnostics import (
     BURST,
     DIAGNOSTICS,
     GAPS,
@@ -25,7 +24,8 @@ from robot_client.platforms.ros2_diagnostics import (
     TOPIC,
     Diagnostics,
 )
-from robot_client.platforms.ros2_types import Types
+from robot_client.platforms.ros2.platform import Ros2Platform
+from robot_client.platforms.ros2.types import Types
 from tests.robot_client.ros import until
 
 OK, WARN, ERROR, STALE = range(4)

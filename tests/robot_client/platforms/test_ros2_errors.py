@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.platforms.ros2_errors import in_words, refusals
+from robot_client.platforms.ros2.errors import in_words, refusals
 
 
 @pytest.mark.parametrize(

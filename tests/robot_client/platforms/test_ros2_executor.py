@@ -16,7 +16,14 @@ from rclpy.clock import Clock, ClockType
 from rclpy.signals import SignalHandlerOptions
 from twisted.internet import reactor as real_reactor
 
-from robot_client.platforms.ros2_executor import BACKLOG, STUCK_SECONDS, TURN, Hop, Spinner, make_executor
+from robot_client.platforms.ros2.executor import (
+    BACKLOG,
+    STUCK_SECONDS,
+    TURN,
+    ReactorBridge,
+    Spinner,
+    make_executor,
+)
 from tests.robot_client.ros import until
 
 
@@ -36,7 +43,7 @@ class Reactor:
 def test_batch_wakes_the_reactor_once() -> None:
     """Many calls put before the reactor turns need one wake-up and come in order."""
     reactor, got = Reactor(), list[int]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
     for number in range(100):
         hop.put(got.append, number)
     assert len(reactor.calls) == 1
@@ -50,7 +57,7 @@ def test_batch_wakes_the_reactor_once() -> None:
 def test_stalled_reactor_does_not_eat_the_memory() -> None:
     """Samples over the bound are dropped and counted; answers of services are not."""
     reactor, got = Reactor(), list[Any]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
     for _ in range(40):
         hop.put(got.append, "sample", BACKLOG // 32)
     hop.put(got.append, "answer")
@@ -62,7 +69,7 @@ def test_stalled_reactor_does_not_eat_the_memory() -> None:
 def test_nothing_is_lost_between_threads() -> None:
     """Calls put by several threads while the reactor drains all arrive."""
     reactor, got = Reactor(), list[int]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
     threads = [
         threading.Thread(target=lambda: [hop.put(got.append, each) for each in range(5000)]) for _ in range(3)
     ]
@@ -77,7 +84,7 @@ def test_nothing_is_lost_between_threads() -> None:
 def test_sample_alone_is_as_large_as_it_is() -> None:
     """Bytes that are put as they are count with their length."""
     reactor, got = Reactor(), list[bytes]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
     sample = bytes(BACKLOG // 2)
     for _ in range(3):
         hop.put(got.append, sample, None)
@@ -97,7 +104,7 @@ def in_threads(count: int, put: Callable[[int], None]) -> list[threading.Thread]
 async def test_bell_wakes_the_reactor_and_loses_nothing() -> None:
     """What threads put arrives by the bell, each thread's in its order, without the reactor's own way."""
     reactor, got = Reactor(), list[int]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
     hop.open(real_reactor)
     try:
         threads = in_threads(3, partial(hop.put, got.append))
@@ -114,7 +121,7 @@ async def test_bell_wakes_the_reactor_and_loses_nothing() -> None:
 async def test_what_is_put_while_the_bell_goes_arrives() -> None:
     """Calls put before, while and after the bell is taken away arrive, then by the reactor's own way."""
     got = list[int]()
-    hop = Hop(real_reactor.callFromThread)  # type: ignore[attr-defined]  # to mypy a module
+    hop = ReactorBridge(real_reactor.callFromThread)  # type: ignore[attr-defined]  # to mypy a module
     hop.open(real_reactor)
     hop.put(got.append, -1)
     hop.close()
@@ -128,7 +135,7 @@ async def test_what_is_put_while_the_bell_goes_arrives() -> None:
 async def test_bell_the_reactor_gave_up_is_replaced() -> None:
     """When the reactor drops its readers, the hop goes on by the reactor's own way."""
     reactor, got = Reactor(), list[int]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
     hop.open(real_reactor)
     bell = hop._bell
     assert bell is not None
@@ -143,7 +150,7 @@ async def test_bell_the_reactor_gave_up_is_replaced() -> None:
 def test_no_bell_is_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an eventfd, of the system or at all, the reactor's own way is used."""
     reactor, got = Reactor(), list[int]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
 
     def refuse(*_: int) -> int:
         raise OSError(24, "Too many open files")
@@ -162,7 +169,7 @@ def test_no_bell_is_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_failing_receiver_costs_nobody_else() -> None:
     """A receiver that throws does not lose the others their calls."""
     reactor, got = Reactor(), list[int]()
-    hop = Hop(reactor)
+    hop = ReactorBridge(reactor)
     hop.put(lambda _: 1 / 0, None)
     hop.put(got.append, 1)
     reactor.turn()

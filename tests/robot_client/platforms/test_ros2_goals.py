@@ -12,11 +12,11 @@ from twisted.internet import reactor
 
 from relay_protocol.errors import Invalid, NotFound
 from relay_protocol.link import MotionPolicy
-from robot_client.platforms import ros2
-from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, Outcome
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.platforms.ros2_goals import RosGoal
-from robot_client.sweep import Sweep
+from robot_client.motion.goal_canceller import GoalCanceller
+from robot_client.platforms.base import ABORTED, CANCELED, NEVER_BEGAN, SUCCEEDED, GoalOutcome
+from robot_client.platforms.ros2 import platform as ros2
+from robot_client.platforms.ros2.goals import RosGoal
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.ros import Peer, until
 
 FIBONACCI = "example_interfaces/action/Fibonacci"
@@ -30,14 +30,14 @@ class Wanted:
     ):
         body = bytes(serialize_message(Fibonacci.Goal(order=order)))
         self.fed: list[list[int]] = []
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[GoalOutcome] = []
         self.goal: RosGoal = ros.pursue(action, type, body, self.feed if listen else None)
         self.goal.result.addCallback(self.outcomes.append)
 
     def feed(self, body: bytes) -> None:
         self.fed.append(list(deserialize_message(body, Fibonacci.Feedback).sequence))
 
-    async def end(self) -> Outcome:
+    async def end(self) -> GoalOutcome:
         await until(lambda: self.outcomes)
         return self.outcomes[0]
 
@@ -136,7 +136,7 @@ async def test_all_goals_of_an_action_are_cancelled_whoever_gave_them(ros: Ros2P
     await serve(ros, peer, "/swept", "forever")
     wanted = [Wanted(ros, "/swept", 3), Wanted(ros, "/swept", 3)]
     await until(lambda: all(each.fed for each in wanted))
-    sweep = Sweep(MotionPolicy(actions=["/swept"]), ros, reactor, lambda topic: False)
+    sweep = GoalCanceller(MotionPolicy(actions=["/swept"]), ros, reactor, lambda topic: False)
     for _ in range(2):
         assert await sweep.stop() == []
         assert sweep.late() == []
@@ -148,7 +148,7 @@ async def test_all_goals_of_an_action_are_cancelled_whoever_gave_them(ros: Ros2P
 async def test_rejected_goal_never_began(ros: Ros2Platform, peer: Peer) -> None:
     """A goal the server rejects has no result, and words that say so."""
     await serve(ros, peer, "/reject", "reject")
-    assert await Wanted(ros, "/reject").end() == Outcome(
+    assert await Wanted(ros, "/reject").end() == GoalOutcome(
         NEVER_BEGAN, None, "the action /reject rejected the goal"
     )
 
@@ -291,7 +291,7 @@ async def test_goal_of_a_server_that_was_out_of_reach_can_still_be_cancelled(
         monkeypatch.setattr(other.goal, "check", lambda servers: None)
         assert (await lost.end()).certain is False
     assert len(peer.told("ended", "/forever")) == before
-    sweep = Sweep(MotionPolicy(actions=["/forever"]), ros, reactor, lambda topic: False)
+    sweep = GoalCanceller(MotionPolicy(actions=["/forever"]), ros, reactor, lambda topic: False)
     assert await sweep.cancel("/forever", lost.goal.id) == ""
     await until(lambda: len(peer.told("ended", "/forever")) == before + 1)
     fed = len(other.fed)

@@ -6,7 +6,7 @@ import pytest
 import pytest_twisted
 
 from relay_protocol import link
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import STRING, Listener, seen
 from tests.robot_client.ros import Peer
 

@@ -11,8 +11,8 @@ import rclpy
 from geometry_msgs.msg import Twist
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from robot_client.guard import PUBLISHERS, RosOutlets
-from robot_client.topics import TypedTopic
+from robot_client.motion.guard import PUBLISHERS, RosOutlets
+from robot_client.motion.typed_topic import TypedTopic
 
 outlets = RosOutlets("switchboard_guard_test", False)
 on = TypedTopic("/cmd_vel", "geometry_msgs/msg/Twist")

@@ -13,9 +13,9 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from relay_protocol import link
-from robot_client.platforms import ros2_topics
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.platforms.ros2_topics import Stamps
+from robot_client.platforms.ros2 import topics
+from robot_client.platforms.ros2.platform import Ros2Platform
+from robot_client.platforms.ros2.topics import Stamps
 from tests.robot_client.platforms.ends import STRING, Listener, node
 from tests.robot_client.ros import until
 
@@ -157,7 +157,7 @@ async def test_rclpy_without_message_info(
     ros: Ros2Platform, three: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Humble's tells no messages apart: the relay is told so, and samples come."""
-    monkeypatch.setattr(ros2_topics, "TELLS_APART", False)
+    monkeypatch.setattr(topics, "TELLS_APART", False)
     topic = "/humble"
     publisher = three[0].create_publisher(String, topic, kept())
     publisher.publish(String(data="kept"))
@@ -177,9 +177,9 @@ def test_stamps_grow_whatever_the_clock_does() -> None:
     assert [stamps.of("/a", (number, 1)) for number in (7, 8)] == [1000, 1001]
     assert stamps.now() == 2000
     assert [stamps.of("/a", (number, 1)) for number in (9, 7)] == [2001, 1000]
-    for number in range(ros2_topics.KNOWN + 5):
+    for number in range(topics.KNOWN + 5):
         stamps.of("/b", (number, 1))
-    assert len(stamps._topics["/b"]) == ros2_topics.KNOWN
-    for number in range(ros2_topics.KNOWN_TOPICS + 5):
+    assert len(stamps._topics["/b"]) == topics.KNOWN
+    for number in range(topics.KNOWN_TOPICS + 5):
         stamps.of(f"/t{number}", (1, 1))
-    assert len(stamps._topics) == ros2_topics.KNOWN_TOPICS
+    assert len(stamps._topics) == topics.KNOWN_TOPICS

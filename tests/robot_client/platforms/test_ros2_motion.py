@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from robot_client.platforms.base import Motion
-from robot_client.platforms.ros2_motion import JOG, judge, rest
+from robot_client.platforms.ros2.motion import JOG, judge, rest
 
 
 class Jog:

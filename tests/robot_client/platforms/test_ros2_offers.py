@@ -9,8 +9,8 @@ import pytest
 import pytest_twisted
 
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.platforms.base import Offer
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.base import AdvertisementHandle
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import seen
 from tests.robot_client.ros import Peer
 
@@ -22,7 +22,7 @@ class Kind(NamedTuple):
     folder: str
     type: str
     theirs: tuple[str, str]
-    offer: Callable[[Ros2Platform, str, str], Offer]
+    offer: Callable[[Ros2Platform, str, str], AdvertisementHandle]
 
 
 KINDS = [

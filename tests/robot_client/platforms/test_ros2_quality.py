@@ -16,9 +16,9 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
 from relay_protocol import link
-from robot_client.motion import MOTION_QOS
-from robot_client.platforms import ros2_qos
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.motion.motion import MOTION_QOS
+from robot_client.platforms.ros2 import qos as ros2_qos
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import STRING, node
 from tests.robot_client.ros import until
 

@@ -7,10 +7,10 @@ import pytest_twisted
 from twisted.internet import reactor
 
 from relay_protocol.link import MotionPolicy
+from robot_client.motion.goal_canceller import GoalCanceller
 from robot_client.platforms.base import CANCELED
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.platforms.ros2_goals import MAX_UNANSWERED
-from robot_client.sweep import Sweep
+from robot_client.platforms.ros2.goals import MAX_UNANSWERED
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import seen
 from tests.robot_client.ros import Peer, until
 
@@ -25,7 +25,7 @@ async def test_goals_of_others_that_go_on_after_a_stop_are_told(ros: Ros2Platfor
     await seen(ros, lambda graph: {"/stubborn", "/idle/stubborn"} <= graph.actions.keys())
     peer.do("send", "/stubborn", 3)
     await until(lambda: peer.told("began", "/stubborn"))
-    sweep = Sweep(MotionPolicy(actions=["*/stubborn"]), ros, reactor, lambda topic: False)
+    sweep = GoalCanceller(MotionPolicy(actions=["*/stubborn"]), ros, reactor, lambda topic: False)
     assert await sweep.stop() == []
     await until(lambda: sweep.late())
     assert sweep.late() == ["/stubborn refuses to cancel goals; it is asked again every second"]
@@ -50,7 +50,7 @@ async def test_a_goal_that_an_action_refuses_to_cancel_is_not_cancelled(
     began: list[bytes] = []
     goal = ros.pursue("/solid", "example_interfaces/action/Fibonacci", b"\0\1\0\0\3\0\0\0", began.append)
     await until(lambda: began)
-    sweep = Sweep(MotionPolicy(actions=["*/solid"]), ros, reactor, lambda topic: False)
+    sweep = GoalCanceller(MotionPolicy(actions=["*/solid"]), ros, reactor, lambda topic: False)
     assert await sweep.cancel("/solid", goal.id) == "/solid refuses to cancel a goal"
     assert await sweep.cancel_surely("/solid") == "/solid refuses to cancel its goals"
     assert await sweep.cancel("/solid", bytes(15) + b"\1") == ""

@@ -14,9 +14,9 @@ from std_srvs.srv import SetBool
 
 from relay_protocol import link
 from relay_protocol.errors import SwitchboardError
-from robot_client.platforms.base import ABORTED, SUCCEEDED, Outcome
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.platforms.ros2_goals import RosGoal
+from robot_client.platforms.base import ABORTED, SUCCEEDED, GoalOutcome
+from robot_client.platforms.ros2.goals import RosGoal
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.ros import Peer, until
 
 SOON = """<?xml version="1.0" encoding="UTF-8" ?>
@@ -69,7 +69,7 @@ async def invert(ros: Ros2Platform, service: str) -> bool:
     return bool(deserialize_message(answer, SetBool.Response).success)
 
 
-def pursue(ros: Ros2Platform, action: str, outcomes: list[Outcome], fed: list[bytes]) -> RosGoal:
+def pursue(ros: Ros2Platform, action: str, outcomes: list[GoalOutcome], fed: list[bytes]) -> RosGoal:
     goal = bytes(serialize_message(Fibonacci.Goal(order=4)))
     begun = ros.pursue(action, "example_interfaces/action/Fibonacci", goal, fed.append)
     begun.result.addCallback(outcomes.append)
@@ -86,7 +86,7 @@ async def test_killed_node_is_followed_when_it_comes_back(ros: Ros2Platform, nod
     ros.subscribe(node.topic, "", None, heard.append, lambda: None)
     await until(lambda: node.peer.do("publish", node.topic, "before") or heard)
     assert await invert(ros, node.service)
-    lost: list[Outcome] = []
+    lost: list[GoalOutcome] = []
     fed: list[bytes] = []
     pursue(ros, node.action, lost, fed)
     await until(lambda: fed)
@@ -108,7 +108,7 @@ async def test_killed_node_is_followed_when_it_comes_back(ros: Ros2Platform, nod
     await until(lambda: lost)
     assert (lost[0].status, lost[0].body) == (ABORTED, None)
     assert "vanished before the goal ended" in lost[0].reason
-    ends: list[Outcome] = []
+    ends: list[GoalOutcome] = []
     pursue(ros, node.action, ends, [])
     await until(lambda: ends)
     assert ends[0].status == SUCCEEDED

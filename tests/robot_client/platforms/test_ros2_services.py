@@ -12,8 +12,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from twisted.internet import reactor, task
 
 from relay_protocol.errors import Invalid
-from robot_client.platforms.base import Offer
-from robot_client.platforms.ros2 import Ros2Platform
+from robot_client.platforms.base import AdvertisementHandle
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import node
 from tests.robot_client.ros import Peer, until
 
@@ -25,7 +25,7 @@ class Client:
 
     def __init__(self, ros: Ros2Platform, service: str, type: str = ADD) -> None:
         self.calls: list[tuple[AddTwoInts.Request, Callable[[bytes], None]]] = []
-        self.offer: Offer = ros.serve(service, type, self.take)
+        self.offer: AdvertisementHandle = ros.serve(service, type, self.take)
 
     def take(self, body: bytes, answer: Callable[[bytes], None]) -> None:
         self.calls.append((deserialize_message(body, AddTwoInts.Request), answer))

@@ -14,12 +14,12 @@ from twisted.internet import reactor
 
 from relay_protocol.clocks import now_ns
 from relay_protocol.link import MotionPolicy
-from robot_client.authority import Authority
-from robot_client.guard_feed import NoGuard
-from robot_client.motion import MOTION_QOS, MotionDesk
-from robot_client.offset import Offset
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.topics import TypedTopic
+from robot_client.link.clock_offset import ClockOffset
+from robot_client.motion.authority import Authority
+from robot_client.motion.guard_port import NoGuard
+from robot_client.motion.motion import MOTION_QOS, MotionControl
+from robot_client.motion.typed_topic import TypedTopic
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.ros import Peer, until
 
 TWIST = "geometry_msgs/msg/Twist"
@@ -63,8 +63,8 @@ async def test_paused_simulation_keeps_no_robot_moving(ros: Ros2Platform, peer: 
     peer.do("listen", topic, "twist")
     authority = Authority()
     authority.hold(1, "ann", "operator", now_ns())
-    desk = MotionDesk(MotionPolicy(types=[TWIST]), ros, reactor, now_ns, NoGuard(), authority)
-    on, offset = TypedTopic(topic, TWIST), Offset()
+    desk = MotionControl(MotionPolicy(types=[TWIST]), ros, reactor, now_ns, NoGuard(), authority)
+    on, offset = TypedTopic(topic, TWIST), ClockOffset()
     offset.add(now_ns(), now_ns(), now_ns())
     desk.open("driver", on, ros.advertise(topic, TWIST, False, MOTION_QOS))
     command = Twist()
@@ -86,8 +86,8 @@ async def test_paused_simulation_keeps_no_robot_moving(ros: Ros2Platform, peer: 
 def test_guard_knows_no_wall_time_of_a_simulation(environment: dict[str, str]) -> None:
     """The guard stamps its stops with 0 when the robot's time is simulated: to controllers that means now."""
     program = f"""
-from robot_client.guard import RosOutlets
-from robot_client.topics import TypedTopic
+from robot_client.motion.guard import RosOutlets
+from robot_client.motion.typed_topic import TypedTopic
 from geometry_msgs.msg import TwistStamped
 from rclpy.serialization import deserialize_message
 for simulated in (True, False):

@@ -13,10 +13,10 @@ from twisted.internet import reactor, task
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid, NotFound
-from robot_client.motion import MOTION_QOS
-from robot_client.platforms.ros2 import LOOK_EVERY, Ros2Platform
-from robot_client.platforms.ros2_topics import RosSink
-from robot_client.topics import TypedTopic
+from robot_client.motion.motion import MOTION_QOS
+from robot_client.motion.typed_topic import TypedTopic
+from robot_client.platforms.ros2.platform import LOOK_EVERY, Ros2Platform
+from robot_client.platforms.ros2.topics import RosSink
 from tests.robot_client.platforms.ends import STAMPED, STRING, TWIST, Listener, node, seen
 from tests.robot_client.ros import Peer, until
 

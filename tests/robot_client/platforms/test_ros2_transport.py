@@ -13,7 +13,7 @@ import pytest
 from switchboard_domains import free_domain
 
 from relay_protocol.errors import Unavailable
-from robot_client.platforms.ros2_transport import profile, without_shared_memory
+from robot_client.platforms.ros2.transport import profile, without_shared_memory
 
 FASTRTPS = "rmw_fastrtps_cpp"
 CHOICES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
@@ -23,7 +23,7 @@ LISTENER = """
 import rclpy
 from rclpy.qos import QoSProfile, DurabilityPolicy
 from std_msgs.msg import String
-from robot_client.platforms.ros2_transport import without_shared_memory
+from robot_client.platforms.ros2.transport import without_shared_memory
 
 with without_shared_memory(rclpy.get_rmw_implementation_identifier()):
     rclpy.init()

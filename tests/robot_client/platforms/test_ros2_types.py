@@ -22,8 +22,8 @@ from trajectory_msgs.msg import (
 
 from relay_protocol.errors import Invalid, NotFound
 from robot_client.platforms.base import Motion
-from robot_client.platforms.ros2_motion import JOY
-from robot_client.platforms.ros2_types import Types, introspected
+from robot_client.platforms.ros2.motion import JOY
+from robot_client.platforms.ros2.types import Types, introspected
 from tests.robot_client.platforms.ends import STAMPED, TWIST
 
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"

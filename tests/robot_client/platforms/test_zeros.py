@@ -8,8 +8,8 @@ from rclpy.serialization import serialize_message
 from twisted.internet import reactor
 
 from relay_protocol.link import MotionPolicy
-from robot_client.platforms.ros2 import Ros2Platform
-from robot_client.zeros import Zeros
+from robot_client.motion.zero_publisher import ZeroPublisher
+from robot_client.platforms.ros2.platform import Ros2Platform
 from tests.robot_client.platforms.ends import TWIST, Listener, node, seen
 from tests.robot_client.ros import until
 
@@ -22,7 +22,7 @@ async def test_zero_reaches_who_listens_and_the_publisher_goes(ros: Ros2Platform
         base.create_subscription(Twist, "/other", lambda message: None, 1)
         await seen(ros, lambda graph: {"/base_vel", "/other"} <= graph.topics.keys())
         heard, other = Listener(ros, "/base_vel", TWIST), Listener(ros, "/other", TWIST)
-        Zeros(MotionPolicy(topics=["/base_vel"]), ros, reactor, lambda topic: False).say()
+        ZeroPublisher(MotionPolicy(topics=["/base_vel"]), ros, reactor, lambda topic: False).say()
         await until(lambda: len(heard.bodies) > 5)
         assert set(heard.bodies) == {bytes(serialize_message(Twist()))}
         await until(lambda: heard.source.publishers == 0)

@@ -15,7 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from switchboard_processes import BIN, Process
 from switchboard_waiting import wait_for
 
-from robot_client.platforms.ros2_transport import without_shared_memory
+from robot_client.platforms.ros2.transport import without_shared_memory
 from robot_client.services.main import COMMAND
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from relay_protocol.errors import Unavailable
 from robot_client.services import battery
-from robot_client.services.battery import CHARGING, Gauge, State
+from robot_client.services.battery import CHARGING, ChargeState, Gauge
 from robot_client.services.health import Level
 
 LAPTOP = {
@@ -87,14 +87,14 @@ def test_without_a_battery_it_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("state", "share"),
     [
-        (State(share=0.4), 0.4),
-        (State(charge=1.0, capacity=4.0), 0.25),
-        (State(volts=21.0), 0.5),
-        (State(volts=30.0), 1.0),
-        (State(share=57.0, volts=18.0), 0.0),
+        (ChargeState(share=0.4), 0.4),
+        (ChargeState(charge=1.0, capacity=4.0), 0.25),
+        (ChargeState(volts=21.0), 0.5),
+        (ChargeState(volts=30.0), 1.0),
+        (ChargeState(share=57.0, volts=18.0), 0.0),
     ],
 )
-def test_the_charge_is_found_in_what_a_battery_tells(state: State, share: float) -> None:
+def test_the_charge_is_found_in_what_a_battery_tells(state: ChargeState, share: float) -> None:
     """As it says, else by capacity, else by voltage; a share that is no share is none."""
     assert Gauge(0.2, 0.1, (18.0, 24.0)).share(state) == pytest.approx(share)
 
@@ -103,21 +103,21 @@ def test_it_warns_when_low_and_is_in_error_when_nearly_empty() -> None:
     """And at a threshold it does not flicker."""
     gauge = Gauge(0.2, 0.1)
     shares = (0.5, 0.19, 0.21, 0.09, 0.11, 0.125, 0.225)
-    levels = [gauge.finding(State(share=each)).level for each in shares]
+    levels = [gauge.finding(ChargeState(share=each)).level for each in shares]
     ok, warn, error = Level.OK, Level.WARN, Level.ERROR
     assert levels == [ok, warn, warn, error, error, warn, ok]
-    assert gauge.finding(State(share=0.05)).message == "nearly empty: 5 %, charge it now"
+    assert gauge.finding(ChargeState(share=0.05)).message == "nearly empty: 5 %, charge it now"
 
 
 def test_what_charges_is_not_low() -> None:
     """Whoever stands at the charger need not be told to go there."""
-    assert Gauge(0.2, 0.1).finding(State(share=0.05, status=CHARGING)).level is Level.OK
+    assert Gauge(0.2, 0.1).finding(ChargeState(share=0.05, status=CHARGING)).level is Level.OK
 
 
 def test_a_battery_in_trouble_is_an_error() -> None:
     """Overheated, gone, or unknown: each in its words."""
     gauge = Gauge(0.2, 0.1)
-    hot = gauge.finding(State(share=0.9, health=battery.HEALTH["Overheat"]))
+    hot = gauge.finding(ChargeState(share=0.9, health=battery.HEALTH["Overheat"]))
     assert (hot.level, hot.message) == (Level.ERROR, "the battery tells: overheat")
-    assert gauge.finding(State(present=False)).level is Level.ERROR
-    assert gauge.finding(State()).level is Level.WARN
+    assert gauge.finding(ChargeState(present=False)).level is Level.ERROR
+    assert gauge.finding(ChargeState()).level is Level.WARN

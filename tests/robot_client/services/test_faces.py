@@ -11,18 +11,18 @@ import pytest
 from skimage import data
 
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
+from robot_client.services.camera_model import of_view
 from robot_client.services.faces import (
     FACE,
     Box,
     Finder,
-    People,
+    KnownFaces,
     histograms,
     likeness,
     look,
     read_people,
     read_picture,
 )
-from robot_client.services.lens import of_view
 from tests.robot_client.services.pictures_of_people import EILEEN, people, scene, stranger
 
 LENS = of_view(640, 480, 75)
@@ -36,7 +36,7 @@ def finder() -> Finder:
 
 
 @pytest.fixture
-def known(finder: Finder, tmp_path: Path) -> People:
+def known(finder: Finder, tmp_path: Path) -> KnownFaces:
     return read_people(people(tmp_path / "people"), finder)
 
 
@@ -65,7 +65,7 @@ def test_pictures_of_any_size_are_looked_at(finder: Finder, shape: tuple[int, in
 
 
 @pytest.mark.parametrize(("factor", "light"), [(1.0, 1.0), (0.8, 1.0), (0.7, 0.6), (0.8, 1.3), (0.6, 1.0)])
-def test_who_is_known_is_recognised(finder: Finder, known: People, factor: float, light: float) -> None:
+def test_who_is_known_is_recognised(finder: Finder, known: KnownFaces, factor: float, light: float) -> None:
     """Nearer and farther, brighter and darker, in colour, with the noise of a camera."""
     picture = scene(EILEEN, factor, (60, 20), light).astype(float)
     picture += np.random.default_rng(1).normal(0, 3, picture.shape)
@@ -75,14 +75,14 @@ def test_who_is_known_is_recognised(finder: Finder, known: People, factor: float
     assert 0.7 < seen.alike <= 1.0
 
 
-def test_strangers_are_not_taken_for_who_is_known(finder: Finder, known: People) -> None:
+def test_strangers_are_not_taken_for_who_is_known(finder: Finder, known: KnownFaces) -> None:
     """Not one of those of forty whose faces are found, and most are."""
     found = [look(scene(stranger(n), 1.0, (150, 100)), LENS, finder, known) for n in range(40)]
     assert sum(1 for each in found if each) >= 30
     assert not [seen for each in found for seen in each if seen.name]
 
 
-def test_each_person_has_her_own_name(finder: Finder, known: People) -> None:
+def test_each_person_has_her_own_name(finder: Finder, known: KnownFaces) -> None:
     """Of two that are known, each is herself."""
     picture = scene(stranger(3), 1.0, (150, 100))
     (box,) = finder.find(picture)
@@ -95,14 +95,14 @@ def test_each_person_has_her_own_name(finder: Finder, known: People) -> None:
 
 def test_where_nobody_is_known_everybody_is_a_stranger(finder: Finder) -> None:
     """But is seen."""
-    (seen,) = look(scene(EILEEN, 0.8, (50, 20)), LENS, finder, People())
+    (seen,) = look(scene(EILEEN, 0.8, (50, 20)), LENS, finder, KnownFaces())
     assert (seen.name, seen.alike) == (None, 0.0)
 
 
 def test_a_face_is_as_far_as_its_size_tells(finder: Finder) -> None:
     """By the size of a usual one; to the left of the middle its bearing is positive."""
-    (near,) = look(scene(EILEEN, 0.8, (0, 20)), LENS, finder, People())
-    (far,) = look(scene(EILEEN, 0.4, (0, 20)), LENS, finder, People())
+    (near,) = look(scene(EILEEN, 0.8, (0, 20)), LENS, finder, KnownFaces())
+    (far,) = look(scene(EILEEN, 0.4, (0, 20)), LENS, finder, KnownFaces())
     assert near.position[2] == pytest.approx(LENS.fx * FACE / near.box.side)
     assert far.distance == pytest.approx(2 * near.distance, rel=0.25)
     middle = near.box.left + near.box.side / 2

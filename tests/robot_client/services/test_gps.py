@@ -16,7 +16,7 @@ from switchboard_waiting import wait_for
 
 from relay_protocol.errors import Invalid, Unavailable
 from robot_client.services.gps import APPROXIMATED, LONGEST, NO_FIX, SBAS_FIX, Lines, Nmea
-from robot_client.services.gps_source import Reader, Recording, opener
+from robot_client.services.gps_source import ByteReader, FileSource, opener
 from robot_client.services.health import Level
 
 
@@ -177,7 +177,7 @@ def test_a_recording_has_its_pace(tmp_path: Path) -> None:
     file = tmp_path / "drive.nmea"
     file.write_bytes(GGA + b"\n" + sentence("GPXYZ,1") + b"\n" + GGA + b"\n")
     waited: list[float] = []
-    recording = Recording(file, 0.5, waited.append)
+    recording = FileSource(file, 0.5, waited.append)
     assert b"".join(recording.read() for _ in range(3)) == file.read_bytes()
     with pytest.raises(EOFError):
         recording.read()
@@ -189,7 +189,9 @@ def test_a_server_that_hangs_up_is_dialled_again() -> None:
     """What it sends comes, also from the second connection."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         came: list[bytes] = []
-        reader = Reader("test", opener(f"tcp://127.0.0.1:{server.getsockname()[1]}", 9600, 1.0), came.append)
+        reader = ByteReader(
+            "test", opener(f"tcp://127.0.0.1:{server.getsockname()[1]}", 9600, 1.0), came.append
+        )
         try:
             for word in (b"one", b"two"):
                 connection, _ = server.accept()
@@ -205,7 +207,7 @@ def test_a_serial_device_is_read_and_found_again() -> None:
     """A terminal is set raw, so that nothing is translated; one that is gone is an error in words."""
     master, slave = os.openpty()
     came: list[bytes] = []
-    reader = Reader("the receiver", opener(os.ttyname(slave), 4800, 1.0), came.append)
+    reader = ByteReader("the receiver", opener(os.ttyname(slave), 4800, 1.0), came.append)
     try:
         wait_for(
             "it is read",

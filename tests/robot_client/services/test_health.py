@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from robot_client.services.health import Freshness, Level
+from robot_client.services.health import InputWatch, Level
 
 
 def test_an_input_is_waited_for_then_fine_then_silent() -> None:
     """Each in words, and fine again when it comes again."""
     now = [0.0]
-    fresh = Freshness("/scan", 2.0, lambda: now[0])
+    fresh = InputWatch("/scan", 2.0, lambda: now[0])
     waiting = fresh.trouble()
     assert waiting is not None
     assert (waiting.level, waiting.message) == (Level.STALE, "waiting for /scan")

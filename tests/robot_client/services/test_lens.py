@@ -7,22 +7,28 @@ import math
 import pytest
 
 from relay_protocol.errors import Invalid
-from robot_client.services import lens
+from robot_client.services import camera_model
 
 K = (600.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0)
 
 
 def test_a_view_of_ninety_degrees_sees_as_far_aside_as_ahead() -> None:
     """The focal length is half the width."""
-    found = lens.of_view(640, 480, 90)
+    found = camera_model.of_view(640, 480, 90)
     assert found.fx == found.fy == pytest.approx(320)
     assert (found.cx, found.cy) == (319.5, 239.5)
 
 
 def test_a_calibration_is_taken_as_it_is() -> None:
     """Focal lengths, middle and distortion; zeros are no distortion."""
-    assert lens.calibrated(K, (0.1, 0.0, 0.0, 0.0, 0.0), "plumb_bob").distortion == (0.1, 0.0, 0.0, 0.0, 0.0)
-    assert lens.calibrated(K, (0.0,) * 5, "") == (600.0, 610.0, 320.0, 240.0, ())
+    assert camera_model.calibrated(K, (0.1, 0.0, 0.0, 0.0, 0.0), "plumb_bob").distortion == (
+        0.1,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
+    assert camera_model.calibrated(K, (0.0,) * 5, "") == (600.0, 610.0, 320.0, 240.0, ())
 
 
 @pytest.mark.parametrize(
@@ -40,10 +46,10 @@ def test_what_is_no_calibration_is_refused(
 ) -> None:
     """A camera that is not calibrated, or a model nobody here knows."""
     with pytest.raises(Invalid):
-        lens.calibrated(matrix, distortion, model)
+        camera_model.calibrated(matrix, distortion, model)
 
 
 def test_pictures_of_half_the_width_have_half_the_focal_length() -> None:
     """The middle stays in the middle."""
-    half = lens.of_view(640, 480, 90).scaled(0.5)
-    assert half[:4] == pytest.approx(lens.of_view(320, 240, 90)[:4])
+    half = camera_model.of_view(640, 480, 90).scaled(0.5)
+    assert half[:4] == pytest.approx(camera_model.of_view(320, 240, 90)[:4])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robot_client.camera.formats import Pixels
-from robot_client.services.lens import Lens, of_view
+from robot_client.services.camera_model import CameraModel, of_view
 from robot_client.services.markers import DICTIONARIES, Detector, quaternion
 
 LENS = of_view(640, 480, 75)
@@ -20,7 +20,7 @@ def drawn(
     number: int,
     at: tuple[float, float, float],
     turn: float = 0.0,
-    lens: Lens = LENS,
+    lens: CameraModel = LENS,
     onto: Pixels | None = None,
     dictionary: str = "4X4_50",
 ) -> Pixels:
@@ -101,7 +101,7 @@ def test_nothing_is_found_where_nothing_is() -> None:
 
 def test_distortion_is_taken_out() -> None:
     """A lens that bends: the marker is drawn through it, and found where it is."""
-    bent = Lens(400.0, 400.0, 319.5, 239.5, (-0.25, 0.05, 0.0, 0.0, 0.0))
+    bent = CameraModel(400.0, 400.0, 319.5, 239.5, (-0.25, 0.05, 0.0, 0.0, 0.0))
     flat = drawn(5, (0.45, 0.25, 1.0), lens=bent)
     matrix = np.array([[400.0, 0, 319.5], [0, 400.0, 239.5], [0, 0, 1]])
     rows, columns = np.mgrid[0:480, 0:640].astype(np.float32)

@@ -11,9 +11,9 @@ import pytest
 from relay_protocol.errors import Invalid
 from robot_client.camera.messages import Image
 from robot_client.services import obstacles
+from robot_client.services.camera_model import of_view
 from robot_client.services.health import Level
-from robot_client.services.lens import of_view
-from robot_client.services.obstacles import Band, Nearness, Place, Scan
+from robot_client.services.obstacles import Band, ObstaclePosition, ProximityAlarm, Scan
 
 LENS = of_view(160, 120, 60)
 
@@ -213,22 +213,22 @@ def test_a_picture_without_depth_or_too_small_is_refused(picture: Image) -> None
 
 def test_nearness_does_not_flicker() -> None:
     """It begins below the threshold and ends a tenth above it."""
-    near = Nearness(1.0)
-    seen = [near.see(Place(distance, 0.0)) for distance in (1.2, 0.99, 1.05, 0.98, 1.11)]
+    near = ProximityAlarm(1.0)
+    seen = [near.see(ObstaclePosition(distance, 0.0)) for distance in (1.2, 0.99, 1.05, 0.98, 1.11)]
     assert seen == [False, True, False, False, True]
     assert not near.near
-    assert near.see(Place(0.5, 0.0)) and near.see(None)
+    assert near.see(ObstaclePosition(0.5, 0.0)) and near.see(None)
 
 
 def test_what_is_as_near_as_can_be_measured_is_near_below_any_threshold() -> None:
     """A scanner that measures from 0.6 m can't tell whether it is 0.5 m away, so it may be."""
-    near = Nearness(0.5)
-    assert not near.see(Place(0.61, 0.0), 0.6)
-    assert near.see(Place(0.6, 0.0), 0.6) and near.near
+    near = ProximityAlarm(0.5)
+    assert not near.see(ObstaclePosition(0.61, 0.0), 0.6)
+    assert near.see(ObstaclePosition(0.6, 0.0), 0.6) and near.near
 
 
 def test_the_finding_says_where() -> None:
     """A warning when it is near, with distance and side."""
-    found = obstacles.finding(True, Place(0.32, math.radians(-30)))
+    found = obstacles.finding(True, ObstaclePosition(0.32, math.radians(-30)))
     assert (found.level, found.message) == (Level.WARN, "an obstacle is near: 0.32 m away, 30° to the right")
     assert obstacles.finding(False, None).level is Level.OK

@@ -18,7 +18,7 @@ from switchboard_waiting import wait_for
 from relay_protocol.errors import Refused, Unavailable
 from robot_client.services import espeak, speech
 from robot_client.services.health import Level
-from robot_client.services.speech import LONGEST_TEXT, WAITING, Player, Speaker, Told, WavFile
+from robot_client.services.speech import LONGEST_TEXT, WAITING, Player, SpeechQueue, SpeechStatus, WavFile
 
 FULL = Path("/dev/full")
 """Takes nothing: Linux says that the disk is full."""
@@ -145,8 +145,8 @@ def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyP
 
 def test_texts_are_said_in_order_and_never_two_at_a_time() -> None:
     """Each begins when the last was heard, and all is told."""
-    ear, told = Ear(), list[Told]()
-    speaker = Speaker(Letters(), ear, told.append)
+    ear, told = Ear(), list[SpeechStatus]()
+    speaker = SpeechQueue(Letters(), ear, told.append)
     for text in ("one", "two", "three"):
         speaker.say(text)
     for count in (1, 2, 3):
@@ -155,13 +155,13 @@ def test_texts_are_said_in_order_and_never_two_at_a_time() -> None:
     wait_for("the end", lambda: len(told) == 6)
     speaker.close()
     assert (ear.heard, ear.most, ear.closed) == (["one", "two", "three"], 1, True)
-    assert told == [each for text in ear.heard for each in (Told(True), Told(False, text))]
+    assert told == [each for text in ear.heard for each in (SpeechStatus(True), SpeechStatus(False, text))]
 
 
 def test_what_is_too_much_is_refused_in_words() -> None:
     """More texts than may wait, and texts that are too long; nothing at all is nothing."""
     ear = Ear()
-    speaker = Speaker(Letters(), ear, lambda _: None)
+    speaker = SpeechQueue(Letters(), ear, lambda _: None)
     speaker.say("first")
     wait_for("it speaks", lambda: ear.heard)
     for _ in range(WAITING):
@@ -178,8 +178,8 @@ def test_what_is_too_much_is_refused_in_words() -> None:
 
 def test_hush_silences_it_and_what_comes_after_is_said() -> None:
     """What was being said is not told as said."""
-    ear, told = Ear(), list[Told]()
-    speaker = Speaker(Letters(), ear, told.append)
+    ear, told = Ear(), list[SpeechStatus]()
+    speaker = SpeechQueue(Letters(), ear, told.append)
     speaker.say("one")
     speaker.say("two")
     wait_for("it speaks", lambda: ear.heard)
@@ -187,53 +187,53 @@ def test_hush_silences_it_and_what_comes_after_is_said() -> None:
     speaker.say("three")
     wait_for("the next", lambda: ear.heard == ["one", "three"])
     ear.go.release()
-    wait_for("the end", lambda: Told(False, "three") in told)
+    wait_for("the end", lambda: SpeechStatus(False, "three") in told)
     speaker.close()
-    assert Told(False, "one") not in told and Told(False, "two") not in told
+    assert SpeechStatus(False, "one") not in told and SpeechStatus(False, "two") not in told
 
 
 def test_a_failure_is_an_error_until_something_is_said() -> None:
     """The next text is said all the same."""
-    ear, told = Ear(), list[Told]()
-    speaker = Speaker(Letters(), ear, told.append)
+    ear, told = Ear(), list[SpeechStatus]()
+    speaker = SpeechQueue(Letters(), ear, told.append)
     speaker.say("broken")
     wait_for("the failure", lambda: speaker.finding().level is Level.ERROR)
     assert speaker.finding().message == "the voice is broken"
     ear.go.release()
     speaker.say("fine")
-    wait_for("the end", lambda: Told(False, "fine") in told)
+    wait_for("the end", lambda: SpeechStatus(False, "fine") in told)
     assert speaker.finding().level is Level.OK
     speaker.close()
 
 
 def test_an_unforeseen_failure_is_logged_and_the_next_text_is_said(caplog: pytest.LogCaptureFixture) -> None:
     """It is an error in words, and the thread goes on: nothing is said for ever."""
-    ear, told = Ear(), list[Told]()
-    speaker = Speaker(Letters(), ear, told.append)
+    ear, told = Ear(), list[SpeechStatus]()
+    speaker = SpeechQueue(Letters(), ear, told.append)
     speaker.say("odd")
     wait_for("the failure", lambda: speaker.finding().level is Level.ERROR)
     assert speaker.finding().message == "saying a text failed: ValueError: what nobody foresaw"
     assert "saying a text failed" in caplog.text and "Traceback" in caplog.text
-    wait_for("its end is told", lambda: told == [Told(True), Told(False)])
+    wait_for("its end is told", lambda: told == [SpeechStatus(True), SpeechStatus(False)])
     assert speaker.hush() == 0
     ear.go.release()
     speaker.say("fine")
-    wait_for("the end", lambda: Told(False, "fine") in told)
+    wait_for("the end", lambda: SpeechStatus(False, "fine") in told)
     assert speaker.finding() == (Level.OK, "silent", {"waiting": "0", "refused": "0"})
     speaker.close()
 
 
-@pytest.mark.parametrize("deaf", [Told(True), Told(False, "one")])
-def test_who_cannot_be_told_silences_nothing(deaf: Told, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("deaf", [SpeechStatus(True), SpeechStatus(False, "one")])
+def test_who_cannot_be_told_silences_nothing(deaf: SpeechStatus, caplog: pytest.LogCaptureFixture) -> None:
     """The text is said, the failure is an error in words, and the next text is said and told."""
-    ear, told = Ear(), list[Told]()
+    ear, told = Ear(), list[SpeechStatus]()
 
-    def tell(what: Told) -> None:
+    def tell(what: SpeechStatus) -> None:
         told.append(what)
         if what == deaf and len(told) <= 2:
             raise RuntimeError("nobody listens")
 
-    speaker = Speaker(Letters(), ear, tell)
+    speaker = SpeechQueue(Letters(), ear, tell)
     speaker.say("one")
     ear.go.release()
     wait_for("the failure", lambda: speaker.finding().level is Level.ERROR)
@@ -242,7 +242,7 @@ def test_who_cannot_be_told_silences_nothing(deaf: Told, caplog: pytest.LogCaptu
     wait_for("the end", lambda: len(told) == 2)
     speaker.say("two")
     ear.go.release()
-    wait_for("the next", lambda: told[2:] == [Told(True), Told(False, "two")])
+    wait_for("the next", lambda: told[2:] == [SpeechStatus(True), SpeechStatus(False, "two")])
     assert (ear.heard, speaker.finding().level) == (["one", "two"], Level.OK)
     speaker.close()
 
@@ -250,11 +250,11 @@ def test_who_cannot_be_told_silences_nothing(deaf: Told, caplog: pytest.LogCaptu
 def test_a_full_disk_is_an_error_and_ends_no_speech(monkeypatch: pytest.MonkeyPatch) -> None:
     """What can't be written is told as not said, in words, each time."""
     full(monkeypatch)
-    told: list[Told] = []
-    speaker = Speaker(Letters(), player("pass"), told.append)
+    told: list[SpeechStatus] = []
+    speaker = SpeechQueue(Letters(), player("pass"), told.append)
     for count in (1, 2):
         speaker.say("one")
-        wait_for("its end", lambda count=count: told == [Told(True), Told(False)] * count)
+        wait_for("its end", lambda count=count: told == [SpeechStatus(True), SpeechStatus(False)] * count)
         found = speaker.finding()
         assert (found.level, "No space left on device" in found.message) == (Level.ERROR, True)
         assert speaker.hush() == 0

@@ -10,13 +10,13 @@ from robot_client.sim.battery import (
     EMPTY_VOLTS,
     FULL_VOLTS,
     IDLE_AMPERES,
-    Battery,
+    SimBattery,
 )
 
 
 def test_standing_drains_the_idle_current() -> None:
     """An hour at 1.2 A takes 1.2 Ah."""
-    battery = Battery()
+    battery = SimBattery()
     battery.step(3600, 0.0, 0.0)
     assert battery.charge == pytest.approx(1 - IDLE_AMPERES / CAPACITY_AH)
 
@@ -24,7 +24,7 @@ def test_standing_drains_the_idle_current() -> None:
 @given(speed=st.floats(0.01, 2), turn=st.floats(0.01, 3))
 def test_motion_costs_whichever_way(speed: float, turn: float) -> None:
     """Driving and turning draw more than standing, backwards as much as forwards."""
-    idle, ahead, back = Battery(), Battery(), Battery()
+    idle, ahead, back = SimBattery(), SimBattery(), SimBattery()
     idle.step(60, 0.0, 0.0)
     ahead.step(60, speed, turn)
     back.step(60, -speed, -turn)
@@ -35,7 +35,7 @@ def test_motion_costs_whichever_way(speed: float, turn: float) -> None:
 @given(st.lists(st.tuples(st.floats(0, 1e5), st.floats(-2, 2), st.floats(-3, 3)), max_size=20))
 def test_charge_only_falls_and_stays_within_bounds(steps: list[tuple[float, float, float]]) -> None:
     """No step brings charge back, none goes below empty, and the voltage stays that of a pack."""
-    battery = Battery()
+    battery = SimBattery()
     for seconds, speed, turn in steps:
         before = battery.charge
         battery.step(seconds, speed, turn)
@@ -45,7 +45,7 @@ def test_charge_only_falls_and_stays_within_bounds(steps: list[tuple[float, floa
 
 def test_a_charger_fills_it_and_then_feeds_the_robot() -> None:
     """A tenth comes back in minutes; a full one draws nothing, gives nothing, and drains again without."""
-    battery = Battery(0.1)
+    battery = SimBattery(0.1)
     battery.step(300, 0.0, 0.0, charging=True)
     assert battery.charging and battery.current == pytest.approx(IDLE_AMPERES - CHARGER_AMPERES)
     assert battery.charge == pytest.approx(0.1 + (CHARGER_AMPERES - IDLE_AMPERES) / 12 / CAPACITY_AH)

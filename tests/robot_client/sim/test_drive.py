@@ -8,12 +8,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from robot_client.sim.drive import HIGHEST_SPEED, RADIUS, STANDING, Body, Limits, Twist, along_arc
-from robot_client.sim.world import Circle, Colour, Look, Pose, Segment, Texture, World, box
+from robot_client.sim.drive import HIGHEST_SPEED, RADIUS, STANDING, MotorLimits, SimBody, Twist, along_arc
+from robot_client.sim.world import Circle, Colour, Pose, Segment, Texture, WallTexture, World, box
 from robot_client.sim.worlds import WORLDS
 
 STEP = 0.02
-GREY = Look(Colour(128, 128, 128), Texture.BRICK)
+GREY = WallTexture(Colour(128, 128, 128), Texture.BRICK)
 ORIGIN = Pose(0, 0, 0)
 HALL = WORLDS["default"]()
 COMMANDS = st.lists(
@@ -25,11 +25,11 @@ COMMANDS = st.lists(
 )  # fmt: skip
 
 
-def body(world: World | None = None, pose: Pose = ORIGIN, speed: float = 0.5) -> Body:
-    return Body(world or World(box(0, 0, 40, 40, 0, GREY), [], pose), pose, Limits(speed=speed))
+def body(world: World | None = None, pose: Pose = ORIGIN, speed: float = 0.5) -> SimBody:
+    return SimBody(world or World(box(0, 0, 40, 40, 0, GREY), [], pose), pose, MotorLimits(speed=speed))
 
 
-def drive(each: Body, speed: float, turn: float, steps: int) -> None:
+def drive(each: SimBody, speed: float, turn: float, steps: int) -> None:
     each.target = Twist(speed, turn)
     for _ in range(steps):
         each.step(STEP)
@@ -43,7 +43,7 @@ class Step(NamedTuple):
     pose: Pose
 
 
-def steps(robot: Body, commands: list[tuple[float, float, int]]) -> Iterator[Step]:
+def steps(robot: SimBody, commands: list[tuple[float, float, int]]) -> Iterator[Step]:
     for speed, turn, count in commands:
         robot.target = Twist(speed, turn)
         for _ in range(count):

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from robot_client.services.lens import of_view
-from robot_client.services.markers import Detector, Seen
-from robot_client.sim.camera import Camera
-from robot_client.sim.plates import MARKER_SIDE
-from robot_client.sim.world import Charger, Circle, Colour, Look, Pose, Segment, Texture, World, box
+from robot_client.services.camera_model import of_view
+from robot_client.services.markers import Detector, SeenMarker
+from robot_client.sim.camera import SimCamera
+from robot_client.sim.charger_plates import MARKER_SIDE
+from robot_client.sim.world import Charger, Circle, Colour, Pose, Segment, Texture, WallTexture, World, box
 from robot_client.sim.worlds import WORLDS
 
 NOON = 1_700_000_000.0
-GREY = Look(Colour(150, 150, 150), Texture.PANEL)
+GREY = WallTexture(Colour(150, 150, 150), Texture.PANEL)
 HALL = WORLDS["default"]()
 LENS = of_view(640, 480, 75)
 CAPTIONS = 430
@@ -22,9 +22,9 @@ PLACE = (-2.7, -4.5)
 """Of the hall's charger."""
 
 
-def seen(world: World, pose: Pose) -> list[Seen]:
+def seen(world: World, pose: Pose) -> list[SeenMarker]:
     """Markers in the picture a robot has from there; the plates of its captions, which may look like some, left out."""
-    picture = Camera(world).render(pose, 0.0, NOON)
+    picture = SimCamera(world).render(pose, 0.0, NOON)
     picture[CAPTIONS:] = 128
     return Detector("4X4_50", MARKER_SIDE).find(picture, LENS)
 
@@ -69,7 +69,7 @@ def test_the_rest_of_the_picture_is_the_same() -> None:
     bare = World(list(HALL.segments), list(HALL.circles), HALL.start)
     for heading, changed in ((0.0, False), (-math.pi / 2, True)):
         pose = Pose(HALL.start.x, HALL.start.y, heading)
-        one, other = (Camera(world).render(pose, 0.0, NOON).astype(int) for world in (HALL, bare))
+        one, other = (SimCamera(world).render(pose, 0.0, NOON).astype(int) for world in (HALL, bare))
         share = float((one != other).any(axis=2).mean())
         assert (0 < share < 0.03) if changed else share == 0.0
 
@@ -78,5 +78,5 @@ def test_the_rest_of_the_picture_is_the_same() -> None:
 def test_right_before_the_lens_it_still_draws(heading: float) -> None:
     """No number overflows, whichever way the robot looks."""
     with np.errstate(all="raise", under="ignore"):
-        frame = Camera(HALL).render(Pose(PLACE[0], PLACE[1] + 0.001, heading), 0.0, NOON)
+        frame = SimCamera(HALL).render(Pose(PLACE[0], PLACE[1] + 0.001, heading), 0.0, NOON)
     assert frame.shape == (480, 640, 3)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from robot_client.sim.recorder import Recorder
-from robot_client.sim.robot import SCAN_FARTHEST, SCAN_RAYS, Robot
+from robot_client.sim.recorder import MotionRecorder
+from robot_client.sim.robot import SCAN_FARTHEST, SCAN_RAYS, SimRobot
 from robot_client.sim.world import Pose
 from robot_client.sim.worlds import WORLDS
 
@@ -21,8 +21,8 @@ class Bench:
     def __init__(self, world: str = "open", seed: int | None = 1) -> None:
         self.now = 0.0
         self.stream = io.BytesIO()
-        recorder = Recorder(self.stream, clock=lambda: round(self.now * 1e9))
-        self.robot = Robot(WORLDS[world](), recorder, seed, clock=lambda: self.now)
+        recorder = MotionRecorder(self.stream, clock=lambda: round(self.now * 1e9))
+        self.robot = SimRobot(WORLDS[world](), recorder, seed, clock=lambda: self.now)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP)):
@@ -117,7 +117,7 @@ def test_noise_repeats_with_its_seed_only() -> None:
 def test_it_is_charged_while_it_stands_at_the_charger() -> None:
     """Not while it drives there, nor where none is; a reset gives back the charge of the beginning."""
     place = Pose(-2.7, -4.0, -math.pi / 2)
-    robot = Robot(WORLDS["default"](), Recorder(None), 1, clock=lambda: 0.0, charge=0.15)
+    robot = SimRobot(WORLDS["default"](), MotionRecorder(None), 1, clock=lambda: 0.0, charge=0.15)
     robot.step(STEP)
     assert robot.battery.charge < 0.15 and not robot.battery.charging
     robot.body.reset(place)

@@ -8,10 +8,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from robot_client.sim.drive import RADIUS
-from robot_client.sim.world import Charger, Circle, Colour, Look, Pose, Segment, Texture, World, box
+from robot_client.sim.world import Charger, Circle, Colour, Pose, Segment, Texture, WallTexture, World, box
 from robot_client.sim.worlds import WORLDS
 
-GREY = Look(Colour(128, 128, 128), Texture.BRICK)
+GREY = WallTexture(Colour(128, 128, 128), Texture.BRICK)
 ANGLES = st.floats(-math.pi, math.pi)
 
 

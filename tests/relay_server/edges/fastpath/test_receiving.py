@@ -15,7 +15,8 @@ from twisted.internet.testing import StringTransport
 from websockets.frames import Frame, Opcode
 from websockets.utils import apply_mask as apply_mask_in_python
 
-from relay_server.edges.fastpath import FastProtocol, receiving
+from relay_server.ws import fast_receive
+from relay_server.ws.fast_receive import FastProtocol
 
 LIMIT = 70_000
 MESSAGE_LIMIT = 100_000
@@ -382,7 +383,7 @@ def test_a_flood_gives_others_their_turn() -> None:
     """After its share of time a client is not read until the next turn, and its own order stays."""
     clock = SlowClock()
     flooder, other = opened(Fast, clock), opened(Fast, clock)
-    clock.step = receiving.SHARE_SECONDS / 10
+    clock.step = fast_receive.SHARE_SECONDS / 10
     flooder.dataReceived(b"".join(frame(b"%020d" % number) for number in range(50)))
     assert 0 < len(flooder.events) < 20
     assert flooder.transport.producerState == "paused"
@@ -398,7 +399,7 @@ def test_slow_frames_have_the_same_share_of_time() -> None:
     """Fragments and pings are no way around it."""
     clock = SlowClock()
     end = opened(Fast, clock)
-    clock.step = receiving.SHARE_SECONDS / 10
+    clock.step = fast_receive.SHARE_SECONDS / 10
     end.dataReceived(b"".join(frame(b"a", fin=False) + frame(b"b", 0) for _ in range(100)))
     assert 0 < len(end.events) < 20
     assert end.transport.producerState == "paused"
@@ -408,7 +409,7 @@ def test_a_failure_after_a_rest_cuts_the_connection(monkeypatch: pytest.MonkeyPa
     """As Twisted does when a protocol fails on what it is given; nobody is left paused for ever."""
     clock = SlowClock()
     end = opened(Fast, clock)
-    clock.step = receiving.SHARE_SECONDS
+    clock.step = fast_receive.SHARE_SECONDS
     end.dataReceived(frame(b"x" * 20) * 5)
     failures: list[str] = []
     monkeypatch.setattr(
@@ -428,7 +429,7 @@ def test_who_is_gone_during_a_rest_is_not_read_again() -> None:
     """Nothing happens on a dead connection."""
     clock = SlowClock()
     end = opened(Fast, clock)
-    clock.step = receiving.SHARE_SECONDS
+    clock.step = fast_receive.SHARE_SECONDS
     end.dataReceived(frame(b"x" * 20) * 5)
     before = len(end.events)
     end.dropConnection(abort=True)
@@ -453,19 +454,19 @@ def test_a_message_that_trickles_in_costs_no_more_than_its_size() -> None:
 
 def test_unmasking_is_done_in_c() -> None:
     """The wheels of the library have the compiled function; in Python it would take a hundred times as long."""
-    assert type(receiving.apply_mask).__name__ == "builtin_function_or_method"
+    assert type(fast_receive.apply_mask).__name__ == "builtin_function_or_method"
 
 
 @given(st.binary(max_size=300), MASKS)
 def test_both_ways_of_unmasking_agree(payload: bytes, mask: bytes) -> None:
     """The one in Python is for platforms without a wheel."""
-    assert receiving.apply_mask(payload, mask) == (apply_mask_in_python(payload, mask) if payload else b"")
-    assert receiving.apply_mask(memoryview(payload), mask) == receiving.apply_mask(payload, mask)
+    assert fast_receive.apply_mask(payload, mask) == (apply_mask_in_python(payload, mask) if payload else b"")
+    assert fast_receive.apply_mask(memoryview(payload), mask) == fast_receive.apply_mask(payload, mask)
 
 
 def test_the_names_are_those_of_the_standard() -> None:
     """First bytes of frames, against a library's own table."""
-    assert receiving._TEXT == 0x80 | Opcode.TEXT
-    assert receiving._PONG == 0x80 | Opcode.PONG
-    assert receiving._CLOSE == 0x80 | Opcode.CLOSE
+    assert fast_receive._TEXT == 0x80 | Opcode.TEXT
+    assert fast_receive._PONG == 0x80 | Opcode.PONG
+    assert fast_receive._CLOSE == 0x80 | Opcode.CLOSE
     assert frame(b"payload", mask=None) == Frame(Opcode.TEXT, b"payload").serialize(mask=False)

@@ -13,8 +13,13 @@ from twisted.internet.task import Clock
 from twisted.internet.tcp import Server
 from twisted.internet.testing import StringTransport
 
-from relay_server.edges.fastpath import Turns, writer_for
-from relay_server.edges.fastpath.sending import JOINED_BYTES, PlainWriter, SocketWriter
+from relay_server.common.socket_writer import (
+    JOINED_BYTES,
+    FlushScheduler,
+    PlainWriter,
+    SocketWriter,
+    writer_for,
+)
 
 reactor: Any = running_reactor
 
@@ -53,7 +58,7 @@ class Pair:
         self.producer = Producer()
         self.transport.registerProducer(self.producer, True)  # type: ignore[arg-type]
         self.clock = Clock()
-        self.turns = Turns(self.clock)
+        self.turns = FlushScheduler(self.clock)
         self.writer = writer_for(self.transport, self.turns)
 
     def watched(self) -> list[bytes]:

@@ -6,12 +6,12 @@ from collections.abc import AsyncIterator
 
 import pytest_twisted
 
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
 from tests.relay_server.edges.video.show import Show
 
 
 @pytest_twisted.async_yield_fixture
-async def show(store: Store) -> AsyncIterator[Show]:
+async def show(store: AsyncDatabase) -> AsyncIterator[Show]:
     """A robot that is known and offline, and ann who may view it."""
     made = Show(store)
     yield made

@@ -21,26 +21,29 @@ from twisted.internet.threads import deferToThread
 from relay_db import queries
 from relay_protocol import link
 from relay_protocol.frames import VideoFrame
-from relay_server import passwords
 from relay_server.access import Access
-from relay_server.auth import Authenticator
-from relay_server.channel import Channels
-from relay_server.control import ControlRules, Desks
-from relay_server.edges.caps import AddressCap
-from relay_server.edges.handshake import Handshake
-from relay_server.edges.limiting import RequestLimits
-from relay_server.edges.site import Missing, RelaySite, Robots, Root
-from relay_server.edges.video import Video, VideoFactory
-from relay_server.edges.websocket import ClientFactory
-from relay_server.frontdesk import FrontDesk
-from relay_server.journal import Journal
-from relay_server.origins import Origins
-from relay_server.registry import Presence, Registry
-from relay_server.rounds import Rounds
-from relay_server.session import Timing
-from relay_server.store import Store
+from relay_server.auth import passwords
+from relay_server.auth.authenticator import Authenticator
+from relay_server.auth.origins import Origins
+from relay_server.channels.channels import Channels
+from relay_server.common.database import AsyncDatabase
+from relay_server.common.timers import PeriodicTimers
+from relay_server.control.controllers import Controllers
+from relay_server.control.types import ControlRules
+from relay_server.events.bus import EventBus
+from relay_server.http.connection_limits import ConnectionLimits
+from relay_server.http.rate_limits import RequestLimits
+from relay_server.http.site import Missing, RelaySite, RobotAddress, Root
+from relay_server.robots.registry import RobotRegistry, RobotState
+from relay_server.sessions.manager import SessionManager
+from relay_server.sessions.ports import Timing
 from relay_server.tls import ServerTls
-from relay_server.video import Stream, Videos
+from relay_server.video.http import VideoResource
+from relay_server.video.stream import CameraStream
+from relay_server.video.streams import CameraStreams
+from relay_server.video.websocket import VideoFactory
+from relay_server.ws.client import ClientFactory
+from relay_server.ws.upgrade import WebSocketUpgrade
 from tests.relay_server.control_record import MemoryRecord
 from tests.relay_server.edges.http_client import api_of
 from tests.relay_server.memory import MemoryLink
@@ -73,16 +76,16 @@ class Show:
     :param tls: listen by TLS
     """
 
-    def __init__(self, store: Store, tls: ServerTls | None = None) -> None:
+    def __init__(self, store: AsyncDatabase, tls: ServerTls | None = None) -> None:
         self.store = store
         clock: Any = reactor
-        self.registry = Registry(time.time)
+        self.registry = RobotRegistry(time.time)
         self.access = Access(store, time.time)
         self.auth = Authenticator(clock, store, time.monotonic, time.time)
-        self.videos = Videos(clock, new_ticket=passwords.new_token)
+        self.videos = CameraStreams(clock, new_ticket=passwords.new_token)
         channels = Channels(clock, linger=5.0, new_ticket=passwords.new_token, wall_ns=time.time_ns)
         origins = Origins("http")
-        self.desk = FrontDesk(
+        self.desk = SessionManager(
             clock,
             store,
             self.auth,
@@ -90,8 +93,8 @@ class Show:
             self.registry,
             channels,
             self.videos,
-            Desks(clock, MemoryRecord(), ControlRules(), self.registry.changed, time.time),
-            Journal(store, time.time),
+            Controllers(clock, MemoryRecord(), ControlRules(), self.registry.changed, time.time),
+            EventBus(store, time.time),
             origins,
             Timing(2.0, 0.1, 5.0),
             cookie="sb",
@@ -99,12 +102,12 @@ class Show:
             wall=time.time,
         )
         api = api_of(clock, self.desk, origins)
-        cap, rounds = AddressCap(100), Rounds(clock)
+        cap, rounds = ConnectionLimits(100), PeriodicTimers(clock)
         limits = RequestLimits(0.0, time.monotonic)
-        websocket = Handshake(ClientFactory(clock, time.monotonic_ns, self.desk, cap, limits))
-        pictures = Handshake(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds, limits))
-        video = Video(clock, rounds, self.desk, api.principal, pictures)
-        robots = Robots(websocket, video, "1.2.3")
+        websocket = WebSocketUpgrade(ClientFactory(clock, time.monotonic_ns, self.desk, cap, limits))
+        pictures = WebSocketUpgrade(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds, limits))
+        video = VideoResource(clock, rounds, self.desk, api.principal, pictures)
+        robots = RobotAddress(websocket, video, "1.2.3")
         root = Root(robots, api.app.resource(), Missing(), Missing(), Missing())
         site = RelaySite(root, clock, cap, tls is not None, limits)
         self._listening = (
@@ -146,7 +149,7 @@ class Show:
     # --- the robot ----------------------------------------------------------------------------------------
 
     @property
-    def robot(self) -> Presence:
+    def robot(self) -> RobotState:
         """The robot as the relay sees it."""
         return self.registry.presence(self.rover.id, "rover", self.rover.realm)
 
@@ -162,7 +165,7 @@ class Show:
         """The robot tells how many streams it makes at a time."""
         self.registry.cameras(self.robot, link.Cameras(cameras=list(self.robot.cameras), streams=streams))
 
-    async def joined(self, control: MemoryLink) -> Stream:
+    async def joined(self, control: MemoryLink) -> CameraStream:
         """The stream the robot was asked for, once it has joined it."""
         (asked,) = await until(lambda: control.take(link.OpenVideo))
         stream = self.videos.redeem(asked.ticket)
@@ -171,13 +174,13 @@ class Show:
         stream.message(link.Playing(width=32, height=24, quality=80))
         return stream
 
-    def shows(self, stream: Stream, body: bytes, stamp: float = 1000.5) -> int:
+    def shows(self, stream: CameraStream, body: bytes, stamp: float = 1000.5) -> int:
         """One picture; its number."""
         number = next(self.numbers)
         stream.picture(VideoFrame(number=number, stamp=round(stamp * 1e9), body=body))
         return number
 
-    def films(self, stream: Stream, body: bytes, fps: float = 20.0) -> None:
+    def films(self, stream: CameraStream, body: bytes, fps: float = 20.0) -> None:
         """Pictures from now on, stamped with the monotonic clock."""
         filming = LoopingCall(lambda: self.shows(stream, body, time.monotonic()))
         filming.start(1 / fps)

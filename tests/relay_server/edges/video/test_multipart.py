@@ -13,9 +13,8 @@ from twisted.internet.defer import DeferredList, ensureDeferred
 
 from relay_protocol import limits, link
 from relay_protocol.errors import Unavailable
-from relay_server.edges import site
-from relay_server.edges.video import multipart
-from relay_server.video import patience
+from relay_server.http import site
+from relay_server.video import first_frame_timeout, multipart
 from tests.relay_server.edges.video.show import CAMERA, STREAM, Show, jpeg, until
 
 
@@ -106,8 +105,8 @@ async def test_a_stalled_viewer_costs_one_picture_and_is_cut_in_time(
         connections.append(transport)
         return real(transport)
 
-    real = multipart.narrow
-    monkeypatch.setattr(multipart, "narrow", narrow)
+    real = multipart.limit_send_buffer
+    monkeypatch.setattr(multipart, "limit_send_buffer", narrow)
     control = show.robot_comes()
     looker = show.looks(STREAM, window=4096)
     stream = await show.joined(control)
@@ -171,7 +170,7 @@ async def test_where_nothing_comes_the_answer_says_why(
     show: Show, monkeypatch: pytest.MonkeyPatch, online: bool
 ) -> None:
     """503 when the robot is not there, 504 when it is; the connection serves the next request."""
-    monkeypatch.setattr(patience, "FIRST_PICTURE_SECONDS", 0.2)
+    monkeypatch.setattr(first_frame_timeout, "FIRST_PICTURE_SECONDS", 0.2)
     if online:
         show.robot_comes()
     looker = show.looks(STREAM)
@@ -186,7 +185,7 @@ async def test_a_camera_that_never_appears_is_told_like_one_that_may_not_be_view
     show: Show, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """404 in the same words; the robot had time to tell of it."""
-    monkeypatch.setattr(patience, "FIRST_PICTURE_SECONDS", 0.2)
+    monkeypatch.setattr(first_frame_timeout, "FIRST_PICTURE_SECONDS", 0.2)
     show.robot_comes()
     looker = show.looks(STREAM.replace(CAMERA, "/nowhere"))
     assert await looker.problem() == (404, "there is no such camera, or you have no right to view it")

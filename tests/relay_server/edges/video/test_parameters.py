@@ -8,12 +8,12 @@ import pytest
 
 from relay_protocol import link
 from relay_protocol.errors import Invalid
-from relay_server.edges.video.parameters import Asked, Kind, asked
+from relay_server.video.parameters import Kind, StreamParameters, parse_parameters
 
 
 def settings(query: str, kind: Kind = "stream") -> link.VideoSettings:
     """How it is wanted."""
-    return asked(f"topic=/a&{query}", kind).settings
+    return parse_parameters(f"topic=/a&{query}", kind).settings
 
 
 @pytest.mark.parametrize(
@@ -79,12 +79,14 @@ def test_what_makes_no_sense_is_an_error_that_says_what_may_be(query: str, words
 def test_a_camera_has_to_be_named(topic: str) -> None:
     """By a name such as a topic has."""
     with pytest.raises(Invalid, match="topic"):
-        asked(topic, "stream")
+        parse_parameters(topic, "stream")
 
 
 def test_a_name_without_slash_is_taken_as_if_it_had_one() -> None:
     """As everywhere."""
-    assert asked("topic=camera/image%20raw", "stream") == Asked("/camera/image raw", link.VideoSettings())
+    assert parse_parameters("topic=camera/image%20raw", "stream") == StreamParameters(
+        "/camera/image raw", link.VideoSettings()
+    )
 
 
 def test_not_everything_can_be_had_everywhere() -> None:

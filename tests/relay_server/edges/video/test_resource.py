@@ -8,8 +8,8 @@ import pytest
 import pytest_twisted
 
 from relay_protocol import link
-from relay_server.auth import Opening
-from relay_server.video import hub
+from relay_server.auth.authenticator import TicketPurpose
+from relay_server.video import streams
 from tests.relay_server.edges.video.show import (
     CAMERA,
     CAMERAS,
@@ -27,7 +27,7 @@ COOKIE = {"Authorization": "", "Cookie": "sb=ann's"}
 
 async def ticket(show: Show, camera: str = "", *, video: bool = True) -> str:
     """A ticket of ann's."""
-    return await show.desk.issue_ticket(await show.desk.token("ann's"), Opening("rover", video, camera))
+    return await show.desk.issue_ticket(await show.desk.token("ann's"), TicketPurpose("rover", video, camera))
 
 
 @pytest.mark.parametrize(
@@ -332,8 +332,8 @@ async def test_who_begins_streams_too_fast_is_told_when_he_may_again(
     show: Show, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With 429, in words and in a header; a stream that there is he may watch."""
-    monkeypatch.setattr(hub, "STREAMS_AT_ONCE", 1)
-    monkeypatch.setattr(hub, "STREAMS_A_SECOND", 1 / 60)
+    monkeypatch.setattr(streams, "STREAMS_AT_ONCE", 1)
+    monkeypatch.setattr(streams, "STREAMS_A_SECOND", 1 / 60)
     control = show.robot_comes()
     first = show.looks(STREAM)
     stream = await show.joined(control)

@@ -15,10 +15,11 @@ from websockets.sync.client import ClientConnection, connect
 
 from relay_db import queries
 from relay_protocol import link
-from relay_server import closing, wsframe
-from relay_server.auth import Opening
-from relay_server.edges.video import socket as module
-from relay_server.video import Stream, hub
+from relay_server.auth.authenticator import TicketPurpose
+from relay_server.common import close_codes, websocket_frames
+from relay_server.video import streams
+from relay_server.video import websocket as module
+from relay_server.video.stream import CameraStream
 from tests.relay_server.edges.video.show import CAMERA, SECRET, STREAM, Looker, Show, jpeg, until
 from tests.relay_server.video.watching import DELTA, KEY
 
@@ -99,7 +100,7 @@ async def opens(show: Show, query: str = "", token: str = "ann's", **options: An
     return Eye(await deferToThread(connect, url, additional_headers=headers, close_timeout=2, **options))
 
 
-async def watched(show: Show, query: str = "") -> tuple[Eye, Stream]:
+async def watched(show: Show, query: str = "") -> tuple[Eye, CameraStream]:
     """An open websocket and its stream, joined by the robot."""
     control = show.robot_comes()
     eye = await opens(show, query)
@@ -109,15 +110,15 @@ async def watched(show: Show, query: str = "") -> tuple[Eye, Stream]:
 @pytest.mark.parametrize(
     ("ticket", "good"),
     [
-        (Opening("rover", video=True, camera=CAMERA), True),
-        (Opening("rover", video=True), True),
-        (Opening("rover", video=True, camera=SECRET), False),
-        (Opening("rover"), False),
-        (Opening("tank", video=True), False),
+        (TicketPurpose("rover", video=True, camera=CAMERA), True),
+        (TicketPurpose("rover", video=True), True),
+        (TicketPurpose("rover", video=True, camera=SECRET), False),
+        (TicketPurpose("rover"), False),
+        (TicketPurpose("tank", video=True), False),
     ],
 )
 @pytest_twisted.ensureDeferred
-async def test_a_ticket_must_be_for_this_camera(show: Show, ticket: Opening, good: bool) -> None:
+async def test_a_ticket_must_be_for_this_camera(show: Show, ticket: TicketPurpose, good: bool) -> None:
     """One for the robot's own websocket is not."""
     show.robot_comes()
     ann = await show.desk.token("ann's")
@@ -212,7 +213,7 @@ async def test_who_takes_no_picture_is_cut(show: Show, monkeypatch: pytest.Monke
     monkeypatch.setattr(module, "LOOK_SECONDS", 0.1)
     eye, stream = await watched(show)
     show.shows(stream, jpeg())
-    assert (await eye.closed())[0] == closing.TOO_SLOW
+    assert (await eye.closed())[0] == close_codes.TOO_SLOW
     assert not stream.viewers
 
 
@@ -232,7 +233,7 @@ async def test_who_takes_a_picture_slowly_is_not_cut(show: Show, monkeypatch: py
     looker.leave()
 
 
-async def stuffed(show: Show) -> tuple[Looker, Stream, int]:
+async def stuffed(show: Show) -> tuple[Looker, CameraStream, int]:
     """A viewer who reads nothing, and the number of a picture that is more than the kernel takes."""
     control = show.robot_comes()
     looker = show.looks(f"/robots/rover/video/ws?topic={CAMERA}", window=4096, **HANDSHAKE)
@@ -293,23 +294,23 @@ async def test_a_revoked_right_closes_with_its_code(show: Show) -> None:
     other = await opens(show)
     await until(lambda: len(show.access._permits) == 2)
     await show.deny(CAMERA)
-    assert await eye.closed() == (closing.FORBIDDEN, f"your right to view {CAMERA} was revoked")
-    assert (await other.closed())[0] == closing.FORBIDDEN
+    assert await eye.closed() == (close_codes.FORBIDDEN, f"your right to view {CAMERA} was revoked")
+    assert (await other.closed())[0] == close_codes.FORBIDDEN
     await show.deny()
     eye = await opens(show)
     await until(lambda: show.access._permits)
     token = (await show.desk.token("ann's")).token_id
     await show.store.write(queries.revoke_token, token)
     await show.access.refresh()
-    assert (await eye.closed())[0] == closing.UNAUTHENTICATED
+    assert (await eye.closed())[0] == close_codes.UNAUTHENTICATED
 
 
 @pytest.mark.parametrize(
     ("query", "token", "status", "code"),
     [
-        ("", "nobody's", 401, closing.UNAUTHENTICATED),
-        ("&quality=best", "ann's", 400, closing.INVALID),
-        (f"&topic={SECRET}", "ann's", 400, closing.INVALID),
+        ("", "nobody's", 401, close_codes.UNAUTHENTICATED),
+        ("&quality=best", "ann's", 400, close_codes.INVALID),
+        (f"&topic={SECRET}", "ann's", 400, close_codes.INVALID),
     ],
 )
 @pytest_twisted.ensureDeferred
@@ -333,7 +334,7 @@ async def test_a_camera_one_may_not_view_is_like_none_here_too(show: Show) -> No
         await opens(show)
     assert refused.value.response.status_code == 403
     browser = await opens(show, origin=f"http://127.0.0.1:{show.port}")
-    assert (await browser.closed())[0] == closing.NOT_FOUND
+    assert (await browser.closed())[0] == close_codes.NOT_FOUND
     assert not show.access._permits
 
 
@@ -356,10 +357,10 @@ async def test_nonsense_and_bytes_are_not_for_here(show: Show) -> None:
     eye, stream = await watched(show)
     for _ in range(module.MISTAKES):
         await eye.says('{"op":"subscribe"}')
-    assert (await eye.closed())[0] == closing.TOO_MANY_ERRORS
+    assert (await eye.closed())[0] == close_codes.TOO_MANY_ERRORS
     eye = await opens(show)
     await eye.says(b"\x00")  # type: ignore[arg-type]
-    assert (await eye.closed())[0] == closing.FORBIDDEN
+    assert (await eye.closed())[0] == close_codes.FORBIDDEN
     assert not stream.viewers
 
 
@@ -376,7 +377,7 @@ async def test_who_takes_what_was_not_sent_is_cut_when_it_is_too_much(show: Show
         await eye.took(number)
     for _ in range(module.MISTAKES):
         await eye.took(0)
-    assert (await eye.closed())[0] == closing.TOO_MANY_ERRORS
+    assert (await eye.closed())[0] == close_codes.TOO_MANY_ERRORS
     assert not stream.viewers
 
 
@@ -389,9 +390,9 @@ async def test_what_is_sent_is_put_into_words_once_for_all_viewers(
 
     def text(words: bytes) -> bytes:
         made.append(words)
-        return wsframe.text(words)
+        return websocket_frames.text(words)
 
-    monkeypatch.setattr(module, "wsframe", SimpleNamespace(text=text))
+    monkeypatch.setattr(module, "websocket_frames", SimpleNamespace(text=text))
     control = show.robot_comes()
     eyes = [await opens(show) for _ in range(5)]
     stream = await show.joined(control)
@@ -408,10 +409,10 @@ async def test_h264_that_the_robot_can_not_make_is_told_with_a_code_of_its_own(s
     """4415: another codec may do; 4503 when the robot makes too many streams as it is."""
     eye, stream = await watched(show, "&codec=h264")
     stream.message(link.NotPlaying(reason="no module named av"))
-    assert await eye.closed() == (closing.NOT_MADE, "no module named av")
+    assert await eye.closed() == (close_codes.NOT_MADE, "no module named av")
     eye, stream = await watched(show, "&codec=h264")
     stream.message(link.NotPlaying(reason="I have eyes for four", busy=True))
-    assert await eye.closed() == (closing.UNAVAILABLE, "I have eyes for four")
+    assert await eye.closed() == (close_codes.UNAVAILABLE, "I have eyes for four")
 
 
 @pytest_twisted.ensureDeferred
@@ -419,20 +420,20 @@ async def test_what_ends_a_stream_is_told_with_a_code(show: Show) -> None:
     """4503 from the robot, 1001 when the relay goes down."""
     eye, stream = await watched(show)
     stream.message(link.NotPlaying(reason="I have eyes for four"))
-    assert await eye.closed() == (closing.UNAVAILABLE, "I have eyes for four")
+    assert await eye.closed() == (close_codes.UNAVAILABLE, "I have eyes for four")
     eye = await opens(show)
     await until(lambda: show.access._permits)
     show.desk.say_goodbye("the relay is going down")
-    assert await eye.closed() == (closing.GOING_AWAY, "the relay is going down")
+    assert await eye.closed() == (close_codes.GOING_AWAY, "the relay is going down")
 
 
 @pytest_twisted.ensureDeferred
 async def test_who_begins_streams_too_fast_is_told_so(show: Show, monkeypatch: pytest.MonkeyPatch) -> None:
     """4503, with the words; it helps to try again later."""
-    monkeypatch.setattr(hub, "STREAMS_AT_ONCE", 1)
-    monkeypatch.setattr(hub, "STREAMS_A_SECOND", 1 / 60)
+    monkeypatch.setattr(streams, "STREAMS_AT_ONCE", 1)
+    monkeypatch.setattr(streams, "STREAMS_A_SECOND", 1 / 60)
     eye, _ = await watched(show)
     code, words = await (await opens(show, "&width=16")).closed()
-    assert code == closing.UNAVAILABLE
+    assert code == close_codes.UNAVAILABLE
     assert words.startswith("you begin streams of robot rover faster than it can; try again in ")
     await eye.leave()

@@ -13,15 +13,15 @@ from twisted.internet import reactor
 from twisted.logger import LogEvent, globalLogPublisher
 
 from relay_protocol.errors import Unavailable
-from relay_server.edges.video.multipart import LEAVING_SECONDS
-from relay_server.store import Store
+from relay_server.common.database import AsyncDatabase
 from relay_server.tls import ServerTls
+from relay_server.video.multipart import LEAVING_SECONDS
 from tests.relay_server.edges.video.show import CAMERA, STREAM, Looker, Show, jpeg, until
 from tests.relay_server.test_tls import make
 
 
 @pytest_twisted.async_yield_fixture
-async def show(store: Store, tmp_path: Path) -> AsyncIterator[Show]:
+async def show(store: AsyncDatabase, tmp_path: Path) -> AsyncIterator[Show]:
     """A relay with a certificate."""
     made = Show(store, ServerTls(*make(tmp_path, "relay")))
     yield made

@@ -8,17 +8,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from relay_server.edges.video import viewing
-from relay_server.edges.video.snapshot import Snapshot
-from relay_server.edges.video.viewing import Made, Waiting
-from relay_server.video import Picture
-from relay_server.video.pictures import STALE_SECONDS
+from relay_server.video import viewing
+from relay_server.video.frames import STALE_SECONDS, VideoFrameInfo
+from relay_server.video.snapshot import Snapshot
+from relay_server.video.viewing import FrameQueue, RenderCache
 from tests.relay_server.memory import Time
 
 
-def picture(number: int, at: float, codec: str = "jpeg", *, key: bool = True, size: int = 3) -> Picture:
+def picture(
+    number: int, at: float, codec: str = "jpeg", *, key: bool = True, size: int = 3
+) -> VideoFrameInfo:
     """One that arrived then."""
-    return Picture(number, 0.0, at + STALE_SECONDS, codec, 32, 24, key, bytes(size))
+    return VideoFrameInfo(number, 0.0, at + STALE_SECONDS, codec, 32, 24, key, bytes(size))
 
 
 class Line:
@@ -27,7 +28,7 @@ class Line:
     def __init__(self, time: Time) -> None:
         self.asked = 0
         self.time = time
-        self.waiting = Waiting(time, self._anew)
+        self.waiting = FrameQueue(time, self._anew)
 
     def _anew(self) -> None:
         self.asked += 1
@@ -168,7 +169,7 @@ def test_a_long_way_is_no_thin_link(time: Time) -> None:
 def test_a_viewer_who_vanished_is_noticed_while_nothing_is_written() -> None:
     """In a minute, not in the two hours that are usual."""
     with socket.socket() as handle:
-        assert viewing.narrow(SimpleNamespace(getHandle=lambda: handle)) is not None
+        assert viewing.limit_send_buffer(SimpleNamespace(getHandle=lambda: handle)) is not None
         assert handle.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
         idle, between, times = (
             handle.getsockopt(socket.IPPROTO_TCP, each)
@@ -181,11 +182,11 @@ def test_what_is_made_of_a_picture_is_made_once_for_all() -> None:
     """Anew for another picture."""
     made: list[int] = []
 
-    def make(each: Picture) -> bytes:
+    def make(each: VideoFrameInfo) -> bytes:
         made.append(each.number)
         return each.body
 
-    shared = Made(make)
+    shared = RenderCache(make)
     one, two = picture(1, 0.0), picture(2, 0.0)
     assert shared.of(one) is shared.of(one)
     shared.of(two)

@@ -1,0 +1,1 @@
+"""Who a client is: passwords, access tokens, tickets, login links, origins."""

@@ -1,0 +1,311 @@
+"""Who is it? Passwords, access tokens, one-time login codes and tickets become a principal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from sqlalchemy.orm import Session
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorThreads
+from twisted.logger import Logger
+
+from relay_db import queries
+from relay_db.models import NAME
+from relay_db.names import normalise
+from relay_protocol.errors import Refused, SwitchboardError, Unavailable
+from relay_protocol.limits import TICKET_SECONDS
+from relay_protocol.realms import parted
+from relay_server.access import BadCredentials, Principal
+from relay_server.auth import passwords
+from relay_server.auth.login_limiter import FAILURES_OF_ACCOUNT, LoginLimiter
+from relay_server.auth.origins import Origins
+from relay_server.common.database import AsyncDatabase, BoundedThreadPool
+
+__all__ = ["Authenticator", "BadCredentials", "TooManyTries", "named_realm", "session_token"]
+
+SESSION_SECONDS = 12 * 3600.0
+HASHING_THREADS = 2
+TICKETS = 10_000
+"""Tickets all users may have open; for a further one the user who has most gives his oldest."""
+
+TICKETS_OF_ONE = 100
+"""Tickets one user may have open; a further one takes the place of the oldest."""
+
+NAMED = 2 * NAME + 1
+"""Characters of a name with its realm that are put on record of who could not log in."""
+
+LOGINS_WAITING = 64
+"""Logins that wait for their password to be hashed; further ones are asked to come back."""
+
+
+class TooManyTries(SwitchboardError):
+    """Further tries are refused for ``retry_after`` seconds."""
+
+    code = "too_many_tries"
+
+    def __init__(self, retry_after: float) -> None:
+        super().__init__(
+            f"too many failed logins from your network, or of this account; try again in {int(retry_after) + 1} s"
+        )
+        self.retry_after = retry_after
+
+
+@dataclass(frozen=True)
+class TicketPurpose:
+    """What a ticket opens.
+
+    :param video: what shows the robot's cameras; else its websocket
+    :param camera: with ``video``, this camera alone; empty for whatever the addresses show
+    """
+
+    robot: str
+    video: bool = False
+    camera: str = ""
+
+    def covers(self, asked: TicketPurpose) -> bool:
+        """Whether it is for what somebody asks for with it."""
+        return (self.robot, self.video) == (asked.robot, asked.video) and self.camera in ("", asked.camera)
+
+
+@dataclass(frozen=True)
+class _Ticket:
+    principal: Principal
+    opens: TicketPurpose
+    until: float
+
+
+@dataclass(frozen=True)
+class LoginResult(Principal):
+    """Somebody who has just logged in, for whom a session may be opened.
+
+    :param password_hash: what was stored then; a session is opened only while that is still so
+    """
+
+    password_hash: str | None = field(default=None, repr=False)
+
+
+class Authenticator:
+    """Turns credentials into a :class:`Principal`, or raises.
+
+    :param seconds: a monotonic clock
+    :param wall: Unix time in seconds
+    """
+
+    log = Logger()
+
+    def __init__(
+        self,
+        reactor: IReactorThreads,
+        store: AsyncDatabase,
+        seconds: Callable[[], float],
+        wall: Callable[[], float],
+    ) -> None:
+        self._store = store
+        self._seconds = seconds
+        self._wall = wall
+        self._limiter = LoginLimiter(seconds, of_account=FAILURES_OF_ACCOUNT)
+        self._hashing = BoundedThreadPool(
+            reactor, "passwords", HASHING_THREADS, LOGINS_WAITING, "too many people log in now; try again"
+        )
+        self._tickets: dict[str, _Ticket] = {}
+
+    def start(self) -> None:
+        """Start the threads that hash passwords, and make ready for the first unknown user."""
+        self._hashing.start()
+        Deferred.fromCoroutine(self._hashing.run(passwords.prepare)).addErrback(
+            lambda failure: self.log.failure("passwords can't be hashed", failure)
+        )
+
+    async def take_up(self) -> None:
+        """Remember from which networks people have logged in lately, as the audit log has it.
+
+        :raises Unavailable: the database does not answer
+        """
+        for account, address in await self._store.read(queries.recent_logins):
+            self._limiter.remember(account, address)
+
+    def stop(self) -> None:
+        """Wait for the hashing under way and end its threads."""
+        self._hashing.stop()
+
+    async def password(self, user: str, password: str, address: str) -> LoginResult:
+        """Check a password; unknown users cost the same time as known ones.
+
+        :param user: ``toad@lab1``; without a realm one of the default one
+        :param address: where the ask comes from, for the limit on failures
+        :raises BadCredentials: unknown user, wrong password or disabled account: one and the same answer
+        :raises TooManyTries: judged before the password is hashed
+        :raises Unavailable: the database does not answer, or too many log in at once
+        """
+        wait = self._limiter.wait(user, address)
+        if wait > 0:
+            raise TooManyTries(wait)
+        self._limiter.failed(user, address)
+        try:
+            return await self._password(user, password, address)
+        except Unavailable:
+            # Nothing was tried.
+            self._limiter.forgive(user, address)
+            raise
+
+    async def _password(self, user: str, password: str, address: str) -> LoginResult:
+        record = await self._store.read(queries.find_user, *parted(user))
+        stored = record.password_hash if record is not None and not record.disabled else None
+        right = await self._hashing.run(passwords.verify_password, password, stored)
+        if record is None or not right:
+            raise BadCredentials("user or password is wrong")
+        self._limiter.succeeded(user, address)
+        return LoginResult(record.id, record.name, record.realm, record.admin, 0, None, password_hash=stored)
+
+    async def new_hash(self, password: str) -> str:
+        """What may be stored of a new password.
+
+        :raises Invalid: it breaks the rules
+        :raises Unavailable: too many are hashed now
+        """
+        return await self._hashing.run(passwords.hash_password, password)
+
+    async def token(self, token: str) -> Principal:
+        """The principal behind an access token or a portal session.
+
+        :raises BadCredentials: unknown, expired or revoked
+        """
+        record = await self._store.read(
+            queries.principal_by_token, passwords.token_hash(token), self._wall(), ("access", "session")
+        )
+        if record is None:
+            raise BadCredentials("the access token is unknown, expired or revoked")
+        return Principal.of(record)
+
+    async def login_code(self, code: str, address: str) -> LoginResult:
+        """The principal of a one-time login link; the code is spent by this.
+
+        :raises BadCredentials: unknown, expired or used
+        :raises TooManyTries: as for passwords
+        """
+        wait = self._limiter.wait(None, address)
+        if wait > 0:
+            raise TooManyTries(wait)
+        login = await self._store.write(_consume, passwords.token_hash(code), self._wall())
+        if login is None:
+            self._limiter.failed(None, address)
+            raise BadCredentials("the login link is unknown, expired or already used; ask for a new one")
+        return login
+
+    async def open_session(self, login: LoginResult, address: str, how: str) -> str:
+        """A portal session for somebody just proved, and an audit entry; returns the token its cookie carries.
+
+        :param how: ``password`` or ``link``, for the record
+        :raises BadCredentials: the password was changed or the account disabled meanwhile
+        :raises Unavailable: it can't be put on record
+        """
+        token = passwords.new_token()
+        try:
+            await self._store.write(
+                _open_session, login, passwords.token_hash(token), address, how, self._wall()
+            )
+        except Refused as error:
+            raise BadCredentials(str(error)) from None
+        self._limiter.remember(login.full, address)
+        return token
+
+    def issue_ticket(self, principal: Principal, opens: TicketPurpose) -> str:
+        """A ticket, good once for :data:`TICKET_SECONDS`; where too many are open, another one is no more."""
+        now = self._seconds()
+        for key in [key for key, ticket in self._tickets.items() if ticket.until <= now]:
+            del self._tickets[key]
+        own = [key for key, ticket in self._tickets.items() if ticket.principal.user_id == principal.user_id]
+        if len(own) >= TICKETS_OF_ONE:
+            del self._tickets[own[0]]
+        if len(self._tickets) >= TICKETS:
+            del self._tickets[self._most_dispensable()]
+        ticket = passwords.new_token()
+        self._tickets[passwords.token_hash(ticket)] = _Ticket(principal, opens, now + TICKET_SECONDS)
+        return ticket
+
+    def _most_dispensable(self) -> str:
+        """The oldest ticket of the user who has most."""
+        [(greedy, _)] = Counter(each.principal.user_id for each in self._tickets.values()).most_common(1)
+        return next(key for key, each in self._tickets.items() if each.principal.user_id == greedy)
+
+    async def ticket(self, ticket: str, asked: TicketPurpose, *, spend: bool = True) -> Principal:
+        """The principal of a ticket.
+
+        :param asked: what is to be opened with it
+        :param spend: the ticket is spent by this, whatever comes of it; else it is only looked at
+        :raises BadCredentials: unknown, used, too old, for something else, or its user's session has ended since
+        """
+        key = passwords.token_hash(ticket)
+        found = self._tickets.pop(key, None) if spend else self._tickets.get(key)
+        if found is None or found.until <= self._seconds() or not found.opens.covers(asked):
+            raise BadCredentials(
+                "the ticket is unknown, used, expired or for something else; ask for a new one"
+            )
+        live = await self._store.read(queries.token_is_live, found.principal.token_id, self._wall())
+        if not live:
+            raise BadCredentials("the session that asked for this ticket has ended; log in again")
+        return found.principal
+
+
+def named_realm(user: str) -> str:
+    """The realm that somebody names with a user's name, there or not; empty where it can't be."""
+    return normalise(parted(user)[1])
+
+
+def session_token(origins: Origins, name: str, header: str, origin: str | None, host: str) -> str | None:
+    """The token of a session cookie in a websocket's handshake, ``None`` when there is no such cookie.
+
+    :param name: of the cookie
+    :param header: ``Cookie``
+    :raises Refused: a cookie without a listed Origin
+    :raises BadCredentials: the relay's own page has none
+    """
+    token = _cookie(header, name)
+    if token is None:
+        if origin is not None and origin == f"{'https' if origins.tls else 'http'}://{host}":
+            raise BadCredentials("your session has ended; log in again")
+        return None
+    origins.check(origin, host)
+    return token
+
+
+def _cookie(header: str, name: str) -> str | None:
+    """The value of a cookie, as Twisted finds it for requests: split, since ``http.cookies`` takes quadratic time."""
+    found = None
+    for each in header.split(";"):
+        key, equals, value = each.lstrip().partition("=")
+        if equals and key == name:
+            found = value
+    return found
+
+
+def _consume(s: Session, code_hash: str, now: float) -> LoginResult | None:
+    """Use a login link up."""
+    found = queries.consume_login(s, code_hash, now)
+    user = None if found is None else queries.get_user(s, found.user_id)
+    if user is None:
+        return None
+    return LoginResult(user.id, user.name, user.realm, user.admin, 0, None, password_hash=user.password_hash)
+
+
+def _open_session(s: Session, login: LoginResult, token_hash: str, origin: str, how: str, now: float) -> None:
+    """The session and its audit entry, both or neither."""
+    queries.open_session(
+        s,
+        login.user_id,
+        token_hash,
+        password_hash=login.password_hash,
+        expires=now + SESSION_SECONDS,
+        now=now,
+    )
+    queries.append_audit(
+        s,
+        at=now,
+        actor=f"user:{login.full}",
+        action="login",
+        target=login.full,
+        origin=origin,
+        data={"how": how},
+    )

@@ -1,0 +1,1 @@
+"""Clocks, queues, timers, sockets and database access: nothing of the domain."""

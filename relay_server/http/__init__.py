@@ -1,0 +1,1 @@
+"""The HTTP framework: limits, errors, conditional requests, forms, OpenAPI, RDF, the site."""

@@ -1,0 +1,1 @@
+"""The HTTP API described, from what stands at its routes."""

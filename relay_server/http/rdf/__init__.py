@@ -1,0 +1,1 @@
+"""State as RDF: encode, decode, serialize, vocabulary."""

@@ -1,0 +1,290 @@
+"""Graphs of RDF as text and back: RDF/XML, Turtle, JSON-LD.
+
+What is read is a stranger's: it is looked through before a parser gets it, so that nothing is fetched or opened for it,
+nothing in it stands for something larger, and it is not nested deeply. It is small: the edge bounds requests.
+
+rdflib's own writers are not used where they lose something: that of Turtle rounds doubles, that of JSON-LD too, and it
+writes no list that begins with 0.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import warnings
+from collections.abc import Callable
+from io import BytesIO
+from itertools import islice
+from typing import Any
+from xml.parsers import expat
+
+import rdflib
+from rdflib import RDF, Graph, Literal, URIRef
+from rdflib.plugins.parsers.jsonld import to_rdf
+from rdflib.plugins.serializers.rdfxml import XMLSerializer
+from rdflib.plugins.serializers.turtle import TurtleSerializer
+from rdflib.term import Node
+
+from relay_protocol import jsontext
+from relay_protocol.errors import Invalid, SwitchboardError
+from relay_protocol.limits import JSON_DEPTH
+from relay_server.http.media_types import JSON_LD, RDF_XML, TURTLE, MediaType
+from relay_server.http.rdf.vocabulary import LONGEST_IRI
+
+# What is read is taken as it is written: a decimal of ten characters may have 10^9 digits.
+rdflib.NORMALIZE_LITERALS = False
+# It tells of every literal that is none of its datatype; who sent it is told so.
+logging.getLogger("rdflib").setLevel(logging.CRITICAL)
+warnings.filterwarnings("ignore", "Parsing weird boolean", UserWarning)
+
+CONTEXT_TERMS = 128
+CONTEXT_CHARACTERS = 16 * 1024
+"""Of a context of JSON-LD."""
+
+PARTS = 2048
+"""Elements of RDF/XML, words of Turtle, values of JSON-LD: parsers take some 30 µs for each. A long array is one."""
+
+NAMESPACES = 64
+"""Of RDF/XML and Turtle; of JSON-LD they are terms."""
+
+XML_DEPTH = 2 * JSON_DEPTH + 2
+"""An element for each node, and one for each property."""
+
+_ABSOLUTE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://\S*\Z|urn:\S*\Z")
+_TERM = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*\Z")
+_LONG_IRI = re.compile(rf"<[^\s<>\"{{}}|^`]{{{LONGEST_IRI},}}")
+_WORD = re.compile(r'"(?:[^"\\]|\\.)*"|<[^<>\s]*>|[\[\](),;]|[^\s\[\](),;"<]+|["<]', re.DOTALL)
+_PREFIX = re.compile(r"(?<![\w:/#])prefix", re.IGNORECASE)
+_KEYWORDS = frozenset({"@id", "@type", "@value", "@list", "@graph", "@vocab"})
+_ESCAPES = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r"})
+
+
+def write(graph: Graph, form: MediaType) -> bytes:
+    """A graph in one of the forms of RDF, in UTF-8."""
+    if form is JSON_LD:
+        return jsontext.encode(_Linked(graph).document())
+    out = BytesIO()
+    serializer: Any = XMLSerializer(graph) if form is RDF_XML else _Turtle(graph)
+    serializer.serialize(out)
+    return out.getvalue()
+
+
+def read(body: bytes, form: MediaType, base: str) -> Graph:
+    """The graph in a text.
+
+    :param base: the address that relative ones are relative to
+    :raises Invalid: it can't be read, or would be dangerous to; in words
+    """
+    try:
+        text = body.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise Invalid(f"the body is not UTF-8 (byte {error.start})") from None
+    graph = Graph(bind_namespaces="none")
+    try:
+        _READERS[form](graph, text, base)
+    except SwitchboardError:
+        raise
+    except RecursionError:
+        raise Invalid("the body is nested too deeply") from None
+    except (
+        Exception
+    ) as error:  # Whatever the parsers stumble over is the sender's fault; they have no error in common.
+        raise Invalid(f"the body is no {form.media} that can be read: {_first_line(error)}") from None
+    return graph
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0][:200]
+
+
+def _too_many(what: str) -> Invalid:
+    return Invalid(f"the body has more than {PARTS} {what}; send it as application/json")
+
+
+# --- RDF/XML ----------------------------------------------------------------------------------------------
+
+
+def _read_xml(graph: Graph, text: str, base: str) -> None:
+    _see_xml(text)
+    graph.parse(data=text.encode(), format="xml", publicID=base)
+
+
+def _see_xml(text: str) -> None:
+    """See that a document is harmless to read.
+
+    :raises Invalid: it has a document type, which could define entities; another encoding; deep nesting; long IRIs;
+        many namespaces, for each of which the parser keeps a table; XML as a value, read anew with each element of it
+    """
+    depth = namespaces = elements = 0
+
+    def declared(version: str, encoding: str | None, standalone: int) -> None:
+        if (encoding or "utf-8").lower() not in ("utf-8", "utf8"):
+            raise Invalid("the body must be UTF-8, and so must its XML declaration say")
+
+    def document_type(*named: Any) -> None:
+        raise Invalid("the body must not have a DOCTYPE: entities are not read")
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        nonlocal depth, namespaces, elements
+        depth += 1
+        elements += 1 + len(attributes)
+        if elements > PARTS:
+            raise _too_many("elements and attributes")
+        namespaces += sum(each.startswith("xmlns") for each in attributes)
+        if namespaces > NAMESPACES:
+            raise Invalid(f"the body declares more than {NAMESPACES} namespaces")
+        for each, value in attributes.items():
+            if each.rpartition(":")[2] == "parseType" and value not in ("Resource", "Collection"):
+                raise Invalid("rdf:parseType can be Resource or Collection: no field is XML")
+        if depth > XML_DEPTH:
+            raise Invalid(f"the body nests elements deeper than {XML_DEPTH}")
+        if any(len(each) > LONGEST_IRI for each in (name, *attributes, *attributes.values())):
+            raise Invalid(f"the body has an attribute of over {LONGEST_IRI} characters")
+
+    def end(name: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser = expat.ParserCreate("utf-8")
+    parser.XmlDeclHandler = declared
+    parser.StartDoctypeDeclHandler = document_type
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.Parse(text.encode(), True)
+
+
+# --- Turtle -----------------------------------------------------------------------------------------------
+
+
+class _Turtle(TurtleSerializer):
+    """Every literal with its datatype and all its digits."""
+
+    def label(self, node: Node, position: int) -> str:
+        if not isinstance(node, Literal):
+            found: str = super().label(node, position)
+            return found
+        quoted = f'"{str(node).translate(_ESCAPES)}"'
+        if node.datatype is None:
+            return quoted
+        return f"{quoted}^^{self.get_pname(node.datatype, gen_prefix=False) or node.datatype.n3()}"
+
+
+def _read_turtle(graph: Graph, text: str, base: str) -> None:
+    if _LONG_IRI.search(text) is not None:
+        raise Invalid(f"the body has an address of over {LONGEST_IRI} characters")
+    if sum(1 for _ in islice(_WORD.finditer(text), PARTS + 1)) > PARTS:
+        raise _too_many("words")
+    # Each is compared with all before it. Also those in strings are counted: so many are none a sender needs.
+    if sum(1 for _ in _PREFIX.finditer(text)) > NAMESPACES:
+        raise Invalid(f"the body declares more than {NAMESPACES} namespaces")
+    graph.parse(data=text, format="turtle", publicID=base)
+
+
+# --- JSON-LD ----------------------------------------------------------------------------------------------
+
+
+class _Linked:
+    """A graph as JSON-LD, with a context of its own: each node where it is used, but those that have an address."""
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+        self._context = {prefix: str(namespace) for prefix, namespace in graph.namespaces()}
+        self._prefixes = {namespace: prefix for prefix, namespace in self._context.items()}
+
+    def document(self) -> dict[str, Any]:
+        """All of it."""
+        named = dict.fromkeys(each for each in self._graph.subjects() if isinstance(each, URIRef))
+        return {"@context": self._context, "@graph": [self._node(each) for each in named]}
+
+    def _node(self, node: Node) -> dict[str, Any]:
+        found: dict[str, Any] = {"@id": str(node)} if isinstance(node, URIRef) else {}
+        for predicate, each in self._graph.predicate_objects(node):
+            if predicate == RDF.type:
+                found.setdefault("@type", []).append(self._short(each))
+            else:
+                found.setdefault(self._short(predicate), []).append(self._value(each))
+        return {name: each[0] if len(each) == 1 and name[0] != "@" else each for name, each in found.items()}
+
+    def _value(self, term: Node) -> Any:
+        if isinstance(term, Literal):
+            if term.datatype is None:
+                return str(term)
+            return {"@type": self._short(term.datatype), "@value": str(term)}
+        if term == RDF.nil:
+            return {"@list": []}
+        if (term, RDF.first, None) in self._graph:
+            return {"@list": [self._value(each) for each in self._graph.items(term)]}
+        return {"@id": str(term)} if isinstance(term, URIRef) else self._node(term)
+
+    def _short(self, term: Node) -> str:
+        text = str(term)
+        cut = max(text.rfind("#"), text.rfind("/")) + 1
+        prefix = self._prefixes.get(text[:cut])
+        return text if prefix is None else f"{prefix}:{text[cut:]}"
+
+
+def _read_json(graph: Graph, text: str, base: str) -> None:
+    value = jsontext.decode_any(text.encode())
+    if not isinstance(value, dict):
+        raise Invalid("the body must be one object of JSON-LD")
+    if "@context" in value:
+        _see_context(value["@context"])
+    _see_no_context({name: each for name, each in value.items() if name != "@context"})
+    to_rdf(value, graph, base=base)
+
+
+def _see_context(context: Any) -> None:
+    """See that a context stands for itself: nothing is fetched, and no term grows out of another.
+
+    :raises Invalid: it does not
+    """
+    if not isinstance(context, dict):
+        raise Invalid("'@context' must be an object in the body itself: no context is fetched")
+    if len(context) > CONTEXT_TERMS or len(jsontext.encode(context)) > CONTEXT_CHARACTERS:
+        raise Invalid(
+            f"'@context' may have {CONTEXT_TERMS} terms and {CONTEXT_CHARACTERS} characters at most"
+        )
+    for name, term in context.items():
+        if name == "@version":
+            continue
+        if name not in ("@base", "@vocab") and _TERM.match(name) is None:
+            raise Invalid(f"'@context' can't have the entry '{name[:40]}' here")
+        parts = term if isinstance(term, dict) else {"@id": term}
+        for word, each in parts.items():
+            _see_term(context, name, word, each)
+
+
+def _see_term(context: dict[str, Any], name: str, word: str, value: Any) -> None:
+    if word == "@container" and value in ("@list", "@set"):
+        return
+    if word in ("@id", "@type") and isinstance(value, str):
+        prefix = context.get(value.partition(":")[0])
+        own = isinstance(prefix, str) and _ABSOLUTE.match(prefix) is not None
+        if len(value) <= LONGEST_IRI and (value in _KEYWORDS or own or _ABSOLUTE.match(value) is not None):
+            return
+    raise Invalid(f"'@context' says of '{name[:40]}' what is not read here: give it one address")
+
+
+def _see_no_context(value: Any) -> None:
+    """:raises Invalid: there is a context below the body's own, or more than can be read"""
+    waiting = [value]
+    values = 0
+    while waiting:
+        each = waiting.pop()
+        values += 1
+        if values > PARTS:
+            raise _too_many("values")
+        if isinstance(each, dict):
+            if "@context" in each or "@import" in each:
+                raise Invalid("'@context' may be at the top of the body alone, and nothing is imported")
+            waiting += each.values()
+        elif isinstance(each, list):
+            waiting += each
+
+
+_READERS: dict[MediaType, Callable[[Graph, str, str], None]] = {
+    RDF_XML: _read_xml,
+    TURTLE: _read_turtle,
+    JSON_LD: _read_json,
+}

@@ -1,0 +1,1 @@
+"""Sessions that the relay opens itself, for HTTP clients and fleet orders."""

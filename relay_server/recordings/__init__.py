@@ -1,0 +1,1 @@
+"""Recordings of topics and cameras in MCAP files."""

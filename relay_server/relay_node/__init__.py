@@ -1,0 +1,1 @@
+"""The relay as a node of every robot's graph: /rosapi/… and /relay/…."""

@@ -1,0 +1,329 @@
+"""``/rosapi/…`` about parameters, answered by the nodes' own parameter services on the robot.
+
+A parameter is named ``<node>:<parameter>``, its value is JSON text. Whoever asks needs the right to call just that
+service of just that node. Source: rosapi of rosbridge_suite for ROS 2; ROS 2 design, "ROS 2 Parameters";
+``rcl_interfaces/msg/ParameterType``.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import contextlib
+import math
+from collections import deque
+from typing import Any
+
+from relay_protocol import jsontext, nonfinite
+from relay_protocol.errors import Invalid, MalformedMessage, NotFound, SwitchboardError, Unavailable
+from relay_protocol.limits import NAME
+from relay_protocol.rights import Operation
+from relay_server.common.gather import PerKeySemaphore, gather_per_key
+from relay_server.relay_node.arguments import absolute, text
+from relay_server.relay_node.view import view
+from relay_server.sessions.session import Session
+
+NOT_SET = 0
+BOOL = 1
+INTEGER = 2
+DOUBLE = 3
+STRING = 4
+BYTES = 5
+BOOLS = 6
+INTEGERS = 7
+DOUBLES = 8
+STRINGS = 9
+
+_FIELDS = {
+    BOOL: "bool_value",
+    INTEGER: "integer_value",
+    DOUBLE: "double_value",
+    STRING: "string_value",
+    BYTES: "byte_array_value",
+    BOOLS: "bool_array_value",
+    INTEGERS: "integer_array_value",
+    DOUBLES: "double_array_value",
+    STRINGS: "string_array_value",
+}
+_OF_ELEMENTS = {BOOL: BOOLS, INTEGER: INTEGERS, DOUBLE: DOUBLES, STRING: STRINGS}
+
+
+def from_parameter(told: Any) -> tuple[Any] | None:
+    """The value as JSON has it, in a tuple of its own because it can be null (NaN); ``None`` when nothing is set.
+
+    :param told: a ParameterValue in JSON, from a robot
+    :raises Invalid: it is none
+    """
+    try:
+        kind = told["type"]
+        if kind == NOT_SET:
+            return None
+        value = told[_FIELDS[kind]]
+        if kind == BYTES and isinstance(value, str):
+            # In messages bytes are base64; a parameter's value is what people read and write.
+            return (list(base64.b64decode(value, validate=True)),)
+    except (TypeError, KeyError, binascii.Error, ValueError):
+        raise Invalid("this is no value of a parameter") from None
+    return (value,)
+
+
+def to_parameter(value: Any, has: int | None = None) -> dict[str, Any]:
+    """A ParameterValue in JSON, to be sent to a robot.
+
+    :param value: decoded from JSON
+    :param has: the type the parameter has now, where that is known: it decides between 1 and 1.0, bytes and
+        integers, what an empty list is of, and whether null is NaN, as which it is read
+    :raises Invalid: no parameter can have this value
+    """
+    if isinstance(value, list):
+        if has == DOUBLES or any(isinstance(each, float) for each in value):
+            value = [math.nan if each is None else each for each in value]
+        kind = _kind_of_list(value, has)
+    else:
+        if value is None and has == DOUBLE:
+            value = math.nan
+        kind = _kind(value)
+        if kind == INTEGER and has == DOUBLE:
+            kind = DOUBLE
+    return {"type": kind, _FIELDS[kind]: value}
+
+
+def _kind(value: Any) -> int:
+    if isinstance(value, bool):
+        return BOOL
+    if isinstance(value, int):
+        return INTEGER
+    if isinstance(value, float):
+        return DOUBLE
+    if isinstance(value, str):
+        return STRING
+    if value is None:
+        raise Invalid(
+            "null is NaN, which only a parameter of numbers with a fraction can be; this one is none now"
+        )
+    raise Invalid("a parameter is a boolean, a number, a string, or a list of one of these")
+
+
+def _kind_of_list(values: list[Any], has: int | None) -> int:
+    kinds = {_kind(each) for each in values}
+    if not kinds:
+        if has in (BYTES, BOOLS, INTEGERS, DOUBLES, STRINGS):
+            return has
+        raise Invalid("nobody can tell what an empty list would hold: the parameter has no type yet")
+    if kinds == {INTEGER, DOUBLE} or (kinds == {INTEGER} and has == DOUBLES):
+        return DOUBLES
+    if kinds == {INTEGER} and has == BYTES and all(0 <= each <= 255 for each in values):
+        return BYTES
+    if len(kinds) > 1:
+        raise Invalid("a parameter's list holds values of one type only")
+    return _OF_ELEMENTS[kinds.pop()]
+
+
+SECONDS = 5.0
+"""A node has this long to answer about one parameter, as in rosapi."""
+
+LIST_SECONDS = 2.0
+"""A node has this long to list its parameters; one that does not is left out."""
+
+ALL_SECONDS = 10.0
+"""All nodes together have this long."""
+
+SURVEYS = 16
+SURVEYS_OF_USER = 4
+"""Questions for which the nodes of one robot are asked at a time, and those of one user."""
+
+_LIST = "rcl_interfaces/srv/ListParameters"
+NAMES = 65_536
+"""Most names in one answer; longer ones than a name may be are left out."""
+
+_surveys = PerKeySemaphore(
+    SURVEYS, f"{SURVEYS} callers are asking all nodes for their parameters; try again in a moment"
+)
+_surveys_of_user = PerKeySemaphore(
+    SURVEYS_OF_USER,
+    f"{SURVEYS_OF_USER} questions of yours for all parameters wait already; try again in a moment",
+)
+
+
+def _split(args: Any) -> tuple[str, str]:
+    """Node and parameter.
+
+    :raises Invalid: not of the form ``<node>:<parameter>``
+    """
+    given = text(args, "name")
+    node, colon, parameter = given.partition(":")
+    if not colon or not node.strip("/") or not parameter:
+        raise Invalid(f"'{given[:80]}' is no parameter; write <node>:<parameter>, say /camera:exposure")
+    return absolute(node), parameter
+
+
+async def _ask(
+    session: Session,
+    node: str,
+    service: str,
+    request: Any,
+    seconds: float = SECONDS,
+    stamp: int | None = None,
+) -> Any:
+    """Call a parameter service of a node.
+
+    :param stamp: the relay's monotonic nanoseconds before which this can't have been asked for; as of now when it is
+        left out
+    :raises Refused: the caller may not call it
+    :raises NotFound: the node is not there, or has no such service
+    """
+    name = f"{node}/{service}"
+    with session.share.counted():
+        session.judge(Operation.CALL, name)
+        found = view(session).services.get(name)
+        if found is None or not found.types:
+            raise NotFound(f"there is no node {node} with parameters on robot {session.robot.name}")
+    session.share.asks_robot()
+    answer = await session.channel.asking.call(
+        name,
+        found.types[0],
+        jsontext.encode(nonfinite.with_marks(request)),
+        seconds,
+        session.calling.sent(name, session.not_before if stamp is None else stamp),
+    )
+    with session.share.counted():
+        return jsontext.decode_any(answer)
+
+
+async def _value(session: Session, node: str, parameter: str) -> Any:
+    """The parameter's ``rcl_interfaces/msg/ParameterValue``; its type is 0 when it is not set."""
+    answer = await _ask(session, node, "get_parameters", {"names": [parameter]})
+    try:
+        values = answer["values"]
+        # A node that does not know the parameter at all sends no value.
+        return values[0] if values else {"type": NOT_SET}
+    except (TypeError, KeyError) as error:
+        raise _odd(node) from error
+
+
+def _odd(node: str) -> Unavailable:
+    return Unavailable(f"node {node} gave an answer about its parameters that makes no sense")
+
+
+async def get_param(session: Session, args: Any) -> Any:
+    """``/rosapi/get_param``. What can't be had comes as ``default_value``, or as null."""
+    default = text(args, "default_value", 1, "")
+    try:
+        node, parameter = _split(args)
+        found = await _value(session, node, parameter)
+        try:
+            value = from_parameter(found)
+        except Invalid as error:
+            raise _odd(node) from error
+        if value is not None:
+            return _got(jsontext.encode(value[0]).decode())
+        if default:
+            return _got(_as_json(default))
+        reason = f"the parameter {parameter} of node {node} is not set"
+    except SwitchboardError as error:
+        reason = str(error)
+    return {"value": _as_json(default), "successful": False, "reason": reason}
+
+
+def _got(value: str) -> dict[str, Any]:
+    return {"value": value, "successful": True, "reason": ""}
+
+
+def _as_json(default: str) -> str:
+    """The default as JSON text; what is none counts as a string."""
+    if not default:
+        return "null"
+    try:
+        return jsontext.encode(jsontext.decode_any(default.encode())).decode()
+    except MalformedMessage:
+        return jsontext.encode(default).decode()
+
+
+async def has_param(session: Session, args: Any) -> Any:
+    """``/rosapi/has_param``: false also for what the caller may not ask, as for what is not there."""
+    try:
+        node, parameter = _split(args)
+        return {"exists": from_parameter(await _value(session, node, parameter)) is not None}
+    except SwitchboardError:
+        return {"exists": False}
+
+
+async def set_param(session: Session, args: Any) -> Any:
+    """``/rosapi/set_param``"""
+    given, stamp = text(args, "value", 1), session.not_before
+    try:
+        node, parameter = _split(args)
+        try:
+            value = nonfinite.plain(jsontext.decode_any(nonfinite.mark(given.encode())))
+        except MalformedMessage as error:
+            raise Invalid(f"'value' must be JSON text: {error}") from None
+        session.judge(Operation.CALL, f"{node}/set_parameters")
+        has = await _type_it_has(session, node, parameter) if _ambiguous(value) else None
+        return await _set(session, node, parameter, to_parameter(value, has), stamp)
+    except SwitchboardError as error:
+        return {"successful": False, "reason": str(error)}
+
+
+def _ambiguous(value: Any) -> bool:
+    """JSON does not tell 1 from 1.0, NaN from nothing, nor bytes from integers, nor what an empty list would hold."""
+    return isinstance(value, list | None) or (isinstance(value, int) and not isinstance(value, bool))
+
+
+async def _type_it_has(session: Session, node: str, parameter: str) -> int | None:
+    """The type of the parameter now, ``None`` when nobody can tell."""
+    try:
+        found = (await _value(session, node, parameter))["type"]
+    except (SwitchboardError, TypeError, KeyError):
+        return None
+    return found if isinstance(found, int) else None
+
+
+async def delete_param(session: Session, args: Any) -> Any:
+    """``/rosapi/delete_param``: in ROS 2 a parameter is deleted by setting it to nothing."""
+    try:
+        node, parameter = _split(args)
+        return await _set(session, node, parameter, {"type": NOT_SET})
+    except SwitchboardError as error:
+        return {"successful": False, "reason": str(error)}
+
+
+async def _set(
+    session: Session, node: str, parameter: str, value: dict[str, Any], stamp: int | None = None
+) -> dict[str, Any]:
+    request = {"parameters": [{"name": parameter, "value": value}]}
+    answer = await _ask(session, node, "set_parameters", request, stamp=stamp)
+    try:
+        (result,) = answer["results"]
+        done, reason = bool(result["successful"]), str(result["reason"])
+    except (TypeError, KeyError, ValueError) as error:
+        raise _odd(node) from error
+    if done:
+        session.notice("param.set", param=f"{node}:{parameter}", deleted=value["type"] == NOT_SET)
+    return {"successful": done, "reason": reason}
+
+
+async def get_param_names(session: Session, args: Any) -> Any:
+    """``/rosapi/get_param_names``: of all nodes the caller may ask, side by side. Who does not answer is left out."""
+    nodes = [
+        name.removesuffix("/list_parameters")
+        for name, service in view(session).services.items()
+        if name.endswith("/list_parameters") and _LIST in service.types
+    ]
+    found: dict[str, list[str]] = {}
+    waiting, room = deque(nodes), NAMES
+
+    async def ask(node: str) -> None:
+        nonlocal room
+        # Who does not answer, or not with names, is left out.
+        with contextlib.suppress(SwitchboardError, TypeError, KeyError):
+            answer = await _ask(session, node, "list_parameters", {}, LIST_SECONDS)
+            told = answer["result"]["names"][:NAMES]
+            found[node] = [f"{node}:{each}" for each in told if isinstance(each, str) and len(each) <= NAME]
+            room -= len(found[node])
+        if room <= 0:
+            waiting.clear()
+
+    mine, places = _surveys_of_user.take(session.allowance), _surveys.take(session.channel)
+    with mine, places, contextlib.suppress(Unavailable):
+        await session.channel.asking.within(ALL_SECONDS, gather_per_key(waiting, ask))
+    return {"names": [name for node in nodes for name in found.get(node, [])][:NAMES]}

@@ -1,0 +1,1 @@
+"""Websockets: handshake, Autobahn adapter, fast path."""

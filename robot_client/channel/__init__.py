@@ -1,0 +1,1 @@
+"""One channel: the relay's messages become actions on the platform."""

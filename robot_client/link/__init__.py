@@ -1,0 +1,1 @@
+"""The link to the relay: dial, prove identity, reconnect, transport."""

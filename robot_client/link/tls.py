@@ -1,0 +1,198 @@
+"""TLS towards the relay: name and chain are checked, and what fails is said in words."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Any, cast
+
+from OpenSSL import SSL
+from service_identity import CertificateError, VerificationError
+from service_identity.hazmat import DNS_ID, IPAddress_ID, verify_service_identity
+from service_identity.pyopenssl import extract_patterns
+from twisted.internet import error, ssl
+from twisted.internet.endpoints import HostnameEndpoint, wrapClientTLS
+from twisted.internet.interfaces import IOpenSSLClientConnectionCreator
+from twisted.python.failure import Failure
+from zope.interface import implementer
+
+from relay_protocol.errors import Invalid, Refused, SwitchboardError
+from robot_client.twisted_types import DialEndpoint
+
+CONNECT_SECONDS = 10.0
+_PEM_END = b"-----END CERTIFICATE-----"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine, where nobody listens in."""
+    if host == "localhost" or host.endswith(".localhost"):
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def trust_root(ca: str) -> Any:
+    """The authorities in a PEM file.
+
+    :raises Invalid: no such file, or no certificate in it
+    """
+    try:
+        text = Path(ca).read_bytes()
+        blocks = [block + _PEM_END for block in text.split(_PEM_END)[:-1]]
+        certificates = [ssl.Certificate.loadPEM(block) for block in blocks]
+    except OSError as problem:
+        raise Invalid(f"the CA file {ca} can't be read: {problem.strerror}") from None
+    except SSL.Error:
+        raise Invalid(f"the CA file {ca} holds something that is no certificate in PEM form") from None
+    if not certificates:
+        raise Invalid(f"the CA file {ca} holds no certificate in PEM form")
+    return ssl.trustRootFromCertificates(certificates)
+
+
+def endpoint(
+    reactor: Any, host: str, port: int, tls: bool, ca: str = "", server_name: str = ""
+) -> DialEndpoint:
+    """Where to dial.
+
+    :param ca: PEM file of the only authorities trusted; empty for the system's
+    :param server_name: name the certificate must bear; empty for ``host``
+    :raises Invalid: the CA file, or the name, can't be used
+    """
+    plain: Any = HostnameEndpoint(reactor, host, port, timeout=CONNECT_SECONDS)
+    if not tls:
+        return cast(DialEndpoint, plain)
+    name = server_name or host
+    trusted = trust_root(ca) if ca else None
+    try:
+        options = ssl.optionsForClientTLS(
+            name,
+            trustRoot=trusted,
+            extraCertificateOptions={"raiseMinimumTo": ssl.TLSVersion.TLSv1_2},
+        )
+    except ValueError:  # that of idna, too
+        raise Invalid(f"'{name}' can't be the name in a certificate; see --server-name") from None
+    return cast(DialEndpoint, wrapClientTLS(cast(Any, _InWords(options, name)), plain))
+
+
+class CertificateRefused(Refused):
+    """The relay's certificate is not good; nothing was said to it."""
+
+
+@implementer(IOpenSSLClientConnectionCreator)
+class _InWords:
+    """Twisted's TLS client, whose checks are made with the reason kept: OpenSSL's error only says *failed*.
+
+    :param inner: makes the connections
+    :param name: what the certificate must be for
+    """
+
+    def __init__(self, inner: Any, name: str) -> None:
+        self._inner = inner
+        self._name = name
+        try:
+            self._id: Any = IPAddress_ID(name)
+        except ValueError:
+            self._id = DNS_ID(name)
+
+    def clientConnectionForTLS(self, protocol: Any) -> SSL.Connection:
+        """A connection that checks chain and name."""
+        connection: SSL.Connection = self._inner.clientConnectionForTLS(protocol)
+
+        def check(_: SSL.Connection, certificate: Any, code: int, depth: int, good: int) -> bool:
+            reason = self._fault(certificate, code, depth, bool(good))
+            if reason:
+                protocol.failVerification(Failure(CertificateRefused(reason)))
+            return not reason
+
+        connection.set_verify(SSL.VERIFY_PEER | SSL.VERIFY_FAIL_IF_NO_PEER_CERT, check)
+        return connection
+
+    def _fault(self, certificate: Any, code: int, depth: int, good: bool) -> str:
+        """What is wrong with one certificate of the chain; empty if nothing is."""
+        if not good:
+            return _CHAIN_WORDS.get(
+                code, f"the relay's certificate can't be verified (OpenSSL's reason {code})"
+            )
+        if depth > 0:
+            return ""
+        try:
+            verify_service_identity(extract_patterns(certificate), [self._id], [])
+        except (VerificationError, CertificateError):
+            return f"the relay's certificate is for another name than {self._name}; see --server-name"
+        except Exception:  # an exception in OpenSSL's callback would be lost, and the certificate taken
+            return "the relay's certificate can't be read"
+        return ""
+
+
+_UNTRUSTED = "the relay's certificate is of nobody this robot trusts; give its CA as --ca"
+_CODES = SSL.X509VerificationCodes
+_CHAIN_WORDS = {
+    _CODES.ERR_CERT_HAS_EXPIRED: "the relay's certificate has expired; it must be renewed there",
+    _CODES.ERR_CERT_NOT_YET_VALID: "the relay's certificate is not valid yet; compare the clocks of both machines",
+    _CODES.ERR_DEPTH_ZERO_SELF_SIGNED_CERT: _UNTRUSTED,
+    _CODES.ERR_SELF_SIGNED_CERT_IN_CHAIN: _UNTRUSTED,
+    _CODES.ERR_UNABLE_TO_GET_ISSUER_CERT_LOCALLY: _UNTRUSTED,
+    _CODES.ERR_UNABLE_TO_VERIFY_LEAF_SIGNATURE: _UNTRUSTED,
+}
+
+
+def explain(failure: Failure) -> str:
+    """Why a connection failed or ended, for a person."""
+    problem = failure.value
+    if isinstance(problem, SwitchboardError):
+        return str(problem)
+    if isinstance(problem, SSL.Error):
+        return _explain_tls(problem)
+    for kind, words in _WORDS.items():
+        if isinstance(problem, kind):
+            return words
+    return f"the connection failed: {problem}"
+
+
+_WORDS: dict[type[BaseException], str] = {
+    error.ConnectionDone: "the relay closed the connection",
+    error.ConnectionRefusedError: "nobody listens at the relay's address",
+    error.DNSLookupError: "the relay's host name can't be resolved",
+    error.TimeoutError: "the relay can't be reached: no answer in time",
+    error.NoRouteError: "there is no route to the relay",
+    error.ConnectionAborted: "the connection was cut on this side",
+    error.ConnectionLost: "the connection to the relay broke",
+}
+
+_TLS_WORDS = {
+    "wrong version number": "the relay does not speak TLS on this port; for a trusted network say --no-tls",
+    "unexpected eof": "the relay ended the TLS connection early; does it speak TLS on this port?",
+}
+
+
+def _explain_tls(problem: SSL.Error) -> str:
+    text = str(problem).lower()
+    for mark, words in _TLS_WORDS.items():
+        if mark in text:
+            return words
+    if isinstance(problem, SSL.ZeroReturnError):
+        return "the relay closed the connection"
+    return "TLS with the relay failed"
+
+
+def split_address(text: str, default_port: int = 9091) -> tuple[str, int]:
+    """``host:port`` or ``[v6]:port`` in its parts.
+
+    :raises Invalid: no host, or a port that is none
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or text.endswith("]"):
+        host, port = text, str(default_port)
+    elif ":" in host and not host.startswith("["):
+        host, port = text, str(default_port)  # a bare IPv6 address
+    if (
+        not host.strip("[]")
+        or any(each == "/" or each.isspace() for each in host)
+        or not port.isascii()
+        or not port.isdigit()
+        or not 0 < int(port) < 65536
+    ):
+        raise Invalid(f"'{text}' is no address; write host:port, as in relay.example:{default_port}")
+    return host.strip("[]"), int(port)

@@ -1,0 +1,1 @@
+"""Everything that keeps a robot still: authority, watchdog, guard, limits, goals, stop."""

@@ -1,0 +1,225 @@
+"""Count what makes the code hard to find one's way in, and fail when a count grows. Run by ``make house``.
+
+It reads the product's Python files as syntax trees; nothing is imported or run.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import statistics
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+PACKAGES = {
+    "relay_protocol": ROOT / "protocol/relay_protocol",
+    "relay_db": ROOT / "db/relay_db",
+    "relay_server": ROOT / "relay_server",
+    "robot_client": ROOT / "robot_client",
+}
+
+LIMITS = {
+    "files in import circles": 16,
+    "class names that occur twice": 0,
+    "private names": 1,
+    "calls with an unpacked tuple": 65,
+    "lines of relay_server/service.py": 416,
+    "lines of a function, 90th percentile": 30,
+    "functions over 60 lines": 10,
+}
+"""The most there may be of each. A change may lower them, never raise them."""
+
+# fmt: off
+PRIVATE = frozenset({
+    "Again", "Answers", "Asker", "Asking", "Bereft", "Bodies", "Book", "Calling", "Comeback", "Concern",
+    "Crowd", "Dating", "Desk", "Doorbell", "Ear", "Eye", "Errand", "Errands", "Fence", "Flaw", "FrontDesk",
+    "Grip", "Grips", "Guest", "Guests", "Halted", "Heap", "Helm", "Hop", "House", "Incoming", "Invitation",
+    "Journal", "Listening", "Look", "Looks", "Made", "Manners", "Meant", "Mender", "Moments",
+    "Noticing", "Numbers", "Occupant", "Office", "Offer", "Offers", "Onlooker", "Outbox", "Outlet", "Owed",
+    "Parcel", "People", "Picture", "Pinging", "Place", "Presence", "Providing", "Publishing", "Pulse",
+    "Pursuer", "Pursuing", "Pursuits", "Pushing", "Said", "Screen", "Senses", "Sent", "Share",
+    "Sheet", "Shot", "Steering", "Stilling", "Studio", "Sweep", "Taken", "Taking", "TakingUp", "Tally",
+    "Tape", "Tellers", "Telling", "Tenure", "Terms", "Told", "Trip", "Turns", "Voice", "Wanted", "Wanting",
+    "Watching", "Ways", "Wish", "Wishes", "Witness", "Workshop",
+})
+# fmt: on
+"""Words that name nothing in ROS, HTTP, OAuth or publish/subscribe; no class name ends in one of them."""
+
+SHARED_NAMES = {"relay_protocol"}
+"""Packages whose classes are named after the protocol's own messages, and may share those names."""
+
+
+@dataclass(frozen=True)
+class Module:
+    """One file of the product."""
+
+    name: str
+    path: Path
+    tree: ast.Module
+
+
+def modules() -> list[Module]:
+    """All modules of the product, parsed."""
+    found = []
+    for package, folder in PACKAGES.items():
+        for path in sorted(folder.rglob("*.py")):
+            parts = path.relative_to(folder).with_suffix("").parts
+            name = ".".join((package, *parts)).removesuffix(".__init__")
+            found.append(Module(name, path, ast.parse(path.read_text(), str(path))))
+    return found
+
+
+def imports_of(module: Module, known: set[str]) -> set[str]:
+    """Modules of the product that this one imports anywhere, also for type checking alone."""
+    package = module.name if module.path.name == "__init__.py" else module.name.rpartition(".")[0]
+    found: set[str] = set()
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Import):
+            found.update(each.name for each in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = (
+                ".".join(package.split(".")[: len(package.split(".")) - node.level + 1]) if node.level else ""
+            )
+            source = ".".join(filter(None, (base, node.module)))
+            for each in node.names:
+                inner = f"{source}.{each.name}"
+                found.add(inner if inner in known else source)
+    return (found & known) - {module.name}
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that reach each other by imports (Tarjan's strongly connected components)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(name: str) -> None:
+        index[name] = low[name] = len(index)
+        stack.append(name)
+        for other in sorted(graph[name]):
+            if other not in index:
+                visit(other)
+                low[name] = min(low[name], low[other])
+            elif other in stack:
+                low[name] = min(low[name], index[other])
+        if low[name] == index[name]:
+            group = stack[stack.index(name) :]
+            del stack[stack.index(name) :]
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    for name in graph:
+        if name not in index:
+            visit(name)
+    return found
+
+
+def import_circles(all_modules: list[Module]) -> list[str]:
+    """One line per circle. A package's ``__init__`` that only re-exports its own modules is no part of one."""
+    known = {each.name for each in all_modules}
+    faces = {each.name for each in all_modules if each.path.name == "__init__.py"}
+    graph = {}
+    for each in all_modules:
+        if each.name not in faces:
+            graph[each.name] = imports_of(each, known) - faces
+    return [f"{len(group)} files: {', '.join(group)}" for group in circles(graph)]
+
+
+def classes(all_modules: list[Module]) -> Iterator[tuple[Module, ast.ClassDef]]:
+    """Every class at the top level of a module."""
+    for module in all_modules:
+        for node in module.tree.body:
+            if isinstance(node, ast.ClassDef):
+                yield module, node
+
+
+def repeated_names(all_modules: list[Module]) -> list[str]:
+    """Class names that occur in more than one module, with where."""
+    places: dict[str, list[str]] = defaultdict(list)
+    for module, node in classes(all_modules):
+        if module.name.split(".")[0] not in SHARED_NAMES:
+            places[node.name].append(module.name)
+    return [f"{name}: {', '.join(where)}" for name, where in sorted(places.items()) if len(where) > 1]
+
+
+def private_names(all_modules: list[Module]) -> list[str]:
+    """Classes whose last word is in :data:`PRIVATE`."""
+    words = re.compile(r"[A-Z][a-z0-9]*")
+    found = []
+    for module, node in classes(all_modules):
+        last = words.findall(node.name)[-1:]
+        if last and (last[0] in PRIVATE or node.name.lstrip("_") in PRIVATE):
+            found.append(f"{module.name}.{node.name}")
+    return found
+
+
+def unpacked_calls(all_modules: list[Module]) -> list[str]:
+    """Constructor calls that unpack a tuple into positional parameters."""
+    found = []
+    for module in all_modules:
+        for node in ast.walk(module.tree):
+            if not isinstance(node, ast.Call) or not any(isinstance(each, ast.Starred) for each in node.args):
+                continue
+            called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            if called[:1].isupper():
+                found.append(f"{module.path.relative_to(ROOT)}:{node.lineno} {called}")
+    return found
+
+
+def function_lengths(all_modules: list[Module]) -> list[tuple[int, str]]:
+    """Lines of each function, from its ``def`` to its end, and where it stands."""
+    found = []
+    for module in all_modules:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or node.lineno) - node.lineno + 1
+                found.append((lines, f"{module.path.relative_to(ROOT)}:{node.lineno} {node.name} ({lines})"))
+    return found
+
+
+def say(line: str) -> None:
+    """Print one line."""
+    sys.stdout.write(f"{line}\n")
+
+
+def main(arguments: list[str]) -> int:
+    """Print the counts, with ``--all`` also what was counted. Returns 1 when one is over its limit."""
+    all_modules = modules()
+    lengths = sorted(function_lengths(all_modules))
+    circle_lines = import_circles(all_modules)
+    details = {
+        "files in import circles": circle_lines,
+        "class names that occur twice": repeated_names(all_modules),
+        "private names": private_names(all_modules),
+        "calls with an unpacked tuple": unpacked_calls(all_modules),
+        "functions over 60 lines": [text for lines, text in lengths if lines > 60],
+    }
+    counts = {name: len(lines) for name, lines in details.items()}
+    counts["files in import circles"] = sum(int(line.split()[0]) for line in circle_lines)
+    counts["lines of relay_server/service.py"] = len(
+        (ROOT / "relay_server/service.py").read_text().splitlines()
+    )
+    counts["lines of a function, 90th percentile"] = lengths[len(lengths) * 9 // 10][0]
+    worse = [name for name, limit in LIMITS.items() if counts[name] > limit]
+    for name, limit in LIMITS.items():
+        say(f"{counts[name]:>6}  {name} (at most {limit})")
+        if "--all" in arguments or name in worse:
+            sys.stdout.writelines(f"          {line}\n" for line in details.get(name, []))
+    say(f"{statistics.median(lines for lines, _ in lengths):>6g}  lines of a function, median")
+    for package, folder in PACKAGES.items():
+        files = [each for each in all_modules if each.name.split(".")[0] == package]
+        lines = sum(len(each.path.read_text().splitlines()) for each in files)
+        say(f"{len(files):>6}  files, {lines} lines in {folder.relative_to(ROOT)}")
+    if worse:
+        say(f"house: over the limit: {', '.join(worse)}")
+    return 1 if worse else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
