@@ -1,10 +1,11 @@
-"""What pages show, looked up and encoded once for all pages that may see the same."""
+"""What pages show, looked up once for all pages of a user, and held once for all that are shown the same."""
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
 from functools import cached_property
 from typing import Any
+from weakref import WeakValueDictionary
 
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
@@ -30,34 +31,29 @@ _Key = tuple[object, ...]
 
 
 class Shown:
-    """What a source has answered, shared by pages.
+    """What a source has answered, shared by all pages that are shown the same bytes.
 
     :param name: of the event that it is sent as
+    :param body: JSON: the rows under the name of the event
     """
 
-    def __init__(self, name: str, rows: Rows, at: float) -> None:
+    def __init__(self, name: str, rows: Rows, body: bytes) -> None:
         self.name = name
         self.rows = rows
-        self.at = at
+        self.body = body
 
     @cached_property
     def lasting(self) -> Rows:
         """The rows without the fields that pass."""
         return [{name: value for name, value in row.items() if name not in PASSING} for row in self.rows]
 
-    @cached_property
-    def body(self) -> bytes:
-        """JSON: the rows under the name of the event."""
-        return jsontext.encode({self.name: self.rows})
-
 
 class _CachedAnswer:
     """What was looked up since something last changed."""
 
     def __init__(self) -> None:
-        self.of: dict[_Key, Shown] = {}
-        self.same: dict[_Key, Shown] = {}
-        """By the rows themselves: different users may be shown the same."""
+        self.of: dict[_Key, tuple[float, Shown]] = {}
+        """When it was looked up for each user, in seconds of the clock, and what was found."""
         self.under_way: dict[_Key, list[Deferred[Shown]]] = {}
 
 
@@ -78,7 +74,9 @@ class Sources:
         self._follow = on_change
         self._forget: Callable[[], None] | None = None
         self._listeners: list[Callable[[], None]] = []
-        self._known = self._before = _CachedAnswer()
+        self._known = _CachedAnswer()
+        self._same: WeakValueDictionary[tuple[str, bytes], Shown] = WeakValueDictionary()
+        """By the encoded rows themselves: users share what is equal to the byte, as long as somebody holds it."""
 
     def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
         """Call a listener at every change, after what was known is forgotten; returns what ends that."""
@@ -91,7 +89,7 @@ class Sources:
             if not self._listeners and self._forget is not None:
                 self._forget()
                 self._forget = None
-                self._known = self._before = _CachedAnswer()
+                self._known = _CachedAnswer()
 
         return end
 
@@ -100,15 +98,15 @@ class Sources:
         return [await self._shown(name, source, principal) for name, source in self._sources.items()]
 
     def _changed(self) -> None:
-        self._before, self._known = self._known, _CachedAnswer()
+        self._known = _CachedAnswer()
         for listener in list(self._listeners):
             listener()
 
     async def _shown(self, name: str, source: Source, principal: Principal) -> Shown:
         key = (name, principal.user_id, principal.admin, principal.scope and str(principal.scope))
         known = self._known
-        found = known.of.get(key)
-        if found is not None and self._clock.seconds() - found.at < COALESCE_SECONDS:
+        at, found = known.of.get(key, (0.0, None))
+        if found is not None and self._clock.seconds() - at < COALESCE_SECONDS:
             return found
         waiting: Deferred[Shown] = Deferred()
         under_way = known.under_way.setdefault(key, [])
@@ -125,18 +123,13 @@ class Sources:
             rows = await source(principal)
         finally:
             del known.under_way[key]
-        same = (name, *map(id, rows))
-        shown = known.same.get(same)
+        body = jsontext.encode({name: rows})
+        shown = self._same.get((name, body))
         if shown is None:
-            shown = Shown(name, rows, self._clock.seconds())
-            before = known.of.get(key) or self._before.of.get(key)
-            if before is not None and before.rows == rows:
-                shown = before
-        shown.at = self._clock.seconds()
+            shown = self._same[name, body] = Shown(name, rows, body)
         if len(known.of) >= KEPT:
             known.of.clear()
-            known.same.clear()
-        known.of[key] = known.same[same] = shown
+        known.of[key] = self._clock.seconds(), shown
         return shown
 
 
