@@ -137,6 +137,8 @@ def _distinct_by_quotes(data: bytes) -> bool:
 
 def _pairs(pairs: list[tuple[str, Any]]) -> None:
     """Look at one object; nothing of it is kept."""
+    if len(dict(pairs)) == len(pairs):
+        return
     keys = set()
     for key, _ in pairs:
         if key in keys:

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from twisted.internet.defer import Deferred
 
-from relay_protocol import jsontext, limits, link, nonfinite
+from relay_protocol import json_cost, jsontext, limits, link, nonfinite
 from relay_protocol.errors import Invalid
 from relay_server.channels.definitions import Definitions
 from relay_server.channels.robot_link import RobotLinkState
@@ -41,12 +41,15 @@ class PayloadCodec:
         :raises Invalid: it does not fit the type, or is too large for a robot
         :raises NotFound: the type's definition is not known
         """
-        value = jsontext.decode_any(text) if text else {}
         types = self._wire.robot.types
+        json_cost.check(text)
+        if not text.startswith(b"{"):
+            # The fields in order, or nothing: these are looked at one by one.
+            json_cost.check_odd(text)
         if self._wire.cdr or types.knows(part):
-            body = types.args_from_json(part, value, self._now_ns())
+            body = types.args_from_json(part, text, self._now_ns())
         if not self._wire.cdr:
-            body = self._as_json(part, text, value)
+            body = self._as_json(part, text, jsontext.decode_any(text) if text else {})
         if len(body) > LARGEST:
             raise Invalid(f"{part} has {len(body)} bytes here; a robot takes at most {LARGEST}")
         return body

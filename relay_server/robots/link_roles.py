@@ -372,6 +372,10 @@ class ControlRole(LinkRole):
         self._hall.registry.seen(self._robot)
 
 
+MOST_QUOTES = 256
+"""Quotation marks of a message whose bulk is base64: more than all its fields have."""
+
+
 class ChannelRole(LinkRole):
     """The robot's end of a channel."""
 
@@ -381,7 +385,9 @@ class ChannelRole(LinkRole):
 
     def message(self, body: bytes) -> None:
         """An answer, or a definition."""
-        if len(body) > limits.JSON_BODY and body.count(b"{") + body.count(b"[") > 1:
+        if len(body) > limits.JSON_BODY and (
+            body.count(b"{") + body.count(b"[") > 1 or body.count(b'"') > MOST_QUOTES
+        ):
             raise MalformedMessage(
                 f"JSON of more than {limits.JSON_BODY} bytes is taken only with its bulk as base64 in 'cdr'"
             )

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from twisted.logger import Logger
 
-from relay_protocol import jsontext, rosbridge
+from relay_protocol import json_cost, jsontext, rosbridge
 from relay_protocol.errors import MalformedMessage, PeerError, Refused, SwitchboardError
+from relay_protocol.json_cost import TooCostly
 from relay_protocol.limits import KIB
 from relay_protocol.nonfinite import NotFinite
 from relay_protocol.rights import Operation
@@ -236,10 +237,12 @@ class Session:
                 self.message(data, joined=joined)
             return
         try:
+            if len(data) > json_cost.COUNTED:
+                self.share.check()
             operation = rosbridge.decode(data)
             if joined and isinstance(operation, rosbridge.Fragment):
                 raise MalformedMessage("a message in fragments can't be a fragment itself")
-        except (PeerError, NotFinite) as error:
+        except (PeerError, NotFinite, TooCostly, Refused) as error:
             self._no_rosbridge(error, data)
             return
         try:
@@ -277,11 +280,11 @@ class Session:
                 raise
 
     def _no_rosbridge(self, error: SwitchboardError, data: bytes) -> None:
-        # NaN in the wrong place is a value that does not fit, not a message that is none.
-        self._malformed += not isinstance(error, NotFinite)
+        # What is too much, or NaN in the wrong place, is no message that is none.
+        self._malformed += isinstance(error, PeerError)
         if not self.share.counting:
             self.share.refused()
-        if self._malformed == 1 and self._noise.take():
+        if isinstance(error, PeerError) and self._malformed == 1 and self._noise.take():
             self.log.info(
                 "client {number} sent what is not rosbridge: {reason}", number=self.number, reason=str(error)
             )

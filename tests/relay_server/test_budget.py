@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from twisted.internet.task import Clock
 
+from relay_protocol import json_cost
 from relay_protocol.rights import Level
 from relay_server.common import close_codes, cpu_quota
 from relay_server.common.cpu_quota import Quota, UserQuotas
@@ -113,6 +114,41 @@ def test_what_is_small_to_publish_and_what_takes_back_is_always_done(world: Worl
     told = person.told()
     assert told[0].startswith("too much at once")
     assert told[1] == "no goal of yours with the id 'g' is under way"
+
+
+@pytest.mark.parametrize(
+    ("op", "answered"),
+    [({"op": "call_service", "service": "/a"}, True), ({"op": "publish", "topic": "/a"}, False)],
+)
+def test_a_large_message_is_not_read_while_the_share_is_used_up(
+    world: World, monkeypatch: pytest.MonkeyPatch, op: dict[str, str], answered: bool
+) -> None:
+    """It is refused by its ``id``, and is no message that is none; a small one is read."""
+    person = world.person()
+    person.says("set_level", level="error")
+    read: list[int] = []
+    decode = core.rosbridge.decode
+    monkeypatch.setattr(core.rosbridge, "decode", lambda data: read.append(len(data)) or decode(data))
+    busy(world, cpu_quota.REQUESTS_RESERVE + 0.5)
+    for _ in range(2 * core.MALFORMED):
+        person.says(**op, id="q", args={"data": "x" * json_cost.COUNTED})
+    assert read == []
+    assert person.client.closed is None
+    said = [each["values"] for each in person.hears("service_response")] if answered else person.told()
+    assert said and said[0].startswith("too much at once")
+    person.says("unsubscribe", topic="/a")
+    assert len(read) == 1
+
+
+def test_a_message_of_too_many_parts_is_refused_by_its_id(world: World) -> None:
+    """The client stays."""
+    person = world.person()
+    for _ in range(2 * core.MALFORMED):
+        person.says("call_service", service="/a", id="q", args=[{}] * 60_000)
+    assert person.client.closed is None
+    (reply, *_) = person.hears("service_response")
+    assert reply["id"] == "q"
+    assert "objects and arrays" in reply["values"]
 
 
 def test_who_is_far_over_his_share_is_cut(world: World) -> None:

@@ -9,7 +9,7 @@ import cbor2
 import msgspec
 import orjson
 
-from relay_protocol import jsontext
+from relay_protocol import json_cost, jsontext
 from relay_protocol.errors import Invalid, MalformedMessage
 from relay_protocol.ros import fast_reader, fast_writer
 from relay_protocol.ros.definition import Definition, parse
@@ -95,6 +95,8 @@ class Compiled:
 
     def _slow_writer(self, name: str, decode: Callable[[bytes], Any]) -> Writer:
         def write(body: Any, now_ns: int) -> bytes:
+            if type(body) is bytes:
+                json_cost.check_odd(body)
             try:
                 value = decode(body) if type(body) is bytes else body
             except MalformedMessage as error:

@@ -199,12 +199,13 @@ async def test_a_ticket_that_is_not_good_opens_nothing(hall: Hall) -> None:
             False,
         ),
         (b'{"op":"ping","t":1,"x":[' + b"{}," * limits.JSON_BODY + b"1]}", False),
+        (b'{"op":"ping","t":1' + b',"":1' * limits.JSON_BODY + b"}", False),
     ],
-    ids=["cdr", "values", "ping"],
+    ids=["cdr", "values", "ping", "keys"],
 )
 @pytest_twisted.ensureDeferred
 async def test_large_json_is_taken_only_for_its_cdr(hall: Hall, body: bytes, taken: bool) -> None:
-    """Millions of brackets would stall everyone; base64 does not."""
+    """Millions of brackets or keys would stall everyone; base64 does not."""
     _, ticket = await asked_to_join(hall)
     end = hall.dial()
     end.says(link.Join(version=1, ticket=ticket))
