@@ -50,6 +50,10 @@ class TokenBucket:
         self._tokens -= cost
         return True
 
+    def give_back(self) -> None:
+        """What was taken for one counts elsewhere."""
+        self._tokens = min(self._burst, self._tokens + 1)
+
     def _fill(self) -> None:
         now = self._seconds()
         self._tokens = min(self._burst, self._tokens + max(0.0, now - self._at) * self._rate)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable
 
 from twisted.web.server import Request
 
-from relay_protocol.errors import SwitchboardError
+from relay_protocol.errors import SwitchboardError, Unavailable
 from relay_server.auth.login_limiter import network_of
 from relay_server.common.token_bucket import Buckets
 
@@ -100,20 +100,33 @@ class RequestLimits:
         """The same for a stream that is the answer to a request, and ends with it.
 
         :raises TooManyStreams: as :meth:`stream`
+        :raises Unavailable: the client has left: nothing would tell that the stream ends
         """
+        if request._disconnected:
+            raise Unavailable("the client has left")
         end = self.stream(user)
         request.notifyFinish().addBoth(lambda _: end())
 
-    def handshake(self, address: str, user: int | None) -> None:
-        """Count a websocket's handshake as a request of the user, or of the network of an unknown client.
+    def handshake(self, address: str) -> Callable[[int], None]:
+        """Count a websocket's handshake for its network, before anybody looks up what it proves.
+
+        Returns what counts it for a user instead, to be called once when it is known whose it is; that raises the same.
 
         :raises TooManyRequests: too many came from there
         """
         if self._rate <= 0:
-            return
-        bucket = self._networks.of(network_of(address)) if user is None else self._users.of(user)
-        if not bucket.take():
-            raise TooManyRequests("your network" if user is None else "yours", bucket.wait)
+            return lambda user: None
+        network = self._networks.of(network_of(address))
+        if not network.take():
+            raise TooManyRequests("your network", network.wait)
+
+        def known(user: int) -> None:
+            network.give_back()
+            bucket = self._users.of(user)
+            if not bucket.take():
+                raise TooManyRequests("yours", bucket.wait)
+
+        return known
 
     def _count(self, request: Request, buckets: Buckets, who: Hashable, name: str, words: str) -> None:
         if self._rate <= 0 or request.__dict__.get("counted"):

@@ -21,7 +21,7 @@ from twisted.logger import Logger
 from relay_protocol import limits, rosbridge
 from relay_protocol.errors import PeerError, SwitchboardError, Unavailable
 from relay_protocol.nonfinite import NotFinite
-from relay_server.access import BadCredentials, Principal
+from relay_server.access import Principal
 from relay_server.auth.authenticator import TicketPurpose
 from relay_server.common import close_codes, websocket_frames
 from relay_server.common.clock import Clock, Timer, cancel
@@ -75,6 +75,7 @@ class ClientProtocol(BoundedProtocol):
         self._unproved_bytes = 0
         self._deadline: Timer | None = None
         self._place: Slot | None = None
+        self._lost = False
         self._end_stream: Callable[[], None] = lambda: None
         self._asking = False
         self._open = False
@@ -166,15 +167,14 @@ class ClientProtocol(BoundedProtocol):
     ) -> tuple[Principal | None, str | None]:
         """Find out who asks, and count the handshake as a request of theirs.
 
+        It counts for the network until then, so a flood of false credentials does not reach the database.
+
         :raises TooManyRequests: they have sent too many
         """
-        count = self.factory.limits.handshake
-        try:
-            principal, chosen = await identify(self.factory.gate, request, asked)
-        except BadCredentials:
-            count(self._address(), None)
-            raise
-        count(self._address(), None if principal is None else principal.user_id)
+        known = self.factory.limits.handshake(self._address())
+        principal, chosen = await identify(self.factory.gate, request, asked)
+        if principal is not None:
+            known(principal.user_id)
         return principal, chosen
 
     def _asked_for(self, request: ConnectionRequest) -> TicketPurpose:
@@ -189,6 +189,9 @@ class ClientProtocol(BoundedProtocol):
 
         :raises SwitchboardError: it may not
         """
+        if self._lost:
+            # It was looked up meanwhile. What is counted now nothing would count out.
+            raise Unavailable("the client has left")
         if self.is_stream:
             self._end_stream = self.factory.limits.stream(principal.user_id)
         return await self.factory.gate.admit(principal, self._robot, self._address())
@@ -321,6 +324,7 @@ class ClientProtocol(BoundedProtocol):
 
     def connectionLost(self, reason: Any = connectionDone) -> None:
         """The connection that began as an HTTP request is gone."""
+        self._lost = True
         self.factory.cap.leave(self._address())
         self._end_stream()
         self._known()

@@ -223,7 +223,8 @@ class _Schemas:
 
     def __init__(self, operations: Sequence[ApiOperation]) -> None:
         # What is no class can't be a key of a dict by its value: it is found again by what it is.
-        types = {id(each): each for each in _types(operations)}
+        # They are kept, so no other object can get an address that is a key here.
+        types = self._types = {id(each): each for each in _types(operations)}
         made, components = msgspec.json.schema_components(list(types.values()), ref_template=_REF + "{name}")
         names = {name: _plain(name) for name in components}
         self._of = {key: _renamed(schema, names) for key, schema in zip(types, made, strict=True)}

@@ -145,6 +145,9 @@ def test_a_handshake_counts_as_a_request_of_its_user_or_network() -> None:
     assert status(Authorization="Bearer wrong") == 429
     assert status() == 429
     assert status(Origin="http://127.0.0.1:9090") == 429
+    # Before anybody has looked up a token it is one of that network.
+    assert status(Authorization="Bearer good") == 429
+    clock.advance(BURST / RATE)
     for _ in range(BURST):
         assert status(Authorization="Bearer good") == 101
     assert status(Authorization="Bearer good") == 429

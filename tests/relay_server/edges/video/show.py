@@ -103,7 +103,8 @@ class Show:
         )
         api = api_of(clock, self.desk, origins)
         cap, rounds = ConnectionLimits(100), PeriodicTimers(clock)
-        limits = RequestLimits(0.0, time.monotonic)
+        limits = self.limits = RequestLimits(0.0, time.monotonic)
+        self.connections = cap
         websocket = WebSocketUpgrade(ClientFactory(clock, time.monotonic_ns, self.desk, cap, limits))
         pictures = WebSocketUpgrade(VideoFactory(clock, time.monotonic_ns, self.desk, cap, rounds, limits))
         video = VideoResource(clock, rounds, self.desk, api.principal, pictures)

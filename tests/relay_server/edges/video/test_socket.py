@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import pytest_twisted
+from twisted.internet.defer import Deferred
 from twisted.internet.task import LoopingCall
 from twisted.internet.threads import deferToThread
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -15,6 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from relay_db import queries
 from relay_protocol import link
+from relay_server.access import Principal
 from relay_server.auth.authenticator import TicketPurpose
 from relay_server.common import close_codes, websocket_frames
 from relay_server.video import streams
@@ -437,3 +439,40 @@ async def test_who_begins_streams_too_fast_is_told_so(show: Show, monkeypatch: p
     assert code == close_codes.UNAVAILABLE
     assert words.startswith("you begin streams of robot rover faster than it can; try again in ")
     await eye.leave()
+
+
+@pytest.mark.parametrize("by_message", [True, False])
+@pytest_twisted.ensureDeferred
+async def test_a_viewer_who_leaves_while_he_is_looked_up_counts_for_no_stream(
+    show: Show, monkeypatch: pytest.MonkeyPatch, by_message: bool
+) -> None:
+    """Whether he proves himself in the handshake or by a message: nothing is counted that nobody counts out."""
+    found: Deferred[None] = Deferred()
+    bearer = show.desk.bearer
+    asked = 0
+
+    async def slow(token: str) -> Principal:
+        nonlocal asked
+        asked += 1
+        await found
+        return await bearer(token)
+
+    monkeypatch.setattr(show.desk, "bearer", slow)
+    show.robot_comes()
+    if by_message:
+        eye = await opens(show, token="")
+        await deferToThread(eye._end.send, json.dumps({"op": "auth", "mac": "ann's"}))
+        await until(lambda: asked)
+        eye._end.socket.close()
+    else:
+        looker = Looker(show.port, f"/robots/rover/video/ws?topic={CAMERA}", **HANDSHAKE)
+        await until(lambda: asked)
+        looker.socket.close()
+    await until(lambda: not show.connections._counts)
+    found.callback(None)
+    monkeypatch.undo()
+    eye = await opens(show)
+    await until(lambda: show.limits._streams)
+    assert dict(show.limits._streams) == {show.ann.id: 1}
+    await eye.leave()
+    await until(lambda: not show.limits._streams)
