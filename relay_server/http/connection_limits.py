@@ -68,6 +68,10 @@ class ConnectionLimits:
         self._strangers += 1
 
 
+class SharedBytes(bytes):
+    """What the relay holds once for as long as it runs: answers that wait for their clients take no memory by it."""
+
+
 class Unsent:
     """Counts bytes of answers that wait for their clients, per network.
 
@@ -79,7 +83,12 @@ class Unsent:
         self._waiting: defaultdict[str, dict[Any, int]] = defaultdict(dict)
 
     def add(self, address: str, channel: Any, size: int) -> None:
-        """A connection that takes nothing has so many bytes to take; it had none before, or they were removed."""
+        """A connection that takes nothing holds so many bytes; it held none before, or they were removed.
+
+        Of a connection that holds none nothing is noted: to cut it would free nothing.
+        """
+        if size <= 0:
+            return
         waiting = self._waiting[network_of(address)]
         waiting[channel] = size
         while sum(waiting.values()) > self._most:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, cast
 
 from twisted.logger import Logger
 from twisted.python.failure import Failure
@@ -17,7 +17,7 @@ from relay_protocol import jsontext, limits
 from relay_server.common.clock import Timer, cancel
 from relay_server.common.tcp import keep_little, tcp_of
 from relay_server.http import request_head
-from relay_server.http.connection_limits import ConnectionLimits, Unsent
+from relay_server.http.connection_limits import ConnectionLimits, SharedBytes, Unsent
 from relay_server.http.openapi.operation import ApiOperation, Credential, Response, described
 from relay_server.http.openapi.schemas import ServerInfo
 from relay_server.http.problems import problem, problem_body, problem_of
@@ -236,7 +236,7 @@ class DeadlineChannel(HTTPChannel):
         self._takes()
         if self._requestProducer is None:
             self._stalled = self.site.reactor.callLater(STALL_SECONDS, self._idle)
-            self.site.unsent.add(self._address, self, sum(map(len, self._pieces)))
+            self.site.unsent.add(self._address, self, sum(map(_held, self._pieces)))
 
     def _takes(self) -> None:
         cancel(self._stalled)
@@ -287,6 +287,11 @@ class DeadlineChannel(HTTPChannel):
         self._deadline = None
         if self.transport is not None:
             self.transport.abortConnection()
+
+
+def _held(piece: memoryview) -> int:
+    """Bytes of memory that a connection takes by a part of an answer: all of the body that it is part of."""
+    return 0 if isinstance(piece.obj, SharedBytes) else len(cast(bytes, piece.obj))
 
 
 class BoundedRequest(Request):

@@ -13,6 +13,7 @@ from twisted.web.server import Request
 from werkzeug.http import parse_accept_header
 
 from relay_protocol.limits import KIB
+from relay_server.http.connection_limits import SharedBytes
 from relay_server.http.problems import problem
 from relay_server.http.request_params import field, known_tags
 from relay_server.http.site import ReadOnly
@@ -43,13 +44,13 @@ class StaticFile:
         headers: Mapping[bytes, bytes] = MappingProxyType({}),
     ) -> None:
         self._headers = headers
-        self._content = content
+        self._content = SharedBytes(content)
         charset = "; charset=utf-8" if content_type.startswith("text/") else ""
         self._content_type = (content_type + charset).encode()
         self._cache_control = cache_control
         self._tag = hashlib.sha256(content).hexdigest()[:24]
         packed = b"" if len(content) <= SMALL_BYTES else gzip.compress(content, 9, mtime=0)
-        self._gzip = packed if len(packed) < len(content) * 0.9 else b""
+        self._gzip = SharedBytes(packed if len(packed) < len(content) * 0.9 else b"")
 
     def answer(self, request: Request) -> bytes:
         """The file in the encoding that the client prefers (RFC 9110 section 12.5.3), or 304 where it has it."""

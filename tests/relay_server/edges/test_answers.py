@@ -212,6 +212,41 @@ def test_what_one_network_does_not_take_is_bounded(tmp_path: Path) -> None:
     assert [each.connected for each in transports] == [False, False, True, True, True]
 
 
+def test_files_of_the_portal_that_are_not_taken_take_no_memory(tmp_path: Path) -> None:
+    """Many downloads of one large file, or of its compressed form, wait; only what an answer has of its own counts."""
+    words = b"".join(b"%d," % number for number in range(100_000))
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "assets" / "app.js").write_bytes(words)
+    world = World(tmp_path)
+    world.cap = world.site.cap = connection_limits.ConnectionLimits(100)
+    world.site.unsent = Unsent(most=len(words))
+    transports = [Socket(world) for _ in range(40)]
+    for number, each in enumerate(transports):
+        each.send(get("/assets/app.js", "Accept-Encoding: gzip\r\n" if number % 2 else ""))
+        assert each.protocol._pieces
+    assert not world.site.unsent._waiting
+    own = [Socket(world) for _ in range(3)]
+    for each in own:
+        each.protocol._handlingRequest = True
+        each.protocol.write(bytes(bytearray(words[: len(words) * 2 // 3])))
+    assert [each.connected for each in own] == [False, False, True]
+    assert all(each.connected for each in transports)
+    transports[0].takes(len(words) + 1000)
+    assert transports[0].taken.endswith(words)
+
+
+def test_what_is_left_of_a_large_answer_counts_as_all_of_it(tmp_path: Path) -> None:
+    """All of it is held until its last part is taken: a client that takes nearly all does not get round the limit."""
+    world = World(tmp_path)
+    world.site.unsent = Unsent(most=1_000_000)
+    first, second = Socket(world), Socket(world)
+    for each in (first, second):
+        each.protocol._handlingRequest = True
+        each.protocol.write(bytes(bytearray(600_000)))
+        each.takes(500_000)
+    assert (first.connected, second.connected) == (False, True)
+
+
 def test_a_pipelined_request_is_told_what_is_wrong_behind_the_answer_before(world: World) -> None:
     """A body that is too large, as the second of two requests."""
     transport = Socket(world)
