@@ -216,7 +216,7 @@ class NameResolver:
     def __init__(self, reactor: Any) -> None:
         self._reactor = reactor
         self._threads = BoundedThreadPool(
-            reactor, "alert-names", THREADS, WAITING, "too many names are looked up"
+            reactor, "alert-names", THREADS, WAITING, "too many names are looked up", only_reads=True
         )
         self._places: dict[int, DeferredSemaphore] = {}
 

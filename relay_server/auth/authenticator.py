@@ -107,7 +107,12 @@ class Authenticator:
         self._wall = wall
         self._limiter = LoginLimiter(seconds, of_account=FAILURES_OF_ACCOUNT)
         self._hashing = BoundedThreadPool(
-            reactor, "passwords", HASHING_THREADS, LOGINS_WAITING, "too many people log in now; try again"
+            reactor,
+            "passwords",
+            HASHING_THREADS,
+            LOGINS_WAITING,
+            "too many people log in now; try again",
+            only_reads=True,
         )
         self._tickets: dict[str, _Ticket] = {}
 

@@ -32,13 +32,24 @@ class BoundedThreadPool:
     :param reactor: calls results back
     :param most: pieces of work that may be under way or wait, also those whose asker has left
     :param overload: what further askers are told
+    :param only_reads: the work changes nothing; what has not begun when its asker leaves is left out
     """
 
-    def __init__(self, reactor: IReactorThreads, name: str, size: int, most: int, overload: str) -> None:
+    def __init__(
+        self,
+        reactor: IReactorThreads,
+        name: str,
+        size: int,
+        most: int,
+        overload: str,
+        *,
+        only_reads: bool = False,
+    ) -> None:
         self._reactor = reactor
         self._pool = ThreadPool(1, size, name)
         self._most = most
         self._overload = overload
+        self._only_reads = only_reads
         self._under_way = 0
 
     def start(self) -> None:
@@ -50,7 +61,7 @@ class BoundedThreadPool:
         self._pool.stop()
 
     async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Do this in a thread.
+        """Do this in a thread. It is done also when its asker leaves (``only_reads`` apart).
 
         :raises Unavailable: too much waits already
         """
@@ -61,7 +72,7 @@ class BoundedThreadPool:
         waiting: Deferred[T] = Deferred()
 
         def begin() -> T:
-            if waiting.called:
+            if self._only_reads and waiting.called:
                 # Nobody waits for it any more: the threads are for others when the database is back.
                 raise CancelledError
             return work(*args, **kwargs)
@@ -87,7 +98,7 @@ class AsyncDatabase:
     def __init__(self, reactor: IReactorThreads, database: Database) -> None:
         self.database = database
         overload = "the database is overloaded; try again in a moment"
-        self._readers = BoundedThreadPool(reactor, "db-read", READERS, WAITING, overload)
+        self._readers = BoundedThreadPool(reactor, "db-read", READERS, WAITING, overload, only_reads=True)
         self._writers = BoundedThreadPool(reactor, "db-write", database.writers, WAITING, overload)
 
     def start(self) -> None:
@@ -117,6 +128,8 @@ class AsyncDatabase:
         self, query: Callable[Concatenate[Session, P], T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """Run a query in a transaction of its own; it has been committed when this returns.
+
+        It is done also when its asker has left: somebody logged out, removed or revoked something.
 
         :raises Unavailable: as :meth:`read`
         """

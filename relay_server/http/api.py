@@ -28,7 +28,7 @@ from relay_protocol.realms import DEFAULT_REALM
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth.authenticator import SESSION_SECONDS, TicketPurpose
 from relay_server.auth.origins import Origins
-from relay_server.common.clock import Clock, shield
+from relay_server.common.clock import Clock, detached, shield
 from relay_server.http.idempotent_requests import see_no_key
 from relay_server.http.media_types import FORMS
 from relay_server.http.openapi.operation import PROBLEM, ApiOperation, Credential, Response, described
@@ -322,9 +322,12 @@ class Api:
         return self.answer(request, self._logout(request))
 
     async def _logout(self, request: Request) -> Any:
+        # It is done also when a page is closed at once, or the database takes too long for an answer.
+        await detached(self._log_out(request))
+
+    async def _log_out(self, request: Request) -> None:
         await self._desk.logout(await self.principal(request))
         self._set_cookie(request, "", 0)
-        return None
 
     # --- robots -------------------------------------------------------------------------------------------
 

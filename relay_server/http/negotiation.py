@@ -62,7 +62,9 @@ class ConversionPool(BoundedThreadPool):
     """
 
     def __init__(self, reactor: Any) -> None:
-        super().__init__(reactor, "forms", 1, 1, "too much is being converted; try again in a moment")
+        super().__init__(
+            reactor, "forms", 1, 1, "too much is being converted; try again in a moment", only_reads=True
+        )
         self._closed = False
 
     def close(self) -> None:

@@ -22,6 +22,7 @@ from relay_protocol import jsontext
 from relay_protocol.errors import Invalid, SwitchboardError, Unavailable
 from relay_server.access import BadCredentials, Principal
 from relay_server.auth.authenticator import TooManyTries
+from relay_server.common.clock import detached
 from relay_server.http.openapi.operation import ApiOperation, Credential, Response, described
 from relay_server.http.openapi.schemas import (
     AboutToken,
@@ -161,8 +162,12 @@ class OAuthResource:
     async def _revoke(self, request: Request) -> Any:
         self._limits.of_network(request)
         fields = _fields(request)
-        await self._desk.revoke(_token_in(fields), *await self._asker(request, fields))
+        # It is done also when the program leaves at once.
+        await detached(self._revoke_token(request, fields))
         return {}
+
+    async def _revoke_token(self, request: Request, fields: dict[str, str]) -> None:
+        await self._desk.revoke(_token_in(fields), *await self._asker(request, fields))
 
     # --- who asks -----------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from twisted.internet.defer import CancelledError, Deferred
 
 from relay_db import queries
 from relay_protocol.errors import Unavailable
-from relay_server.common.database import AsyncDatabase, BoundedThreadPool
+from relay_server.common.database import READERS, AsyncDatabase, BoundedThreadPool
 
 
 @pytest.fixture
@@ -75,6 +75,27 @@ async def test_askers_who_leave_keep_their_place_until_the_work_is_done(threads:
         reactor.callLater(0.005, done.callback, None)  # type: ignore[attr-defined]
         await done
     assert await threads.run(int, "7") == 7
+
+
+@pytest_twisted.ensureDeferred
+async def test_a_write_is_done_also_when_its_asker_has_left(store: AsyncDatabase) -> None:
+    """It waits its turn as before. A read that nobody waits for is left out."""
+    go = threading.Event()
+    done: list[str] = []
+    busy = [Deferred.fromCoroutine(store.write(lambda session: go.wait(20)))]
+    busy += [Deferred.fromCoroutine(store.read(lambda session: go.wait(20))) for _ in range(READERS)]
+    left = Deferred.fromCoroutine(store.write(lambda session: done.append("written")))
+    unread = Deferred.fromCoroutine(store.read(lambda session: done.append("read")))
+    for each in (left, unread):
+        each.cancel()
+        with pytest.raises(CancelledError):
+            await each
+    go.set()
+    for each in busy:
+        assert await each
+    await store.write(lambda session: done.append("next"))
+    await store.read(lambda session: None)
+    assert done == ["written", "next"]
 
 
 @pytest_twisted.ensureDeferred

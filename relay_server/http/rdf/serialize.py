@@ -14,7 +14,6 @@ import re
 import warnings
 from collections.abc import Callable
 from io import BytesIO
-from itertools import islice
 from typing import Any
 from xml.parsers import expat
 
@@ -53,7 +52,24 @@ XML_DEPTH = 2 * JSON_DEPTH + 2
 _ABSOLUTE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://\S*\Z|urn:\S*\Z")
 _TERM = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*\Z")
 _LONG_IRI = re.compile(rf"<[^\s<>\"{{}}|^`]{{{LONGEST_IRI},}}")
-_WORD = re.compile(r'"(?:[^"\\]|\\.)*"|<[^<>\s]*>|[\[\](),;]|[^\s\[\](),;"<]+|["<]', re.DOTALL)
+_NAME_CHARACTERS = r"""[^\t\r\n !"\#$&'()*+,/;<=>?@\[\\\]^`{|}~]"""
+_WORD = re.compile(
+    rf"""
+    (?P<nothing> (?: [ \t\r\n] | \#[^\n]*+ )++ )
+    | "{"{3}"} (?: [^"\\] | \\. | "(?!"") )*+ "{"{3,5}"}
+    | '{"{3}"} (?: [^'\\] | \\. | '(?!'') )*+ '{"{3,5}"}
+    | "(?!"") (?: [^"\\\r\n] | \\. )*+ "
+    | '(?!'') (?: [^'\\\r\n] | \\. )*+ '
+    | (?:\^\^)? <[^\x00-\x20<>"{{}}|^`]*+>
+    | [+-]? (?: [0-9]++ (?:\.[0-9]*+)? | \.[0-9]++ ) (?: [eE][+-]?[0-9]++ )?
+    | (?:\^\^|@)? (?![-.0-9]) {_NAME_CHARACTERS} (?: {_NAME_CHARACTERS} | \\. )*+
+    | [^"'<\\]
+    """,
+    re.VERBOSE,
+)
+"""What rdflib takes for one word or mark, or passes over. Where none matches, a string or an address has no end, and
+reading ends there: nothing is looked through twice."""
+
 _PREFIX = re.compile(r"(?<![\w:/#])prefix", re.IGNORECASE)
 _KEYWORDS = frozenset({"@id", "@type", "@value", "@list", "@graph", "@vocab"})
 _ESCAPES = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r"})
@@ -173,12 +189,30 @@ class _Turtle(TurtleSerializer):
 def _read_turtle(graph: Graph, text: str, base: str) -> None:
     if _LONG_IRI.search(text) is not None:
         raise Invalid(f"the body has an address of over {LONGEST_IRI} characters")
-    if sum(1 for _ in islice(_WORD.finditer(text), PARTS + 1)) > PARTS:
-        raise _too_many("words")
+    _see_words(text)
     # Each is compared with all before it. Also those in strings are counted: so many are none a sender needs.
     if sum(1 for _ in _PREFIX.finditer(text)) > NAMESPACES:
         raise Invalid(f"the body declares more than {NAMESPACES} namespaces")
     graph.parse(data=text, format="turtle", publicID=base)
+
+
+def _see_words(text: str) -> None:
+    """See that a text has few words, however they are quoted and whatever stands between them.
+
+    :raises Invalid: it has too many, or a string or an address that does not end
+    """
+    words = at = 0
+    while at < len(text):
+        found = _WORD.match(text, at)
+        if found is None:
+            line = text.count("\n", 0, at) + 1
+            raise Invalid(
+                f"the body is no {TURTLE.media} that can be read: what begins in line {line} has no end"
+            )
+        words += found["nothing"] is None
+        if words > PARTS:
+            raise _too_many("words")
+        at = found.end()
 
 
 # --- JSON-LD ----------------------------------------------------------------------------------------------

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from rdflib import Graph
 
 from relay_protocol import jsontext
@@ -231,6 +234,71 @@ def _cpu(body: str, form: MediaType) -> float:
     began = time.process_time()
     refused(body, form)
     return time.process_time() - began
+
+
+HIDDEN = ("'\"' ", '# "\n', """''' " ''' """, '""""a" """" ', "<a> <b> '''\"''' . ")
+"""What Turtle reads as something whole, though a quotation mark in it seems to begin a string, or to go on."""
+
+
+@pytest.mark.parametrize("edge", HIDDEN)
+@pytest.mark.parametrize("words", ["1 ", "+1", ".1", "a:b ", "[]", "'' ", '"""a"""'])
+def test_no_quotation_mark_hides_words(edge: str, words: str) -> None:
+    """Many words between two of them are many all the same."""
+    assert "more than 2048" in refused(f"<a> <b> {edge}({words * 3000}) {edge}.", TURTLE)
+
+
+FRAGMENTS = {
+    TURTLE: r"""" ' \" \' \\" ''' \ < > <a> # a a: _: 1 +1 .1 1. e . ; , ( ) [ ] { } @ @prefix prefix ^^ ^ ! ? = <= %
+        \u é "a" 'a' @en & / | ~ $ * """
+    + '"""',
+    RDF_XML: """< > /> <a <a> </a> <a/> " ' = a=" a="" xmlns:a="" & &amp; &#1; &#x <!-- --> -- <![CDATA[ ]]> ]] <? ?>
+        <?a <! a é <a:b <rdf:li/>""",
+    JSON_LD: r"""{ } [ ] " \" \ \u "a" "a": : , 1 e . - 0 NaN Infinity true {}, [], "@id" "@id": "@type": "@value":
+        "@list": "@context": é "_:a" "http://x/a":1,""",
+}
+STARTS = {
+    TURTLE: ("", "<a> <b> ", "<a> <b> (", '<a> <b> "', '<a> <b> """', "<", 'a="'),
+    RDF_XML: ("", "<a>", '<a b="', "<a ", "<!DOCTYPE ", XML.partition("%s")[0]),
+    JSON_LD: ("", "{", '{"a":', '{"http://x/":"', '{"@graph":[', '{"@context":{"', "["),
+}
+
+
+@st.composite
+def shapes(draw: st.DrawFn) -> tuple[MediaType, str, str, str]:
+    """A form, how a body of it begins, what it repeats, and how it ends."""
+    form = draw(st.sampled_from([TURTLE, RDF_XML, JSON_LD]))
+    fragment = st.sampled_from([*FRAGMENTS[form].split(), " ", "\n", "\r", "\t", "\x0c", "\u00a0"])
+    unit = "".join(draw(st.lists(fragment, min_size=1, max_size=4)))
+    return form, draw(st.sampled_from(STARTS[form])), unit, "".join(draw(st.lists(fragment, max_size=2)))
+
+
+@settings(max_examples=200, deadline=None)
+@given(shapes())
+@example((TURTLE, '"', '\\"', ""))
+@example((TURTLE, 'a="', '\\"', ""))
+@example((TURTLE, "<a> <b> '", "\\'", ""))
+@example((TURTLE, '"""', '\\"""', ""))
+@example((TURTLE, "", "<a ", ""))
+@example((TURTLE, "", '""" ""', ""))
+@example((TURTLE, "", "#", ""))
+def test_twice_as_much_takes_no_more_than_twice_as_long(shape: tuple[MediaType, str, str, str]) -> None:
+    """Whatever the shape of a body; what takes less than 50 ms may take what it likes."""
+    form, start, unit, end = shape
+    times = BODY // len(unit.encode())
+
+    def cost(times: int, tries: int) -> float:
+        body = (start + unit * times + end).encode()
+        return min(_thread_seconds(body, form) for _ in range(tries))
+
+    if cost(times, 1) > 0.05 and (whole := cost(times, 5)) > 0.05:
+        assert whole < 3 * cost(times // 2, 5)
+
+
+def _thread_seconds(body: bytes, form: MediaType) -> float:
+    began = time.thread_time()
+    with contextlib.suppress(SwitchboardError):
+        read(body, form, BASE)
+    return time.thread_time() - began
 
 
 def test_namespaces_are_few() -> None:
