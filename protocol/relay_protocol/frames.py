@@ -38,6 +38,9 @@ SAMPLE_HEAD = 13
 COMMAND_HEAD = 17
 """The same of a command, which has a source too."""
 
+JSON_NUMBER = 0
+"""Parts of this number make a JSON message. No subscription or publication has it."""
+
 UNFINISHED = 1024
 """Most samples that have come in part only, over one link."""
 
@@ -105,7 +108,7 @@ class PicturePart(_Frame, frozen=True, order=True, gc=False):
 
 
 Frame = JsonFrame | SampleFrame | CommandFrame | VideoFrame | PicturePart
-"""What a stream is cut into; parts of a sample (kind 3) come out as the sample they make."""
+"""What a stream is cut into; parts (kind 3) come out as the sample or the JSON message they make."""
 
 
 def encode_json(body: bytes) -> bytes:
@@ -131,6 +134,7 @@ def encode_video(number: int, stamp: int, body: bytes) -> bytes:
 def encode_part(number: int, stamp: int, total: int, offset: int, piece: bytes) -> bytes:
     """The frame around one part of a sample; see :class:`SampleFrame`.
 
+    :param number: :data:`JSON_NUMBER` for a part of a JSON message
     :param total: bytes of the whole message
     :param offset: bytes of it that went before
     """
@@ -199,7 +203,7 @@ class FrameDecoder:
             elif kind == PART:
                 sample = self._parts.join(data, start + 4, end, limit, largest)
                 if sample is not None:
-                    frames.append(sample)
+                    frames.append(JsonFrame(sample.body) if sample.number == JSON_NUMBER else sample)
             else:
                 frames.append(_parse(data, start + 4, end))
             start = end
@@ -233,6 +237,8 @@ class _Parts:
                 "a part of a sample needs 20 bytes of head, and at least one of the sample"
             )
         number, stamp, total, offset = _PART.unpack_from(buffer, start + 1)
+        if number == JSON_NUMBER:
+            largest = limit - 1
         if total > largest:
             raise FrameTooLarge(f"a sample of {total} bytes was announced; at most {largest} are taken here")
         size = end - start - 21

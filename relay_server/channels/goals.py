@@ -191,11 +191,17 @@ class GraphGoal(ActionGoal):
     def tell_end(self, end: GoalResult) -> None:
         """With the result, or with the reason for none."""
         fields = {} if end.body is None else self._bodies.values(end.body)
-        self._origin.send(
-            link.ActionResult(
-                id=self._id, status=end.status, result=end.body is not None, reason=end.reason, **fields
+        try:
+            self._origin.send(
+                link.ActionResult(
+                    id=self._id, status=end.status, result=end.body is not None, reason=end.reason, **fields
+                )
             )
-        )
+        except Unavailable as error:
+            end = failed(end.status, str(error))
+            self._origin.send(
+                link.ActionResult(id=self._id, status=end.status, result=False, reason=end.reason)
+            )
 
 
 def why_not_begun(failure: Failure, action: str) -> GoalResult:
@@ -328,17 +334,21 @@ class ActionGoals:
             raise Unavailable(f"robot {self._wire.robot.name} is not connected")
         pursuit = RobotExecution(str(next(self._ids)), goal, self._wire, self._at_robot)
         goal.pursuer = self._at_robot[pursuit.id] = pursuit
-        self._wire.send(
-            link.SendActionGoal(
-                id=pursuit.id,
-                action=goal.action,
-                type=goal.type,
-                feedback=goal.wants_feedback,
-                source=sent.source,
-                stamp=sent.stamp,
-                **self._bodies.args(body),
-            )
+        message = link.SendActionGoal(
+            id=pursuit.id,
+            action=goal.action,
+            type=goal.type,
+            feedback=goal.wants_feedback,
+            source=sent.source,
+            stamp=sent.stamp,
+            **self._bodies.args(body),
         )
+        try:
+            self._wire.send(message)
+        except Unavailable:
+            goal.pursuer = None
+            pursuit.forget()
+            raise
 
     def _client_pursues(self, goal: ActionGoal, offer: ClientAdvertisement, body: bytes) -> None:
         self._offers.check(offer)

@@ -33,7 +33,10 @@ class ChannelPort(Protocol):
     """The robot's end of a channel."""
 
     def send(self, message: link.Message) -> None:
-        """Queue a message that must not be lost."""
+        """Queue a message that must not be lost.
+
+        :raises Unavailable: it is a call, a goal or an answer, and too much waits for a slow robot already
+        """
 
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Queue a sample; the newest survive."""
@@ -232,7 +235,10 @@ class RobotLinkState:
         self.names += 1
 
     def send(self, message: link.Message) -> None:
-        """Send if there is a link; what matters is sent again when one opens."""
+        """Send if there is a link; what matters is sent again when one opens.
+
+        :raises Unavailable: see :meth:`ChannelPort.send`
+        """
         if self.link is not None:
             self.link.send(message)
 

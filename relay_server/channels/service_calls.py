@@ -216,9 +216,9 @@ class ServiceCalls:
             raise Unavailable(f"robot {self._wire.robot.name} is not connected")
         waiting: Deferred[link.ServiceResponse] = Deferred()
         self._pending[message.id] = waiting
-        self._wire.send(message)
         timer = self._clock.callLater(seconds + GRACE, self._late, message, seconds)
         try:
+            self._wire.send(message)
             return await waiting
         finally:
             self._pending.pop(message.id, None)
@@ -349,9 +349,13 @@ class ClientServiceCalls:
         try:
             body = await self._answer(message)
         except SwitchboardError as error:
-            origin.send(_no(message, str(error)))
+            response = _no(message, str(error))
         else:
-            origin.send(link.ServiceResponse(id=message.id, result=True, **self._bodies.values(body)))
+            response = link.ServiceResponse(id=message.id, result=True, **self._bodies.values(body))
+        try:
+            origin.send(response)
+        except Unavailable as error:
+            origin.send(_no(message, str(error)))
 
     async def _answer(self, message: link.CallService) -> bytes:
         offer = self._offers.standing(message.service)

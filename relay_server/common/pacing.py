@@ -5,6 +5,22 @@ everything before it has arrived), or, when the window is full, held back in the
 replace older ones and small messages overtake large ones. A message larger than the window leaves piece by piece, so
 that pings and the close frame go between its pieces. The window is :class:`relay_protocol.pacing.SendWindow`.
 
+===================================  ==========================  ====================================================
+What                                 overtakes                   but never
+===================================  ==========================  ====================================================
+pings, pongs, close frame, ``bye``,  everything that waits, and  what was written before. They change no order: a
+``refused``                          pieces                      ``pong`` tells the time, an answer to a ping tells of
+                                                                 what was written before the ping
+control messages, answers            samples, commands           one another, a message that is being sent
+commands of up to :data:`SEGMENT`    pieces of a sample or of a  an older command of their publication, another
+                                     control message; control    message than in pieces
+                                     messages that wait
+small samples                        large samples               an older sample of their topic, control messages
+===================================  ==========================  ====================================================
+
+Stop, resume, control and suppress go over the control link of the robot, which is not paced, in the order they come. No
+order holds between two links: so the robot judges each command by its stamp (SPEC 2.5).
+
 On a fast connection this costs a subtraction a message, and a call to the kernel for every :data:`SPACING` bytes.
 """
 
@@ -16,7 +32,7 @@ from typing import Any, Protocol
 from relay_protocol.limits import KIB
 from relay_protocol.pacing import FIRST, TARGET, SendWindow
 from relay_server.common.clock import Clock, Timer, cancel
-from relay_server.common.send_queue import SendQueue
+from relay_server.common.send_queue import SEGMENT, SendQueue
 from relay_server.common.socket_writer import TransportWriter
 from relay_server.common.tcp import unacknowledged
 
@@ -27,10 +43,10 @@ PIECE = 16 * KIB
 """Most bytes of a piece of a large message, and of a small message."""
 
 MORE = 4 * KIB
-"""Bytes of small messages that may be sent between pieces beyond the window."""
+"""Bytes of commands that may be sent beyond the window."""
 
-SEGMENT = 1400
-"""A message of no more bytes, one packet, is never divided."""
+STUCK_SECONDS = 2.0
+"""A receiver that has answered no ping for so long takes nothing."""
 
 TRUSTED = (32 * KIB, 256 * KIB)
 """Bytes that may be taken for arrived by the kernel's word alone after a quick answer to a probe, and after several.
@@ -40,6 +56,11 @@ TCP's acknowledgements cost no answer, but come from the nearest proxy."""
 
 class Pieces(Protocol):
     """A message that is taken piece by piece."""
+
+    divided: bool
+    """Whether commands may go between its pieces."""
+    command: bool
+    """Whether it is a command."""
 
     @property
     def left(self) -> int:
@@ -59,6 +80,7 @@ class Pacer:
     """
 
     __slots__ = (
+        "_answered_at",
         "_clock",
         "_credit",
         "_granted",
@@ -99,6 +121,8 @@ class Pacer:
         """Bytes sent when the latest probe was."""
         self._trust = self._credit = 0
         self._opening: Timer | None = None
+        self._answered_at = seconds()
+        outbox.taking = self._taking
         self._granted = writer.budget = FIRST // 2
         writer.spent = self._spent
 
@@ -112,8 +136,10 @@ class Pacer:
         """A ping was answered."""
         self._account()
         window = self.window
-        if not window.answered(key, self._seconds()):
+        now = self._seconds()
+        if not window.answered(key, now):
             return
+        self._answered_at = now
         quick = window.delay < TARGET / 4 and not window.limited
         self._trust = self._credit = min(TRUSTED[1], max(TRUSTED[0], 2 * self._trust)) if quick else 0
         self._outbox.limit(round(window.size) if window.limited else None, window.rate)
@@ -129,6 +155,7 @@ class Pacer:
             return
         now = self._seconds()
         while (rest := self._rest) is not None:
+            self.commands()
             room = window.room(now)
             if room < min(SPACING[0], rest.left) or outbox.paused_since is not None:
                 break
@@ -141,21 +168,19 @@ class Pacer:
             self._grant()
             outbox.release()
             self._open_later()
-        elif not window.probed:
-            self._probe()
+        else:
+            self.commands()
+            if not window.probed:
+                self._probe()
 
-    def between(self, data: bytes) -> bool:
-        """Send a small message between two pieces of a large one; false where that can't be.
-
-        Only where the pieces leave room for others, as parts of samples do on a robot's link.
-        """
-        window = self.window
-        if self._rest is None or self._outbox.paused_since is not None or len(data) > SEGMENT:
-            return False
-        if window.flight > window.size + MORE:
-            return False
-        self._put(data)
-        return True
+    def commands(self) -> None:
+        """Send commands that wait, oldest first, ahead of what the window holds up, and between pieces of a message."""
+        outbox = self._outbox
+        while outbox.held and outbox.paused_since is None and self._may_go_between():
+            command = outbox.take_command()
+            if command is None:
+                break
+            self._put(command)
 
     def stop(self) -> None:
         """The connection ends; nothing more is sent but what is urgent."""
@@ -164,6 +189,15 @@ class Pacer:
         self._opening = None
 
     # --- inside -------------------------------------------------------------------------------------------
+
+    def _may_go_between(self) -> bool:
+        return (self._rest is None or self._rest.divided) and self._has_more()
+
+    def _has_more(self) -> bool:
+        return self.window.flight <= self.window.size + MORE
+
+    def _taking(self) -> bool:
+        return self._seconds() - self._answered_at <= STUCK_SECONDS
 
     @property
     def _spacing(self) -> float:
@@ -176,14 +210,15 @@ class Pacer:
         self._writer.budget += size
         self._account()
         room = window.room(self._seconds(), small=size <= PIECE)
-        if size <= room or (size <= SEGMENT and room > 0):
+        pieces = self._pieces(data)
+        if size <= room or (size <= SEGMENT and (room > 0 or (pieces.command and self._has_more()))):
             trusted = self._trusts(size)
             self._put(data)
             if not trusted:
                 self._probe()
             self._grant()
             return
-        self._rest = self._pieces(data)
+        self._rest = pieces
         self._outbox.hold(large=size > window.size)
         self.go_on()
 

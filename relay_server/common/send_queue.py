@@ -26,6 +26,11 @@ PATIENCE = 1.0
 """Seconds after which a large sample goes before small ones, or it would wait for ever."""
 CONTROL_MESSAGES = 1024
 CONTROL_BYTES = 2 * MIB
+TAKEN = 8
+"""So many times as much control may wait for a receiver that takes bytes: the window, and no longer the kernel, holds
+what comes at once."""
+SEGMENT = 1400
+"""A message of no more bytes, one packet, is never divided, and a command of no more bytes goes ahead."""
 DROPS_OF = 4096
 """Topics whose drops are counted one by one."""
 
@@ -40,12 +45,16 @@ class LazyMessage(Protocol):
 
 
 class _TopicQueue:
-    """Samples of one topic that wait, each with the moment it came."""
+    """Samples of one topic that wait, each with the moment it came.
 
-    __slots__ = ("bytes", "key", "samples")
+    :ivar commands: whether they are commands
+    """
 
-    def __init__(self, key: Hashable) -> None:
+    __slots__ = ("bytes", "commands", "key", "samples")
+
+    def __init__(self, key: Hashable, commands: bool) -> None:
         self.key = key
+        self.commands = commands
         self.samples: deque[tuple[float, int, bytes | LazyMessage]] = deque()
         self.bytes = 0
 
@@ -56,6 +65,7 @@ class SendQueue:
     :param write: puts one message on the transport; only called while it is not paused
     :param seconds: a monotonic clock
     :param overflow: called once when control messages exceed their bound; the receiver must be cut
+    :param requests: bytes of requests that may wait besides, see :meth:`has_room`
     """
 
     __slots__ = (
@@ -70,6 +80,7 @@ class SendQueue:
         "_open",
         "_opens",
         "_overflow",
+        "_requests",
         "_seconds",
         "_sending_since",
         "dropped",
@@ -80,15 +91,21 @@ class SendQueue:
         "passing",
         "paused_since",
         "rate",
+        "taking",
         "write",
     )
 
     def __init__(
-        self, write: Callable[[bytes], None], seconds: Callable[[], float], overflow: Callable[[], None]
+        self,
+        write: Callable[[bytes], None],
+        seconds: Callable[[], float],
+        overflow: Callable[[], None],
+        requests: int = 0,
     ) -> None:
         self.write = write
         self._seconds = seconds
         self._overflow = overflow
+        self._requests = requests
         # A deque takes 600 bytes when it is empty; most never have to wait.
         self._control: deque[bytes] | None = None
         self._control_bytes = 0
@@ -114,6 +131,8 @@ class SendQueue:
         """Whether others had to wait for it."""
         self._opens = 0.0
         """When the next large sample may go; 0 once it may."""
+        self.taking = _unknown
+        """Whether the receiver is known to take bytes."""
         self.dropped = 0
         self.drops: dict[Hashable, int] = {}
         """Samples dropped of each topic that was not forgotten since."""
@@ -245,15 +264,34 @@ class SendQueue:
             self._control = deque()
         self._control.append(message)
         self._control_bytes += len(message)
-        if len(self._control) > CONTROL_MESSAGES or self._control_bytes > CONTROL_BYTES:
+        if self._exceeds(1) and (not self.taking() or self._exceeds(TAKEN)):
             self.close()
             self._overflow()
 
-    def data(self, key: Hashable, parcel: bytes | LazyMessage, depth: int = DATA_PER_TOPIC) -> None:
+    def _exceeds(self, times: int) -> bool:
+        return (
+            len(self._control or ()) > times * CONTROL_MESSAGES
+            or self._control_bytes > times * CONTROL_BYTES + self._requests
+        )
+
+    def has_room(self, size: int) -> bool:
+        """Whether a request of so many bytes may be given to :meth:`control`, so that it leaves others their room."""
+        messages = len(self._control or ())
+        return messages < CONTROL_MESSAGES // 2 and self._control_bytes + size <= self._requests
+
+    def data(
+        self,
+        key: Hashable,
+        parcel: bytes | LazyMessage,
+        depth: int = DATA_PER_TOPIC,
+        *,
+        commands: bool = False,
+    ) -> None:
         """Send a sample of a topic; the oldest give way when they pile up.
 
         :param key: the topic, and what a :class:`LazyMessage` is opened with
         :param depth: most samples of this topic that may wait, at least one
+        :param commands: whether samples of this topic are commands, all of them bytes
         """
         if self._closed:
             return
@@ -264,7 +302,7 @@ class SendQueue:
         self._note(size)
         queue = self._data.get(key)
         if queue is None:
-            queue = self._data[key] = _TopicQueue(key)
+            queue = self._data[key] = _TopicQueue(key, commands)
         queue.samples.append((self._seconds(), size, parcel))
         queue.bytes += size
         self._data_bytes += size
@@ -282,6 +320,22 @@ class SendQueue:
             del self._data[key]
         if self._open:
             self._drain()
+
+    def take_command(self) -> bytes | None:
+        """The next small command that waits; topics take turns. ``None`` if none of any topic is next."""
+        for queue in self._data.values():
+            if queue.commands:
+                self._forget_stale(queue)
+                if queue.samples[0][1] <= SEGMENT:
+                    break
+        else:
+            return None
+        del self._data[queue.key]
+        command = self._take(queue)
+        if queue.samples:
+            self._data[queue.key] = queue
+        assert isinstance(command, bytes)
+        return command
 
     def _note(self, size: int) -> None:
         """A sample begins to wait."""
@@ -341,3 +395,8 @@ class SendQueue:
         queue.bytes -= size
         self._data_bytes -= size
         return parcel
+
+
+def _unknown() -> bool:
+    """Nobody measures whether the receiver takes bytes."""
+    return False

@@ -61,6 +61,8 @@ class Fragments:
 
     __slots__ = ("_at", "_frames", "_left", "_opcode")
 
+    divided = command = False
+
     def __init__(self, frames: bytes) -> None:
         self._frames = memoryview(frames)
         self._at = 0

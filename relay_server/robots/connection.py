@@ -22,6 +22,9 @@ from twisted.python.failure import Failure
 from relay_protocol import jsontext, limits, link
 from relay_protocol.errors import MalformedMessage, PeerError, SwitchboardError, Unavailable
 from relay_protocol.frames import (
+    COMMAND,
+    JSON,
+    JSON_NUMBER,
     SAMPLE,
     CommandFrame,
     Frame,
@@ -37,7 +40,7 @@ from relay_protocol.frames import (
 from relay_server.common.clock import Clock, Timer, cancel, looping
 from relay_server.common.pacing import Pacer
 from relay_server.common.push_producer import PushProducer
-from relay_server.common.send_queue import SendQueue
+from relay_server.common.send_queue import SEGMENT, SendQueue
 from relay_server.common.socket_writer import FlushScheduler, TransportWriter, writer_for
 from relay_server.common.tcp import tcp_of
 from relay_server.http.connection_limits import ConnectionLimits, Slot
@@ -48,6 +51,10 @@ PINGS = 256
 
 REPLACED_SECONDS = 2.0
 """A link that a newer one has replaced is closed after so long at most."""
+
+REQUEST_BYTES = 6 * limits.MIB
+"""Calls, goals and answers of clients that may wait for a robot: one of the largest (:data:`limits.COMMAND_FRAME`), and
+some small ones. A call that finds no room is refused to its caller, and the channel goes on."""
 
 MEASURED_SECONDS = 1.0
 """A link whose quality is told is pinged at least so often."""
@@ -132,7 +139,7 @@ class RobotConnection(TwistedProtocol):
         self._meter = LinkQualityMeter()
         self._answered = 0
         self.on_round_trip: Callable[[float], None] = lambda seconds: None
-        self._outbox = SendQueue(_nowhere, clock.seconds, self._overflow)
+        self._outbox = SendQueue(_nowhere, clock.seconds, self._overflow, REQUEST_BYTES)
         self._pacer: Pacer | None = None
         self.address = ""
 
@@ -209,13 +216,22 @@ class RobotConnection(TwistedProtocol):
             self._pacer.go_on()
 
     def send(self, message: link.Message) -> None:
-        """Queue a message that must not be lost."""
+        """Queue a message that must not be lost.
+
+        :raises Unavailable: it is a call, a goal or an answer, and too much waits for a slow robot already
+        """
         frame = link.frame(message)
+        if isinstance(message, _OF_CLIENTS) and not self._takes(message, len(frame)):
+            raise Unavailable("the robot's link is too slow for what waits for it already; try again later")
         # A ping that counted against the budget would ask for another one.
         if self._role is not None and self._outbox.paused_since is None and isinstance(message, _AHEAD):
             self._writer.urgent(frame)
         else:
             self._outbox.control(frame)
+
+    def _takes(self, message: link.Message, size: int) -> bool:
+        """Whether there is room for what clients ask; a short answer finds it always."""
+        return (size <= SEGMENT and not isinstance(message, _ASKED)) or self._outbox.has_room(size)
 
     def sample(self, number: int, stamp: int, body: bytes) -> None:
         """Queue a sample; when the robot is slow the newest survive."""
@@ -230,8 +246,10 @@ class RobotConnection(TwistedProtocol):
         frame = encode_command(number, stamp, source, body)
         if self._outbox.passing:
             self._outbox.write(frame)
-        elif self._pacer is None or not self._pacer.between(frame):
-            self._outbox.data(number, frame)
+        else:
+            self._outbox.data(number, frame, commands=True)
+            if self._pacer is not None:
+                self._pacer.commands()
 
     def newest(self, key: str, message: link.Message) -> None:
         """Queue a message of which, under one key, only the newest must survive."""
@@ -474,12 +492,19 @@ class _Replaced(LinkRole):
 _AHEAD = (link.Ping, link.Pong, link.Bye, link.Refused)
 """Messages that do not wait for what a thin link has yet to carry."""
 
+_ASKED = (link.CallService, link.SendActionGoal)
+_OF_CLIENTS = (*_ASKED, link.ServiceResponse, link.ActionResult)
+"""Messages as large and as many as clients make them."""
+
 
 class _Whole:
     """A frame that is not divided."""
 
+    divided = False
+
     def __init__(self, frame: bytes) -> None:
         self._frame = frame
+        self.command = frame[4] == COMMAND
 
     @property
     def left(self) -> int:
@@ -493,7 +518,7 @@ class _Whole:
 
 
 class _Parts(_Whole):
-    """A frame that is divided where it is a sample (SPEC section 2.1). Other frames may go between two parts."""
+    """A frame that is divided where it is a sample or a message (SPEC section 2.1). Commands may go in between."""
 
     def __init__(self, frame: bytes) -> None:
         super().__init__(frame)
@@ -503,6 +528,9 @@ class _Parts(_Whole):
             (sample,) = FrameDecoder(len(frame)).feed(frame)
             assert isinstance(sample, SampleFrame)
             self._number, self._stamp, self._body = sample.number, sample.stamp, memoryview(sample.body)
+        elif frame[4] == JSON and len(frame) > SEGMENT:
+            self._number, self._body = JSON_NUMBER, memoryview(frame)[5:]
+        self.divided = bool(self._body)
 
     @property
     def left(self) -> int:
@@ -510,7 +538,7 @@ class _Parts(_Whole):
         return len(self._body) - self._at if self._body else super().left
 
     def take(self, most: int) -> bytes:
-        """The next part, or all of what is no sample."""
+        """The next part, or all of what is not divided."""
         if not self._body:
             return super().take(most)
         begun, self._at = self._at, min(len(self._body), self._at + most)

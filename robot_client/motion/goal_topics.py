@@ -92,6 +92,8 @@ class GoalTopics:
 
     def take(self, source: str, goal: GoalMessage) -> None:
         """Publish a goal if it is allowed, fresh and sane, as soon as the link has proved itself; else count it."""
+        if not self._motion.in_order(goal.by, self._open[source].on.topic, goal.stamp):
+            return
         now = self._now()
         sent = earliest(goal.stamp, now, goal.offset)
         if self._authority.judge_request(goal.by, now, sent) is Verdict.ALLOWED:

@@ -10,7 +10,7 @@ from twisted.logger import Logger
 from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.link import MotionPolicy, QoS
 from robot_client.link.clock_offset import ClockOffset
-from robot_client.motion.authority import Authority, Verdict
+from robot_client.motion.authority import Authority, Verdict, note
 from robot_client.motion.governor import Governor, unreadable
 from robot_client.motion.guard_port import GuardPort
 from robot_client.motion.motion_topics import MotionPublisher, MotionTopic, MotionTopics
@@ -72,6 +72,8 @@ class MotionControl:
         self.proof: Callable[[], int] = now
         """When the latest ping that the relay has answered was sent."""
         self.stale_commands = 0
+        self._stamps: dict[tuple[int, str], int] = {}
+        """Stamps of the newest commands of sources on topics, the latest last."""
         self.invalid_commands = 0
         self.watchdog_stops = 0
         self.unguarded_commands = 0
@@ -149,6 +151,8 @@ class MotionControl:
         :param by: the connection that gave it
         """
         on = self._outlets[source].on
+        if not self.in_order(by, on.topic, stamp):
+            return False
         now = self._now()
         verdict = self._platform.judge(on.type, body)
         fresh = freshness(stamp, now, offset, self._times(on).deadline_ms) is CommandAge.FRESH
@@ -258,6 +262,17 @@ class MotionControl:
         self._finishing.append(done)
         self._tell_finished()
         return done
+
+    def in_order(self, by: int, topic: str, stamp: int) -> bool:
+        """Whether no newer command of this source came on this topic before; else it is counted as too old.
+
+        :param stamp: of the command, the relay's monotonic nanoseconds
+        """
+        newest = self._stamps.get((by, topic), stamp)
+        note(self._stamps, (by, topic), max(newest, stamp))
+        if stamp < newest:
+            self.stale_commands += 1
+        return stamp >= newest
 
     # --- one command ---------------------------------------------------------------------------------------
 

@@ -56,6 +56,7 @@ class Robot:
         self.numbers: dict[str, int] = {}
         self.commands: list[dict[str, Any]] = []
         self.command_ages: list[float] = []
+        self.command_stamps: list[int] = []
         self.samples: list[tuple[float, Any]] = []
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -107,6 +108,7 @@ class Robot:
                     body = json.loads(frame.body)
                     if isinstance(frame, frames.CommandFrame):
                         self.commands.append(body)
+                        self.command_stamps.append(frame.stamp)
                         self.command_ages.append(time.monotonic() - body["angular"]["z"])
                     else:
                         self.samples.append((time.monotonic(), body))
@@ -143,6 +145,12 @@ class Robot:
         assert self.channel is not None
         frame = frames.encode_sample(self.numbers[topic], time.time_ns(), json.dumps(body).encode())
         self._send_bytes(self.channel, frame)
+
+    def check_order(self) -> None:
+        """Commands came as they were sent, each with what it is judged by."""
+        numbers = [each["linear"]["x"] for each in self.commands]
+        assert numbers == sorted(numbers), "commands overtook each other"
+        assert self.command_stamps == sorted(self.command_stamps)
 
 
 class Ground:
@@ -284,6 +292,7 @@ def test_a_heavy_topic_takes_neither_control_nor_the_small_topics_away(
         assert secure or socket.protocol.close_rcvd is not None, "the answer to the close frame was lost"
     arrived = {each["linear"]["x"] for each in at.robot.commands}
     lost = [number for number in range(1, seen.sent + 1) if 1.0 + number not in arrived]
+    at.robot.check_order()
     # A machine that stands still makes commands old, but no line does.
     assert len(lost) <= seen.sent / 50, f"commands {lost} of {seen.sent} are lost"
     alone = HEAVY_BYTES / rate
@@ -358,6 +367,7 @@ def test_what_a_client_uploads_does_not_hold_up_commands_on_a_robots_thin_downli
         wait_for(
             "the last command arrives", lambda: any(each["linear"]["x"] == 150.0 for each in robot.commands)
         )
+        robot.check_order()
         assert statistics.median(robot.command_ages) <= (1 if parts else 3) * HEAVY_BYTES / rate
         assert len(robot.command_ages) >= (140 if parts else 40)
         assert len(robot.samples) >= 15

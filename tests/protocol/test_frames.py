@@ -24,6 +24,7 @@ from relay_protocol.frames import (
 
 U32 = st.integers(0, frames.MAX_U32)
 U64 = st.integers(0, frames.MAX_U64)
+NUMBER = st.integers(1, frames.MAX_U32)
 BODIES = st.binary(max_size=60)
 FRAMES = st.one_of(
     st.builds(JsonFrame, BODIES),
@@ -137,7 +138,7 @@ def test_an_unfinished_frame_waits() -> None:
     assert decoder.buffered == 0
 
 
-PARTED = st.tuples(U32, U64, st.binary(min_size=1, max_size=60))
+PARTED = st.tuples(NUMBER, U64, st.binary(min_size=1, max_size=60))
 
 
 def in_parts(number: int, stamp: int, body: bytes, size: int) -> list[bytes]:
@@ -169,6 +170,17 @@ def test_parts_make_the_samples_they_came_from(
     samples = [frame for frame in got if isinstance(frame, SampleFrame)]
     assert sorted(samples) == sorted(SampleFrame(*sample) for sample in sent)
     assert decoder.buffered == 0
+
+
+def test_parts_of_number_zero_make_a_message() -> None:
+    """No longer than one that comes whole, by the limit of frames."""
+    decoder = FrameDecoder(limit=1000)
+    decoder.sample_limit = 5000
+    body = bytes(999)
+    got = [frame for part in in_parts(frames.JSON_NUMBER, 0, body, 100) for frame in decoder.feed(part)]
+    assert got == [JsonFrame(body)]
+    with pytest.raises(FrameTooLarge, match="at most 999"):
+        decoder.feed(frames.encode_part(frames.JSON_NUMBER, 0, 1000, 0, b"a"))
 
 
 def test_memory_grows_with_what_came() -> None:

@@ -9,6 +9,7 @@ import pytest
 from relay_protocol.limits import MIB
 from relay_server.channels import client_subscription, goals, publications, robot_link, service_calls
 from relay_server.common import send_queue
+from relay_server.robots import connection
 from relay_server.sessions import service_calls as session_calls
 from relay_server.sessions import session, subscriptions
 
@@ -27,7 +28,9 @@ SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text()
         f"of one client | {client_subscription.QUEUE_BYTES // MIB} MiB, {client_subscription.QUEUES_BYTES // MIB} MiB;",
         f"slow client | {send_queue.DATA_PER_TOPIC} of a topic, {send_queue.DATA_BYTES // MIB} MiB together, "
         f"{send_queue.DATA_AGE:g} s;",
-        f"slow client | {send_queue.CONTROL_MESSAGES}, {send_queue.CONTROL_BYTES // MIB} MiB; then it is cut",
+        f"slow client | {send_queue.CONTROL_MESSAGES}, {send_queue.CONTROL_BYTES // MIB} MiB, "
+        f"and {send_queue.TAKEN} times as much while it answers pings; then it is cut (4429)",
+        f"answers of clients, that wait for a slow robot | {connection.REQUEST_BYTES // MIB} MiB together,",
         f"| {publications.HELD_MESSAGES} of a topic, {publications.HELD_BYTES // MIB} MiB of a client together, "
         f"{publications.HELD_SECONDS:g} s |",
         f"wait for the robot | {session_calls.CALLS}, {session_calls.CALL_BYTES // MIB} MiB together |",

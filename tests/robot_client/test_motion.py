@@ -131,6 +131,21 @@ def test_stale_commands_do_not_feed_it(scene: Scene) -> None:
     assert scene.desk.stale_commands == 10
 
 
+def test_a_command_that_a_newer_one_has_overtaken_is_dropped(scene: Scene) -> None:
+    """A movement that comes after the zero that followed it, of the same source and topic, moves nothing."""
+    scene.command(GO)
+    scene.clock.advance(0.2)
+    scene.command(ZERO)
+    sent = list(scene.sent)
+    assert not scene.command(GO, age=0.1)
+    assert scene.sent == sent
+    assert scene.desk.stale_commands == 1
+    assert scene.command(GO)
+    assert not scene.command(ZERO, age=0.1)
+    scene.open("b", "/other/cmd_vel")
+    assert scene.command(GO, "b", age=0.1)
+
+
 def test_stale_zero_is_no_letting_go(scene: Scene) -> None:
     """One that a stalled link delivers after a resume does not let the stream go on that was there before."""
     scene.command(GO)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.internet.task import Clock
 
 from relay_protocol.pacing import FIRST
 from relay_server.common import websocket_frames
-from relay_server.common.pacing import Pacer
-from relay_server.common.send_queue import SendQueue
+from relay_server.common.pacing import STUCK_SECONDS, Pacer
+from relay_server.common.send_queue import CONTROL_BYTES, TAKEN, SendQueue
 from relay_server.common.socket_writer import PlainWriter, Stalls
 
 TICK = 0.005
@@ -29,7 +30,8 @@ class Wire:
         """When each frame was there."""
         self.pings = 0
         self.writer = PlainWriter(self)
-        self.outbox = SendQueue(self.writer.write, self.clock.seconds, lambda: None)
+        self.overflows = 0
+        self.outbox = SendQueue(self.writer.write, self.clock.seconds, self.overflow)
         self.pacer = Pacer(
             self.writer,
             self.outbox,
@@ -39,6 +41,10 @@ class Wire:
             websocket_frames.Fragments,
             None,
         )
+
+    def overflow(self) -> None:
+        """Answers pile up."""
+        self.overflows += 1
 
     def write(self, data: bytes) -> None:
         """As a transport."""
@@ -124,6 +130,31 @@ def test_nothing_but_control_frames_follows_the_end() -> None:
     before = len(wire.way)
     wire.pass_time(20)
     assert {frame[0] for _, frame in wire.came[before:]} <= {websocket_frames.PING}
+
+
+@pytest.mark.parametrize("sizes", [[50_000, 2_200_000], 12 * [1_000_000], 5000 * [100]])
+def test_a_client_that_takes_bytes_is_not_cut_for_what_comes_at_once(sizes: list[int]) -> None:
+    """The window holds what the kernel would have taken: it is no sign of a slow client."""
+    wire = Wire(100e6)
+    for size in sizes:
+        wire.outbox.control(websocket_frames.text(bytes(size)))
+    wire.pass_time(3)
+    assert [len(each) for each in wire.payloads()] == sizes
+    assert not wire.overflows
+
+
+def test_what_waits_for_a_client_is_bounded_whether_it_takes_bytes_or_not() -> None:
+    """Less of it where no ping comes back."""
+    for seconds, most in ((0.0, TAKEN * CONTROL_BYTES), (STUCK_SECONDS + 1, CONTROL_BYTES)):
+        wire = Wire(1.0)
+        wire.outbox.control(websocket_frames.text(bytes(100_000)))
+        wire.pass_time(seconds)
+        held = 0
+        while not wire.overflows:
+            held = wire.outbox.waiting_bytes
+            wire.outbox.control(websocket_frames.text(bytes(100_000)))
+        assert most - 200_000 <= held <= most
+        assert wire.outbox.waiting_bytes == 0
 
 
 @given(
