@@ -108,6 +108,8 @@ class MemoryLink:
         self.commands: list[tuple[int, int, int, bytes]] = []
         self.closed: str | None = None
         self.pings: list[Deferred[float]] = []
+        self.full = False
+        """Whether there is no room for what clients ask for, or answer at length."""
         self.obeys: Callable[[Order], None] | None = None
         """Carries out orders about motion."""
         self.has_no_type: Callable[[link.Failed], None] | None = None
@@ -116,6 +118,9 @@ class MemoryLink:
     def send(self, message: link.Message) -> None:
         """Keep it, once it has proved to be JSON that a robot can read."""
         msgspec.json.decode(msgspec.json.encode(message))
+        answered = isinstance(message, link.ServiceResponse | link.ActionResult) and message.result
+        if self.full and (answered or isinstance(message, link.CallService | link.SendActionGoal)):
+            raise Unavailable("no room")
         self.said.append(message)
         if self.obeys is not None and isinstance(message, Order):
             self.obeys(message)
