@@ -45,8 +45,8 @@ PIECE = 16 * KIB
 MORE = 4 * KIB
 """Bytes of commands that may be sent beyond the window."""
 
-STUCK_SECONDS = 2.0
-"""A receiver that has answered no ping for so long takes nothing."""
+STUCK_SECONDS = 3.0
+"""A receiver that has answered no ping for so long takes nothing. Who only watches is pinged every 2 s."""
 
 TRUSTED = (32 * KIB, 256 * KIB)
 """Bytes that may be taken for arrived by the kernel's word alone after a quick answer to a probe, and after several.
@@ -121,7 +121,8 @@ class Pacer:
         """Bytes sent when the latest probe was."""
         self._trust = self._credit = 0
         self._opening: Timer | None = None
-        self._answered_at = seconds()
+        self._answered_at = float("-inf")
+        """When a ping was answered last, or the window became full since."""
         outbox.taking = self._taking
         self._granted = writer.budget = FIRST // 2
         writer.spent = self._spent
@@ -219,6 +220,7 @@ class Pacer:
             self._grant()
             return
         self._rest = pieces
+        self._answered_at = self._seconds()
         self._outbox.hold(large=size > window.size)
         self.go_on()
 
