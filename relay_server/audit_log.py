@@ -39,6 +39,9 @@ KEEP_SECONDS = 1.5
 FILE = "audit.waiting"
 """File in the data folder for entries that could not be written before the relay stopped, one JSON object a line."""
 
+UNREADABLE = "audit.unreadable"
+"""A copy of that file when some of it can't be read, for somebody to look at."""
+
 LOST = "audit.lost"
 """Action of the entry that stands for lost ones, and event of the journal about each robot concerned."""
 
@@ -109,7 +112,9 @@ class AuditLog(Collector):
         self._write()
 
     def restore(self) -> None:
-        """Take up what an earlier relay could not write. Lines that can't be read are logged and left out."""
+        """Take up what an earlier relay could not write. Lines that can't be read are counted as lost, and the file
+        is kept beside as :data:`UNREADABLE`.
+        """
         try:
             lines = self._path.read_bytes().splitlines()
         except FileNotFoundError:
@@ -119,14 +124,32 @@ class AuditLog(Collector):
                 "audit entries of an earlier run stay in {file}: {reason}", file=FILE, reason=error.strerror
             )
             return
+        unreadable = 0
         for line in lines[: WAITING + 1]:
             try:
                 self._entries.append(msgspec.json.decode(line, type=AuditLogEntry))
             except (msgspec.MsgspecError, UnicodeDecodeError):
-                self.log.error("an audit entry in {file} can't be read: {line}", file=FILE, line=line[:500])
+                unreadable += 1
+        if unreadable or len(lines) > WAITING + 1:
+            self._keep_aside(lines, unreadable)
         self._restored = True
         self._unsure = len(self._entries)
         self._write()
+
+    def _keep_aside(self, lines: list[bytes], unreadable: int) -> None:
+        lost = unreadable + max(0, len(lines) - WAITING - 1)
+        self.lost += lost
+        self.log.error(
+            "{count} audit entries in {file} can't be read or are too many; all of it is kept as {kept}",
+            count=lost,
+            file=FILE,
+            kept=UNREADABLE,
+        )
+        try:
+            with private(self._path.with_name(UNREADABLE)) as stream:
+                stream.writelines(line + b"\n" for line in lines)
+        except OSError as error:
+            self.log.error("{kept} can't be written: {reason}", kept=UNREADABLE, reason=error.strerror)
 
     async def close(self) -> None:
         """Write what waits, into the database or else into a file that the next relay reads."""
@@ -171,16 +194,20 @@ class AuditLog(Collector):
     # --- writing ------------------------------------------------------------------------------------------
 
     def _lose(self, entry: AuditLogEntry) -> None:
-        """Count an entry that finds no room, in the entry about lost ones at the end."""
-        self.lost += 1
+        """An entry finds no room."""
         self.log.error(
             "'{action}' of {target} by {actor} is not on record: the database does not keep up",
             action=entry.action,
             target=entry.target,
             actor=entry.actor,
         )
-        last = self._entries[-1]
-        if last.action != LOST or len(self._entries) == self._under_way:
+        self._count(entry)
+
+    def _count(self, entry: AuditLogEntry) -> None:
+        """Count a lost entry, in the entry about lost ones at the end."""
+        self.lost += 1
+        last = self._entries[-1] if self._entries else None
+        if last is None or last.action != LOST or len(self._entries) == self._under_way:
             last = AuditLogEntry(entry.at, "relay", LOST, "audit log", data={"count": 0})
             self._entries.append(last)
         self._entries[-1] = msgspec.structs.replace(
@@ -223,11 +250,13 @@ class AuditLog(Collector):
             # One of them can't be written at all. The others must not wait behind it.
             self._batch = 1
         else:
-            self._take_out(1)
-            self.lost += 1
             self.log.failure("not on record: {entry}", failure, entry=batch[0])
-            for robot in batch[0].robots:
-                self._notify(LOST, robot)
+            self._take_out(1)
+            if batch[0].action == LOST:
+                # Nothing follows it that could fail in the same way again, without end.
+                self.lost += 1
+            else:
+                self._count(batch[0])
 
     def _take_out(self, count: int) -> None:
         for _ in range(count):

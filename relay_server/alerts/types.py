@@ -80,7 +80,7 @@ class AlertEvent(str, enum.Enum):
 
 def endless(kind: str) -> bool:
     """Whether alerts of this kind may have no end of their own: to acknowledge one ends it."""
-    return kind in (CONTROL, ROBOT, KEY) or kind not in KINDS
+    return kind in (CONTROL, ROBOT, AUDIT, KEY) or kind not in KINDS
 
 
 def from_robot(kind: str, about: str) -> tuple[str, str]:

@@ -19,7 +19,15 @@ from twisted.logger import LogLevel, capturedLogs, formatEvent
 from relay_db import queries, sqlite
 from relay_db.queries import AuditRecord
 from relay_server import audit_log as module
-from relay_server.audit_log import BATCH, FILE, KEEP_SECONDS, RETRY_SECONDS, AuditLog, AuditLogEntry
+from relay_server.audit_log import (
+    BATCH,
+    FILE,
+    KEEP_SECONDS,
+    RETRY_SECONDS,
+    UNREADABLE,
+    AuditLog,
+    AuditLogEntry,
+)
 from relay_server.common.database import AsyncDatabase
 
 ROVER = 7
@@ -180,9 +188,15 @@ async def test_an_entry_that_can_not_be_written_at_all_holds_up_no_other(scene: 
         await scene.settled()
     with capturedLogs() as logs:
         await scene.tries_again()
-    assert await scene.times() == [1, 3]
+    kept = await scene.kept()
+    assert [(each.at, each.action) for each in kept] == [
+        (1, "control.taken"),
+        (3, "control.taken"),
+        (2, "audit.lost"),
+    ]
+    assert kept[2].data == {"count": 1, "until": 2}
     assert any("not on record" in str(formatEvent(each)) for each in logs)
-    assert scene.told == [("audit.lost", ROVER)]
+    assert scene.told == [("audit.lost", ROVER), ("audit.written", ROVER)]
 
 
 @pytest_twisted.ensureDeferred
@@ -221,6 +235,9 @@ async def test_an_entry_of_that_file_that_is_in_the_database_already_is_not_writ
     following.restore()
     await scene.settled(following)
     assert await scene.times() == [1, 2, 3]
+    assert following.lost == 1
+    assert b"{broken" in (scene.folder / UNREADABLE).read_bytes()
+    assert not (scene.folder / FILE).exists()
 
 
 @pytest_twisted.ensureDeferred
@@ -250,5 +267,5 @@ async def test_what_can_be_kept_nowhere_is_in_the_log(scene: Scene, monkeypatch:
         scene.clock.advance(KEEP_SECONDS)
         await closing
     (line,) = [formatEvent(each) for each in logs if each["log_level"] is LogLevel.critical]
-    assert line.startswith("not on record, No space left on device: Entry(at=1")
+    assert line.startswith("not on record, No space left on device: AuditLogEntry(at=1")
     assert "control.taken" in line and "user:ann" in line
