@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from traceback import walk_tb
 from typing import Any, cast
 
 from twisted.logger import Logger
@@ -108,7 +109,9 @@ class DeadlineChannel(HTTPChannel):
         self._start_deadline(limits.UNPROVEN_SECONDS, self._too_late)
 
     def dataReceived(self, data: bytes) -> None:
-        """Bytes of a head or body. Errors of Twisted's parsers are the sender's fault, and answered with 400."""
+        """Bytes of a head or body. Errors of Twisted's parsers are the sender's fault, and answered with 400; errors of
+        the relay's own code are logged with their traceback, and answered with 500.
+        """
         if self._refused:
             return
         try:
@@ -116,6 +119,12 @@ class DeadlineChannel(HTTPChannel):
         except request_head.BadHead as error:
             self.refuse(error.status, str(error))
         except Exception as error:
+            if not _in_parser(error):
+                self.log.failure("a request from {address} failed", address=self._address, limited="failed")
+                self.refuse(
+                    b"500 Internal Server Error", "the relay failed on this request; its log tells more"
+                )
+                return
             self.log.info(
                 "a request from {address} can't be read: {error!r}",
                 address=self._address,
@@ -294,6 +303,13 @@ def _held(piece: memoryview) -> int:
     return 0 if isinstance(piece.obj, SharedBytes) else len(cast(bytes, piece.obj))
 
 
+def _in_parser(error: Exception) -> bool:
+    """Whether Twisted, or what it calls, raised an error while it read what the relay had handed to it."""
+    modules = [str(frame.f_globals.get("__name__", "")) for frame, _ in walk_tb(error.__traceback__)]
+    ours = max(number for number, name in enumerate(modules) if name.startswith("relay_"))
+    return modules[ours + 1 : ours + 2] != [] and modules[ours + 1].startswith("twisted.")
+
+
 class BoundedRequest(Request):
     """A request whose body may not grow beyond :data:`BODY_BYTES`, announced or not."""
 
@@ -323,7 +339,11 @@ class BoundedRequest(Request):
         for name, values in list(headers.getAllRawHeaders()):
             # Twisted fails where somebody reads as text what is none (RFC 9110 section 5.5).
             headers.setRawHeaders(name, [each.decode(errors="replace").encode() for each in values])
-        super().process()
+        try:
+            super().process()
+        except Exception:
+            # The request is read: from here on no error is the sender's. Those of resources Twisted hands over itself.
+            self.processingFailed(Failure())
 
     def render(self, resource: IResource) -> None:
         # Twisted has named itself and its version by now.

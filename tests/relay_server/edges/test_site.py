@@ -7,6 +7,7 @@ import random
 from pathlib import Path
 
 import pytest
+from twisted.logger import capturedLogs
 
 from relay_protocol import limits
 from relay_server.http import site as module
@@ -326,3 +327,31 @@ def test_requests_for_the_portal_are_counted(folder: Path) -> None:
         answer = world.ask("GET", path)
         told(answer, 429)
         assert int(answer.headers["retry-after"]) > 0
+
+
+def fails(*_: object) -> None:
+    """A bug."""
+    raise KeyError("the secret of our insides")
+
+
+@pytest.mark.parametrize(
+    ("place", "status"),
+    [
+        ("relay_server.http.request_head.check_field", 500),
+        ("relay_server.http.request_head.check_fields", 500),
+        ("twisted.web.server.datetimeToString", 500),
+        ("twisted.web.http.Request.parseCookies", 400),
+        ("twisted.web.http.parse_qs", 400),
+    ],
+)
+def test_errors_of_the_relay_are_logged_with_their_traceback(
+    world: World, monkeypatch: pytest.MonkeyPatch, place: str, status: int
+) -> None:
+    """And answered with 500; those of parsers are the sender's, and one line."""
+    monkeypatch.setattr(place, fails)
+    transport = world.connect()
+    with capturedLogs() as logs:
+        world.send(transport, b"GET /healthz?a=b HTTP/1.1\r\nHost: x\r\n\r\n")
+    told(parse(transport.value()), status)
+    assert b"insides" not in transport.value()
+    assert any("log_failure" in each for each in logs) is (status == 500)
