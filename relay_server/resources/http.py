@@ -147,8 +147,8 @@ class TopicResource:
         left = request.notifyFinish()
         left.addErrback(lambda failure: None)
         # What is there already comes at once.
-        for name, value in (("content-type", "text/event-stream"), ("x-accel-buffering", "no")):
-            request.setHeader(name, value)
+        request.setHeader("content-type", "text/event-stream")
+        request.setHeader("x-accel-buffering", "no")
         request.setHeader(HEADER, self._moments.now())
 
         def tell(body: bytes) -> None:
