@@ -252,7 +252,7 @@ def test_bytes_that_are_no_frames_end_a_robots_link_in_words(
 # --- messages from clients --------------------------------------------------------------------------------
 
 BAD_ROSBRIDGE = {
-    "100,000 deep": (b'{"op":"publish","topic":"/cmd_vel","msg":' + DEEP, "deeper than 64"),
+    "10,000 deep": (b'{"op":"publish","topic":"/cmd_vel","msg":' + DEEP[:10_000], "deeper than 64"),
     "a word that is no number": (
         b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":nan}}}',
         "not JSON",
@@ -356,7 +356,9 @@ def test_text_that_is_not_utf8_closes_every_websocket(
     url = f"ws://127.0.0.1:{world.relay.http_port}{WEBSOCKETS[address]}"
     headers = {"Authorization": f"Bearer {world.viewer}"} if proved else {}
     with connect(url, additional_headers=headers) as websocket:
-        websocket.send(fragments[0] if len(fragments) == 1 else iter(fragments), text=True)
+        with contextlib.suppress(ConnectionClosed):
+            # The relay may close before the last fragment is sent.
+            websocket.send(fragments[0] if len(fragments) == 1 else iter(fragments), text=True)
         with pytest.raises(ConnectionClosed) as closed:
             while True:
                 websocket.recv(10)

@@ -104,7 +104,7 @@ def asked() -> dict[str, Any]:
         schemas[name]["properties"]["timeout"]["maximum"] = SHORT
     schemas["Order"]["properties"]["robots"]["items"] = {"enum": ["rover", "r*", "nobody", "group:all"]}
     # Nothing leaves the machine.
-    schemas["AlertsAsk"]["properties"]["channel"] = {"enum": ["portal", "apprise", "pigeon"]}
+    schemas["RuleRequest"]["properties"]["channel"] = {"enum": ["portal", "apprise", "pigeon"]}
     return told
 
 
