@@ -122,11 +122,11 @@ class Authority:
         :param sent: before when it can't have been sent, own clock, nanoseconds; no later than ``now``
         """
         verdict = self._rank(source, topic, now)
-        note(self._heard, source, None)
+        _note(self._heard, source, None)
         if not moving:
             self._grips.pop((source, topic), None)
             if source == self.holder:
-                note(self._released, (self.user, topic), None)
+                _note(self._released, (self.user, topic), None)
                 if len(self._opened) < GRIPS:
                     self._opened.add(topic)
         elif self._barred(source, topic, verdict, now, sent) and verdict is Verdict.ALLOWED:
@@ -134,7 +134,7 @@ class Authority:
         elif self._overtaken(source, sent) and verdict is Verdict.ALLOWED:
             verdict = Verdict.OVERTAKEN
         if self._just_met(now):
-            note(self._again, (source, topic), None)
+            _note(self._again, (source, topic), None)
         if verdict is not Verdict.ALLOWED:
             self.refused += 1
         return verdict
@@ -182,9 +182,9 @@ class Authority:
                 grip.barred = grip.barred or not grip.innocent or (met and self._returned(user, topic))
         self._opened.clear()
         if holder != NOBODY and user:
-            note(self._users, user, None)
+            _note(self._users, user, None)
         if self.holder != NOBODY:
-            note(self._ceded, self.holder, now)
+            _note(self._ceded, self.holder, now)
         self.holder = holder
         return True
 
@@ -232,10 +232,10 @@ class Authority:
         self._opened.clear()
         self._resumed = self._met = None
         for source in self._heard:
-            note(self._former, source, None)
+            _note(self._former, source, None)
         self._heard.clear()
         for user in self._users:
-            note(self._former_users, user, None)
+            _note(self._former_users, user, None)
         self._users.clear()
         self._lost = True
 
@@ -287,7 +287,7 @@ class Authority:
         grip = self._grips.get((source, topic))
         if grip is None or (self.stopped is None and sent - grip.last >= LET_GO):
             if grip is not None and source == self.holder:
-                note(self._released, (self.user, topic), None)
+                _note(self._released, (self.user, topic), None)
             grip = self._take(source, topic, now)
             grip.barred = self._holds_on(source, topic, now, sent)
         else:
@@ -349,7 +349,7 @@ class Authority:
             del self._grips[key]
 
 
-def note(known: dict[_Key, _Value], key: _Key, value: _Value) -> None:
+def _note(known: dict[_Key, _Value], key: _Key, value: _Value) -> None:
     """Remember it as the latest of at most :data:`GRIPS`."""
     known.pop(key, None)
     known[key] = value

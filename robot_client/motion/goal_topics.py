@@ -84,6 +84,7 @@ class GoalTopics:
     def close(self, source: str) -> None:
         """A publication ends, and its sink is closed; a goal that waits is dropped."""
         outlet = self._open.pop(source, None)
+        self._motion.forget_order(source)
         if outlet is None:
             return
         self._supersede(source)
@@ -92,10 +93,10 @@ class GoalTopics:
 
     def take(self, source: str, goal: GoalMessage) -> None:
         """Publish a goal if it is allowed, fresh and sane, as soon as the link has proved itself; else count it."""
-        if not self._motion.in_order(goal.by, self._open[source].on.topic, goal.stamp):
-            return
         now = self._now()
         sent = earliest(goal.stamp, now, goal.offset)
+        if not self._motion.in_order(source, goal.by, goal.stamp, fresh=True):
+            return
         if self._authority.judge_request(goal.by, now, sent) is Verdict.ALLOWED:
             self._judge(source, goal, sent)
 

@@ -10,7 +10,7 @@ from twisted.logger import Logger
 from relay_protocol.errors import Refused, Unavailable
 from relay_protocol.link import MotionPolicy, QoS
 from robot_client.link.clock_offset import ClockOffset
-from robot_client.motion.authority import Authority, Verdict, note
+from robot_client.motion.authority import GRIPS, Authority, Verdict
 from robot_client.motion.governor import Governor, unreadable
 from robot_client.motion.guard_port import GuardPort
 from robot_client.motion.motion_topics import MotionPublisher, MotionTopic, MotionTopics
@@ -72,8 +72,8 @@ class MotionControl:
         self.proof: Callable[[], int] = now
         """When the latest ping that the relay has answered was sent."""
         self.stale_commands = 0
-        self._stamps: dict[tuple[int, str], int] = {}
-        """Stamps of the newest commands of sources on topics, the latest last."""
+        self._stamps: dict[str, dict[int, int]] = {}
+        """By publication, the stamp of each connection's newest fresh command, the latest last."""
         self.invalid_commands = 0
         self.watchdog_stops = 0
         self.unguarded_commands = 0
@@ -151,11 +151,11 @@ class MotionControl:
         :param by: the connection that gave it
         """
         on = self._outlets[source].on
-        if not self.in_order(by, on.topic, stamp):
-            return False
         now = self._now()
-        verdict = self._platform.judge(on.type, body)
         fresh = freshness(stamp, now, offset, self._times(on).deadline_ms) is CommandAge.FRESH
+        if not self.in_order(source, by, stamp, fresh):
+            return False
+        verdict = self._platform.judge(on.type, body)
         # Zero that is too old tells nothing of what its source does now: it is no letting go.
         moving = verdict is not Motion.STILL or not fresh
         sent = earliest(stamp, now, offset)
@@ -193,6 +193,7 @@ class MotionControl:
     def close(self, source: str) -> None:
         """A publication ends; what it left moving is stopped, and its sink closed when that is said."""
         outlet = self._outlets.pop(source, None)
+        self.forget_order(source)
         if outlet is None:
             return
         self.leave(source)
@@ -263,16 +264,26 @@ class MotionControl:
         self._tell_finished()
         return done
 
-    def in_order(self, by: int, topic: str, stamp: int) -> bool:
-        """Whether no newer command of this source came on this topic before; else it is counted as too old.
+    def in_order(self, source: str, by: int, stamp: int, fresh: bool) -> bool:
+        """Whether no newer command of this connection came on this publication before; else it counts as too old.
 
         :param stamp: of the command, the relay's monotonic nanoseconds
+        :param fresh: whether later commands are compared with it; a stamp of the future would shut them out
         """
-        newest = self._stamps.get((by, topic), stamp)
-        note(self._stamps, (by, topic), max(newest, stamp))
+        stamps = self._stamps.setdefault(source, {})
+        newest = stamps.get(by, stamp)
+        if fresh:
+            stamps.pop(by, None)
+            stamps[by] = max(newest, stamp)
+            if len(stamps) > GRIPS:
+                del stamps[next(iter(stamps))]
         if stamp < newest:
             self.stale_commands += 1
         return stamp >= newest
+
+    def forget_order(self, source: str) -> None:
+        """A publication has ended."""
+        self._stamps.pop(source, None)
 
     # --- one command ---------------------------------------------------------------------------------------
 

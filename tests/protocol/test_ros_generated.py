@@ -333,7 +333,7 @@ def nested(depth: int, sequences: bool) -> str:
         (nested(9, sequences=True), True),
         (nested(32, sequences=False), False),
         (nested(32, sequences=True), True),
-        ("float64[200000] a", False),
+        ("float64[100000] a", False),
         ("\n".join(f"T f{i}" for i in range(300)) + f"\n{LINE}\nMSG: a/T\nint8 x\nint8 y\nint8 z", True),
         ("T[4] a" + "".join(f"\n{LINE}\nMSG: a/T{'T' * i}\nT{'T' * (i + 1)}[4] a" for i in range(5))
          + f"\n{LINE}\nMSG: a/{'T' * 6}\nstring s", True),

@@ -269,7 +269,7 @@ def test_unfinished_samples_fit_the_relay() -> None:
     while chunk := link.take(2**16):
         got += decoder.feed(b"".join(chunk))
         assert decoder.buffered <= 2**20
-    assert sorted(each.number for each in got) == list(range(40))
+    assert sorted(each.number for each in got if isinstance(each, SampleFrame)) == list(range(40))
 
 
 @given(
