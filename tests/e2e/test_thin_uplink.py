@@ -55,8 +55,9 @@ def test_a_heavy_topic_does_not_make_the_small_ones_of_a_robot_late(rate: int) -
 
             reading = threading.Thread(target=read, daemon=True)
             reading.start()
-            for topic in (SMALL, CLOUD):
-                socket.send(json.dumps({"op": "subscribe", "topic": topic}))
+            # With its type a topic that the relay does not see yet is waited for.
+            for topic, type_name in ((SMALL, "std_msgs/msg/String"), (CLOUD, "sensor_msgs/msg/PointCloud2")):
+                socket.send(json.dumps({"op": "subscribe", "topic": topic, "type": type_name}))
             wait_for("both topics come", lambda: ages and clouds)
             robot.proxy.squeeze(rate * 8)
             time.sleep(3)  # what had left before has to pass
