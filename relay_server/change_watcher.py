@@ -14,7 +14,7 @@ from relay_server.alerts.alerts import AlertHub
 from relay_server.common.clock import SingleFlight
 from relay_server.common.database import AsyncDatabase
 from relay_server.control.controllers import Controllers
-from relay_server.registry.leases import LeaseKeeper
+from relay_server.registry.leases import LeaseExpiry
 from relay_server.robots.registry import RobotRegistry
 from relay_server.video.streams import CameraStreams
 
@@ -35,7 +35,7 @@ class ChangeWatcher:
         desks: Controllers,
         videos: CameraStreams,
         alerts: AlertHub,
-        leases: LeaseKeeper,
+        leases: LeaseExpiry,
         sweep: Callable[[], object],
         seconds: Callable[[], float] = time.monotonic,
     ) -> None:

@@ -13,7 +13,7 @@ from relay_server.channels.channels import Channels
 from relay_server.common.database import AsyncDatabase
 from relay_server.registry.changes import Changes
 from relay_server.registry.entries import event
-from relay_server.registry.leases import EntryCache, LeaseKeeper
+from relay_server.registry.leases import EntryCache, LeaseExpiry
 from relay_server.registry.robot_entries import RobotEntries
 from relay_server.registry.service import RegistryService
 from relay_server.robots.registry import RobotRegistry
@@ -40,7 +40,7 @@ class RegistryParts:
         self._note = note
         self._wall = wall
         self._changes = Changes(secrets.token_hex(4))
-        self.leases = LeaseKeeper(reactor, store, wall, EntryCache(), self._gone)
+        self.leases = LeaseExpiry(reactor, store, wall, EntryCache(), self._gone)
         self.desk = RegistryService(
             store,
             access,

@@ -38,7 +38,7 @@ class EntryCache:
         return set(self._known)
 
 
-class LeaseKeeper:
+class LeaseExpiry:
     """See the module's text.
 
     :param wall: Unix time in seconds

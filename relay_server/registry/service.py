@@ -28,7 +28,7 @@ from relay_server.registry.entries import (
     data_text,
     event,
 )
-from relay_server.registry.leases import LeaseKeeper
+from relay_server.registry.leases import LeaseExpiry
 from relay_server.registry.limits import CHANGES_A_SECOND, CHANGES_AT_ONCE, OF_REALM, OF_USER, USERS
 from relay_server.registry.robot_entries import RobotEntries, VisibleRobot
 from relay_server.resources.etags import PreconditionFailed, see_match, tag_of
@@ -75,7 +75,7 @@ class RegistryService:
         store: AsyncDatabase,
         access: Access,
         robots: RobotEntries,
-        leases: LeaseKeeper,
+        leases: LeaseExpiry,
         changes: Changes,
         note: Callable[[NewStoredEvent], None],
         wall: Callable[[], float],

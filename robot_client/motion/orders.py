@@ -22,7 +22,7 @@ from robot_client.motion.motion import MotionControl
 from robot_client.motion.robot_port import RobotPort
 from robot_client.motion.safety import MILLI
 from robot_client.motion.state_reporter import StateReporter, safety
-from robot_client.motion.stop_store import StopKeeper, StopStore, but
+from robot_client.motion.stop_store import StopRecorder, StopStore, but
 from robot_client.motion.unlimited_command_alert import UnlimitedCommandAlert
 from robot_client.twisted_types import DelayedCall
 
@@ -85,7 +85,7 @@ class OrderHandler:
         """Those that end suppressions, by topic."""
         self._stopping: list[_Stopping] = []
         """Orders to stop that wait for hardware and actions, while those are being stopped."""
-        self._keeping = StopKeeper(latch, body.alert)
+        self._keeping = StopRecorder(latch, body.alert)
         self._resuming: int | None = None
         self._looks = 0
         """How often was looked while the robot was stopped."""

@@ -167,7 +167,7 @@ class DiskStopStore(StopStore):
             os.close(handle)
 
 
-class StopKeeper:
+class StopRecorder:
     """Keeps a stop through a restart; whatever fails in that is words.
 
     :param alert: tells a person

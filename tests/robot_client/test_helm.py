@@ -17,7 +17,7 @@ from robot_client.motion.hardware import LOOKS, PATIENCE, RARELY, Hardware, Swit
 from robot_client.motion.motion import MotionControl
 from robot_client.motion.orders import KEEP_EVERY, UNFORESEEN
 from robot_client.motion.state_reporter import TELL_EVERY
-from robot_client.motion.stop_store import MemoryStopStore, StopKeeper
+from robot_client.motion.stop_store import MemoryStopStore, StopRecorder
 from robot_client.motion.zero_publisher import ZeroPublisher
 from robot_client.platforms.base import CANCELED, GoalOutcome, GraphView
 from robot_client.platforms.memory import TWIST, twist
@@ -364,7 +364,7 @@ def test_stop_whose_record_fails_unforeseen_is_answered_and_can_be_resumed() -> 
         (Hardware, "stop"),
         (GoalCanceller, "stop"),
         (ZeroPublisher, "say"),
-        (StopKeeper, "keep"),
+        (StopRecorder, "keep"),
     ],
 )
 def test_part_of_a_stop_that_fails_unforeseen_keeps_no_other_from_being_done(
@@ -381,7 +381,7 @@ def test_part_of_a_stop_that_fails_unforeseen_keeps_no_other_from_being_done(
     assert (done["ok"], done["reason"]) == (False, UNFORESEEN)
     assert switched.scene.daemon.authority.stopped is not None
     assert (len(switched.asked) == 1) is (owner is not Hardware)
-    assert (switched.scene.latch.stopped is not None) is (owner is not StopKeeper)
+    assert (switched.scene.latch.stopped is not None) is (owner is not StopRecorder)
     switched.control.say(resume())
     switched.answer(True)
     assert switched.done() == [{"op": "done", "id": 3}]
